@@ -1,0 +1,1 @@
+"""What crosses the wire: topics, payloads, the MAVLink dialect, the model contract."""

@@ -1,0 +1,54 @@
+"""The contract between the trainer, which exports a model, and the daemon, which flies it.
+
+It travels inside the ONNX file (metadata key `uavpose_contract`, JSON), so a file says by itself what it takes,
+what it returns and what it was made from. The graph's interface:
+
+    inputs   image  uint8   [N, H, W, 3]  BGR pixels, as OpenCV decodes them; normalisation is inside the graph
+             K      float32 [N, 3, 3]     intrinsics of exactly these pixels (pixel centres at integers)
+    outputs  score        float32 [N, M]        heatmap peak, 0..1, falling
+             center_px    float32 [N, M, 2]     centre of the visible box, pixels of `image`
+             size_px      float32 [N, M, 2]     width and height of the visible box
+             origin_px    float32 [N, M, 2]     projection of the target's body origin
+             t_cam_target_m  float32 [N, M, 3]
+             R_cam_target    float32 [N, M, 3, 3]
+             sigma        float32 [N, M, 6]     1-sigma of (u px, v px, log Z, rotation x, y, z rad in `cam`)
+
+H and W are free multiples of 32; M = `max_peaks`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+METADATA_KEY = "uavpose_contract"
+CONTRACT_VERSION = 1
+INPUT_NAMES = ("image", "K")
+OUTPUT_NAMES = ("score", "center_px", "size_px", "origin_px", "t_cam_target_m", "R_cam_target", "sigma")
+
+
+class ModelContract(BaseModel):
+    """Everything the daemon must know of a model, and everything a person asks of one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    version: int = Field(CONTRACT_VERSION, description="version of this contract's layout")
+    name: str = Field(description="name of the model")
+    configuration: Literal["edge", "paper"]
+    backbone: str
+    precision: Literal["fp32", "int8"]
+    max_peaks: int = Field(ge=1, description="M: targets decoded for each image")
+    acquire_size_wh: tuple[int, int] = Field(description="network input of the whole frame, pixels")
+    acquire_fit: Literal["letterbox", "squash"] = Field(description="how a whole frame is fitted into it")
+    track_size_wh: tuple[int, int] | None = Field(description="network input of a track window; None: no track stage")
+    track_window_scale: float = Field(gt=1.0, description="side of the window on the frame / longer side of the target's box")
+    acquire_score_min: float = Field(ge=0, le=1, description="below it a whole-frame peak is no target")
+    track_score_min: float = Field(ge=0, le=1, description="below it a window's peak is no target")
+    trained_range_m: tuple[float, float]
+    trained_focal_px: tuple[float, float]
+    trained_box_px: tuple[float, float] = Field(description="longer side of the visible box in network pixels, as trained")
+    airframes: list[str] = Field(description="airframe classes in the training data")
+    training: dict[str, str | int | float] = Field(description="data, seed, samples, resolution, commit")
+    metrics: dict[str, float] = Field(description="measured when the file was made; empty if not measured")
+    weights_sha256: str = Field(description="hash of the float weights the graph was made from")

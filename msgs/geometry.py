@@ -1,0 +1,108 @@
+"""Rotations and quaternions, pure NumPy, broadcasting over leading axes.
+
+`R_a_b` turns vectors of frame b into frame a. Quaternions are Hamilton; their order stands in the name.
+Angles are radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def skew(vector: ArrayLike) -> Array:
+    """[..., 3] to the [..., 3, 3] matrix with skew(v) @ w = v x w."""
+    v = np.asarray(vector, dtype=np.float64)
+    out = np.zeros(v.shape[:-1] + (3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(rotation_vector_rad: ArrayLike) -> Array:
+    """Rotation vectors [..., 3] to rotation matrices [..., 3, 3] (Rodrigues)."""
+    w = np.asarray(rotation_vector_rad, dtype=np.float64)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = skew(w)
+    # np.sinc(x) = sin(pi x) / (pi x): smooth at 0 without a branch.
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation matrices [..., 3, 3] to rotation vectors [..., 3], |w| <= pi; well-conditioned up to pi."""
+    q = q_wxyz_from_R(R)
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    half_angle = np.arctan2(np.linalg.norm(q[..., 1:], axis=-1, keepdims=True), q[..., :1])
+    scale = 2.0 / np.sinc(half_angle / np.pi)
+    return q[..., 1:] * scale
+
+
+def rotation_angle(R_a: ArrayLike, R_b: ArrayLike) -> Array:
+    """Geodesic distance [...] in radians between rotations [..., 3, 3] (paper: E_r, before degrees)."""
+    relative = np.swapaxes(np.asarray(R_a, dtype=np.float64), -1, -2) @ np.asarray(R_b, dtype=np.float64)
+    axis = np.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(axis, axis=-1)
+    cosine = 0.5 * (np.trace(relative, axis1=-2, axis2=-1) - 1.0)
+    return np.arctan2(sine, cosine)
+
+
+def q_wxyz_from_R(R: ArrayLike) -> Array:
+    """Rotation matrices [..., 3, 3] to unit quaternions [..., 4], w >= 0 (Bar-Itzhack: largest diagonal first)."""
+    m = np.asarray(R, dtype=np.float64)
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    candidates = np.stack(
+        [
+            np.stack([1 + m00 + m11 + m22, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
+            np.stack([m[..., 2, 1] - m[..., 1, 2], 1 + m00 - m11 - m22, m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0]], -1),
+            np.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1], 1 - m00 + m11 - m22, m[..., 2, 1] + m[..., 1, 2]], -1),
+            np.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2], 1 - m00 - m11 + m22], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.stack([m00 + m11 + m22, m00, m11, m22], axis=-1), axis=-1)
+    q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def R_from_q_wxyz(q_wxyz: ArrayLike) -> Array:
+    """Quaternions [..., 4] (normalised here) to rotation matrices [..., 3, 3]. Raises ValueError on a zero quaternion."""
+    q = np.asarray(q_wxyz, dtype=np.float64)
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.all(norm > 1e-9):
+        raise ValueError("a zero or non-finite quaternion is not a rotation")
+    w, x, y, z = np.moveaxis(q / norm, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def R_from_euler(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Array:
+    """Aerospace Z-Y-X angles [...] to R_ned_body [..., 3, 3]."""
+    roll, pitch, yaw = np.broadcast_arrays(roll_rad, pitch_rad, yaw_rad)
+    zero = np.zeros_like(np.asarray(roll, dtype=np.float64))
+    about = lambda x, y, z: so3_exp(np.stack([x + zero, y + zero, z + zero], axis=-1))  # noqa: E731
+    return about(zero, zero, yaw) @ about(zero, pitch, zero) @ about(roll, zero, zero)
+
+
+def euler_from_R(R_ned_body: ArrayLike) -> tuple[Array, Array, Array]:
+    """R_ned_body [..., 3, 3] to aerospace (roll, pitch, yaw), radians; roll is 0 by convention at pitch = ±90°."""
+    R = np.asarray(R_ned_body, dtype=np.float64)
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return roll, pitch, yaw
