@@ -1,0 +1,90 @@
+"""What moves through the daemon: Frame → Estimate → Track → Report. Each names its frames and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameMeta:
+    """Who a frame is, all times on the monotonic clock."""
+
+    sequence: int  # counts frames the source produced, so a gap is a drop
+    capture_ns: int  # exposure time
+    arrival_ns: int  # when the daemon held the pixels
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture and the intrinsics of exactly its pixels."""
+
+    meta: FrameMeta
+    image_bgr: NDArray[np.uint8]  # [H, W, 3]
+    K: Array  # [3, 3], pixel centres at integers
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One target in one frame, as the network sees it, in `cam` (x right, y down, z forward)."""
+
+    score: float
+    box_xyxy_px: Array  # [4], visible box on the full frame
+    R_cam_target: Array  # [3, 3], target body axes (FRD) into cam
+    t_cam_target_m: Array  # [3]
+    covariance: Array  # [6, 6], (x, y, z m, rot x, y, z rad) in cam; rotation as R = exp(w) R_hat
+    stage: Literal["acquire", "track"]
+
+
+@dataclass(frozen=True)
+class OwnShip:
+    """The camera's vehicle at one instant (a frame's exposure)."""
+
+    time_ns: int  # monotonic
+    R_ned_body: Array  # [3, 3]
+    t_ned_body_m: Array | None  # [3], None without a position source
+    v_ned_body_mps: Array | None  # [3]
+    lat_lon_alt: tuple[float, float, float] | None  # degrees, degrees, metres AMSL, of the ned origin
+
+
+class TrackState(Enum):
+    TENTATIVE = "tentative"
+    CONFIRMED = "confirmed"
+    COASTING = "coasting"
+
+
+@dataclass(frozen=True)
+class Track:
+    """One target over time, at the last frame's exposure time."""
+
+    track_id: int  # 0..max_targets-1; the topic's `tN`
+    state: TrackState
+    time_ns: int  # monotonic time the state is valid for
+    measured_ns: int  # monotonic time of the last measurement in it: its age is what a receiver judges
+    score: float
+    box_xyxy_px: Array  # [4], where the target is, or should be, on the frame
+    R_cam_target: Array  # [3, 3]
+    t_cam_target_m: Array  # [3]
+    covariance: Array  # [6, 6] in cam, as in Estimate
+    R_ned_target: Array | None  # [3, 3]; None without own attitude
+    t_ned_target_m: Array | None  # [3], from the ned origin, or from the own ship if its position is unknown
+    v_ned_target_mps: Array | None  # [3]
+    covariance_ned: Array | None  # [9, 9], (position, velocity, rotation) in ned
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that leaves the daemon for one frame."""
+
+    meta: FrameMeta
+    K: Array
+    image_size_wh: tuple[int, int]
+    tracks: tuple[Track, ...]
+    own_ship: OwnShip | None  # at meta.capture_ns; None: no attitude, tracks are in `cam` only
+    model_sha256: str
