@@ -1,0 +1,56 @@
+#!/bin/sh
+# Make .venv hold the packages of one use: `demo` (what flies, and the replay harness) or `dev` (everything, and GL).
+# Does nothing when that was done before and pyproject.toml has not changed since.
+set -eu
+use=${1:?usage: bootstrap.sh demo|dev}
+cd "$(dirname "$0")/.."
+
+say() { printf 'setup: %s\n' "$*" >&2; }
+
+apt_install() {
+    if ! command -v apt-get >/dev/null; then
+        say "please install these with your system's package manager, then run this again: $*"; exit 2
+    fi
+    sudo=""
+    if [ "$(id -u)" -ne 0 ]; then
+        if ! sudo -n true 2>/dev/null; then
+            say "system packages are missing and this is not root; run: sudo apt-get install $*"; exit 2
+        fi
+        sudo="sudo -n"
+    fi
+    say "installing system packages: $*"
+    $sudo apt-get update -qq
+    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+}
+
+find_python() {
+    for candidate in python3 python3.13 python3.12 python3.11; do
+        if command -v "$candidate" >/dev/null &&
+            "$candidate" -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+            echo "$candidate"; return
+        fi
+    done
+    say "Python 3.11, 3.12 or 3.13 is needed and none was found"; exit 2
+}
+
+if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+    python=$(find_python)
+    "$python" -c 'import ensurepip, venv' 2>/dev/null || apt_install "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
+    say "making .venv with $("$python" --version)"
+    "$python" -m venv .venv
+fi
+
+if [ "$use" = dev ]; then
+    # The renderer draws through EGL: on a GPU where its driver is there, else in software by Mesa.
+    ldconfig=$(command -v ldconfig || echo /sbin/ldconfig)
+    $ldconfig -p | grep -q 'libEGL\.so\.1' && $ldconfig -p | grep -q 'libEGL_\(mesa\|nvidia\)\.so\.0' && $ldconfig -p | grep -q 'libGL\.so\.1' ||
+        apt_install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri
+fi
+
+stamp=".venv/.$use-$(cat pyproject.toml deploy/constraints.txt | sha256sum | cut -c1-16)"
+if [ ! -e "$stamp" ]; then
+    case $use in demo) extras=replay ;; dev) extras=dev ;; *) say "no such use: $use"; exit 2 ;; esac
+    say "installing Python packages for $use"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint deploy/constraints.txt --editable ".[$extras]"
+    : >"$stamp"
+fi
