@@ -51,6 +51,6 @@ stamp=".venv/.$use-$(cat pyproject.toml deploy/constraints.txt | sha256sum | cut
 if [ ! -e "$stamp" ]; then
     case $use in demo) extras=replay ;; dev) extras=dev ;; *) say "no such use: $use"; exit 2 ;; esac
     say "installing Python packages for $use"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint deploy/constraints.txt --editable ".[$extras]"
+    .venv/bin/python -m pip install -qq --disable-pip-version-check --constraint deploy/constraints.txt --editable ".[$extras]"
     : >"$stamp"
 fi
