@@ -1,0 +1,93 @@
+"""zenoh session settings: the UAV is a peer, the ground a router, its tools are clients.
+
+No discovery unless asked for, timestamps on (cached topics need them), and a lease short enough that an outage is
+noticed within seconds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+LEASE_MS = 2000
+RETRY_PERIOD_MS = 200
+RETRY_PERIOD_MAX_MS = 500
+
+
+@dataclass(frozen=True)
+class TlsFiles:
+    """Mutual TLS for `tls/` and `quic/` endpoints: PEM files; the certificate serves for listening and connecting."""
+
+    root_ca: Path
+    certificate: Path
+    private_key: Path
+
+
+def peer_config(
+    listen: Sequence[str],
+    connect: Sequence[str],
+    *,
+    discovery: bool = False,
+    tls: TlsFiles | None = None,
+    pose_rate_max_hz: float | None = None,
+) -> zenoh.Config:
+    """The daemon's session: opens whether or not anything listens at `connect`, and goes on trying.
+
+    `pose_rate_max_hz` thins poses and odometry on what leaves for the network; loopback keeps every one.
+    Raises zenoh.ZError for an endpoint that is no endpoint.
+    """
+    config = _config("peer", listen, connect, discovery, tls)
+    _insert(config, "connect/timeout_ms", -1)
+    _insert(config, "connect/exit_on_failure", False)
+    retry = {"period_init_ms": RETRY_PERIOD_MS, "period_max_ms": RETRY_PERIOD_MAX_MS, "period_increase_factor": 2}
+    _insert(config, "connect/retry", retry)
+    if pose_rate_max_hz is not None:
+        rules = [{"key_expr": f"*/*/target/*/{topic}/**", "freq": pose_rate_max_hz} for topic in ("pose", "odom")]
+        rule_set = {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}
+        _insert(config, "downsampling", [rule_set])
+    return config
+
+
+def router_config(listen: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
+    """The ground's session, which UAVs and tools connect to."""
+    return _config("router", listen, [], False, tls)
+
+
+def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
+    """A tool's session. Opening it raises zenoh.ZError at once if none of the endpoints answers."""
+    return _config("client", [], connect, False, tls)
+
+
+def _config(
+    mode: str, listen: Sequence[str], connect: Sequence[str], discovery: bool, tls: TlsFiles | None
+) -> zenoh.Config:
+    config = zenoh.Config()
+    _insert(config, "mode", mode)
+    # An empty list would keep the built-in default of listening everywhere.
+    _insert(config, "listen/endpoints", {"router": list(listen), "peer": list(listen), "client": []})
+    _insert(config, "connect/endpoints", list(connect))
+    _insert(config, "scouting/multicast/enabled", discovery)
+    _insert(config, "scouting/gossip/enabled", discovery)
+    _insert(config, "timestamping/enabled", True)
+    _insert(config, "transport/link/tx/lease", LEASE_MS)
+    _insert(config, "transport/shared_memory/enabled", False)
+    if tls is not None:
+        settings = {
+            "root_ca_certificate": str(tls.root_ca),
+            "listen_certificate": str(tls.certificate),
+            "listen_private_key": str(tls.private_key),
+            "connect_certificate": str(tls.certificate),
+            "connect_private_key": str(tls.private_key),
+            "enable_mtls": True,
+        }
+        for name, value in settings.items():
+            _insert(config, f"transport/link/tls/{name}", value)
+    return config
+
+
+def _insert(config: zenoh.Config, key: str, value: object) -> None:
+    config.insert_json5(key, json.dumps(value))

@@ -1,0 +1,288 @@
+"""Our CDR against rosbags' for random values, and against bytes that nobody sane would send."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msgs import cdr, topics
+from msgs.wire import PayloadError, Refusal
+
+from .ros_oracle import STORE, deserialize, make, serialize
+
+FEW = settings(max_examples=25, deadline=None)
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64)
+text = st.text(st.characters(exclude_characters="\x00", exclude_categories=["Cs"]), max_size=9)
+stamps = st.integers(0, 2**31 * 10**9 - 1)
+u32 = st.integers(0, 2**32 - 1)
+
+
+def vectors(n: int) -> st.SearchStrategy[np.ndarray]:
+    return st.lists(finite, min_size=n, max_size=n).map(np.array)
+
+
+@st.composite
+def quaternions(draw: st.DrawFn) -> np.ndarray:
+    q = np.array(draw(st.lists(st.floats(-1, 1), min_size=4, max_size=4)))
+    norm = np.linalg.norm(q)
+    return q / norm if norm > 1e-3 else np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@st.composite
+def covariances(draw: st.DrawFn) -> np.ndarray:
+    rng = np.random.default_rng(draw(u32))
+    root = rng.normal(size=(6, draw(st.integers(1, 6)))) * 10.0 ** rng.uniform(-4, 3, size=(6, 1))
+    full = root @ root.T
+    return (full + full.T) / 2
+
+
+hypotheses = st.builds(cdr.Hypothesis, text, finite, vectors(3), quaternions(), covariances())
+detections = st.builds(
+    cdr.Detection3D,
+    stamps,
+    text,
+    st.lists(hypotheses, max_size=2).map(tuple),
+    vectors(3),
+    quaternions(),
+    vectors(3),
+    text,
+)
+transforms = st.builds(cdr.TransformStamped, stamps, text, text, vectors(3), quaternions())
+statuses = st.builds(
+    cdr.DiagnosticStatus,
+    st.integers(0, 3),
+    text,
+    text,
+    text,
+    st.lists(st.tuples(text, text), max_size=3).map(tuple),
+)
+payloads = st.one_of(
+    st.builds(cdr.PoseWithCovarianceStamped, stamps, text, vectors(3), quaternions(), covariances()),
+    st.builds(
+        cdr.Odometry,
+        stamps,
+        text,
+        text,
+        vectors(3),
+        quaternions(),
+        covariances(),
+        vectors(3),
+        vectors(3),
+        covariances(),
+    ),
+    st.builds(cdr.Detection3DArray, stamps, text, st.lists(detections, max_size=3).map(tuple)),
+    st.builds(cdr.TFMessage, st.lists(transforms, max_size=3).map(tuple)),
+    st.builds(
+        cdr.CameraInfo,
+        stamps,
+        text,
+        u32,
+        u32,
+        text,
+        st.lists(finite, max_size=8).map(np.array),
+        vectors(9).map(lambda v: v.reshape(3, 3)),
+        vectors(9).map(lambda v: v.reshape(3, 3)),
+        vectors(12).map(lambda v: v.reshape(3, 4)),
+        u32,
+        u32,
+        st.builds(cdr.RegionOfInterest, u32, u32, u32, u32, st.booleans()),
+    ),
+    st.builds(cdr.CompressedImage, stamps, text, text, st.binary(max_size=40)),
+    st.builds(cdr.DiagnosticArray, stamps, text, st.lists(statuses, max_size=3).map(tuple)),
+    st.builds(cdr.Log, stamps, st.integers(0, 255), text, text, text, text, u32),
+)
+
+
+def _stamp(ns: int) -> Any:
+    return make("builtin_interfaces/msg/Time", ns // 10**9, ns % 10**9)
+
+
+def _header(message: Any) -> Any:
+    return make("std_msgs/msg/Header", _stamp(message.stamp_ns), message.frame_id)
+
+
+def _pose(t: np.ndarray, q: np.ndarray) -> Any:
+    point = make("geometry_msgs/msg/Point", *t)
+    return make("geometry_msgs/msg/Pose", point, make("geometry_msgs/msg/Quaternion", *q))
+
+
+def _pose_cov(t: np.ndarray, q: np.ndarray, covariance: np.ndarray) -> Any:
+    return make("geometry_msgs/msg/PoseWithCovariance", _pose(t, q), covariance.ravel())
+
+
+def _vector(v: np.ndarray) -> Any:
+    return make("geometry_msgs/msg/Vector3", *v)
+
+
+def _detection(d: cdr.Detection3D) -> Any:
+    results = [
+        make(
+            "vision_msgs/msg/ObjectHypothesisWithPose",
+            make("vision_msgs/msg/ObjectHypothesis", h.class_id, h.score),
+            _pose_cov(h.t_cam_target_m, h.q_cam_target_xyzw, h.covariance),
+        )
+        for h in d.hypotheses
+    ]
+    box = make("vision_msgs/msg/BoundingBox3D", _pose(d.t_cam_box_m, d.q_cam_box_xyzw), _vector(d.size_m))
+    return make("vision_msgs/msg/Detection3D", _header(d), results, box, d.id)
+
+
+def _transform(t: cdr.TransformStamped) -> Any:
+    rotation = make("geometry_msgs/msg/Quaternion", *t.q_frame_child_xyzw)
+    transform = make("geometry_msgs/msg/Transform", _vector(t.t_frame_child_m), rotation)
+    return make("geometry_msgs/msg/TransformStamped", _header(t), t.child_frame_id, transform)
+
+
+def _status(s: cdr.DiagnosticStatus) -> Any:
+    values = [make("diagnostic_msgs/msg/KeyValue", *pair) for pair in s.values]
+    return make("diagnostic_msgs/msg/DiagnosticStatus", s.level, s.name, s.message, s.hardware_id, values)
+
+
+def as_ros(m: cdr.Payload) -> Any:
+    """The same message, built from rosbags' own classes."""
+    match m:
+        case cdr.PoseWithCovarianceStamped():
+            pose = _pose_cov(m.t_cam_target_m, m.q_cam_target_xyzw, m.covariance)
+            return make("geometry_msgs/msg/PoseWithCovarianceStamped", _header(m), pose)
+        case cdr.Odometry():
+            twist = make("geometry_msgs/msg/Twist", _vector(m.v_target_mps), _vector(m.omega_target_radps))
+            twist_cov = make("geometry_msgs/msg/TwistWithCovariance", twist, m.covariance_twist.ravel())
+            pose = _pose_cov(m.t_ned_target_m, m.q_ned_target_xyzw, m.covariance)
+            return make("nav_msgs/msg/Odometry", _header(m), m.child_frame_id, pose, twist_cov)
+        case cdr.Detection3DArray():
+            return make("vision_msgs/msg/Detection3DArray", _header(m), [_detection(d) for d in m.detections])
+        case cdr.TFMessage():
+            return make("tf2_msgs/msg/TFMessage", [_transform(t) for t in m.transforms])
+        case cdr.CameraInfo():
+            roi = make("sensor_msgs/msg/RegionOfInterest", *dataclasses.astuple(m.roi))
+            size, matrices = (m.height_px, m.width_px), (m.K.ravel(), m.R.ravel(), m.P.ravel())
+            rest = (m.distortion_model, m.distortion, *matrices, m.binning_x, m.binning_y, roi)
+            return make("sensor_msgs/msg/CameraInfo", _header(m), *size, *rest)
+        case cdr.CompressedImage():
+            data = np.frombuffer(m.data, np.uint8)
+            return make("sensor_msgs/msg/CompressedImage", _header(m), m.format, data)
+        case cdr.DiagnosticArray():
+            return make("diagnostic_msgs/msg/DiagnosticArray", _header(m), [_status(s) for s in m.status])
+        case cdr.Log():
+            fields = (m.level, m.name, m.msg, m.file, m.function, m.line)
+            return make("rcl_interfaces/msg/Log", _stamp(m.stamp_ns), *fields)
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    return a == b
+
+
+@settings(max_examples=250, deadline=None)
+@given(payloads)
+def test_bytes_equal_rosbags_and_come_back_as_they_went(message: cdr.Payload) -> None:
+    ros = as_ros(message)
+    payload = message.encode()
+    assert payload == serialize(ros)
+    assert type(deserialize(payload, ros.__msgtype__)) is type(ros)
+    assert same(cdr.DECODERS[ros.__msgtype__](payload), message)
+
+
+@pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda t: t.name)
+def test_type_hashes_are_those_of_the_interfaces(topic: topics.Topic) -> None:
+    assert topic.type_hash == STORE.hash_rihs01(topic.ros_type)
+    assert topic.ros_type in cdr.DECODERS
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.sampled_from(sorted(cdr.DECODERS)), st.binary(max_size=500), st.booleans())
+def test_junk_is_refused_with_a_reason(ros_type: str, junk: bytes, framed: bool) -> None:
+    try:
+        cdr.DECODERS[ros_type](b"\x00\x01\x00\x00" + junk if framed else junk)
+    except PayloadError as error:
+        assert error.reason in Refusal
+
+
+@settings(max_examples=250, deadline=None)
+@given(payloads, st.data())
+def test_a_damaged_payload_is_refused_or_still_valid(message: cdr.Payload, data: st.DataObject) -> None:
+    damaged = bytearray(message.encode())
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    damaged = damaged[: data.draw(st.integers(0, len(damaged)))]
+    try:
+        decoded = type(message).decode(bytes(damaged))
+    except PayloadError:
+        return
+    assert same(type(message).decode(decoded.encode()), decoded)
+
+
+POSE = cdr.PoseWithCovarianceStamped(
+    1_700_000_000_123_456_789, "cam", np.array([1.0, -2.0, 300.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)
+)
+
+
+def _with(**changes: Any) -> bytes:
+    return dataclasses.replace(POSE, **changes).encode()
+
+
+def _covariance(*entries: tuple[int, int, float]) -> np.ndarray:
+    matrix = np.eye(6)
+    for row, column, value in entries:
+        matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (_with(t_cam_target_m=np.array([1.0, np.nan, 2.0])), Refusal.NOT_FINITE),
+        (_with(t_cam_target_m=np.array([1.0, 2.0, np.inf])), Refusal.NOT_FINITE),
+        (_with(q_cam_target_xyzw=np.array([0.0, 0.0, 0.0, 1.01])), Refusal.QUATERNION),
+        (_with(q_cam_target_xyzw=np.zeros(4)), Refusal.QUATERNION),
+        (_with(q_cam_target_xyzw=np.full(4, 1e200)), Refusal.QUATERNION),
+        (_with(covariance=_covariance((0, 0, -1.0))), Refusal.COVARIANCE),
+        (_with(covariance=_covariance((0, 1, 0.5))), Refusal.COVARIANCE),
+        (_with(covariance=_covariance((0, 1, 1.5), (1, 0, 1.5))), Refusal.COVARIANCE),
+        (
+            _with(covariance=_covariance(*[(i, j, -0.9) for i in range(3) for j in range(3) if i != j])),
+            Refusal.COVARIANCE,
+        ),
+        (_with(covariance=_covariance((0, 0, 1e-300), (0, 1, 1e300), (1, 0, 1e300))), Refusal.COVARIANCE),
+        (POSE.encode()[:-1], Refusal.TRUNCATED),
+        (POSE.encode() + bytes(4), Refusal.TRAILING),
+        (b"\x00\x00" + POSE.encode()[2:], Refusal.ENCAPSULATION),
+        (b"", Refusal.ENCAPSULATION),
+        (POSE.encode()[:12] + struct.pack("<I", 2**32 - 1) + POSE.encode()[16:], Refusal.LENGTH),
+        (POSE.encode()[:8] + struct.pack("<I", 10**9) + POSE.encode()[12:], Refusal.STAMP),
+        (POSE.encode().replace(b"cam\x00", b"camx"), Refusal.STRING),
+        (POSE.encode().replace(b"cam\x00", b"c\xffm\x00"), Refusal.STRING),
+    ],
+)
+def test_each_lie_has_its_reason(payload: bytes, reason: Refusal) -> None:
+    with pytest.raises(PayloadError) as caught:
+        cdr.PoseWithCovarianceStamped.decode(payload)
+    assert caught.value.reason is reason
+
+
+def test_padding_to_four_bytes_is_no_lie() -> None:
+    assert same(cdr.PoseWithCovarianceStamped.decode(POSE.encode() + bytes(3)), POSE)
+
+
+@FEW
+@given(covariances())
+def test_covariances_rounded_to_float32_are_still_taken(covariance: np.ndarray) -> None:
+    rounded = covariance.astype(np.float32).astype(np.float64)
+    assert same(cdr.PoseWithCovarianceStamped.decode(_with(covariance=rounded)).covariance, rounded)
+
+
+def test_a_misshapen_array_is_never_sent() -> None:
+    with pytest.raises(ValueError, match="shape"):
+        _with(covariance=np.eye(3))
