@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import struct
 from typing import Any
@@ -203,11 +204,10 @@ def test_type_hashes_are_those_of_the_interfaces(topic: topics.Topic) -> None:
 
 @settings(max_examples=400, deadline=None)
 @given(st.sampled_from(sorted(cdr.DECODERS)), st.binary(max_size=500), st.booleans())
-def test_junk_is_refused_with_a_reason(ros_type: str, junk: bytes, framed: bool) -> None:
-    try:
-        cdr.DECODERS[ros_type](b"\x00\x01\x00\x00" + junk if framed else junk)
-    except PayloadError as error:
-        assert error.reason in Refusal
+def test_junk_raises_nothing_but_payload_error(ros_type: str, junk: bytes, framed: bool) -> None:
+    payload = b"\x00\x01\x00\x00" + junk if framed else junk
+    with contextlib.suppress(PayloadError):
+        cdr.DECODERS[ros_type](payload).encode()
 
 
 @settings(max_examples=250, deadline=None)

@@ -1,0 +1,164 @@
+"""MAVLink 2: pymavlink's `common` dialect plus the messages of dialect/uavpose.xml, and packing that checks.
+
+Only `MAVLink` (pack and parse) is used of pymavlink; sockets, addresses and signatures belong to the link.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+# Any text in it, "0" too, would switch CRC checks off.
+os.environ.pop("MAV_IGNORE_CRC", None)
+
+from pymavlink.dialects.v20 import common as dialect
+
+# pymavlink may have been imported, and have read the variable, before this module.
+dialect.MAVLINK_IGNORE_CRC = 0
+
+DIALECT_XML = Path(__file__).parent / "dialect" / "uavpose.xml"
+
+MAVLink = dialect.MAVLink
+MAVLinkMessage = dialect.MAVLink_message
+MAVError = dialect.MAVError
+
+TARGET_OBS_FRAME_OTHER = 3
+_Q_UNKNOWN = (0.0, 0.0, 0.0, 0.0)
+_TYPES = {
+    "uint64_t": ("Q", 8), "int64_t": ("q", 8), "double": ("d", 8),
+    "uint32_t": ("I", 4), "int32_t": ("i", 4), "float": ("f", 4),
+    "uint16_t": ("H", 2), "int16_t": ("h", 2),
+    "uint8_t": ("B", 1), "int8_t": ("b", 1),
+}  # fmt: skip
+
+
+def _message_class(definition: ET.Element) -> type[Any]:
+    """A pymavlink message class from a `<message>` without extensions or text fields.
+
+    The wire order is by size of the element, largest first, and stable; CRC_EXTRA is the published checksum of the
+    name and the fields in that order (MAVLink guide, "Serialization").
+    """
+    name = definition.attrib["name"]
+    fields = []
+    for element in definition.findall("field"):
+        base, _, count = element.attrib["type"].rstrip("]").partition("[")
+        fields.append((element.attrib["name"], base, int(count or 0)))
+    ordered = sorted(fields, key=lambda field: -_TYPES[field[1]][1])
+    checksum = dialect.x25crc(f"{name} ".encode())
+    for field, base, length in ordered:
+        checksum.accumulate(f"{base} {field} ".encode())
+        if length:
+            checksum.accumulate(bytes([length]))
+    names = [field for field, _, _ in fields]
+    wire_names = [field for field, _, _ in ordered]
+
+    def __init__(self: Any, *values: Any) -> None:
+        MAVLinkMessage.__init__(self, self.id, self.msgname)
+        self._fieldnames = self.fieldnames
+        for field, value in zip(names, values, strict=True):
+            setattr(self, field, value)
+
+    def pack(self: Any, mav: Any, force_mavlink1: bool = False) -> bytes:
+        flat: list[Any] = []
+        for field, _, count in ordered:
+            value = getattr(self, field)
+            flat.extend(value if count else [value])
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(*flat), force_mavlink1=force_mavlink1)
+
+    return type(
+        f"MAVLink_{name.lower()}_message",
+        (MAVLinkMessage,),
+        {
+            "id": int(definition.attrib["id"]),
+            "msgname": name,
+            "fieldnames": names,
+            "ordered_fieldnames": wire_names,
+            "fieldtypes": [base for _, base, _ in fields],
+            "orders": [wire_names.index(field) for field in names],
+            "lengths": [count or 1 for _, _, count in ordered],
+            "array_lengths": [count for _, _, count in ordered],
+            "crc_extra": (checksum.crc & 0xFF) ^ (checksum.crc >> 8),
+            "unpacker": struct.Struct("<" + "".join(f"{count or ''}{_TYPES[base][0]}" for _, base, count in ordered)),
+            "__init__": __init__,
+            "pack": pack,
+        },
+    )
+
+
+def _register() -> dict[str, type[Any]]:
+    messages = [_message_class(element) for element in ET.parse(DIALECT_XML).getroot().iter("message")]
+    for message in messages:
+        dialect.mavlink_map[message.id] = message
+    return {message.msgname: message for message in messages}
+
+
+MAVLink_target_relative_message = _register()["TARGET_RELATIVE"]
+
+
+def pack(mav: Any, message: Any, *, unknown: Collection[str] = ()) -> bytes:
+    """Pack a message as MAVLink 2 with `mav`'s ids and signing, and count its sequence on.
+
+    Raises ValueError, naming message and field, for a number that is not finite, unless the field is in `unknown`
+    (those whose definition gives NaN that meaning), and for a value that does not fit its field.
+    """
+    for field in message.get_fieldnames():
+        value = getattr(message, field)
+        numbers = value if isinstance(value, (list, tuple)) else (value,)
+        if field not in unknown and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
+            raise ValueError(f"{message.get_type()}.{field} is not finite: {value}")
+    try:
+        packed = message.pack(mav)
+    except (struct.error, OverflowError, IndexError, TypeError) as error:
+        raise ValueError(f"{message.get_type()} cannot be packed: {error}") from error
+    mav.seq = (mav.seq + 1) % 256
+    return packed
+
+
+def pack_target_relative(
+    mav: Any,
+    *,
+    utc_us: int,
+    target_id: int,
+    t_cam_target_m: Sequence[float],
+    position_std_m: Sequence[float],
+    attitude_std_rad: float,
+    q_cam_target_wxyz: Sequence[float],
+    q_ned_cam_wxyz: Sequence[float] | None,
+) -> bytes:
+    """TARGET_RELATIVE (511) with the target's full pose in `cam` (frame OTHER), as one MAVLink 2 packet.
+
+    Vectors are [3], quaternions [4] of unit length; `q_ned_cam_wxyz` None: own attitude unknown. `utc_us` is the
+    exposure time. Raises ValueError for a value that is not finite, no rotation, or does not fit its field.
+    """
+    q_target = _unit_quaternion("q_target", q_cam_target_wxyz)
+    q_sensor = _Q_UNKNOWN if q_ned_cam_wxyz is None else _unit_quaternion("q_sensor", q_ned_cam_wxyz)
+    message = MAVLink_target_relative_message(
+        utc_us,
+        target_id,
+        TARGET_OBS_FRAME_OTHER,
+        *_floats("x, y, z", t_cam_target_m, 3),
+        _floats("pos_std", position_std_m, 3),
+        float(attitude_std_rad),
+        q_target,
+        q_sensor,
+        dialect.LANDING_TARGET_TYPE_VISION_OTHER,
+    )
+    return pack(mav, message)
+
+
+def _floats(field: str, values: Sequence[float], count: int) -> tuple[float, ...]:
+    if len(values) != count:
+        raise ValueError(f"TARGET_RELATIVE.{field} takes {count} numbers, not {len(values)}")
+    return tuple(float(value) for value in values)
+
+
+def _unit_quaternion(field: str, q_wxyz: Sequence[float]) -> tuple[float, ...]:
+    q = _floats(field, q_wxyz, 4)
+    if not abs(math.hypot(*q) - 1.0) <= 1e-3:
+        raise ValueError(f"TARGET_RELATIVE.{field} is not of unit length: {q}")
+    return q

@@ -1,0 +1,186 @@
+"""The dialect: its checksum by the published algorithm, its packets read by MAVSDK, and what is never packed."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import threading
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.mavlink_direct import MavlinkDirect
+
+from msgs import mavlink
+
+POSE: dict[str, Any] = {
+    "utc_us": 1_700_000_000_123_456,
+    "target_id": 2,
+    "t_cam_target_m": (1.5, -2.25, 300.125),
+    "position_std_m": (0.5, 0.75, 12.0),
+    "attitude_std_rad": 0.125,
+    "q_cam_target_wxyz": (0.5, 0.5, -0.5, 0.5),
+    "q_ned_cam_wxyz": (0.0, 1.0, 0.0, 0.0),
+}
+
+
+def crc16_mcrf4xx(data: bytes) -> int:
+    """The checksum of the MAVLink guide, bit by bit."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0x8408 if crc & 1 else 0)
+    return crc
+
+
+def test_crc_extra_of_the_xml_is_upstreams() -> None:
+    sizes = {"uint64_t": 8, "float": 4, "uint8_t": 1}
+    message = next(m for m in ET.parse(mavlink.DIALECT_XML).iter("message") if m.get("id") == "511")
+    fields = [(f.attrib["type"], f.attrib["name"]) for f in message.iter("field")]
+    fields.sort(key=lambda f: sizes[f[0].split("[")[0]], reverse=True)
+    data = b"TARGET_RELATIVE "
+    for kind, name in fields:
+        base, _, count = kind.partition("[")
+        data += f"{base} {name} ".encode() + (bytes([int(count[:-1])]) if count else b"")
+    crc = crc16_mcrf4xx(data)
+    assert (crc & 0xFF) ^ (crc >> 8) == 28
+    ours = mavlink.MAVLink_target_relative_message
+    assert (ours.id, ours.crc_extra, ours.unpacker.format, ours.unpacker.size) == (511, 28, "<Qfff3ff4f4fBBB", 71)
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def ground() -> Iterator[tuple[Mavsdk, int]]:
+    """MAVSDK as a ground station listening on a UDP port."""
+    port = _free_port()
+    peer = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    assert peer.add_any_connection(f"udpin://127.0.0.1:{port}") == 0
+    yield peer, port
+    peer.destroy()
+
+
+def test_mavsdk_decodes_target_relative_field_by_field(ground: tuple[Mavsdk, int]) -> None:
+    peer, port = ground
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    heartbeat = mavlink.dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    seen, decoded = threading.Event(), threading.Event()
+    messages: list[Any] = []
+    peer.subscribe_on_new_system(lambda *_: seen.set())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        while not seen.wait(0.05):
+            sender.sendto(mavlink.pack(mav, heartbeat), ("127.0.0.1", port))
+        direct = MavlinkDirect(peer.get_systems()[0])
+        direct.load_custom_xml(mavlink.DIALECT_XML.read_text())
+        direct.subscribe_message("TARGET_RELATIVE", lambda message, _: (messages.append(message), decoded.set()))
+        while not decoded.wait(0.05):
+            sender.sendto(mavlink.pack_target_relative(mav, **POSE), ("127.0.0.1", port))
+    assert (messages[0].system_id, messages[0].component_id) == (1, 191)
+    fields = json.loads(messages[0].fields_json)
+    assert fields == {
+        "message_id": 511,
+        "message_name": "TARGET_RELATIVE",
+        "timestamp": POSE["utc_us"],
+        "id": 2,
+        "frame": 3,
+        "x": 1.5,
+        "y": -2.25,
+        "z": 300.125,
+        "pos_std": [0.5, 0.75, 12.0],
+        "yaw_std": 0.125,
+        "q_target": [0.5, 0.5, -0.5, 0.5],
+        "q_sensor": [0.0, 1.0, 0.0, 0.0],
+        "type": 3,
+    }
+
+
+f32 = st.floats(-1e6, 1e6, width=32)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**64 - 1), st.integers(0, 255), st.tuples(f32, f32, f32), st.integers(0, 2**32 - 1))
+def test_our_parser_reads_back_what_was_packed(utc_us: int, target_id: int, t: tuple[float, ...], seed: int) -> None:
+    q = np.random.default_rng(seed).normal(size=4)
+    q = (q / np.linalg.norm(q)).astype(np.float32)
+    pose = POSE | {"utc_us": utc_us, "target_id": target_id, "t_cam_target_m": t, "q_cam_target_wxyz": q}
+    packet = mavlink.pack_target_relative(mavlink.MAVLink(None, 7, 191), **pose)
+    (message,) = mavlink.MAVLink(None).parse_buffer(packet)
+    assert (message.timestamp, message.id, (message.x, message.y, message.z)) == (utc_us, target_id, t)
+    assert np.array_equal(message.q_target, q)
+    assert (message.get_srcSystem(), message.get_srcComponent()) == (7, 191)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"t_cam_target_m": (math.nan, 0.0, 1.0)},
+        {"t_cam_target_m": (0.0, 1.0)},
+        {"t_cam_target_m": (0.0, 0.0, 1e300)},
+        {"position_std_m": (1.0, math.inf, 1.0)},
+        {"attitude_std_rad": math.nan},
+        {"q_cam_target_wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"q_cam_target_wxyz": (math.nan, 0.0, 0.0, 1.0)},
+        {"q_ned_cam_wxyz": (1.0, 1.0, 0.0, 0.0)},
+        {"utc_us": -1},
+        {"target_id": 256},
+    ],
+)
+def test_what_is_no_pose_is_never_packed(change: dict[str, Any]) -> None:
+    mav = mavlink.MAVLink(None, 1, 191)
+    with pytest.raises(ValueError, match="TARGET_RELATIVE"):
+        mavlink.pack_target_relative(mav, **(POSE | change))
+    assert mav.seq == 0
+
+
+def test_unknown_own_attitude_is_the_zero_quaternion() -> None:
+    packet = mavlink.pack_target_relative(mavlink.MAVLink(None, 1, 191), **(POSE | {"q_ned_cam_wxyz": None}))
+    (message,) = mavlink.MAVLink(None).parse_buffer(packet)
+    assert message.q_sensor == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_nan_passes_only_where_it_means_unknown() -> None:
+    fields = (1, 0, 0, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    message = mavlink.dialect.MAVLink_camera_tracking_image_status_message(*fields)
+    with pytest.raises(ValueError, match=r"CAMERA_TRACKING_IMAGE_STATUS\.point_x"):
+        mavlink.pack(mavlink.MAVLink(None, 1, 100), message)
+    assert mavlink.pack(mavlink.MAVLink(None, 1, 100), message, unknown={"point_x"})
+
+
+def test_sequence_counts_and_wraps() -> None:
+    mav, parser = mavlink.MAVLink(None, 1, 191), mavlink.MAVLink(None)
+    heartbeat = mavlink.dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    numbers = [parser.parse_buffer(mavlink.pack(mav, heartbeat))[0].get_seq() for _ in range(258)]
+    assert numbers == [n % 256 for n in range(258)]
+
+
+@pytest.mark.parametrize("before", ["", "from pymavlink.dialects.v20 import common"])
+def test_a_corrupt_packet_is_refused_whatever_the_environment_says(before: str) -> None:
+    script = f"""
+{before}
+from msgs import mavlink
+heartbeat = mavlink.dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+packet = bytearray(mavlink.pack(mavlink.MAVLink(None, 1, 191), heartbeat))
+packet[12] ^= 1
+try:
+    mavlink.MAVLink(None).parse_buffer(packet)
+except mavlink.MAVError:
+    print("refused")
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | {"MAV_IGNORE_CRC": "0"}, capture_output=True, text=True
+    )
+    assert run.stdout.strip() == "refused", run.stderr
