@@ -1,0 +1,251 @@
+"""A simulated autopilot: tells own-ship state over MAVLink on UDP, and takes what the daemon sends.
+
+It reports a sequence's telemetry as an ArduPilot plane would, on a boot clock of its own: HEARTBEAT,
+ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME; it answers TIMESYNC and
+MAV_CMD_SET_MESSAGE_INTERVAL.
+
+    python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
+
+Prints one JSON object a line: `ready`, each `target_relative` with its receive time, and a `summary` when it is told
+to stop (SIGTERM, SIGINT) or the process that started it ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import socket
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from msgs.geometry import R_from_q_wxyz, euler_from_R
+from msgs.mavlink import MAVLink, dialect, pack
+from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
+
+SYSTEM_ID = 1
+COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
+TARGET_RELATIVE_ID = 511
+# What it streams unasked; MAV_CMD_SET_MESSAGE_INTERVAL changes it.
+DEFAULT_RATES_HZ = {
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20.0,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
+    dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+}
+# Up for an odd while before the first frame: no test may pass by taking boot time for the host's.
+BOOT_BEFORE_START_NS = 734_567_891_234
+INTERVAL_MIN_NS = 1_000_000
+_POLL_S = 0.2
+_DATAGRAM_BYTES = 65535
+
+
+class Autopilot:
+    """Bytes in, bytes out, on the host's monotonic clock; no sockets, no waiting.
+
+    `received` counts valid messages by name, `refused` everything else by reason.
+    """
+
+    def __init__(self, telemetry: Telemetry, start_at_ns: int, boot_at_ns: int) -> None:
+        self._telemetry = telemetry
+        self._start_at_ns = start_at_ns
+        self._boot_at_ns = boot_at_ns
+        self._mav = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
+        self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in DEFAULT_RATES_HZ.items()}
+        self._next_ns = dict.fromkeys(DEFAULT_RATES_HZ, boot_at_ns)
+        self._last_target_us: dict[int, int] = {}
+        self.received: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+
+    def next_due_ns(self) -> int | None:
+        """Monotonic time of the next telemetry message; None if all are switched off."""
+        return min(self._next_ns.values(), default=None)
+
+    def due(self, now_ns: int) -> list[bytes]:
+        """Telemetry to be sent by `now_ns`, packed. What fell behind is skipped, not sent in a burst."""
+        packed = []
+        for message_id, next_ns in self._next_ns.items():
+            if next_ns <= now_ns:
+                packed.append(pack(self._mav, self._telemetry_message(message_id, now_ns)))
+                interval_ns = self._interval_ns[message_id]
+                self._next_ns[message_id] = max(next_ns + interval_ns, now_ns + interval_ns // 2)
+        return packed
+
+    def take(self, datagram: bytes, now_ns: int) -> tuple[list[bytes], list[dict[str, Any]]]:
+        """Take one datagram off the wire; nothing in it is trusted.
+
+        Returns:
+            Packed replies, and a record of each valid TARGET_RELATIVE.
+        """
+        # A parser for each datagram: a truncated frame must not swallow what follows.
+        parser = MAVLink(None)
+        parser.robust_parsing = True
+        replies, records = [], []
+        for message in parser.parse_buffer(datagram) or []:
+            reason = self._refusal(message)
+            if reason is not None:
+                self.refused[reason] += 1
+                continue
+            self.received[message.get_type()] += 1
+            reply = self._reply(message, now_ns)
+            if reply is not None:
+                replies.append(pack(self._mav, reply))
+            if message.get_msgId() == TARGET_RELATIVE_ID:
+                records.append(_target_record(message, now_ns))
+        return replies, records
+
+    def _boot_ms(self, now_ns: int) -> int:
+        return (now_ns - self._boot_at_ns) // 1_000_000 % 2**32
+
+    def _telemetry_message(self, message_id: int, now_ns: int) -> Any:
+        if message_id == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            kind, autopilot = dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+            armed = dialect.MAV_MODE_FLAG_SAFETY_ARMED | dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+            return dialect.MAVLink_heartbeat_message(kind, autopilot, armed, 0, dialect.MAV_STATE_ACTIVE, 3)
+        boot_ms = self._boot_ms(now_ns)
+        if message_id == dialect.MAVLINK_MSG_ID_SYSTEM_TIME:
+            return dialect.MAVLink_system_time_message(time.time_ns() // 1000, boot_ms)
+        state = self._telemetry.at(now_ns - self._start_at_ns)
+        if message_id == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
+            q_and_rates = (*state.q_ned_body_wxyz.tolist(), *state.rates_body_radps.tolist())
+            return dialect.MAVLink_attitude_quaternion_message(boot_ms, *q_and_rates)
+        if message_id == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            position_and_velocity = (*state.t_ned_body_m.tolist(), *state.v_ned_body_mps.tolist())
+            return dialect.MAVLink_local_position_ned_message(boot_ms, *position_and_velocity)
+        _, _, yaw_rad = euler_from_R(R_from_q_wxyz(state.q_ned_body_wxyz))
+        return dialect.MAVLink_global_position_int_message(
+            boot_ms,
+            round(state.lat_deg * 1e7),
+            round(state.lon_deg * 1e7),
+            round(state.alt_m * 1e3),
+            round(-state.t_ned_body_m[2] * 1e3),
+            *(round(v * 100.0) for v in state.v_ned_body_mps.tolist()),
+            round(math.degrees(float(yaw_rad)) * 100.0) % 36000,
+        )
+
+    def _refusal(self, message: Any) -> str | None:
+        """Why a parsed message is not taken, or None."""
+        kind = message.get_type()
+        if kind == "BAD_DATA":
+            return "not MAVLink"
+        if kind.startswith("UNKNOWN"):
+            return "unknown message"
+        if message.get_srcSystem() != SYSTEM_ID or message.get_srcComponent() == COMPONENT_ID:
+            return "not from a component of this vehicle"
+        if message.get_msgId() != TARGET_RELATIVE_ID:
+            return None
+        numbers = (message.x, message.y, message.z, *message.pos_std, message.yaw_std, *message.q_target)
+        if not all(math.isfinite(value) for value in (*numbers, *message.q_sensor)):
+            return "TARGET_RELATIVE is not finite"
+        if not abs(math.hypot(*message.q_target) - 1.0) <= 1e-3:
+            return "TARGET_RELATIVE holds no rotation"
+        if message.timestamp <= self._last_target_us.get(message.id, -1):
+            return "TARGET_RELATIVE is not newer than the last"
+        self._last_target_us[message.id] = message.timestamp
+        return None
+
+    def _reply(self, message: Any, now_ns: int) -> Any | None:
+        if message.get_msgId() == dialect.MAVLINK_MSG_ID_TIMESYNC and message.tc1 == 0:
+            return dialect.MAVLink_timesync_message(now_ns - self._boot_at_ns, message.ts1)
+        if message.get_msgId() == dialect.MAVLINK_MSG_ID_COMMAND_LONG:
+            if message.target_system != SYSTEM_ID or message.target_component not in (0, COMPONENT_ID):
+                return None
+            result = self._command(message, now_ns)
+            asker = (message.get_srcSystem(), message.get_srcComponent())
+            return dialect.MAVLink_command_ack_message(message.command, result, 0, 0, *asker)
+        return None
+
+    def _command(self, message: Any, now_ns: int) -> int:
+        """Carry out a COMMAND_LONG; returns its MAV_RESULT."""
+        numbers = (message.param1, message.param2)
+        if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        if not all(math.isfinite(value) for value in numbers) or int(message.param1) not in DEFAULT_RATES_HZ:
+            return int(dialect.MAV_RESULT_DENIED)
+        message_id, interval_us = int(message.param1), message.param2
+        if interval_us < 0:
+            self._next_ns.pop(message_id, None)
+            return int(dialect.MAV_RESULT_ACCEPTED)
+        default_ns = round(1e9 / DEFAULT_RATES_HZ[message_id])
+        self._interval_ns[message_id] = max(round(interval_us * 1e3), INTERVAL_MIN_NS) if interval_us else default_ns
+        self._next_ns[message_id] = now_ns
+        return int(dialect.MAV_RESULT_ACCEPTED)
+
+
+def _target_record(message: Any, now_ns: int) -> dict[str, Any]:
+    return {
+        "event": "target_relative",
+        "target": message.id,
+        "capture_utc_us": message.timestamp,
+        "received_ns": now_ns,
+        "t_cam_target_m": [message.x, message.y, message.z],
+        "q_cam_target_wxyz": list(message.q_target),
+    }
+
+
+def _emit(record: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(record) + "\n")
+    sys.stdout.flush()
+
+
+def _fly(autopilot: Autopilot, address: tuple[str, int], stop: list[int]) -> None:
+    """Exchange datagrams with the daemon at `address` until `stop` holds a signal or the parent process is gone."""
+    parent = os.getppid()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind((address[0] if address[0].startswith("127.") else "0.0.0.0", 0))
+        _emit({"event": "ready", "port": link.getsockname()[1]})
+        while not stop and os.getppid() == parent:
+            next_ns = autopilot.next_due_ns()
+            wait_s = _POLL_S if next_ns is None else min((next_ns - time.monotonic_ns()) * 1e-9, _POLL_S)
+            link.settimeout(max(wait_s, 1e-4))
+            outgoing: list[bytes] = []
+            try:
+                datagram, sender = link.recvfrom(_DATAGRAM_BYTES)
+            except TimeoutError:
+                pass
+            else:
+                if sender == address:
+                    outgoing, records = autopilot.take(datagram, time.monotonic_ns())
+                    for record in records:
+                        _emit(record)
+                else:
+                    autopilot.refused["sender is not the daemon"] += 1
+            for packed in outgoing + autopilot.due(time.monotonic_ns()):
+                link.sendto(packed, address)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
+    return socket.gethostbyname(host), int(port)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m sim_replay.autopilot", description=__doc__.splitlines()[0])
+    parser.add_argument("--telemetry", type=Path, required=True, help="telemetry.csv of the sequence")
+    parser.add_argument("--endpoint", type=_address, required=True, help="HOST:PORT the daemon listens on (udpin)")
+    parser.add_argument("--start-at-ns", type=int, required=True, help="monotonic ns of frame 0's exposure")
+    args = parser.parse_args(argv)
+    try:
+        telemetry = read_telemetry(args.telemetry)
+    except TelemetryError as error:
+        print(error, file=sys.stderr)
+        return 2
+    stop: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda received, _: stop.append(received))
+    autopilot = Autopilot(telemetry, args.start_at_ns, args.start_at_ns - BOOT_BEFORE_START_NS)
+    _fly(autopilot, args.endpoint, stop)
+    _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
