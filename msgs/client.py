@@ -1,0 +1,183 @@
+"""A typed client for whoever uses the poses. Needs zenoh, numpy and xxhash, nothing else.
+
+from msgs.client import connect, subscribe
+
+with connect("tcp/127.0.0.1:7447") as session, subscribe(session, "uav1") as poses:
+    for target in poses:
+        x, y, z = target.pose.t_cam_target_m
+        print(f"{target.target}: {z:.1f} m ahead, {target.age_s * 1e3:.0f} ms old")
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+
+import zenoh
+from zenoh import ext, handlers
+
+from msgs import topics
+from msgs.receive import PoseReceiver, TargetPose
+from msgs.session import TlsFiles, client_config
+from msgs.wire import Refusal
+
+
+def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
+    """Open a session with a router or daemon, e.g. `tcp/127.0.0.1:7447`; close it, or use it as a context.
+
+    Raises ConnectionError at once if nothing answers there or the endpoint is malformed.
+    """
+    try:
+        return zenoh.open(client_config([endpoint], tls=tls))
+    except zenoh.ZError as error:
+        raise ConnectionError(f"no zenoh session with {endpoint}: {error}") from error
+
+
+class PoseSubscription:
+    """Iterates over validated poses, newest kept when the reader is slow; ends when it or the session is closed."""
+
+    def __init__(self, subscriber: zenoh.Subscriber, receiver: PoseReceiver) -> None:
+        self._subscriber = subscriber
+        self._receiver = receiver
+
+    @property
+    def accepted(self) -> int:
+        """Samples taken."""
+        return self._receiver.accepted
+
+    @property
+    def refused(self) -> Counter[Refusal]:
+        """Samples refused, by reason."""
+        return self._receiver.refused
+
+    def __iter__(self) -> Iterator[TargetPose]:
+        for sample in self._subscriber:
+            pose = _receive(self._receiver, sample)
+            if pose is not None:
+                yield pose
+
+    def poll(self) -> TargetPose | None:
+        """The oldest pose waiting, without blocking; None if there is none."""
+        while (sample := self._subscriber.try_recv()) is not None:
+            pose = _receive(self._receiver, sample)
+            if pose is not None:
+                return pose
+        return None
+
+    def close(self) -> None:
+        self._subscriber.undeclare()
+
+    def __enter__(self) -> PoseSubscription:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def subscribe(
+    session: zenoh.Session,
+    uav: str,
+    *,
+    target: str | None = None,
+    domain: int = 0,
+    max_age_s: float = 1.0,
+    depth: int = 8,
+) -> PoseSubscription:
+    """Poses of a UAV's targets, or of one of them (`t0`, …); `depth` poses wait for a slow reader, older ones go."""
+    key = topics.subscription_key(topics.POSE, uav, target, domain=domain)
+    subscriber = session.declare_subscriber(key, handlers.RingChannel(depth))
+    return PoseSubscription(subscriber, PoseReceiver(uav, domain=domain, max_age_s=max_age_s))
+
+
+class TopicCounts:
+    """Counts the samples of every topic of one UAV, and judges its poses; made by `subscribe_all`."""
+
+    def __init__(self, uav: str, domain: int, max_age_s: float, on_pose: Callable[[TargetPose], None]) -> None:
+        self._uav = uav
+        self._domain = domain
+        self._on_pose = on_pose
+        self._receiver = PoseReceiver(uav, domain=domain, max_age_s=max_age_s)
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._failures: Counter[str] = Counter()
+        self._subscribers: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
+
+    def counts(self) -> dict[str, int]:
+        """Samples received by topic, e.g. `uav1/target/t0/pose`; refused poses are counted too."""
+        with self._lock:
+            return dict(self._counts)
+
+    def refused(self) -> dict[Refusal, int]:
+        """Poses refused, by reason."""
+        with self._lock:
+            return dict(self._receiver.refused)
+
+    def failures(self) -> dict[str, int]:
+        """Exceptions that `on_pose` let out, by message: they are counted here and stop nothing."""
+        with self._lock:
+            return dict(self._failures)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._subscribers.clear()
+
+    def __enter__(self) -> TopicCounts:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        row = topics.parse_key(str(sample.key_expr), self._uav, domain=self._domain)
+        with self._lock:
+            if row is None:
+                return
+            topic, target = row
+            self._counts[topics.topic_name(topic, self._uav, target)] += 1
+            pose = _receive(self._receiver, sample) if topic is topics.POSE else None
+        if pose is None:
+            return
+        # zenoh would print an exception and forget it.
+        try:
+            self._on_pose(pose)
+        except Exception as error:
+            with self._lock:
+                self._failures[f"{type(error).__name__}: {error}"] += 1
+
+    def _declare(self, session: zenoh.Session) -> None:
+        # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
+        handler = handlers.Callback(self._on_sample, indirect=False)
+        for topic in topics.TOPICS:
+            key = topics.subscription_key(topic, self._uav, domain=self._domain)
+            if not topic.cache:
+                self._subscribers.append(session.declare_subscriber(key, handler))
+                continue
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
+            recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+            advanced = ext.declare_advanced_subscriber(session, key, handler, history=history, recovery=recovery)
+            self._subscribers.append(advanced)
+
+
+def subscribe_all(
+    session: zenoh.Session,
+    uav: str,
+    on_pose: Callable[[TargetPose], None] = lambda _: None,
+    *,
+    domain: int = 0,
+    max_age_s: float = 1.0,
+) -> TopicCounts:
+    """Every topic of the table for one UAV; what is cached comes with its history.
+
+    `on_pose` gets each validated pose on zenoh's receiving thread: let it be quick. Close it, or use it as a context.
+    """
+    counts = TopicCounts(uav, domain, max_age_s, on_pose)
+    counts._declare(session)
+    return counts
+
+
+def _receive(receiver: PoseReceiver, sample: zenoh.Sample) -> TargetPose | None:
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    return receiver.receive(str(sample.key_expr), sample.payload.to_bytes(), attachment, time.time_ns())

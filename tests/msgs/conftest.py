@@ -1,0 +1,54 @@
+"""Real zenoh sessions on loopback: explicit endpoints, no discovery."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import zenoh
+
+from msgs import cdr, session
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def pose_now(z_m: float = 300.0, age_s: float = 0.0) -> cdr.PoseWithCovarianceStamped:
+    stamp_ns = time.time_ns() - round(age_s * 1e9)
+    t, q = np.array([1.0, 2.0, z_m]), np.array([0.0, 0.0, 0.0, 1.0])
+    return cdr.PoseWithCovarianceStamped(stamp_ns, "camera_optical_frame", t, q, np.eye(6))
+
+
+def until(done: Callable[[], bool], act: Callable[[], object] = lambda: None, timeout_s: float = 20.0) -> None:
+    """Act until it is done; fail after the timeout."""
+    deadline = time.monotonic() + timeout_s
+    while not done():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        act()
+        time.sleep(0.01)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A daemon's peer and the ground's router that it connects to."""
+
+    endpoint: str
+    daemon: zenoh.Session
+    router: zenoh.Session
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        router = stack.enter_context(zenoh.open(session.router_config([endpoint])))
+        daemon = stack.enter_context(zenoh.open(session.peer_config([free_endpoint()], [endpoint])))
+        yield Network(endpoint, daemon, router)

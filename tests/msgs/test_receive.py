@@ -1,0 +1,93 @@
+"""What a pose receiver takes and what it refuses, with its reasons counted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msgs import topics
+from msgs.receive import PoseReceiver
+from msgs.topics import POSE
+from msgs.wire import Refusal
+
+from .conftest import pose_now
+
+NOW_NS = 1_700_000_000_000_000_000
+GID, OTHER_GID = bytes(range(16)), bytes(range(1, 17))
+KEY = topics.publication_key(POSE, "uav1", "t0")
+
+
+def sample(sequence: int, stamp_ns: int, gid: bytes = GID) -> tuple[bytes, bytes]:
+    payload = dataclasses.replace(pose_now(), stamp_ns=stamp_ns).encode()
+    return payload, topics.attachment(sequence, NOW_NS, gid)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "stamp_ns", "reason"),
+    [
+        (2, NOW_NS, Refusal.SEQUENCE),
+        (1, NOW_NS, Refusal.SEQUENCE),
+        (3, NOW_NS - 1_000_000_001, Refusal.STALE),
+        (3, NOW_NS - 100_000_000, Refusal.STALE),
+        (3, NOW_NS - 100_000_001, Refusal.STALE),
+        (3, NOW_NS + 500_000_001, Refusal.FUTURE),
+    ],
+)
+def test_repeated_late_and_future_poses_are_refused(sequence: int, stamp_ns: int, reason: Refusal) -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(KEY, *sample(2, NOW_NS - 100_000_000), NOW_NS)
+    assert receiver.receive(KEY, *sample(sequence, stamp_ns), NOW_NS) is None
+    assert (receiver.accepted, dict(receiver.refused)) == (1, {reason: 1})
+    assert receiver.receive(KEY, *sample(3, NOW_NS - 99_999_999), NOW_NS)
+
+
+def test_a_restarted_publisher_counts_from_one_again() -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(KEY, *sample(900, NOW_NS - 5), NOW_NS)
+    taken = receiver.receive(KEY, *sample(1, NOW_NS - 4, OTHER_GID), NOW_NS)
+    assert taken is not None
+    assert taken.sequence == 1
+    assert taken.age_s == pytest.approx(4e-9)
+
+
+def test_targets_are_judged_apart() -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(KEY, *sample(5, NOW_NS), NOW_NS)
+    assert receiver.receive(topics.publication_key(POSE, "uav1", "t1"), *sample(1, NOW_NS), NOW_NS)
+
+
+def test_keys_and_attachments_are_judged_too() -> None:
+    receiver = PoseReceiver("uav1")
+    payload, attachment = sample(1, NOW_NS)
+    assert receiver.receive(topics.publication_key(topics.ODOM, "uav1", "t0"), payload, attachment, NOW_NS) is None
+    assert receiver.receive(topics.publication_key(POSE, "uav2", "t0"), payload, attachment, NOW_NS) is None
+    assert receiver.receive(KEY, payload, b"", NOW_NS) is None
+    assert dict(receiver.refused) == {Refusal.TOPIC: 2, Refusal.ATTACHMENT: 1}
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(st.integers(-3, 40), st.integers(-2_000, 1_000), st.booleans()), max_size=30))
+def test_stamps_and_sequences_taken_always_rise(samples: list[tuple[int, int, bool]]) -> None:
+    receiver = PoseReceiver("uav1")
+    taken = []
+    for sequence, offset_ms, other in samples:
+        stamp_ns = NOW_NS + offset_ms * 1_000_000
+        pose = receiver.receive(KEY, *sample(sequence, stamp_ns, OTHER_GID if other else GID), NOW_NS)
+        if pose is not None:
+            taken.append((pose.stamp_ns, other, pose.sequence))
+    assert [t[0] for t in taken] == sorted({t[0] for t in taken})
+    for publisher in (False, True):
+        numbers = [t[2] for t in taken if t[1] is publisher]
+        assert numbers == sorted(set(numbers))
+    assert receiver.accepted + sum(receiver.refused.values()) == len(samples)
+    assert all(-0.5 <= (NOW_NS - stamp_ns) / 1e9 <= 1.0 for stamp_ns, _, _ in taken)
+
+
+def test_made_up_publishers_do_not_grow_the_receiver() -> None:
+    receiver = PoseReceiver("uav1")
+    for n in range(1, 1000):
+        assert receiver.receive(KEY, *sample(1, NOW_NS + n, n.to_bytes(16, "little")), NOW_NS)
+    assert len(receiver._sequences) <= 16
