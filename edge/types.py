@@ -43,6 +43,14 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Mount:
+    """How the camera sits on its vehicle."""
+
+    R_body_cam: Array  # [3, 3], cam (optical) into body (FRD)
+    t_body_cam_m: Array  # [3], the camera's centre from the body origin
+
+
+@dataclass(frozen=True)
 class OwnShip:
     """The camera's vehicle at one instant (a frame's exposure)."""
 

@@ -1,0 +1,309 @@
+"""The typed configuration tree: one TOML file, unknown keys refused, every field described.
+
+Paths are taken from the folder the file lies in. `uavpose-edge check --config FILE` validates one.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+
+from edge.errors import InputError
+from edge.types import Array, Mount
+from msgs.geometry import R_from_euler
+
+SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
+
+# Optical axis along the nose, image right along the right wing: the mount when all three angles are zero.
+R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
+    folder = (info.context or {}).get("folder", Path())
+    return (folder / path.expanduser()).resolve()
+
+
+def _endpoint(text: str) -> str:
+    match = re.fullmatch(r"(udpin|udpout):(\[[^\]]+\]|[^:\s]+):(\d{1,5})", text)
+    if not match or not 0 <= int(match[3]) <= 65535:
+        raise ValueError(f"'{text}' is not udpin:HOST:PORT or udpout:HOST:PORT")
+    return text
+
+
+ConfigPath = Annotated[Path, AfterValidator(_from_config_folder)]
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class VehicleSettings(Section):
+    name: str = Field(
+        default="uav1", pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$", description="ROS-legal name, first part of every topic"
+    )
+
+
+class IntrinsicsSettings(Section):
+    """Either `file`, or the numbers themselves."""
+
+    file: ConfigPath | None = Field(default=None, description="calibration YAML as ROS camera_info or OpenCV write it")
+    fx: PositivePx | None = Field(default=None, description="focal length along x, pixels")
+    fy: PositivePx | None = Field(default=None, description="focal length along y, pixels")
+    cx: Finite | None = Field(default=None, description="principal point x, pixels; pixel centres at integers")
+    cy: Finite | None = Field(default=None, description="principal point y, pixels; pixel centres at integers")
+    width: int | None = Field(default=None, gt=0, description="width of the calibrated picture, pixels")
+    height: int | None = Field(default=None, gt=0, description="height of the calibrated picture, pixels")
+    distortion: list[Finite] = Field(
+        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: the picture has none"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> IntrinsicsSettings:
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+        if self.file is not None and (self.distortion or any(n is not None for n in numbers)):
+            raise ValueError("give either file or fx fy cx cy width height, not both")
+        if self.file is None and any(n is None for n in numbers):
+            raise ValueError("needs file, or all of fx fy cx cy width height")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError("distortion takes 4, 5 or 8 coefficients, or none")
+        return self
+
+
+class SequenceCamera(Section):
+    type: Literal["sequence"]
+    path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
+    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
+    start_at_ns: int | None = Field(
+        default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
+    )
+    loop: bool = Field(default=False, description="begin again after the last frame")
+    intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
+
+
+class FileCamera(Section):
+    type: Literal["file"]
+    path: ConfigPath = Field(description="video file, played at its own rate")
+    intrinsics: IntrinsicsSettings
+
+
+class DeviceCamera(Section):
+    type: Literal["device"]
+    device: str = Field(default="/dev/video0", description="V4L2 device")
+    width: int = Field(default=1920, gt=0, description="pixels asked of the device")
+    height: int = Field(default=1080, gt=0, description="pixels asked of the device")
+    fps: float = Field(default=30.0, gt=0, description="rate asked of the device")
+    fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
+    latency_ms: float = Field(
+        default=0.0, ge=0, le=1000, description="measured time from exposure to arrival, milliseconds"
+    )
+    intrinsics: IntrinsicsSettings
+
+
+class StreamCamera(Section):
+    type: Literal["stream"]
+    url: str = Field(min_length=1, description="RTSP, HTTP or UDP address, as ffmpeg takes it")
+    latency_ms: float = Field(
+        default=0.0, ge=0, le=5000, description="measured time from exposure to arrival, milliseconds"
+    )
+    intrinsics: IntrinsicsSettings
+
+
+CameraSettings = Annotated[
+    SequenceCamera | FileCamera | DeviceCamera | StreamCamera,
+    Field(discriminator="type", description="where frames are from"),
+]
+
+
+class MountSettings(Section):
+    """How the camera sits on the vehicle: three angles, or the matrix. All zero: it looks along the nose, upright."""
+
+    roll_deg: Finite = Field(default=0.0, description="about the nose, right side down positive")
+    pitch_deg: Finite = Field(default=0.0, ge=-90, le=90, description="optical axis above the nose positive")
+    yaw_deg: Finite = Field(default=0.0, description="optical axis to the right of the nose positive")
+    R_body_cam: list[list[Finite]] | None = Field(
+        default=None, description="3x3 rotation, cam (optical) into body (FRD)"
+    )
+    t_body_cam_m: tuple[Finite, Finite, Finite] = Field(default=(0.0, 0.0, 0.0), description="camera in body, metres")
+
+    @model_validator(mode="after")
+    def _rotation(self) -> MountSettings:
+        if self.R_body_cam is None:
+            return self
+        if {"roll_deg", "pitch_deg", "yaw_deg"} & self.model_fields_set:
+            raise ValueError("give either the angles or R_body_cam, not both")
+        if [len(row) for row in self.R_body_cam] != [3, 3, 3]:
+            raise ValueError("R_body_cam takes three rows of three numbers")
+        R = np.array(self.R_body_cam)
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+            raise ValueError("R_body_cam is not a rotation")
+        return self
+
+    def mount(self) -> Mount:
+        """R_body_cam [3, 3], exactly orthonormal, and t_body_cam_m [3]."""
+        if self.R_body_cam is not None:
+            u, _, vt = np.linalg.svd(np.array(self.R_body_cam))
+            R_body_cam: Array = u @ vt
+        else:
+            angles_rad = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
+            R_body_cam = R_from_euler(*angles_rad) @ R_BODY_CAM_FORWARD
+        return Mount(R_body_cam, np.array(self.t_body_cam_m))
+
+
+class ModelSettings(Section):
+    path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file that carries its contract")
+    threads: int = Field(default=2, ge=1, le=64, description="CPU threads of one inference")
+    spinning: bool = Field(
+        default=False, description="threads spin between inferences: faster alone, slower beside others"
+    )
+
+
+class EstimatorSettings(Section):
+    max_targets: int = Field(default=4, ge=1, le=4, description="targets tracked at once")
+    acquire_every_n: int = Field(
+        default=30, ge=1, description="whole frame searched every so many frames while tracking"
+    )
+
+
+class ZenohSettings(Section):
+    enabled: bool = Field(default=True, description="publish over zenoh")
+    mode: Literal["peer"] = Field(default="peer", description="the daemon is a peer; the ground runs the router")
+    listen: list[str] = Field(
+        default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
+    )
+    connect: list[str] = Field(default_factory=list, description="endpoints of the ground; retried for ever")
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
+    ros_distribution: Literal["jazzy", "humble", "off"] = Field(
+        default="jazzy", description="whose keys and type hashes"
+    )
+    max_age_ms: float = Field(default=500.0, gt=0, description="an older measurement is not published as a pose")
+
+
+class MavlinkSettings(Section):
+    enabled: bool = Field(default=True, description="speak MAVLink to the autopilot")
+    endpoints: list[Endpoint] = Field(
+        default_factory=lambda: ["udpin:127.0.0.1:14550"],
+        min_length=1,
+        description="udpin:HOST:PORT or udpout:HOST:PORT",
+    )
+    system_id: int | None = Field(
+        default=None, ge=1, le=255, description="the vehicle's; default: taken from its heartbeat"
+    )
+    component_id: int = Field(default=191, ge=1, le=255, description="ours; 191 is the onboard computer")
+    camera_component_id: int = Field(default=100, ge=1, le=255, description="the camera's; 100 is the first")
+    allowed_hosts: list[str] = Field(
+        default_factory=list,
+        description="addresses heard on udpin; empty: the first that sends a valid autopilot heartbeat",
+    )
+    target_relative: bool = Field(default=True, description="send TARGET_RELATIVE (511) to autopilots other than PX4")
+    target_relative_to_px4: bool = Field(
+        default=False, description="send it to PX4 too: with VTE_EN=0 it is a landing target there"
+    )
+    target_relative_rate_hz: float = Field(default=50.0, gt=0, le=50, description="upper bound of its rate")
+    tracking_rate_hz: float = Field(default=10.0, ge=5, le=20, description="rate of CAMERA_TRACKING_* messages")
+    attitude_rate_hz: float = Field(default=50.0, gt=0, le=400, description="asked of the autopilot")
+    position_rate_hz: float = Field(default=20.0, gt=0, le=100, description="asked of the autopilot")
+    max_age_ms: float = Field(default=200.0, gt=0, description="an older measurement is never sent")
+
+
+class Config(Section):
+    vehicle: VehicleSettings = VehicleSettings()
+    camera: CameraSettings
+    mount: MountSettings = MountSettings()
+    model: ModelSettings = ModelSettings()
+    estimator: EstimatorSettings = EstimatorSettings()
+    zenoh: ZenohSettings = ZenohSettings()
+    mavlink: MavlinkSettings = MavlinkSettings()
+
+
+@dataclass(frozen=True)
+class ConfigFile:
+    """A configuration and where it was written, so that a complaint can name file, line and key."""
+
+    path: Path
+    text: str
+    config: Config
+
+    @contextmanager
+    def blame(self, *key: str) -> Iterator[None]:
+        """Errors raised inside are told as errors of this key, for example blame("model", "path")."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(_sentence(self.path, self.text, key, str(error))) from error
+
+
+def load_config(path: Path) -> ConfigFile:
+    """Read and validate a TOML file. Raises InputError: one line a fault, each naming file, line and key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    try:
+        config = Config.model_validate(tree, context={"folder": path.resolve().parent})
+    except ValidationError as error:
+        lines = [_sentence(path, text, _key(item), _reason(item)) for item in error.errors()]
+        raise InputError("\n".join(lines)) from error
+    return ConfigFile(path, text, config)
+
+
+def _key(item: Any) -> tuple[str, ...]:
+    parts = [str(part) for part in item["loc"]]
+    if parts[:1] == ["camera"] and len(parts) > 1:
+        parts = parts[:1] + parts[2:]  # pydantic puts the chosen type there
+    return tuple(parts)
+
+
+def _reason(item: Any) -> str:
+    if item["type"] == "extra_forbidden":
+        return "unknown key"
+    if item["type"] == "missing":
+        return "is missing"
+    if item["type"] == "union_tag_not_found":
+        return "needs type = one of 'sequence', 'file', 'device', 'stream'"
+    if item["type"] == "union_tag_invalid":
+        return f"type must be one of {item['ctx']['expected_tags']}"
+    return str(item["msg"]).removeprefix("Value error, ")
+
+
+def _sentence(path: Path, text: str, key: tuple[str, ...], reason: str) -> str:
+    line = _line_of(text, key)
+    place = f"{path}:{line}" if line else f"{path}"
+    words = list(key)
+    indices = [words.pop() for _ in range(len(words)) if words and words[-1].isdigit()]
+    table = f"[{'.'.join(words[:-1] or words)}]" if words else "the file"
+    name = f"{table} {words[-1]}" if len(words) > 1 else table
+    index = "".join(f"[{i}]" for i in reversed(indices))
+    return f"{place}: {name}{index}: {reason}"
+
+
+def _line_of(text: str, key: tuple[str, ...]) -> int | None:
+    """Line of the key's assignment, else of its table's header, else None (a key that is not in the file)."""
+    section: tuple[str, ...] = ()
+    header_line = None
+    words = tuple(word for word in key if not word.isdigit())
+    for number, line in enumerate(text.splitlines(), start=1):
+        header = re.match(r"\s*\[([^\[\]]+)\]", line)
+        if header:
+            section = tuple(part.strip() for part in header[1].split("."))
+            if section == words[: len(section)]:
+                header_line = number
+        assignment = re.match(r"\s*([\w.-]+)\s*=", line)
+        if assignment and section + tuple(assignment[1].split(".")) == words:
+            return number
+    return header_line
