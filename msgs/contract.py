@@ -42,12 +42,16 @@ class ModelContract(BaseModel):
     acquire_size_wh: tuple[int, int] = Field(description="network input of the whole frame, pixels")
     acquire_fit: Literal["letterbox", "squash"] = Field(description="how a whole frame is fitted into it")
     track_size_wh: tuple[int, int] | None = Field(description="network input of a track window; None: no track stage")
-    track_window_scale: float = Field(gt=1.0, description="side of the window on the frame / longer side of the target's box")
+    track_window_scale: float = Field(
+        gt=1.0, description="side of the window on the frame / longer side of the target's box"
+    )
     acquire_score_min: float = Field(ge=0, le=1, description="below it a whole-frame peak is no target")
     track_score_min: float = Field(ge=0, le=1, description="below it a window's peak is no target")
     trained_range_m: tuple[float, float]
     trained_focal_px: tuple[float, float]
-    trained_box_px: tuple[float, float] = Field(description="longer side of the visible box in network pixels, as trained")
+    trained_box_px: tuple[float, float] = Field(
+        description="longer side of the visible box in network pixels, as trained"
+    )
     airframes: list[str] = Field(description="airframe classes in the training data")
     training: dict[str, str | int | float] = Field(description="data, seed, samples, resolution, commit")
     metrics: dict[str, float] = Field(description="measured when the file was made; empty if not measured")

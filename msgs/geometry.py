@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 def skew(vector: ArrayLike) -> Array:
     """[..., 3] to the [..., 3, 3] matrix with skew(v) @ w = v x w."""
     v = np.asarray(vector, dtype=np.float64)
-    out = np.zeros(v.shape[:-1] + (3, 3))
+    out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
@@ -61,15 +61,15 @@ def q_wxyz_from_R(R: ArrayLike) -> Array:
     """Rotation matrices [..., 3, 3] to unit quaternions [..., 4], w >= 0 (Bar-Itzhack: largest diagonal first)."""
     m = np.asarray(R, dtype=np.float64)
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    candidates = np.stack(
-        [
-            np.stack([1 + m00 + m11 + m22, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
-            np.stack([m[..., 2, 1] - m[..., 1, 2], 1 + m00 - m11 - m22, m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0]], -1),
-            np.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1], 1 - m00 + m11 - m22, m[..., 2, 1] + m[..., 1, 2]], -1),
-            np.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2], 1 - m00 - m11 + m22], -1),
-        ],
-        axis=-2,
-    )
+    x, y, z = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
+    xy, xz, yz = (m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2])
+    rows = [
+        [1 + m00 + m11 + m22, x, y, z],
+        [x, 1 + m00 - m11 - m22, xy, xz],
+        [y, xy, 1 - m00 + m11 - m22, yz],
+        [z, xz, yz, 1 - m00 - m11 + m22],
+    ]
+    candidates = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     best = np.argmax(np.stack([m00 + m11 + m22, m00, m11, m22], axis=-1), axis=-1)
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -77,7 +77,7 @@ def q_wxyz_from_R(R: ArrayLike) -> Array:
 
 
 def R_from_q_wxyz(q_wxyz: ArrayLike) -> Array:
-    """Quaternions [..., 4] (normalised here) to rotation matrices [..., 3, 3]. Raises ValueError on a zero quaternion."""
+    """Quaternions [..., 4] (normalised here) to rotation matrices [..., 3, 3]; ValueError on a zero quaternion."""
     q = np.asarray(q_wxyz, dtype=np.float64)
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(norm > 1e-9):

@@ -37,7 +37,7 @@ def peer_config(
 ) -> zenoh.Config:
     """The daemon's session: opens whether or not anything listens at `connect`, and goes on trying.
 
-    `pose_rate_max_hz` thins poses and odometry on what leaves for the network; loopback keeps every one.
+    `pose_rate_max_hz` thins poses and odometry on quic, tls and udp links; plain tcp, for tools on board, keeps all.
     Raises zenoh.ZError for an endpoint that is no endpoint.
     """
     config = _config("peer", listen, connect, discovery, tls)

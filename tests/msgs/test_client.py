@@ -142,12 +142,6 @@ def test_the_daemon_opens_without_a_ground_and_delivers_once_there_is_one() -> N
             until(lambda: poses.poll() is not None, lambda: publisher.put(pose_now().encode()))
 
 
-def test_nothing_listens_or_connects_that_was_not_asked_for() -> None:
-    with zenoh.open(session.peer_config([], [])) as one, zenoh.open(session.peer_config([], [])) as other:
-        assert list(one.info.peers_zid()) == list(other.info.peers_zid()) == []
-        assert one.config.get_json("listen/endpoints") if hasattr(one, "config") else True
-
-
 READER = """
 import sys
 class OnlyWhatIsDeclared:

@@ -1,0 +1,116 @@
+"""What the session settings let in: nothing unasked for, and over TLS only who holds a certificate."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from msgs import client, session, topics
+from msgs.publish import Node
+
+from .conftest import free_endpoint, pose_now, until
+
+
+def sockets() -> set[str]:
+    """TCP sockets that listen, and UDP sockets, of this process: `tcp <port>`, `udp <port>`."""
+    inodes = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            inodes.add(os.readlink(descriptor))
+        except FileNotFoundError:
+            continue
+    found = set()
+    for protocol in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path("/proc/self/net", protocol).read_text().splitlines()[1:]:
+            columns = line.split()
+            if f"socket:[{columns[9]}]" in inodes and (protocol.startswith("udp") or columns[3] == "0A"):
+                found.add(f"{protocol[:3]} {int(columns[1].split(':')[1], 16)}")
+    return found
+
+
+def test_nothing_listens_that_was_not_asked_for() -> None:
+    before = sockets()
+    endpoint = free_endpoint()
+    with zenoh.open(session.peer_config([], [])):
+        assert sockets() == before
+    with zenoh.open(session.router_config([endpoint])), client.connect(endpoint):
+        assert sockets() - before == {f"tcp {endpoint.rpartition(':')[2]}"}
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "tcp/", "carrier-pigeon/127.0.0.1:1"])
+def test_an_endpoint_that_is_none_is_a_connection_error(endpoint: str) -> None:
+    with pytest.raises(ConnectionError, match=endpoint):
+        client.connect(endpoint)
+
+
+def _openssl(*arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], check=True, capture_output=True)
+
+
+def _authority(folder: Path) -> tuple[Path, Path]:
+    certificate, key = folder / "ca.pem", folder / "ca.key"
+    new_key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-noenc", "-keyout", str(key)]
+    _openssl("req", "-x509", *new_key, "-subj", "/CN=test ca", "-days", "2", "-out", str(certificate))
+    return certificate, key
+
+
+def _identity(folder: Path, name: str, authority: tuple[Path, Path]) -> session.TlsFiles:
+    certificate, key, request = (folder / f"{name}.{suffix}" for suffix in ("pem", "key", "csr"))
+    new_key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-noenc", "-keyout", str(key)]
+    _openssl("req", *new_key, "-subj", f"/CN={name}", "-out", str(request))
+    extensions = folder / f"{name}.ext"
+    extensions.write_text("subjectAltName=DNS:localhost,IP:127.0.0.1\nextendedKeyUsage=serverAuth,clientAuth\n")
+    signing = ["-CA", str(authority[0]), "-CAkey", str(authority[1]), "-days", "2", "-extfile", str(extensions)]
+    _openssl("x509", "-req", "-in", str(request), *signing, "-out", str(certificate))
+    return session.TlsFiles(authority[0], certificate, key)
+
+
+@pytest.fixture
+def identities(tmp_path: Path) -> Sequence[session.TlsFiles]:
+    """Ground and UAV of one authority, and a stranger of another."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl makes the certificates of this test and is not installed")
+    folders = [tmp_path / name for name in ("ours", "theirs")]
+    for folder in folders:
+        folder.mkdir()
+    ours, theirs = map(_authority, folders)
+    stranger = _identity(folders[1], "stranger", theirs)
+    trusting = session.TlsFiles(ours[0], stranger.certificate, stranger.private_key)
+    return _identity(folders[0], "ground", ours), _identity(folders[0], "uav1", ours), trusting
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_only_who_holds_our_certificate_gets_in_and_poses_are_thinned_there(
+    identities: Sequence[session.TlsFiles], protocol: str
+) -> None:
+    ground, uav, stranger = identities
+    secure = free_endpoint().replace("tcp/", f"{protocol}/")
+    plain = free_endpoint()
+    received: Counter[str] = Counter()
+    with ExitStack() as stack:
+        router = stack.enter_context(zenoh.open(session.router_config([secure], tls=ground)))
+        with pytest.raises(ConnectionError):
+            client.connect(secure, tls=stranger)
+        config = session.peer_config([plain], [secure], tls=uav, pose_rate_max_hz=5.0)
+        daemon = stack.enter_context(zenoh.open(config))
+        on_board = stack.enter_context(client.connect(plain))
+        for name, place in (("ground", router), ("on board", on_board)):
+            handler = zenoh.handlers.Callback(lambda _, name=name: received.update([name]), indirect=False)
+            place.declare_subscriber(topics.subscription_key(topics.POSE, "uav1"), handler)
+        publisher = stack.enter_context(Node(daemon, "uav1")).publisher(topics.POSE, "t0")
+        until(lambda: len(received) == 2, lambda: publisher.put(pose_now().encode()))
+        received.clear()
+        started = time.monotonic()
+        until(lambda: received["on board"] >= 60, lambda: publisher.put(pose_now().encode()))
+        elapsed_s = time.monotonic() - started
+        # One for the period that had begun, one that was on its way when counting started.
+        assert received["ground"] <= 5.0 * elapsed_s + 2
