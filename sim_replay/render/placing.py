@@ -1,0 +1,157 @@
+"""Draws the training distribution: lens, range, attitude and place of a target, and the window cut around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs.geometry import R_from_euler, so3_exp
+from sim_replay.render.renderer import extents_px, project_px, solid_vertices_m
+from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
+
+Array = NDArray[np.float64]
+Kind = Literal["track", "acquire"]
+FRAME_WIDTH_PX, FRAME_HEIGHT_PX = 1920, 1080
+RANGE_M = (90.0, 550.0)
+FOCAL_PX = (1200.0, 8000.0)
+BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame; its mean area is then about 1.2 % of it
+WINDOW_SCALE = 1.8
+ACQUIRE_DOWNSCALE = 3.0
+VISIBLE_SHARE_MIN = 0.35
+
+
+@dataclass(frozen=True)
+class Window:
+    """One window to render: the scene at render resolution and what becomes of it."""
+
+    scene: Scene
+    kind: Kind
+    size_px: int  # side of the finished window; the scene may be rendered smaller and then enlarged
+    native_scale: float  # rendered pixels per native pixel, at most 1
+    visible_share: float  # share of the target's outline inside the window; 0 without a target
+    distractors: bool
+
+
+def crop_K(K: Array, x0_px: float, y0_px: float, scale: float) -> Array:
+    """Intrinsics of a window whose first pixel is (x0, y0) of the frame, resized by `scale`: c' = (c+0.5)s-0.5."""
+    out = K.copy()
+    out[:2] *= scale
+    out[0, 2] = (K[0, 2] - x0_px + 0.5) * scale - 0.5
+    out[1, 2] = (K[1, 2] - y0_px + 0.5) * scale - 0.5
+    return out
+
+
+def looking_along(direction_ned: Array, roll_rad: float, ray_cam: Array) -> Array:
+    """R_ned_cam of a camera rolled about, and with its pixel ray [3] along, a direction [3] that is not vertical."""
+    z = direction_ned / np.linalg.norm(direction_ned)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(z, x), z], axis=1)
+    ray = ray_cam / np.linalg.norm(ray_cam)
+    axis = np.cross(ray, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis)
+    to_axis = so3_exp(axis / max(sine, 1e-12) * np.arctan2(sine, ray[2]))
+    return upright @ so3_exp([0.0, 0.0, roll_rad]) @ to_axis
+
+
+def _clipped_normal(rng: np.random.Generator, sigma_deg: float, limit_deg: float) -> float:
+    return float(np.radians(np.clip(rng.normal(0.0, sigma_deg), -limit_deg, limit_deg)))
+
+
+def _lens_for(rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, los: Array, range_m: float) -> float:
+    """Focal length, pixels, that shows the target as large as BOX_PX, within the lenses there are."""
+    if rng.random() < 0.12:
+        return float(np.exp(rng.uniform(*np.log(FOCAL_PX))))
+    across = vertices_m @ R_ned_body.T @ looking_along(los, 0.0, np.array([0.0, 0.0, 1.0]))
+    size_m = np.ptp(across[:, :2], axis=0).max()
+    return float(np.clip(rng.uniform(*BOX_PX) * range_m / size_m, *FOCAL_PX))
+
+
+def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int]) -> Scene:
+    """A whole 1920 x 1080 frame with one target wholly inside it where the lens allows."""
+    airframe_id = int(rng.choice(np.asarray(airframe_ids)))
+    vertices_m = solid_vertices_m(airframe_id)
+    range_m = rng.uniform(*RANGE_M) if rng.random() < 0.5 else np.exp(rng.uniform(*np.log(RANGE_M)))
+    R_ned_body = R_from_euler(
+        _clipped_normal(rng, 25, 75), _clipped_normal(rng, 8, 30), rng.uniform(-np.pi, np.pi))
+    los = R_from_euler(0.0, _clipped_normal(rng, 13, 40), rng.uniform(-np.pi, np.pi)) @ np.array([1.0, 0.0, 0.0])
+    focal = _lens_for(rng, vertices_m, R_ned_body, los, float(range_m))
+    anisotropy = np.exp(rng.normal(0.0, 0.003))
+    fx, fy = focal * anisotropy, focal / anisotropy
+    K = np.array([
+        [fx, 0, (FRAME_WIDTH_PX - 1) / 2 + rng.normal(0, 12)], [0, fy, (FRAME_HEIGHT_PX - 1) / 2 + rng.normal(0, 12)],
+        [0, 0, 1]])
+    reach_px = 0.55 * focal * np.linalg.norm(np.ptp(vertices_m, axis=0)) / range_m
+    margin = np.minimum([reach_px, reach_px], [0.45 * FRAME_WIDTH_PX, 0.45 * FRAME_HEIGHT_PX])
+    pixel = rng.uniform(margin, np.array([FRAME_WIDTH_PX, FRAME_HEIGHT_PX]) - margin)
+    ray = np.linalg.solve(K, [*pixel, 1.0])
+    R_ned_cam = looking_along(los, _clipped_normal(rng, 12, 40), ray)
+    lowest_m = 60.0 + max(0.0, float(los[2]) * float(range_m))
+    height_m = max(lowest_m, float(np.exp(rng.uniform(np.log(150.0), np.log(3500.0)))))
+    t_ned_cam_m = np.array([rng.uniform(-4000, 4000), rng.uniform(-4000, 4000), -height_m])
+    target = Target(airframe_id, int(rng.integers(2**31)), R_ned_body, t_ned_cam_m + range_m * los)
+    camera = Camera(K, FRAME_WIDTH_PX, FRAME_HEIGHT_PX, R_ned_cam, t_ned_cam_m)
+    return Scene(camera, (target,), environment_from_seed(int(rng.integers(2**31))))
+
+
+def outline_px(target: Target, camera: Camera) -> Array:
+    """Projected vertices [V, 2] of the target without its propeller disc."""
+    return project_px(solid_vertices_m(target.airframe_id), *target.pose_in(camera), camera.K)
+
+
+def visible_share(pixels: Array, width_px: int, height_px: int) -> float:
+    """Share of the area of the projected convex hull that lies inside the image."""
+    hull = cv2.convexHull(pixels.astype(np.float32))
+    edges = np.array([[-0.5, -0.5], [width_px - 0.5, -0.5], [width_px - 0.5, height_px - 0.5], [-0.5, height_px - 0.5]])
+    area = cv2.contourArea(hull)
+    inside, _ = cv2.intersectConvexConvex(hull, edges.astype(np.float32))
+    return float(min(inside / area, 1.0)) if area > 1e-6 else 0.0
+
+
+def _track_cut(rng: np.random.Generator, scene: Scene) -> tuple[float, float, float]:
+    """(x0, y0, side) on the frame of a jittered window around the visible box."""
+    box = extents_px(outline_px(scene.targets[0], scene.camera))
+    assert box is not None, "a target at flying range lies ahead of the camera"
+    low, high = np.maximum(box[:2], -0.5), np.minimum(box[2:], [FRAME_WIDTH_PX - 0.5, FRAME_HEIGHT_PX - 0.5])
+    side = WINDOW_SCALE * float((high - low).max()) * float(np.exp(rng.uniform(np.log(0.75), np.log(1.33))))
+    centre = 0.5 * (low + high) + side * rng.uniform(-0.15, 0.15, 2)
+    return float(centre[0] - side / 2 + 0.5), float(centre[1] - side / 2 + 0.5), side
+
+
+def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[float, float, float]:
+    """(x0, y0, side) on the frame of a window of the reduced frame with the target anywhere in it."""
+    side = size_px * ACQUIRE_DOWNSCALE
+    pixel = outline_px(scene.targets[0], scene.camera).mean(axis=0)
+    corner = pixel - rng.uniform(0.0, 1.0, 2) * side
+    # Where the frame is larger than the window, the window lies inside the frame.
+    limit = np.array([FRAME_WIDTH_PX, FRAME_HEIGHT_PX]) - side
+    corner = np.where(limit > 0, np.clip(corner, 0.0, np.maximum(limit, 0.0)), corner)
+    return float(corner[0]), float(corner[1]), side
+
+
+def draw_window(
+    seed: int, index: int, size_px: int, airframe_ids: Sequence[int], acquire_share: float, empty_share: float
+) -> Window:
+    """Window number `index`: a pure function of its arguments."""
+    rng = np.random.default_rng([seed, index, size_px])
+    kind: Kind = "acquire" if rng.random() < acquire_share else "track"
+    empty = bool(rng.random() < empty_share)
+    distractors = bool(rng.random() < (0.5 if empty else 0.12))
+    frame = frame_scene(rng, airframe_ids)
+    x0, y0, side = _acquire_cut(rng, frame, size_px) if kind == "acquire" else _track_cut(rng, frame)
+    rendered_px = int(np.clip(round(side), 24, size_px))
+    scale = rendered_px / side
+    camera = Camera(
+        crop_K(frame.camera.K, x0, y0, scale), rendered_px, rendered_px, frame.camera.R_ned_cam,
+        frame.camera.t_ned_cam_m)
+    targets = () if empty else frame.targets
+    share = visible_share(outline_px(targets[0], camera), rendered_px, rendered_px) if targets else 0.0
+    if share == 0.0:
+        targets = ()
+    scene = Scene(camera, targets, frame.environment, int(rng.integers(2**31)), index)
+    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors)

@@ -1,0 +1,179 @@
+"""The training feed: windows rendered on demand, each a pure function of (seed, index, size), with exact labels.
+
+    python -m sim_replay.sampler --size 128 --count 256
+
+measures how many windows a second this machine renders.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay.airframes import AIRFRAMES
+from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window, outline_px, visible_share
+from sim_replay.render.renderer import Rendered, Renderer, extents_px
+from sim_replay.render.scene import Camera, Scene
+from sim_replay.render.sensor import Sensor, add_distractors, exposed, sensor_from
+from sim_replay.sample import SampleBatch
+
+MASK_COVERAGE_MIN = 64  # of 255: a quarter of the pixel, so that thin wings stay in the mask
+TILES = (4, 4)
+
+
+def _labels_blank(count: int, height_px: int, width_px: int) -> dict[str, NDArray]:
+    return {
+        "image_bgr": np.zeros((count, height_px, width_px, 3), np.uint8),
+        "K": np.zeros((count, 3, 3), np.float32),
+        "present": np.zeros(count, np.bool_),
+        "R_cam_target": np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+        "t_cam_target_m": np.zeros((count, 3), np.float32),
+        "box_xyxy_px": np.zeros((count, 4), np.float32),
+        "mask": np.zeros((count, height_px, width_px), np.bool_),
+        "noc": np.zeros((count, height_px, width_px, 3), np.float16),
+        "airframe_id": np.full(count, -1, np.int32),
+        "diameter_m": np.zeros(count, np.float32),
+    }
+
+
+def visible_box(scene: Scene, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+    """[4] box of the first target; None if nothing of it is seen.
+
+    A target wholly inside the image has the box of its outline, exact to a fraction of a pixel; one that the image
+    cuts has the box of its mask.
+    """
+    if not mask.any():
+        return None
+    height, width = mask.shape
+    outline = extents_px(outline_px(scene.targets[0], camera))
+    if outline and min(outline[:2]) >= -0.5 and outline[2] <= width - 0.5 and outline[3] <= height - 0.5:
+        return np.asarray(outline, np.float32)
+    x, y = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return np.array([x[0] - 0.5, y[0] - 0.5, x[-1] + 0.5, y[-1] + 0.5], np.float32)
+
+
+def _write_target(
+    out: dict[str, NDArray], k: int, scene: Scene, camera: Camera, mask: NDArray[np.bool_], noc: NDArray
+) -> None:
+    box = visible_box(scene, camera, mask)
+    if box is None:
+        return
+    target = scene.targets[0]
+    out["present"][k] = True
+    out["box_xyxy_px"][k] = box
+    out["R_cam_target"][k], out["t_cam_target_m"][k] = target.pose_in(camera)
+    out["mask"][k] = mask
+    out["noc"][k] = noc * mask[..., None]
+    out["airframe_id"][k] = target.airframe_id
+    out["diameter_m"][k] = AIRFRAMES[target.airframe_id].diameter_m()
+
+
+def _enlarged(
+    coverage: NDArray[np.uint8], noc: NDArray[np.float16], size_px: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
+    """Coverage and coordinates [S, S, 3] at the window's size; coordinates are averaged over the aircraft only."""
+    wide = cv2.resize(coverage, (size_px, size_px), interpolation=cv2.INTER_LINEAR)
+    hit = (np.abs(noc).sum(axis=-1) > 0).astype(np.float32)
+    weight = cv2.resize(hit, (size_px, size_px), interpolation=cv2.INTER_LINEAR)
+    sums = cv2.resize(noc.astype(np.float32), (size_px, size_px), interpolation=cv2.INTER_LINEAR)
+    return wide, (sums / np.maximum(weight, 1e-3)[..., None]).astype(np.float16)
+
+
+class WindowSampler:
+    """Windows of `size_px` square with, mostly, one aircraft. Make one in each worker process."""
+
+    def __init__(
+        self, seed: int, size_px: int, airframe_ids: Sequence[int] | None = None, acquire_share: float = 0.3,
+        empty_share: float = 0.12,
+    ) -> None:
+        self.seed, self.size_px = seed, size_px
+        self.airframe_ids = tuple(range(len(AIRFRAMES)) if airframe_ids is None else airframe_ids)
+        self.acquire_share, self.empty_share = acquire_share, empty_share
+        self._renderer: Renderer | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_renderer": None}
+
+    def batch(self, first_index: int, count: int) -> SampleBatch:
+        """Windows first_index .. first_index + count - 1; the same whatever the batch they are asked for in."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.size_px, self.size_px, *TILES)
+        out = _labels_blank(count, self.size_px, self.size_px)
+        for start in range(0, count, self._renderer.capacity):
+            windows = [
+                draw_window(self.seed, first_index + k, self.size_px, self.airframe_ids, self.acquire_share,
+                            self.empty_share)
+                for k in range(start, min(start + self._renderer.capacity, count))
+            ]
+            rendered = self._renderer.draw([window.scene for window in windows])
+            for k, window in enumerate(windows):
+                self._finish(out, start + k, window, rendered, k)
+        return SampleBatch(**out)
+
+    def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:
+        side, size = window.scene.camera.width_px, self.size_px
+        rng = np.random.default_rng([window.scene.sensor_seed, self.seed])
+        image, coverage = rendered.image_bgr[tile, :side, :side], rendered.coverage[tile, :side, :side]
+        noc = rendered.coordinate[tile, :side, :side]
+        if window.distractors:
+            image = add_distractors(image, coverage, rng)
+        image = exposed(image, sensor_from(rng), window.native_scale, rng)
+        camera = window.scene.camera
+        if side < size:
+            image = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
+            coverage, noc = _enlarged(coverage, noc, size)
+            camera = Camera(crop_K(camera.K, 0.0, 0.0, size / side), size, size, camera.R_ned_cam, camera.t_ned_cam_m)
+        out["image_bgr"][k], out["K"][k] = image, camera.K
+        if window.visible_share >= VISIBLE_SHARE_MIN:
+            _write_target(out, k, window.scene, camera, coverage >= MASK_COVERAGE_MIN, noc)
+
+
+_frame_renderers: dict[tuple[int, int], Renderer] = {}
+
+
+def render_frame(scene: Scene, sensor: Sensor | None = None) -> SampleBatch:
+    """A whole frame, batch of one, labelled with the scene's first target.
+
+    The sky, the ground and the camera (unless given) depend on the scene's values alone, so the frames of a sequence
+    that share an environment and a sensor seed show one world; only the noise follows `frame_index`.
+    """
+    camera = scene.camera
+    size = (camera.width_px, camera.height_px)
+    if size not in _frame_renderers:
+        _frame_renderers[size] = Renderer(*size, 1, 1)
+    rendered = _frame_renderers[size].draw([scene])
+    out = _labels_blank(1, camera.height_px, camera.width_px)
+    chosen = sensor or sensor_from(np.random.default_rng([scene.sensor_seed, 1]))
+    out["image_bgr"][0] = exposed(
+        rendered.image_bgr[0], chosen, 1.0, np.random.default_rng([scene.sensor_seed, 2, scene.frame_index]))
+    out["K"][0] = camera.K
+    if scene.targets:
+        mask = (rendered.coverage[0] >= MASK_COVERAGE_MIN) & (rendered.target[0] == 1)
+        if visible_share(outline_px(scene.targets[0], camera), *size) >= VISIBLE_SHARE_MIN:
+            _write_target(out, 0, scene, camera, mask, rendered.coordinate[0])
+    return SampleBatch(**out)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures and prints windows a second."""
+    parser = argparse.ArgumentParser(description="Measure how fast training windows are rendered on this machine.")
+    parser.add_argument("--size", type=int, default=128, help="side of a window, pixels (default %(default)s)")
+    parser.add_argument("--count", type=int, default=256, help="windows to render (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    sampler = WindowSampler(options.seed, options.size)
+    sampler.batch(0, TILES[0] * TILES[1])
+    start = time.perf_counter()
+    batch = sampler.batch(0, options.count)
+    rate = options.count / (time.perf_counter() - start)
+    print(f"{rate:.0f} windows/s at {options.size} px, {batch.present.mean():.0%} with a target")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
