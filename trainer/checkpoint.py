@@ -1,0 +1,80 @@
+"""Files of a training run: `weights.pt` (half-precision averaged weights) and `resume.pt` (everything else).
+
+Both are written beside their place and renamed into it, so a crash leaves the last whole one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from trainer.config import ConfigError, TrainerConfig, parse_config
+from trainer.model import PoseNet
+
+WEIGHTS_NAME = "weights.pt"
+RESUME_NAME = "resume.pt"
+TRAINING_ONLY_PREFIX = "head_dense."
+
+
+def write_atomic(path: Path, content: dict[str, Any]) -> None:
+    """torch.save to a neighbour, flush to disk, rename."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, suffix=".part", delete=False) as file:
+        try:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+
+
+def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Matrices and kernels in half precision; vectors (norm statistics, biases) stay whole. Training-only heads go."""
+    kept = {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
+    return {key: value.half() if value.ndim > 1 else value.clone() for key, value in kept.items()}
+
+
+def weights_sha256(state: dict[str, Tensor]) -> str:
+    """Hash of names and values, in order of name, whatever the file around them."""
+    digest = hashlib.sha256()
+    for key in sorted(state):
+        digest.update(key.encode())
+        digest.update(state[key].detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def save_weights(path: Path, averaged: nn.Module, config_text: str, training: dict[str, str | int | float]) -> None:
+    """Write `weights.pt`: weights, the TOML they were trained with, and where they come from."""
+    write_atomic(path, {"weights": half_weights(averaged.state_dict()), "config": config_text, "training": training})
+
+
+def load_file(path: Path) -> dict[str, Any]:
+    """Read either file. Raises ConfigError naming it when it is missing or no checkpoint."""
+    if path.is_dir():
+        path = path / WEIGHTS_NAME
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except Exception as error:
+        raise ConfigError(f"{path}: not a checkpoint of this program: {type(error).__name__}") from None
+
+
+def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int | float], str]:
+    """`weights.pt` to an evaluation-ready network (without training-only heads), its configuration, origin and hash."""
+    content = load_file(path)
+    if not {"weights", "config", "training"} <= content.keys():
+        raise ConfigError(f"{path}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
+    config = parse_config(content["config"], f"{path} (config)")
+    model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False}))
+    weights = content["weights"]
+    model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
+    return model.eval(), config, content["training"], weights_sha256(weights)

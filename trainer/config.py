@@ -1,0 +1,150 @@
+"""The trainer's typed configuration, read from TOML. Unknown keys are refused; errors name the file and the key."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
+
+
+class ConfigError(ValueError):
+    """A configuration that a person must correct; the message names the file and the key."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ModelConfig(_Section):
+    configuration: Literal["edge", "paper"] = Field(description="which of the two configurations this is")
+    backbone: BackboneName
+    pretrained: bool = Field(description="start from public ImageNet weights (efficientnet_lite0 only)")
+    channels: int = Field(128, ge=8, description="C of F_global")
+    hidden: int = Field(256, ge=8, description="width of the embedding, of gamma and beta, and of the branches")
+    soft_argmax_sigma_cells: float | None = Field(None, gt=0, description="sigma_g in cells; absent: W_f / 32")
+    box_anchor_px: float | None = Field(None, gt=0, description="scale anchor a in pixels; absent: (0.1 W, 0.1 H)")
+    origin_range: float = Field(1.25, gt=0, description="lambda_o")
+    focal: Literal["mean", "geometric"] = Field(description="(fx + fy) / 2 or sqrt(fx fy)")
+    depth: Literal["plain", "rotation_aware"] = Field(description="APDD's scale: free, or latent extents seen from R")
+    uncertainty: bool = Field(description="train the sigma heads")
+    dense: bool = Field(description="train the mask and object-coordinate heads, which export drops")
+    max_peaks: int = Field(4, ge=1, description="M: targets decoded for each image")
+
+    @model_validator(mode="after")
+    def _pretrained_exists(self) -> ModelConfig:
+        if self.pretrained and self.backbone != "efficientnet_lite0":
+            raise ValueError(f"there are no public weights for backbone {self.backbone!r}: set pretrained = false")
+        return self
+
+
+class LossConfig(_Section):
+    """Weights of the joint loss; `heatmap`, `size`, `translation`, `rotation` are the paper's lambda_1..4."""
+
+    heatmap: float = Field(50.0, ge=0)
+    size: float = Field(4.0, ge=0)
+    translation: float = Field(4.0, ge=0)
+    rotation: float = Field(25.0, ge=0)
+    depth: float = Field(20.0, ge=0, description="mu_1, on log Z")
+    planar: float = Field(50.0, ge=0, description="mu_2, on T_xy / Z")
+    depth_beta: float = Field(1.0, gt=0, description="where SmoothL1 of log Z turns from square to linear")
+    rotation_6d: float = Field(5.0, ge=0, description="eta")
+    center: float = Field(0.0, ge=0, description="soft-argmax centre, in cells")
+    origin: float = Field(0.0, ge=0, description="projected body origin, in longer box sides")
+    mask: float = Field(0.0, ge=0)
+    noc: float = Field(0.0, ge=0)
+    uncertainty: float = Field(0.0, ge=0)
+
+
+class DataConfig(_Section):
+    seed: int = Field(ge=0)
+    validation_seed: int = Field(ge=0)
+    airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
+    acquire_share: float = Field(0.3, ge=0, le=1, description="share of views as the acquire stage sees them")
+    empty_share: float = Field(0.12, ge=0, lt=1, description="share of windows without a target")
+    batch_size: int = Field(ge=2)
+    workers: int = Field(1, ge=1, description="rendering processes")
+    prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")
+    validation_samples: int = Field(256, ge=8)
+
+    @model_validator(mode="after")
+    def _seeds_differ(self) -> DataConfig:
+        if self.seed == self.validation_seed:
+            raise ValueError("validation_seed must differ from seed: the validation windows are held out")
+        return self
+
+
+class SizeStage(_Section):
+    from_progress: float = Field(ge=0, lt=1, description="share of the run after which this size is used")
+    size_px: int = Field(ge=32, multiple_of=32)
+
+
+class ScheduleConfig(_Section):
+    samples: int = Field(ge=1, description="planned number of training samples")
+    warmup_samples: int = Field(ge=0)
+    lr: float = Field(5e-4, gt=0)
+    lr_final: float = Field(1e-5, gt=0)
+    backbone_lr_scale: float = Field(1.0, gt=0)
+    weight_decay: float = Field(0.01, ge=0)
+    gradient_clip: float = Field(5.0, gt=0)
+    ema_decay: float = Field(0.999, ge=0, lt=1)
+    teacher_until: float = Field(0.4, ge=0, le=1, description="progress at which true centres and boxes stop guiding")
+    sizes: list[SizeStage] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _sizes_start_and_rise(self) -> ScheduleConfig:
+        starts = [stage.from_progress for stage in self.sizes]
+        if starts[0] != 0 or starts != sorted(set(starts)):
+            raise ValueError("sizes must start at from_progress = 0 and rise")
+        return self
+
+
+class RunConfig(_Section):
+    threads: int = Field(2, ge=1, description="CPU threads of the training process")
+    bf16: bool = Field(True, description="run the convolutions in bfloat16")
+    log_every_steps: int = Field(25, ge=1)
+    validate_every_samples: int = Field(8000, ge=1)
+    checkpoint_every_s: float = Field(120.0, gt=0)
+
+
+class ContractConfig(_Section):
+    """What export writes into the model file and measurement cannot find out."""
+
+    name: str
+    acquire_size_wh: tuple[int, int]
+    acquire_fit: Literal["letterbox", "squash"]
+    track_size_wh: tuple[int, int] | None = None
+    track_window_scale: float = Field(gt=1.0)
+    trained_range_m: tuple[float, float] = (100.0, 500.0)
+
+
+class TrainerConfig(_Section):
+    model: ModelConfig
+    loss: LossConfig
+    data: DataConfig
+    schedule: ScheduleConfig
+    run: RunConfig
+    contract: ContractConfig
+
+
+def parse_config(text: str, source: str) -> TrainerConfig:
+    """TOML text to a configuration. Raises ConfigError naming `source` and every wrong key."""
+    try:
+        return TrainerConfig.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    except ValidationError as error:
+        lines = [f"{'.'.join(map(str, item['loc'])) or 'file'}: {item['msg']}" for item in error.errors()]
+        raise ConfigError(f"{source}: " + "; ".join(lines)) from None
+
+
+def load_config(path: Path) -> TrainerConfig:
+    """Read a TOML file. Raises ConfigError when it is missing or wrong."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    return parse_config(text, str(path))

@@ -1,0 +1,187 @@
+"""The data feed: rendering processes make sampler batches ahead of training and deliver them in index order.
+
+Sample i is a pure function of (seed, i, size), so the place in the stream is one integer and a resumed run sees
+exactly the samples that an unbroken one would have.
+"""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import queue
+import signal
+import traceback
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sim_replay.sample import SampleBatch
+from trainer.config import DataConfig
+from trainer.losses import Labels
+
+DENSE_STRIDE = 4
+POLL_S = 1.0
+
+
+class Sampler(Protocol):
+    """What a feed needs of sim_replay.sampler.WindowSampler."""
+
+    def batch(self, first_index: int, count: int) -> SampleBatch: ...
+
+
+class FeedError(RuntimeError):
+    """A rendering process failed; the message carries its traceback."""
+
+
+class TrainingBatch(NamedTuple):
+    """A sampler's batch made small to travel: dense labels at stride 4, boxes as centre and size."""
+
+    image_bgr: NDArray[np.uint8]  # [N, H, W, 3]
+    K: NDArray[np.float32]
+    present: NDArray[np.bool_]
+    R_cam_target: NDArray[np.float32]
+    t_cam_target_m: NDArray[np.float32]
+    center_px: NDArray[np.float32]
+    size_px: NDArray[np.float32]
+    coverage: NDArray[np.float32]  # [N, H/4, W/4]
+    noc: NDArray[np.float32]  # [N, 3, H/4, W/4]
+    diameter_m: NDArray[np.float32]
+
+
+def training_batch(sample: SampleBatch) -> TrainingBatch:
+    """Pool the dense labels over 4x4 pixels (object coordinates over visible ones only) and split the boxes."""
+    count, rows, columns = sample.mask.shape
+    tiles = (count, rows // DENSE_STRIDE, DENSE_STRIDE, columns // DENSE_STRIDE, DENSE_STRIDE)
+    visible = sample.mask.reshape(tiles).sum((2, 4)).astype(np.float32)
+    masked = np.where(sample.mask[..., None], sample.noc, 0).astype(np.float32)
+    noc = masked.reshape(*tiles, 3).sum((2, 4)) / np.maximum(visible, 1.0)[..., None]
+    box = sample.box_xyxy_px
+    return TrainingBatch(
+        image_bgr=sample.image_bgr,
+        K=sample.K,
+        present=sample.present,
+        R_cam_target=sample.R_cam_target,
+        t_cam_target_m=sample.t_cam_target_m,
+        center_px=0.5 * (box[:, :2] + box[:, 2:]),
+        size_px=box[:, 2:] - box[:, :2],
+        coverage=visible / DENSE_STRIDE**2,
+        noc=np.ascontiguousarray(noc.transpose(0, 3, 1, 2)),
+        diameter_m=sample.diameter_m,
+    )
+
+
+def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor, Labels]:
+    """The images [N, H, W, 3] uint8 and the labels on `device`."""
+    put = lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device)  # noqa: E731
+    labels = Labels(
+        K=put(batch.K),
+        present=put(batch.present.astype(np.float32)),
+        R_cam_target=put(batch.R_cam_target),
+        t_cam_target_m=put(batch.t_cam_target_m),
+        center_px=put(batch.center_px),
+        size_px=put(batch.size_px),
+        coverage=put(batch.coverage),
+        noc=put(batch.noc),
+    )
+    return put(batch.image_bgr), labels
+
+
+def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler:
+    from sim_replay.sampler import WindowSampler
+
+    ids = config.airframe_ids
+    return WindowSampler(seed, size_px, ids, acquire_share=config.acquire_share, empty_share=config.empty_share)
+
+
+def window_sampler(config: DataConfig, seed: int, size_px: int) -> Callable[[], Sampler]:
+    """A picklable opener of the renderer's sampler; the renderer starts in the process that calls it."""
+    return partial(_open_window_sampler, config, seed, size_px)
+
+
+def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, out: mp.Queue) -> None:
+    """Body of a rendering process: batches first, first + stride, ... until the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    parent = mp.parent_process()
+    try:
+        os.nice(1)
+        sampler = open_sampler()
+        start = first
+        while True:
+            batch = training_batch(sampler.batch(start, batch_size))
+            start += stride
+            while True:
+                try:
+                    out.put(batch, timeout=POLL_S)
+                    break
+                except queue.Full:
+                    if parent is None or not parent.is_alive():
+                        return
+    except Exception:
+        out.put(traceback.format_exc())
+
+
+class Feed:
+    """Batches of consecutive samples from `first_index` on, rendered by `workers` processes. Use as a context."""
+
+    def __init__(
+        self,
+        open_sampler: Callable[[], Sampler],
+        batch_size: int,
+        first_index: int,
+        workers: int = 1,
+        prefetch: int = 4,
+    ) -> None:
+        context = mp.get_context("spawn")
+        self._turn = 0
+        self._queues: list[mp.Queue] = []
+        self._processes = []
+        for worker in range(workers):
+            out: mp.Queue = context.Queue(maxsize=prefetch)
+            first = first_index + worker * batch_size
+            arguments = (open_sampler, batch_size, first, workers * batch_size, out)
+            process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
+            process.start()
+            self._queues.append(out)
+            self._processes.append(process)
+
+    def next(self) -> TrainingBatch:
+        """The next batch in index order. Raises FeedError when its renderer failed."""
+        source, process = self._queues[self._turn], self._processes[self._turn]
+        while True:
+            try:
+                batch = source.get(timeout=POLL_S)
+                break
+            except queue.Empty:
+                if not process.is_alive():
+                    raise FeedError(f"{process.name} ended with exit code {process.exitcode}") from None
+        if isinstance(batch, str):
+            raise FeedError(f"{process.name} failed:\n{batch}")
+        self._turn = (self._turn + 1) % len(self._queues)
+        return batch
+
+    def close(self) -> None:
+        """Stop the renderers; idempotent."""
+        for process in self._processes:
+            process.terminate()
+        for process, out in zip(self._processes, self._queues, strict=True):
+            process.join(timeout=5.0)
+            out.close()
+            out.cancel_join_thread()
+
+    def __enter__(self) -> Feed:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def render_once(open_sampler: Callable[[], Sampler], count: int, chunk: int = 16) -> list[TrainingBatch]:
+    """Samples 0..count-1 (rounded up to whole chunks) through a renderer of their own, kept in memory."""
+    with Feed(open_sampler, chunk, 0) as feed:
+        return [feed.next() for _ in range((count + chunk - 1) // chunk)]

@@ -1,0 +1,102 @@
+"""What a model does on labelled images: pose errors, boxes, detection. Pure functions of predictions and labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from sim_replay import metrics
+from trainer.data import TrainingBatch
+from trainer.model import PoseNet
+
+SCORE_THRESHOLD = 0.3
+
+
+class Predictions(NamedTuple):
+    """The highest peak of each image, as msgs.contract names it."""
+
+    score: NDArray[np.float32]  # [N]
+    center_px: NDArray[np.float32]  # [N, 2]
+    size_px: NDArray[np.float32]  # [N, 2]
+    origin_px: NDArray[np.float32]  # [N, 2]
+    t_cam_target_m: NDArray[np.float32]  # [N, 3]
+    R_cam_target: NDArray[np.float32]  # [N, 3, 3]
+    sigma: NDArray[np.float32]  # [N, 6]
+
+
+Predictor = Callable[[NDArray[np.uint8], NDArray[np.float32]], Predictions]
+
+
+def torch_predictor(model: PoseNet) -> Predictor:
+    """A predictor that runs `model` in evaluation mode on the device its weights are on."""
+    device = next(model.parameters()).device
+
+    @torch.no_grad()
+    def predict(image_bgr: NDArray[np.uint8], K: NDArray[np.float32]) -> Predictions:
+        out = model(torch.from_numpy(image_bgr).to(device), torch.from_numpy(K).to(device))
+        return Predictions(*(value[:, 0].float().cpu().numpy() for value in out))
+
+    return predict
+
+
+def predict_all(predict: Predictor, batches: Iterable[TrainingBatch]) -> Predictions:
+    """Predictions of all batches, concatenated."""
+    parts = [predict(np.ascontiguousarray(b.image_bgr), np.ascontiguousarray(b.K)) for b in batches]
+    return Predictions(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def box_iou(center_a: NDArray, size_a: NDArray, center_b: NDArray, size_b: NDArray) -> NDArray:
+    """Intersection over union [N] of boxes given as centres and sizes [N, 2]."""
+    low = np.maximum(center_a - size_a / 2, center_b - size_b / 2)
+    high = np.minimum(center_a + size_a / 2, center_b + size_b / 2)
+    both = np.prod(np.maximum(high - low, 0.0), axis=-1)
+    return both / (np.prod(size_a, axis=-1) + np.prod(size_b, axis=-1) - both)
+
+
+def ranking_auc(positive: NDArray, negative: NDArray) -> float:
+    """Probability that a positive outranks a negative (ties count half); NaN when either is missing."""
+    if len(positive) == 0 or len(negative) == 0:
+        return float("nan")
+    difference = positive[:, None] - negative[None, :]
+    return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
+
+
+def measure(
+    predicted: Predictions, batches: list[TrainingBatch], threshold: float = SCORE_THRESHOLD
+) -> dict[str, float]:
+    """Metrics of one set of windows. Pose metrics are over every window with a target, found or not."""
+    labels = TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
+    on = labels.present
+    est = Predictions(*(value[on] for value in predicted))
+    R, t = labels.R_cam_target[on], labels.t_cam_target_m[on]
+    center, size = labels.center_px[on], labels.size_px[on]
+    E_r = metrics.rotation_error_deg(est.R_cam_target, R)
+    depth = metrics.depth_error_rel(est.t_cam_target_m, t)
+    E_t = metrics.translation_error_m(est.t_cam_target_m, t)
+    pose = metrics.pose_10deg_5pct(est.R_cam_target, est.t_cam_target_m, R, t)
+    inside = np.all(np.abs(est.center_px - center) <= np.maximum(size / 2, 4.0), axis=-1)
+    found = (est.score >= threshold) & inside
+    empty = predicted.score[~on]
+    return {
+        "windows": float(len(on)),
+        "E_r_mean_deg": float(E_r.mean()),
+        "E_r_median_deg": float(np.median(E_r)),
+        "rot_lt_10deg": float(np.mean(E_r < 10.0)),
+        "E_t_mean_m": float(E_t.mean()),
+        "E_t_median_m": float(np.median(E_t)),
+        "E_z_mean_m": float(metrics.depth_error_m(est.t_cam_target_m, t).mean()),
+        "depth_rel_mean": float(depth.mean()),
+        "depth_rel_median": float(np.median(depth)),
+        "depth_lt_5pct": float(np.mean(depth < 0.05)),
+        "pose_10deg_5pct": float(pose.mean()),
+        "bearing_median_deg": float(np.median(metrics.bearing_error_deg(est.t_cam_target_m, t))),
+        "box_iou_mean": float(box_iou(est.center_px, est.size_px, center, size).mean()),
+        "recall": float(found.mean()),
+        "false_alarms": float(np.mean(empty >= threshold)) if len(empty) else float("nan"),
+        "score_auc": ranking_auc(est.score, empty),
+        "score_median": float(np.median(est.score)),
+    }

@@ -1,0 +1,149 @@
+"""The joint loss and what edge adds to it.
+
+Paper: L_total = lambda_1 L_hm + lambda_2 L_wh + lambda_3 L_trans + lambda_4 L_rot.
+
+Every term is a mean over the windows that hold a target, but the heatmap's, which all windows train.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from trainer import equations as eq
+from trainer.config import LossConfig
+from trainer.model import Decoded
+
+SMALLEST_SIZE_PX = 2.0
+
+
+class Labels(NamedTuple):
+    """Labels of N images as tensors; see sim_replay.sample.SampleBatch for frames. Dense ones are at stride 4."""
+
+    K: Tensor  # [N, 3, 3]
+    present: Tensor  # [N], float 0 or 1
+    R_cam_target: Tensor  # [N, 3, 3]
+    t_cam_target_m: Tensor  # [N, 3]
+    center_px: Tensor  # [N, 2]
+    size_px: Tensor  # [N, 2]
+    coverage: Tensor  # [N, H/4, W/4], share of visible target pixels
+    noc: Tensor  # [N, 3, H/4, W/4]
+
+
+def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
+    """CenterNet's radius [...]: corners moved by it keep IoU >= overlap with a box [..., 2]; at least one cell."""
+    w, h = size_cells[..., 0], size_cells[..., 1]
+    total, area = w + h, w * h
+    solve = lambda a, b, c: (b - torch.sqrt(torch.clamp(b * b - 4 * a * c, min=0.0))) / (2 * a)  # noqa: E731
+    both = solve(1.0, total, area * (1 - overlap) / (1 + overlap))
+    inside = solve(4.0, 2 * total, (1 - overlap) * area)
+    b = 2 * overlap * total
+    outside = (-b + torch.sqrt(b * b - 16 * overlap * (overlap - 1) * area)) / (8 * overlap)
+    return torch.clamp(torch.minimum(torch.minimum(both, inside), outside), min=1.0)
+
+
+def center_cell(center_px: Tensor, rows: int, columns: int) -> Tensor:
+    """The stride-8 cell [..., 2] (x, y) that holds a pixel [..., 2], kept inside the map."""
+    cell = torch.floor((center_px + 0.5) / eq.STRIDE)
+    return torch.stack([cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)], dim=-1)
+
+
+def heatmap_target(labels: Labels, rows: int, columns: int) -> Tensor:
+    """P [N, rows, columns]: a Gaussian with a peak of exactly 1 at the centre's cell, zeros without a target."""
+    cell = center_cell(labels.center_px, rows, columns)
+    sigma = (2 * gaussian_radius(labels.size_px / eq.STRIDE) + 1) / 6
+    x = torch.arange(columns, device=cell.device)
+    y = torch.arange(rows, device=cell.device)
+    squared = (x[None, None] - cell[:, 0, None, None]) ** 2 + (y[None, :, None] - cell[:, 1, None, None]) ** 2
+    return torch.exp(-squared / (2 * sigma[:, None, None] ** 2)) * labels.present[:, None, None]
+
+
+def heatmap_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """Penalty-reduced focal loss (paper: L_hm) over all windows, divided by the number of targets."""
+    log_p, log_not_p = F.logsigmoid(logits), F.logsigmoid(-logits)
+    p = torch.sigmoid(logits)
+    positive = (target >= 1.0).to(logits.dtype)
+    terms = positive * (1 - p) ** 2 * log_p + (1 - positive) * (1 - target) ** 4 * p**2 * log_not_p
+    return -terms.sum() / positive.sum().clamp(min=1.0)
+
+
+def rotation_residual(R_est: Tensor, R_true: Tensor) -> Tensor:
+    """Rotation vector [..., 3] in `cam`, radians, that turns the estimate [..., 3, 3] into the truth."""
+    R = R_true @ R_est.transpose(-1, -2)
+    axis = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], dim=-1)
+    return F.normalize(axis, dim=-1) * eq.rotation_angle(R_est, R_true)[..., None]
+
+
+def _laplace_nll(residual: Tensor, log_scale: Tensor) -> Tensor:
+    return residual.abs() * torch.exp(-log_scale) + log_scale
+
+
+def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, Tensor]:
+    """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels."""
+    center, log_size, origin, log_Z, R_allo, R_ego, log_sigma = (value[:, 0] for value in out)
+    t, K = labels.t_cam_target_m, labels.K
+    Z = torch.clamp(t[:, 2], min=1.0)
+    true_plane = t[:, :2] / Z[:, None]
+    f_xy = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1)
+    true_origin = true_plane * f_xy + torch.stack([K[:, 0, 2], K[:, 1, 2]], dim=-1)
+    true_log_size = torch.log(torch.clamp(labels.size_px, min=SMALLEST_SIZE_PX))
+    longer = torch.exp(true_log_size).amax(-1, keepdim=True)
+    t_xy = eq.back_project(eq.image_plane_point(origin, K), torch.exp(log_Z))[:, :2]
+    R_allo_true = eq.ray_rotation(eq.unit_ray(true_plane)).transpose(-1, -2) @ labels.R_cam_target
+
+    terms = {
+        "size": F.smooth_l1_loss(log_size, true_log_size, reduction="none", beta=0.1).sum(-1),
+        "depth": F.smooth_l1_loss(log_Z, torch.log(Z), reduction="none", beta=weights.depth_beta),
+        "planar": F.smooth_l1_loss(t_xy, t[:, :2], reduction="none").sum(-1) / Z,
+        "geodesic": eq.rotation_angle(R_ego, labels.R_cam_target) / math.pi,
+        "rotation_6d": F.smooth_l1_loss(R_allo[..., ::2], R_allo_true[..., ::2], reduction="none").mean((-1, -2)),
+        "center": F.smooth_l1_loss(center, labels.center_px, reduction="none", beta=2.0).sum(-1) / eq.STRIDE,
+        "origin": F.smooth_l1_loss(origin / longer, true_origin / longer, reduction="none", beta=0.02).sum(-1),
+    }
+    if weights.uncertainty > 0:
+        side = torch.exp(0.5 * log_size.sum(-1, keepdim=True))
+        residual = torch.cat(
+            [
+                (origin - true_origin) / side,
+                (log_Z - torch.log(Z))[:, None],
+                rotation_residual(R_ego, labels.R_cam_target),
+            ],
+            dim=-1,
+        )
+        terms["uncertainty"] = _laplace_nll(residual.detach(), log_sigma).sum(-1)
+    return terms
+
+
+def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
+    """Training-only heads [N, 4, H/4, W/4]: mask over all windows, object coordinates where the target is seen."""
+    mask = F.binary_cross_entropy_with_logits(dense[:, 0], labels.coverage, reduction="none").mean((1, 2))
+    seen = (labels.coverage > 0.3).to(dense.dtype)
+    # Object coordinates lie within half a diameter: 10 brings their errors to the size of the other terms.
+    error = F.smooth_l1_loss(10 * dense[:, 1:], 10 * labels.noc, reduction="none").mean(1)
+    noc = (error * seen).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1.0)
+    return {"mask": mask, "noc": noc}
+
+
+def joint_loss(
+    heat_logits: Tensor, out: Decoded, dense: Tensor | None, labels: Labels, weights: LossConfig
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """L_total and its unweighted terms, each a scalar."""
+    count = labels.present.sum().clamp(min=1.0)
+    over_targets = {k: (v * labels.present).sum() / count for k, v in pose_terms(out, labels, weights).items()}
+    terms = {"heatmap": heatmap_loss(heat_logits, heatmap_target(labels, *heat_logits.shape[-2:])), **over_targets}
+    if dense is not None:
+        by_window = dense_terms(dense, labels)
+        terms["mask"] = by_window["mask"].mean()
+        terms["noc"] = (by_window["noc"] * labels.present).sum() / count
+    L_trans = weights.depth * terms["depth"] + weights.planar * terms["planar"]
+    L_rot = terms["geodesic"] + weights.rotation_6d * terms["rotation_6d"]
+    total = weights.heatmap * terms["heatmap"] + weights.size * terms["size"]
+    total = total + weights.translation * L_trans + weights.rotation * L_rot
+    for name in ("center", "origin", "mask", "noc", "uncertainty"):
+        if name in terms:
+            total = total + getattr(weights, name) * terms[name]
+    return total, terms

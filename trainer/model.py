@@ -1,0 +1,227 @@
+"""MF-UAVPose6D: one image and its intrinsics to the 6-DoF poses of the aircraft in it.
+
+Read `PoseNet.forward` first: backbone and neck, heatmap peaks, then `decode` takes each peak through the paper's
+modules in the paper's order. Training decodes one guided peak (`forward_guided`), inference the highest M.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from trainer import equations as eq
+from trainer.backbones import build_backbone
+from trainer.config import ModelConfig
+from trainer.neck import AlignFuseNeck, conv_bn_relu
+
+Z_RANGE_M = (50.0, 600.0)
+OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+REGION = 7
+IMAGENET_MEAN_BGR = (103.53, 116.28, 123.675)
+IMAGENET_STD_BGR = (57.375, 57.12, 58.395)
+
+
+class Decoded(NamedTuple):
+    """What one pass says of M peaks in N images. Pixels of the input image; `cam` frame; metres."""
+
+    center_px: Tensor  # [N, M, 2]
+    log_size: Tensor  # [N, M, 2], log (w, h) in log pixels
+    origin_px: Tensor  # [N, M, 2]
+    log_Z: Tensor  # [N, M], not clamped
+    R_allo: Tensor  # [N, M, 3, 3]
+    R_ego: Tensor  # [N, M, 3, 3]
+    log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), log Z, rotation x y z in rad
+
+
+class Perception(NamedTuple):
+    """Everything that does not depend on a peak."""
+
+    F_global: Tensor  # [N, C, H/8, W/8]
+    heat_logits: Tensor  # [N, H/8, W/8]
+
+
+def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Two linear layers with a ReLU between."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, outputs))
+
+
+class PerspectiveAwareModule(nn.Module):
+    """PAM: f_pam = Proj(f_c) * sigmoid(gamma) + beta, with [gamma, beta] = MLP_ray(x/z, y/z)."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        self.ray_encoder = mlp(2, hidden // 2, 2 * hidden)
+        self.project = nn.Linear(channels, hidden)
+
+    def forward(self, f_c: Tensor, plane_xy: Tensor) -> Tensor:
+        gamma, beta = self.ray_encoder(plane_xy).chunk(2, dim=-1)
+        return self.project(f_c) * torch.sigmoid(gamma) + beta
+
+
+class DynamicTopologicalSampling(nn.Module):
+    """DTS: eight points on the box's edges and corners (f_oct) and a 7x7 grid over it (f_reg)."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        steps = torch.linspace(-1.0, 1.0, REGION)
+        grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)
+        offsets = torch.cat([torch.tensor(OCT_OFFSETS, dtype=torch.float32), grid])
+        self.register_buffer("offsets", offsets, persistent=False)
+        narrow = channels // 2
+        self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, channels, 3, stride=2))
+        self.region = nn.Linear(channels * 16, hidden)
+
+    def forward(self, F_global: Tensor, center_px: Tensor, size_px: Tensor) -> tuple[Tensor, Tensor]:
+        """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px to f_oct [N, M, 8 C] and f_reg [N, M, hidden]."""
+        offsets = self.get_buffer("offsets")
+        points_px = center_px[:, :, None] + 0.5 * size_px[:, :, None] * offsets
+        extent = eq.STRIDE * torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
+        # align_corners=False puts -1 and 1 on the outer edges of the border pixels.
+        normalised = (2.0 * points_px + 1.0) / extent - 1.0
+        sampled = F.grid_sample(F_global, normalised, mode="bilinear", padding_mode="zeros", align_corners=False)
+        sampled = sampled.permute(0, 2, 3, 1)  # [N, M, 57, C]
+        peaks, channels = sampled.shape[1], sampled.shape[3]
+        f_oct = sampled[:, :, :8].flatten(2)
+        grid = sampled[:, :, 8:].reshape(-1, REGION, REGION, channels).permute(0, 3, 1, 2)
+        f_reg = F.relu(self.region(self.convs(grid).flatten(1)))
+        return f_oct, f_reg.reshape(-1, peaks, f_reg.shape[-1])
+
+
+class GatedFusion(nn.Module):
+    """Gamma(f_reg, Phi(f_geo)) with a gate of its own: f_reg + sigmoid(g) * Phi(f_geo)."""
+
+    def __init__(self, geo: int, hidden: int) -> None:
+        super().__init__()
+        self.context = nn.Sequential(nn.Linear(geo, hidden), nn.ReLU(inplace=True))
+        self.gate = nn.Linear(2 * hidden, hidden)
+
+    def forward(self, f_reg: Tensor, f_geo: Tensor) -> Tensor:
+        context = self.context(f_geo)
+        return f_reg + torch.sigmoid(self.gate(torch.cat([f_reg, context], dim=-1))) * context
+
+
+class PoseNet(nn.Module):
+    """The network. `forward` is the exported graph (see msgs.contract); a train step calls `forward_guided`."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        C, hidden = config.channels, config.hidden
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN_BGR)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD_BGR)[:, None, None], persistent=False)
+        self.backbone = build_backbone(config.backbone, config.pretrained)
+        self.neck = AlignFuseNeck(self.backbone.channels, C)
+        self.head_hm = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 1, 1))
+        self.pam = PerspectiveAwareModule(C, hidden)
+        self.mlp_wh = mlp(hidden, hidden // 2, 2)
+        self.dts = DynamicTopologicalSampling(C, hidden)
+        geo = C + 8 * C + hidden + 2
+        self.fuse_t, self.fuse_r = GatedFusion(geo, hidden), GatedFusion(geo, hidden)
+        self.mlp_t, self.mlp_r = (nn.Sequential(mlp(hidden, hidden, hidden), nn.ReLU(inplace=True)) for _ in range(2))
+        self.head_trans = nn.Linear(hidden, 3)
+        self.head_rot = nn.Linear(hidden, 6)
+        self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
+        self.head_sigma_t = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
+        self.head_sigma_r = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
+        # Linear but for one small layer, so that object coordinates must be written into F_global itself.
+        self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
+        self._init_priors()
+
+    @torch.no_grad()
+    def _init_priors(self) -> None:
+        """Start where an aircraft is likely: heatmap at 0.01, S near 8 m, body down near image down."""
+        last = self.head_hm[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        last.bias.fill_(math.log(0.01 / 0.99))
+        for head in (self.head_trans, self.head_rot, self.head_extents):
+            if head is not None:
+                head.weight.mul_(0.1)
+                head.bias.zero_()
+        self.head_rot.bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.1]))
+        if self.head_extents is not None:
+            self.head_extents.bias.copy_(torch.log(torch.tensor([4.5, 5.5, 1.5])))
+        else:
+            self.head_trans.bias[2] = math.log(8.0)
+
+    def perceive(self, image_bgr: Tensor) -> Perception:
+        """uint8 image [N, H, W, 3] to F_global and the heatmap's logits."""
+        x = (image_bgr.permute(0, 3, 1, 2).float() - self.get_buffer("mean")) / self.get_buffer("std")
+        if image_bgr.device.type == "cuda" or torch.is_autocast_enabled("cpu"):
+            x = x.contiguous(memory_format=torch.channels_last)
+        F_global = self.neck(self.backbone(x))
+        return Perception(F_global, self.head_hm(F_global)[:, 0])
+
+    def dense(self, F_global: Tensor) -> Tensor:
+        """Mask logit and object coordinates [N, 4, H/4, W/4]; training only."""
+        assert self.head_dense is not None
+        return F.pixel_shuffle(self.head_dense(F_global), 2)
+
+    def decode(self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None) -> Decoded:
+        """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box."""
+        F_global, log_P = seen.F_global, F.logsigmoid(seen.heat_logits)
+        K = K[:, None]
+        W, center_px = eq.soft_argmax(log_P, peaks_xy.to(log_P.dtype), self._sigma_g(log_P))
+        f_c = W @ F_global.flatten(2).transpose(1, 2)
+        f_pam = self.pam(f_c, eq.image_plane_point(center_px, K))
+        log_size = self.mlp_wh(f_pam) + torch.log(self._anchor(F_global))
+        size_px = torch.exp(log_size)
+        grid_size = size_px.detach()
+        if guide_size_px is not None:
+            grid_size = torch.where(guide_size_px > 0, guide_size_px, grid_size)
+        f_oct, f_reg = self.dts(F_global, center_px.detach(), grid_size)
+        # The grid is normalised by the box, so the context says which box it was.
+        f_geo = torch.cat([f_c, f_oct, f_pam, torch.log(grid_size / 32.0)], dim=-1)
+        f_trans = self.mlp_t(self.fuse_t(f_reg, f_geo))
+        f_rot = self.mlp_r(self.fuse_r(f_reg, f_geo))
+
+        R_allo = eq.gram_schmidt(self.head_rot(f_rot))
+        o_xy, s = self.head_trans(f_trans).split([2, 1], dim=-1)
+        origin_px = center_px + self.config.origin_range * size_px * torch.tanh(o_xy)
+        S = torch.exp(s[..., 0])
+        if self.head_extents is not None:
+            S = S * eq.seen_scale(torch.exp(self.head_extents(f_trans)), R_allo.detach())
+        log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
+        R_ego = eq.ray_rotation(eq.unit_ray(eq.image_plane_point(origin_px, K))) @ R_allo
+        return Decoded(center_px, log_size, origin_px, log_Z, R_allo, R_ego, self._log_sigma(f_trans, f_rot))
+
+    def _log_sigma(self, f_trans: Tensor, f_rot: Tensor) -> Tensor:
+        """From detached features: the uncertainty never pulls at the means."""
+        if self.head_sigma_t is None or self.head_sigma_r is None:
+            return torch.zeros_like(f_trans[..., :6])
+        raw = torch.cat([self.head_sigma_t(f_trans.detach()), self.head_sigma_r(f_rot.detach())], dim=-1)
+        return torch.clamp(raw - 2.0, -7.0, 1.5)
+
+    def _sigma_g(self, log_P: Tensor) -> Tensor | float:
+        cells = self.config.soft_argmax_sigma_cells
+        return cells if cells is not None else _float(log_P.shape[-1], log_P) / 32.0
+
+    def _anchor(self, F_global: Tensor) -> Tensor:
+        if self.config.box_anchor_px is not None:
+            return torch.full_like(F_global[0, 0, 0, :1], self.config.box_anchor_px)
+        sides = torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
+        return 0.1 * eq.STRIDE * sides
+
+    def forward(self, image: Tensor, K: Tensor) -> tuple[Tensor, ...]:
+        """The exported graph: the outputs of msgs.contract.OUTPUT_NAMES, in that order."""
+        seen = self.perceive(image)
+        seen = Perception(seen.F_global.float(), seen.heat_logits.float())
+        score, peaks_xy = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), self.config.max_peaks)
+        out = self.decode(seen, K, peaks_xy)
+        Z = torch.clamp(torch.exp(out.log_Z), *Z_RANGE_M)
+        t_cam_target_m = eq.back_project(eq.image_plane_point(out.origin_px, K[:, None]), Z)
+        size_px = torch.exp(out.log_size)
+        # A Laplace law of scale b has the standard deviation sqrt(2) b.
+        sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
+        side_px = torch.sqrt(size_px[..., :1] * size_px[..., 1:])
+        sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
+        return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
+
+
+def _float(length: int, like: Tensor) -> Tensor:
+    """A dimension as a scalar tensor, so that export keeps it dynamic."""
+    return torch.as_tensor(length, device=like.device).to(like.dtype)

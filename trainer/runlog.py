@@ -1,0 +1,109 @@
+"""The record of a training run: a readable line, JSON lines, TensorBoard scalars, and where everything came from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.tensorboard import SummaryWriter
+
+from trainer.config import TrainerConfig
+
+
+def _commit() -> str:
+    """The source tree's commit, with `+` when it has uncommitted changes; "unknown" outside a repository."""
+    here = Path(__file__).parent
+    try:
+        ask = lambda *words: subprocess.check_output(["git", *words], cwd=here, stderr=subprocess.DEVNULL, text=True)  # noqa: E731
+        head, changed = ask("rev-parse", "HEAD").strip(), ask("status", "--porcelain", "-uno", "--", ".").strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + ("+" if changed else "")
+
+
+def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
+    """What is needed to make the run again, beside its configuration."""
+    return {
+        "seed": config.data.seed,
+        "commit": _commit(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
+    }
+
+
+class RunLog:
+    """Writes into a run folder; every line is on disk when its call returns."""
+
+    def __init__(self, out: Path, config_text: str, origin: dict[str, str | int | float]) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "config.toml").write_text(config_text, encoding="utf-8")
+        digest = hashlib.sha256(config_text.encode()).hexdigest()
+        record = json.dumps({**origin, "config_sha256": digest}, indent=2)
+        (out / "run.json").write_text(record + "\n", encoding="utf-8")
+        self._lines = (out / "log.jsonl").open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(out / "tensorboard"))
+        self._started_s = time.monotonic()
+        self._reset()
+
+    def _reset(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._count = 0
+        self._since_s = time.monotonic()
+
+    def add(self, loss: float, terms: dict[str, float], rotation_deg: float, depth_rel: float) -> None:
+        """One step's values; `report` means them."""
+        for name, value in {"loss": loss, **terms, "rotation_deg": rotation_deg, "depth_rel": depth_rel}.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._count += 1
+
+    def report(self, step: int, samples: int, progress: float, rate: float) -> None:
+        """One line for a person and one for a machine: means since the last report."""
+        means = {name: value / self._count for name, value in self._sums.items()}
+        done = self._count * samples / step
+        per_s = done / max(time.monotonic() - self._since_s, 1e-6)
+        told_apart = ("loss", "rotation_deg", "depth_rel", "geodesic")
+        terms = " ".join(f"{name} {value:.3f}" for name, value in means.items() if name not in told_apart)
+        print(
+            f"step {step:6d}  samples {samples:7d}  {100 * progress:5.1f} %  {per_s:5.1f} images/s  lr {rate:.1e}  "
+            f"loss {means['loss']:.3f}  rotation {means['rotation_deg']:5.1f} deg  "
+            f"depth {100 * means['depth_rel']:5.1f} %  [{terms}]",
+            flush=True,
+        )
+        record = {"step": step, "samples": samples, "progress": progress, "images_per_s": per_s, "lr": rate, **means}
+        self._record("train", samples, record)
+        self._reset()
+
+    def validation(self, step: int, samples: int, size_px: int, metrics: dict[str, float]) -> None:
+        """Metrics on held-out windows."""
+        print(
+            f"held out at {size_px} px after {samples} samples: rotation mean {metrics['E_r_mean_deg']:.1f} "
+            f"median {metrics['E_r_median_deg']:.1f} deg, depth median {100 * metrics['depth_rel_median']:.1f} %, "
+            f"pose@10/5 {100 * metrics['pose_10deg_5pct']:.1f} %, box IoU {metrics['box_iou_mean']:.2f}, "
+            f"recall {100 * metrics['recall']:.1f} %, false alarms {100 * metrics['false_alarms']:.1f} %, "
+            f"score AUC {metrics['score_auc']:.3f}",
+            flush=True,
+        )
+        self._record("validation", samples, {"step": step, "samples": samples, "size_px": size_px, **metrics})
+        self._since_s = time.monotonic()
+        self._sums, self._count = {}, 0
+
+    def note(self, text: str) -> None:
+        print(text, flush=True)
+
+    def _record(self, kind: str, samples: int, values: dict[str, float]) -> None:
+        self._lines.write(json.dumps({"kind": kind, "wall_s": time.monotonic() - self._started_s, **values}) + "\n")
+        self._lines.flush()
+        for name, value in values.items():
+            self._board.add_scalar(f"{kind}/{name}", value, samples)
+
+    def close(self) -> None:
+        self._lines.close()
+        self._board.close()

@@ -1,0 +1,298 @@
+"""Training: `run_training` is the loop, top-down; `Trainer` is its state, which a checkpoint carries whole."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from trainer import equations as eq
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, write_atomic
+from trainer.config import ConfigError, ScheduleConfig, TrainerConfig
+from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors, window_sampler
+from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
+from trainer.model import Decoded, Perception, PoseNet
+from trainer.runlog import RunLog, provenance
+
+OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
+
+
+class Budget(NamedTuple):
+    """Wall-clock seconds of this run so far, before this start, and in total; total None: no limit."""
+
+    used_before_s: float
+    total_s: float | None
+
+
+def learning_rate(schedule: ScheduleConfig, samples_done: int, progress: float) -> float:
+    """Linear warm-up over samples, then cosine from lr to lr_final over progress 0..1."""
+    warmup = min(1.0, (samples_done + 1) / max(schedule.warmup_samples, 1))
+    cosine = 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return warmup * (schedule.lr_final + (schedule.lr - schedule.lr_final) * cosine)
+
+
+def size_at(schedule: ScheduleConfig, progress: float) -> int:
+    """Side of the training windows at that progress, pixels."""
+    return [stage.size_px for stage in schedule.sizes if stage.from_progress <= progress][-1]
+
+
+def guided_peaks(
+    heat_logits: Tensor, labels: Labels, teacher: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Which peak and which box each image is decoded with: cells [N, 1, 2] and sizes [N, 1, 2] px, 0 for predicted.
+
+    With probability `teacher` the true centre's cell, sometimes one off, and the true box, jittered; otherwise the
+    highest cell of the heatmap inside the true box and the predicted box.
+    """
+    count, rows, columns = heat_logits.shape
+    cell = center_cell(labels.center_px, rows, columns)
+    draw = torch.rand((count, 5), generator=generator).to(heat_logits.device)
+    step = torch.where(draw[:, :2] < 0.15, -1.0, torch.where(draw[:, :2] > 0.85, 1.0, 0.0))
+    limit = torch.tensor([columns - 1.0, rows - 1.0], device=heat_logits.device)
+    jittered = torch.minimum(torch.clamp(cell + step, min=0.0), limit)
+
+    reach = torch.clamp(labels.size_px / (4 * eq.STRIDE), min=1.0)
+    x, y = torch.arange(columns, device=cell.device), torch.arange(rows, device=cell.device)
+    near_x = (x - cell[:, :1]).abs() <= reach[:, :1]
+    near_y = (y - cell[:, 1:]).abs() <= reach[:, 1:]
+    near = near_y[:, :, None] & near_x[:, None, :]
+    best = heat_logits.detach().masked_fill(~near, -torch.inf).flatten(1).argmax(1)
+    highest = torch.stack([best % columns, best // columns], dim=-1).to(cell.dtype)
+
+    taught = (draw[:, 4] < teacher)[:, None]
+    noise = torch.exp(0.3 * (draw[:, 2:4] - 0.5))
+    size = torch.clamp(labels.size_px, min=SMALLEST_SIZE_PX) * noise
+    peaks = torch.where(taught, jittered, highest)
+    return peaks[:, None], torch.where(taught, size, torch.zeros_like(size))[:, None]
+
+
+class StepResult(NamedTuple):
+    loss: float
+    terms: dict[str, float]
+    rotation_deg: float  # mean over the batch's targets
+    depth_rel: float  # mean over the batch's targets
+
+
+class Trainer:
+    """Network, moving average, optimiser and counters of one run."""
+
+    def __init__(self, config: TrainerConfig, device: torch.device) -> None:
+        torch.manual_seed(config.data.seed)
+        self.config, self.device = config, device
+        self.model = PoseNet(config.model).to(device)
+        for part in (self.model.backbone, self.model.neck, self.model.head_hm):
+            part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr)
+        self.steps = 0
+        self.samples = 0
+
+    def _parameter_groups(self) -> list[dict[str, Any]]:
+        """Vectors (norms, biases) do not decay; a pretrained backbone learns at its own share of the rate."""
+        schedule = self.config.schedule
+        groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+        for name, parameter in self.model.named_parameters():
+            scale = schedule.backbone_lr_scale if name.startswith("backbone.") else 1.0
+            decay = schedule.weight_decay if parameter.ndim > 1 else 0.0
+            groups.setdefault((scale, decay), []).append(parameter)
+        return [{"params": p, "lr_scale": scale, "weight_decay": decay} for (scale, decay), p in groups.items()]
+
+    def step(self, batch: TrainingBatch, progress: float) -> StepResult:
+        """One optimiser step. Its only randomness is drawn from (seed, step), so a resumed run repeats it."""
+        schedule = self.config.schedule
+        image, labels = to_tensors(batch, self.device)
+        generator = torch.Generator().manual_seed(self.config.data.seed * 1_000_003 + self.steps)
+        self.model.train()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
+            seen = self.model.perceive(image)
+            dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
+        seen = Perception(seen.F_global.float(), seen.heat_logits.float())
+        teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
+        peaks, guide_size = guided_peaks(seen.heat_logits, labels, teacher, generator)
+        out = self.model.decode(seen, labels.K, peaks, guide_size)
+        loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss)
+
+        rate = learning_rate(schedule, self.samples, progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * group["lr_scale"]
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.model.parameters(), schedule.gradient_clip)
+        self.optimizer.step()
+        self.steps += 1
+        self.samples += len(batch.present)
+        self._update_average()
+        rotation_deg, depth_rel = _batch_errors(out, labels)
+        return StepResult(loss.item(), {k: v.item() for k, v in terms.items()}, rotation_deg, depth_rel)
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Exponential moving average of weights and norm statistics, shorter while young."""
+        decay = min(self.config.schedule.ema_decay, (1 + self.steps) / (10 + self.steps))
+        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
+            if mean.dtype.is_floating_point:
+                mean.lerp_(value, 1 - decay)
+            else:
+                mean.copy_(value)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next step depends on."""
+        return {
+            "model": self.model.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "steps": self.steps,
+            "samples": self.samples,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take the state of an earlier run with the same network."""
+        self.model.load_state_dict(state["model"])
+        self.average.load_state_dict(state["average"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.steps, self.samples = state["steps"], state["samples"]
+
+
+@torch.no_grad()
+def _batch_errors(out: Decoded, labels: Labels) -> tuple[float, float]:
+    weight = labels.present / labels.present.sum().clamp(min=1.0)
+    angle = torch.rad2deg(eq.rotation_angle(out.R_ego[:, 0], labels.R_cam_target))
+    Z = labels.t_cam_target_m[:, 2].clamp(min=1.0)
+    return float((angle * weight).sum()), float(((torch.exp(out.log_Z[:, 0]) / Z - 1).abs() * weight).sum())
+
+
+@contextlib.contextmanager
+def stop_on_signals() -> Iterator[list[int]]:
+    """A list that SIGTERM and SIGINT append to, so that the loop ends between two steps."""
+    received: list[int] = []
+    previous = {s: signal.signal(s, lambda number, _: received.append(number)) for s in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def resume_run(out: Path, trainer: Trainer, config_text: str) -> float:
+    """Restore `trainer` from the run folder and return the seconds already used. Raises ConfigError."""
+    state = load_file(out / RESUME_NAME)
+    if state["config"] != config_text:
+        raise ConfigError(f"{out / RESUME_NAME}: has another configuration; give the same --config or another --out")
+    trainer.restore(state["trainer"])
+    return float(state["used_s"])
+
+
+def run_training(
+    config: TrainerConfig,
+    config_text: str,
+    out: Path,
+    *,
+    budget_s: float | None = None,
+    resume: bool = False,
+    samples: int | None = None,
+    open_sampler: OpenSampler | None = None,
+    max_steps: int | None = None,
+) -> Trainer:
+    """Train until the planned samples, the budget, `max_steps` of this start, or a signal; leave a checkpoint.
+
+    Progress, which drives the schedule, is the larger of samples done over planned and time used over budget.
+    """
+    torch.set_num_threads(config.run.threads)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
+    trainer = Trainer(config, device)
+    if not resume and (out / RESUME_NAME).exists():
+        raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+    used_before_s = resume_run(out, trainer, config_text) if resume else 0.0
+    budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
+    loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
+    with stop_on_signals() as stopped:
+        loop.run(stopped, max_steps)
+    return trainer
+
+
+class _Loop:
+    """Feeds, clock, log and checkpoints around a Trainer."""
+
+    def __init__(
+        self, trainer: Trainer, config_text: str, out: Path, budget: Budget, planned: int, opener: OpenSampler
+    ) -> None:
+        self.trainer, self.config, self.config_text = trainer, trainer.config, config_text
+        self.out, self.budget, self.planned, self.opener = out, budget, planned, opener
+        self.started_s = time.monotonic()
+        self.saved_s = self.started_s
+        self.provenance = provenance(trainer.config)
+        self.log = RunLog(out, config_text, self.provenance)
+        self.held_out: dict[int, list[TrainingBatch]] = {}
+
+    def used_s(self) -> float:
+        return self.budget.used_before_s + time.monotonic() - self.started_s
+
+    def progress(self) -> float:
+        by_samples = self.trainer.samples / self.planned
+        by_time = self.used_s() / self.budget.total_s if self.budget.total_s else 0.0
+        return max(by_samples, by_time)
+
+    def run(self, stopped: list[int], max_steps: int | None) -> None:
+        last_step = None if max_steps is None else self.trainer.steps + max_steps
+        reason = "the planned samples are done"
+        try:
+            while (progress := self.progress()) < 1.0:
+                size_px = size_at(self.config.schedule, progress)
+                if self._train_at(size_px, stopped, last_step):
+                    reason = "stopped before the end of the plan"
+                    break
+            if self.budget.total_s and self.used_s() >= self.budget.total_s:
+                reason = "the time budget is used up"
+        finally:
+            self.save()
+        self.validate(size_at(self.config.schedule, min(self.progress(), 1.0)))
+        self.log.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
+        self.log.close()
+
+    def _train_at(self, size_px: int, stopped: list[int], last_step: int | None) -> bool:
+        """Train with windows of one size until the schedule changes it or ends. True: told to stop."""
+        trainer, data, run = self.trainer, self.config.data, self.config.run
+        self.log.note(f"windows of {size_px} px from sample {trainer.samples} on")
+        opener = self.opener(data.seed, size_px)
+        with Feed(opener, data.batch_size, trainer.samples, data.workers, data.prefetch) as feed:
+            while (progress := self.progress()) < 1.0 and size_at(self.config.schedule, progress) == size_px:
+                if stopped or (last_step is not None and trainer.steps >= last_step):
+                    return True
+                result = trainer.step(feed.next(), progress)
+                self.log.add(result.loss, result.terms, result.rotation_deg, result.depth_rel)
+                if trainer.steps % run.log_every_steps == 0:
+                    rate = trainer.optimizer.param_groups[-1]["lr"]
+                    self.log.report(trainer.steps, trainer.samples, progress, rate)
+                if trainer.samples % run.validate_every_samples < data.batch_size:
+                    self.validate(size_px)
+                if time.monotonic() - self.saved_s > run.checkpoint_every_s:
+                    self.save()
+        return False
+
+    def validate(self, size_px: int) -> None:
+        """Measure the averaged network on held-out windows of this size, rendered once."""
+        if size_px not in self.held_out:
+            data = self.config.data
+            self.held_out[size_px] = render_once(self.opener(data.validation_seed, size_px), data.validation_samples)
+        batches = self.held_out[size_px]
+        metrics = measure(predict_all(torch_predictor(self.trainer.average), batches), batches)
+        self.log.validation(self.trainer.steps, self.trainer.samples, size_px, metrics)
+
+    def save(self) -> None:
+        """Both files; the weights first, so that resume.pt never knows more than weights.pt."""
+        state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
+        training = {**self.provenance, "samples": self.trainer.samples, "steps": self.trainer.steps}
+        training["resolution_px"] = size_at(self.config.schedule, min(self.progress(), 1.0))
+        save_weights(self.out / WEIGHTS_NAME, self.trainer.average, self.config_text, training)
+        write_atomic(self.out / RESUME_NAME, state)
+        self.saved_s = time.monotonic()
