@@ -31,6 +31,16 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class CameraInfo:
+    """What a camera gives, known before its first frame."""
+
+    name: str
+    image_size_wh: tuple[int, int]
+    K: Array  # [3, 3], pixel centres at integers; a zooming sequence's frames carry their own
+    frame_rate_hz: float | None  # None: not known beforehand
+
+
+@dataclass(frozen=True)
 class Estimate:
     """One target in one frame, as the network sees it, in `cam` (x right, y down, z forward)."""
 

@@ -1,0 +1,103 @@
+"""The capture thread: never blocks on a reader, keeps the newest frame alone, counts what it drops."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+
+from edge.cameras.reconnect import LinkState, Reconnect
+from edge.cameras.source import EndOfStream, Source, SourceLost, wait_until
+from edge.errors import InputError
+from edge.types import Frame
+
+log = logging.getLogger(__name__)
+
+
+class Capture:
+    """Owns a source and the thread that reads it. The source may be open already, or not yet."""
+
+    def __init__(self, source: Source, opened: bool) -> None:
+        self._source = source
+        self._opened = opened
+        self._stop = threading.Event()
+        self._fresh = threading.Condition()
+        self._newest: Frame | None = None
+        self._end: EndOfStream | InputError | None = None
+        self._last_sequence: int | None = None
+        self._counts: Counter[str] = Counter(captured=0, dropped=0, reconnects=0)
+        self._link = Reconnect()
+        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def newest(self, timeout_s: float) -> Frame | None:
+        """The newest frame not yet taken, waiting up to `timeout_s`; None when none came.
+
+        Raises EndOfStream after the last frame was taken, InputError when the source can never deliver.
+        """
+        with self._fresh:
+            self._fresh.wait_for(lambda: self._newest is not None or self._end is not None, timeout_s)
+            frame, self._newest = self._newest, None
+            if frame is None and self._end is not None:
+                raise self._end
+            return frame
+
+    @property
+    def streaming(self) -> bool:
+        return self._link.state is LinkState.STREAMING
+
+    def counters(self) -> dict[str, int]:
+        """captured; dropped (missed at the source or overtaken before they were taken); reconnects."""
+        with self._fresh:
+            return dict(self._counts)
+
+    def stop(self) -> None:
+        """Stop the thread and close the source; a driver stuck in a read keeps nobody waiting for long."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=1.0)
+        if not self._thread.is_alive():
+            self._source.close()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                if not self._opened:
+                    wait_until(self._link.retry_at_ns, self._stop)
+                    self._source.open()
+                    self._opened = True
+                frame = self._source.read(self._stop)
+            except SourceLost as error:
+                self._lose(error)
+            except (EndOfStream, InputError) as end:
+                with self._fresh:
+                    self._end = end
+                    self._fresh.notify_all()
+                return
+            else:
+                self._link = self._link.delivered()
+                self._offer(frame)
+
+    def _lose(self, error: SourceLost) -> None:
+        if self._opened:
+            self._source.close()
+            self._opened = False
+        if self._link.failures == 0:
+            log.warning("camera lost: %s; trying again", error)
+        self._link = self._link.lost(time.monotonic_ns())
+        with self._fresh:
+            self._counts["reconnects"] += 1
+
+    def _offer(self, frame: Frame) -> None:
+        with self._fresh:
+            last = self._last_sequence
+            missed = frame.meta.sequence - last - 1 if last is not None else frame.meta.sequence
+            overtaken = 1 if self._newest is not None else 0
+            self._counts["captured"] += 1
+            self._counts["dropped"] += max(missed, 0) + overtaken
+            self._last_sequence = frame.meta.sequence
+            self._newest = frame
+            self._fresh.notify_all()

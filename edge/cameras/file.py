@@ -1,0 +1,74 @@
+"""A video file, played at its own rate on the monotonic clock."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+
+import cv2
+import numpy as np
+
+from edge.cameras.intrinsics import Undistorter, load_intrinsics
+from edge.cameras.source import EndOfStream, wait_until
+from edge.config import FileCamera
+from edge.errors import InputError
+from edge.types import CameraInfo, Frame, FrameMeta
+
+
+class FileSource:
+    """Frame k is taken as exposed at start + k / fps; frames a late reader missed are skipped, as with a camera."""
+
+    def __init__(self, settings: FileCamera) -> None:
+        self._settings = settings
+        self._capture: cv2.VideoCapture | None = None
+        self._start_ns: int | None = None
+        self._next = 0
+
+    def open(self) -> CameraInfo:
+        """Raises InputError: no video, no frame rate, or intrinsics that do not fit."""
+        path = self._settings.path
+        if not path.is_file():
+            raise InputError(f"{path} does not exist")
+        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise InputError(f"{path} is not a readable video")
+        self._fps = self._capture.get(cv2.CAP_PROP_FPS)
+        if not math.isfinite(self._fps) or not 0 < self._fps <= 1000:
+            raise InputError(f"{path} does not say its frame rate")
+        size_wh = (
+            int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+            int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+        )
+        intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(size_wh)
+        self._K = intrinsics.K
+        self._undistort = Undistorter(intrinsics)
+        self._start_ns, self._next = None, 0
+        return CameraInfo(path.name, size_wh, self._K, self._fps)
+
+    def read(self, stop: threading.Event) -> Frame:
+        """The next frame, not before its time. Raises EndOfStream after the last, InputError if none can be read."""
+        assert self._capture is not None
+        if self._start_ns is None:
+            self._start_ns = time.monotonic_ns()
+        while self._exposure_ns(self._next + 1) <= time.monotonic_ns() and self._capture.grab():
+            self._next += 1
+        capture_ns = self._exposure_ns(self._next)
+        wait_until(capture_ns, stop)
+        read, image_bgr = self._capture.read()
+        if not read:
+            if self._next == 0:
+                raise InputError(f"{self._settings.path} has no readable frame")
+            raise EndOfStream
+        meta = FrameMeta(self._next, capture_ns, time.monotonic_ns())
+        self._next += 1
+        return Frame(meta, self._undistort(np.asarray(image_bgr, dtype=np.uint8)), self._K)
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def _exposure_ns(self, index: int) -> int:
+        assert self._start_ns is not None
+        return self._start_ns + round(index * 1e9 / self._fps)

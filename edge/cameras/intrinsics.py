@@ -1,0 +1,107 @@
+"""Calibrations: read, fitted to the picture's size, distortion taken out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.config import IntrinsicsSettings
+from edge.errors import InputError
+from edge.types import Array
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera with plumb-bob distortion, for pictures of one size."""
+
+    K: Array  # [3, 3], pixel centres at integers
+    image_size_wh: tuple[int, int]
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty: none
+
+    def scaled_to(self, image_size_wh: tuple[int, int]) -> Intrinsics:
+        """The same lens on pictures of another size. Raises InputError unless both sides scale alike, exactly."""
+        (w, h), (new_w, new_h) = self.image_size_wh, image_size_wh
+        if new_w * h != new_h * w:
+            raise InputError(
+                f"these intrinsics are for {w}x{h} pixels, but the camera gives {new_w}x{new_h}, "
+                "which is not the same picture scaled"
+            )
+        scale = new_w / w
+        K = self.K.copy()
+        K[:2, :2] *= scale
+        K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
+        return Intrinsics(K, image_size_wh, self.distortion)
+
+
+class Undistorter:
+    """Takes a lens's distortion out of pictures; the pinhole K stays the same."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self._maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+        if any(intrinsics.distortion):
+            self._maps = cv2.initUndistortRectifyMap(
+                intrinsics.K,
+                np.array(intrinsics.distortion),
+                np.eye(3),
+                intrinsics.K,
+                intrinsics.image_size_wh,
+                cv2.CV_16SC2,
+            )
+
+    def __call__(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """[H, W, 3] to [H, W, 3]; the very same array when the lens has no distortion."""
+        if self._maps is None:
+            return image_bgr
+        return np.asarray(cv2.remap(image_bgr, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def load_intrinsics(settings: IntrinsicsSettings) -> Intrinsics:
+    """From the numbers in the configuration or the file it names. Raises InputError."""
+    if settings.file is not None:
+        return read_calibration(settings.file)
+    numbers = (settings.fx, settings.fy, settings.cx, settings.cy)
+    fx, fy, cx, cy = (float(n) for n in numbers if n is not None)
+    assert settings.width is not None
+    assert settings.height is not None
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Intrinsics(K, (settings.width, settings.height), tuple(settings.distortion))
+
+
+def read_calibration(path: Path) -> Intrinsics:
+    """A calibration YAML: image_width, image_height, camera_matrix, distortion_coefficients.
+
+    Both ROS camera_calibration and OpenCV write these keys. Raises InputError.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"calibration {path} cannot be read: {error}") from error
+    if not text.startswith("%YAML"):
+        text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        size_wh = (int(storage.getNode("image_width").real()), int(storage.getNode("image_height").real()))
+        K = _matrix(storage.getNode("camera_matrix"))
+        distortion = _matrix(storage.getNode("distortion_coefficients"))
+    except cv2.error as error:
+        raise InputError(f"calibration {path} is not valid YAML: {error.err}") from error
+    if min(size_wh) <= 0:
+        raise InputError(f"calibration {path} has no image_width and image_height")
+    if K.size != 9 or not np.all(np.isfinite(K)) or K[0] <= 0 or K[4] <= 0:
+        raise InputError(f"calibration {path} has no camera_matrix of nine numbers with positive focal lengths")
+    if distortion.size not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
+        raise InputError(f"calibration {path}: distortion_coefficients takes 4, 5 or 8 numbers (plumb bob)")
+    return Intrinsics(K.reshape(3, 3), size_wh, tuple(float(d) for d in distortion))
+
+
+def _matrix(node: cv2.FileNode) -> Array:
+    """Flat numbers of a matrix node, as OpenCV tags it or ROS writes it (rows, cols, data); empty if there is none."""
+    if node.empty():
+        return np.zeros(0)
+    data = node.getNode("data")
+    return np.array([data.at(i).real() for i in range(data.size())], dtype=np.float64)
