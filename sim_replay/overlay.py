@@ -30,15 +30,6 @@ _VIDEO_WIDTH_PX = 1280
 _CODECS = ("vp09", "mp4v")  # browsers play the first; not every build of OpenCV has it
 
 
-@dataclass(frozen=True, eq=False)
-class FrameView:
-    """All that is drawn of one frame beside its pixels."""
-
-    K: Array  # [3, 3], pixel centres at integers
-    match: Match | None  # None: the frame holds no target
-    latency_ms: float | None
-
-
 @dataclass(frozen=True)
 class Extents:
     """The target's box in its own axes (FRD), metres: drawn at the true and at the estimated pose alike."""
@@ -50,6 +41,16 @@ class Extents:
         """[8, 3]; bits 0, 1, 2 of the index choose the far side along x, y, z."""
         bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
         return np.array(self.min_m) + bits * np.array(self.size_m)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """All that is drawn of one frame beside its pixels."""
+
+    K: Array  # [3, 3], pixel centres at integers
+    match: Match | None  # None: the frame holds no target
+    extents: Extents | None  # of that target
+    latency_ms: float | None
 
 
 def project(points_cam_m: ArrayLike, K: Array) -> Array | None:
@@ -84,9 +85,8 @@ def draw_pose(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color
 class Overlay:
     """Draws the frames of one replay. Layout follows the height of the frame."""
 
-    def __init__(self, views: Sequence[FrameView], extents: Extents, size_wh: tuple[int, int]) -> None:
+    def __init__(self, views: Sequence[FrameView], size_wh: tuple[int, int]) -> None:
         self._views = views
-        self._extents = extents
         self._width, self._height = size_wh
         self._unit = self._height / 1080.0
         self._font: Any = cv2.FontFace("sans")
@@ -119,18 +119,18 @@ class Overlay:
         return len(inside) > 0.1 * max(len(centers), 1)
 
     def _draw_poses(self, canvas: Image, view: FrameView, K: Array, thickness: int) -> None:
-        if view.match is None:
+        if view.match is None or view.extents is None:
             return
-        draw_pose(canvas, K, view.match.truth, self._extents, TRUTH_BGR, thickness + self._px(2))
+        draw_pose(canvas, K, view.match.truth, view.extents, TRUTH_BGR, thickness + self._px(2))
         if view.match.estimate is not None:
-            draw_pose(canvas, K, view.match.estimate, self._extents, ESTIMATE_BGR, thickness)
+            draw_pose(canvas, K, view.match.estimate, view.extents, ESTIMATE_BGR, thickness)
 
     def _inset(self, view: FrameView, image_bgr: Image) -> Image | None:
         """The target's surroundings enlarged, boxes drawn at the inset's own resolution."""
-        if view.match is None:
+        if view.match is None or view.extents is None:
             return None
         truth = view.match.truth
-        corners = project(self._extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, view.K)
+        corners = project(view.extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, view.K)
         if corners is None:
             return None
         low, high = corners.min(axis=0), corners.max(axis=0)

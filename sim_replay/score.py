@@ -29,8 +29,9 @@ class TargetPose:
 
 @dataclass(frozen=True, eq=False)
 class Truth(TargetPose):
-    """What the sequence says; only `diameter_m` is needed beside the pose."""
+    """What the sequence says of one target."""
 
+    object_id: int  # BOP's obj_id: which airframe
     diameter_m: float  # largest distance between two points of the target
 
 

@@ -32,15 +32,15 @@ EXTENTS = Extents((-3.0, -6.0, -1.0), (6.0, 12.0, 2.0))
 
 def truth(frame: int = 0, t_cam_target_m: tuple[float, float, float] = (0.0, 0.0, 60.0)) -> Truth:
     R = Rotation.from_euler("xyz", [80, 20, 30], degrees=True).as_matrix()
-    return Truth(frame, R, np.array(t_cam_target_m), diameter_m=12.0)
+    return Truth(frame, R, np.array(t_cam_target_m), object_id=1, diameter_m=12.0)
 
 
 def view(frame: int, turned_deg: float | None, t_cam_target_m: tuple[float, float, float] = (0, 0, 60)) -> FrameView:
     target = truth(frame, t_cam_target_m)
     if turned_deg is None:
-        return FrameView(K, Match(target, None), None)
+        return FrameView(K, Match(target, None), EXTENTS, None)
     R = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix() @ target.R_cam_target
-    return FrameView(K, Match(target, TargetPose(frame, R, target.t_cam_target_m)), 12.5)
+    return FrameView(K, Match(target, TargetPose(frame, R, target.t_cam_target_m)), EXTENTS, 12.5)
 
 
 def drawn(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_projecting_into_a_window_is_cropping_and_resizing_the_projection(
 
 
 def test_truth_is_cyan_and_estimate_magenta_on_the_frame_and_in_the_inset() -> None:
-    overlay = Overlay([view(0, 25.0)], EXTENTS, SIZE_WH)
+    overlay = Overlay([view(0, 25.0)], SIZE_WH)
     image = overlay.draw(0, np.zeros((360, 640, 3), np.uint8))
     centre, inset = np.s_[120:240, 220:420], np.s_[10:170, 470:630]
     for color in (TRUTH_BGR, ESTIMATE_BGR):
@@ -88,7 +88,7 @@ def test_truth_is_cyan_and_estimate_magenta_on_the_frame_and_in_the_inset() -> N
 
 
 def test_a_missed_target_shows_its_truth_alone() -> None:
-    image = Overlay([view(0, None)], EXTENTS, SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8))
+    image = Overlay([view(0, None)], SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8))
     centre = image[120:240, 220:420]
     assert drawn(centre, TRUTH_BGR).any()
     assert not drawn(centre, ESTIMATE_BGR).any()
@@ -96,7 +96,7 @@ def test_a_missed_target_shows_its_truth_alone() -> None:
 
 def test_the_inset_stands_aside_when_targets_fly_there() -> None:
     up_right = [view(k, 5.0, (15.0, -8.0, 60.0)) for k in range(3)]
-    image = Overlay(up_right, EXTENTS, SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8))
+    image = Overlay(up_right, SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8))
     assert drawn(image[10:170, 10:170], TRUTH_BGR).sum() > 100
 
 
@@ -106,7 +106,7 @@ def test_the_frame_to_show_is_the_typical_one() -> None:
 
 
 def test_the_video_plays_back_every_frame_at_its_rate(tmp_path: Path) -> None:
-    overlay = Overlay([view(k, 3.0 * k) for k in range(6)], EXTENTS, SIZE_WH)
+    overlay = Overlay([view(k, 3.0 * k) for k in range(6)], SIZE_WH)
     background = np.full((360, 640, 3), 90, np.uint8)
     write_video(tmp_path / "overlay.mp4", (overlay.draw(k, background) for k in range(6)), 30.0, SIZE_WH)
     video = cv2.VideoCapture(str(tmp_path / "overlay.mp4"))

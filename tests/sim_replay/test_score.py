@@ -20,7 +20,7 @@ START_NS, FPS = 5_000_000_000, 30.0
 
 
 def truth(frame: int, range_m: float = 300.0, x_m: float = 0.0) -> Truth:
-    return Truth(frame, np.eye(3), np.array([x_m, 0.0, range_m]), diameter_m=12.0)
+    return Truth(frame, np.eye(3), np.array([x_m, 0.0, range_m]), object_id=1, diameter_m=12.0)
 
 
 def estimate(of: Truth, turned_deg: float = 0.0, stretched: float = 1.0) -> TargetPose:
