@@ -1,0 +1,210 @@
+"""Plays a sequence for a person to watch: a live line, a summary, score.json, a picture and a video."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.progress import track
+from rich.table import Table
+
+from edge.estimator.model import load_model
+from sim_replay.ground_truth import PlayedSequence
+from sim_replay.overlay import Image, Overlay, showcase_index, write_video
+from sim_replay.play import PlaySettings, Record, Recording, play
+from sim_replay.result import (
+    Result,
+    frame_of_record,
+    frame_views,
+    judge,
+    latency_ms,
+    pose_of,
+    score_json,
+)
+from sim_replay.score import match_poses
+
+BUNDLED_SEQUENCE = Path(__file__).parent / "data" / "crossing"
+_RATE_WINDOW = 30
+_PLAIN_PERIOD_S = 1.0
+
+
+@dataclass
+class LiveFigures:
+    """The newest of everything a person wants to see while it runs."""
+
+    sequence: PlayedSequence
+    frame: int | None = None
+    range_m: float | None = None
+    range_error_m: float | None = None
+    rotation_error_deg: float | None = None
+    latency_ms: float | None = None
+    captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RATE_WINDOW))
+
+    def take(self, recording: Recording, record: Record) -> None:
+        """Read one line of a peer."""
+        if record["event"] == "target_relative":
+            self.latency_ms = latency_ms(record, recording)
+        elif record["event"] == "pose":
+            self._take_pose(recording, record)
+
+    def _take_pose(self, recording: Recording, record: Record) -> None:
+        self.frame = frame_of_record(record, recording, self.sequence)
+        self.captures_ns.append(recording.capture_ns(record))
+        self.range_m = float(np.linalg.norm(record["t_cam_target_m"]))
+        self.range_error_m = self.rotation_error_deg = None
+        if self.frame is None:
+            return
+        truths = [truth for truth in self.sequence.scene.truths if truth.frame == self.frame]
+        for match in match_poses(truths, [pose_of(record, self.frame)])[0]:
+            if match.estimate is not None:
+                self.range_error_m = self.range_m - float(np.linalg.norm(match.truth.t_cam_target_m))
+                self.rotation_error_deg = match.rotation_error_deg
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Poses a second over the last thirty."""
+        if len(self.captures_ns) < 2 or self.captures_ns[-1] <= self.captures_ns[0]:
+            return None
+        return (len(self.captures_ns) - 1) * 1e9 / (self.captures_ns[-1] - self.captures_ns[0])
+
+    def cells(self) -> dict[str, str]:
+        """Column by column, as text."""
+        frames = len(self.sequence.scene.images)
+        return {
+            "frame": "waiting" if self.frame is None else f"{self.frame + 1}/{frames}",
+            "range": _text(self.range_m, "{:.1f} m"),
+            "range error": _text(self.range_error_m, "{:+.1f} m"),
+            "rotation error": _text(self.rotation_error_deg, "{:.1f}°"),
+            "latency": _text(self.latency_ms, "{:.1f} ms"),
+            "rate": _text(self.rate_hz, "{:.1f} Hz"),
+        }
+
+
+class LiveView:
+    """Shows LiveFigures: a table that renews itself on a terminal, a line a second elsewhere."""
+
+    def __init__(self, console: Console, figures: LiveFigures) -> None:
+        self._console = console
+        self._figures = figures
+        self._live = Live(self._table(), console=console, refresh_per_second=10) if console.is_terminal else None
+        self._printed_s = -np.inf
+
+    def __enter__(self) -> LiveView:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+            self._live.stop()
+
+    def on_record(self, recording: Recording, record: Record) -> None:
+        self._figures.take(recording, record)
+        if record["event"] != "pose":
+            return
+        if self._live is not None:
+            self._live.update(self._table())
+        elif time.monotonic() - self._printed_s >= _PLAIN_PERIOD_S:
+            self._printed_s = time.monotonic()
+            cells = self._figures.cells().items()
+            self._console.print("  ".join(f"{name} {value}" for name, value in cells), highlight=False)
+
+    def _table(self) -> Table:
+        table = Table(title=f"{self._figures.sequence.scene.name}, live", title_justify="left")
+        cells = self._figures.cells()
+        for name in cells:
+            table.add_column(name, justify="right", min_width=10)
+        table.add_row(*cells.values())
+        return table
+
+
+def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> bool:
+    """Play a sequence and write score.json, overlay.png and overlay.mp4 into `out`.
+
+    Returns:
+        Whether both peers received poses.
+
+    Raises:
+        InputError, PlayError, OSError.
+    """
+    loaded = load_model(model, threads=1)
+    console.print(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}", highlight=False)
+    figures = LiveFigures(sequence)
+    with LiveView(console, figures) as view:
+        recording = play(PlaySettings(sequence, out, model), view.on_record)
+    result = judge(sequence, recording)
+    score = score_json(sequence, result, loaded)
+    (out / "score.json").write_text(json.dumps(score, indent=2) + "\n", encoding="utf-8")
+    _draw(sequence, result, out, console)
+    console.print(summary_table(score))
+    console.print(f"written to {out}: score.json, overlay.mp4, overlay.png, daemon.log, config.toml", highlight=False)
+    return bool(recording.poses) and bool(recording.targets)
+
+
+def _draw(sequence: PlayedSequence, result: Result, out: Path, console: Console) -> None:
+    """overlay.png of a typical frame and overlay.mp4 of all."""
+    scene = sequence.scene
+    views = frame_views(sequence, result)
+    first = _read(scene.images[0])
+    size_wh = (first.shape[1], first.shape[0])
+    overlay = Overlay(views, size_wh)
+    shown = showcase_index(views)
+    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, _read(scene.images[shown])))
+
+    def frames() -> Iterator[Image]:
+        order = range(len(views))
+        for index in track(order, "drawing overlay.mp4", console=console, disable=not console.is_terminal):
+            yield overlay.draw(index, _read(scene.images[index]))
+
+    write_video(out / "overlay.mp4", frames(), sequence.fps, size_wh)
+
+
+def _read(path: Path) -> Image:
+    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image_bgr is None:
+        raise OSError(f"{path} is not a readable picture")
+    return np.asarray(image_bgr, dtype=np.uint8)
+
+
+def summary_table(score: dict[str, Any]) -> Table:
+    """The figures of a score, as a person reads them."""
+    table = Table("figure", "value", title=f"score of {score['sequence']}", title_justify="left")
+    rows = {
+        "frames / poses received": f"{score['frames']} / {score['poses']}",
+        "targets found": _text(score["detection_rate"], "{:.1%}"),
+        "rotation error, mean / median": _pair(score["rotation_error_deg"], "{:.2f}°"),
+        "translation error, mean / median": _pair(score["translation_error_m"], "{:.2f} m"),
+        "depth error, mean": _text(score["depth_error_rel"]["mean"], "{:.2%}"),
+        "pose within 10° and 5 %": _text(score["pose_10deg_5pct"], "{:.1%}"),
+    }
+    if "latency_ms" in score:
+        rows["capture to MAVLink, p50 / p95 / p99"] = _percentiles(score["latency_ms"])
+        rows["frames dropped"] = _text(score["dropped_frames"], "{:d}")
+    if "estimate_ms" in score:
+        rows["acquire and track, p50 / p95 / p99"] = _percentiles(score["estimate_ms"])
+    rows["model"] = f"{score['model']['file']} ({score['model']['precision']})"
+    for row in rows.items():
+        table.add_row(*row)
+    return table
+
+
+def _pair(values: dict[str, float | None], form: str) -> str:
+    return f"{_text(values['mean'], form)} / {_text(values['median'], form)}"
+
+
+def _percentiles(values: dict[str, float | None]) -> str:
+    return " / ".join(_text(values[name], "{:.1f}") for name in ("p50", "p95", "p99")) + " ms"
+
+
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)

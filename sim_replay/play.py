@@ -1,0 +1,249 @@
+"""Plays a sequence through the real daemon, with both of its peers, and keeps what they received.
+
+Four processes on one host share CLOCK_MONOTONIC: the daemon exposes frame 0 at `start_at_ns`, the simulated autopilot
+flies the telemetry from there, and the subscriber listens. This one only starts them, waits and reads.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sim_replay.ground_truth import PlayedSequence
+
+LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
+READY_MARGIN_NS = 100_000_000
+_OVERTIME_S = 20.0
+_STOP_TIMEOUT_S = 5.0
+_SETTLE_S = 0.3
+
+Record = dict[str, Any]
+
+
+class PlayError(RuntimeError):
+    """The daemon or a peer did not do its part; the text is a whole sentence."""
+
+
+@dataclass
+class Recording:
+    """What came out of one replay. Times ending in `_ns` are monotonic unless they say UTC."""
+
+    start_at_ns: int
+    utc_minus_monotonic_ns: int
+    mavlink_port: int
+    zenoh_endpoint: str
+    daemon_exit: int | None = None
+    poses: list[Record] = field(default_factory=list)  # sim_replay.subscriber's `pose`
+    targets: list[Record] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
+    diagnostics: list[Record] = field(default_factory=list)
+    mavlink: Record = field(default_factory=dict)  # the autopilot's `summary`
+    zenoh: Record = field(default_factory=dict)  # the subscriber's `summary`
+
+    def take(self, name: str, record: Record) -> None:
+        """File one line of a peer."""
+        lists = {"pose": self.poses, "target_relative": self.targets, "diagnostics": self.diagnostics}
+        if record["event"] in lists:
+            lists[record["event"]].append(record)
+        elif record["event"] == "summary":
+            (self.mavlink if name == "autopilot" else self.zenoh).update(record)
+
+    def capture_ns(self, record: Record) -> int:
+        """Exposure time, monotonic, of a pose or target record."""
+        utc_ns = record["capture_utc_ns"] if "capture_utc_ns" in record else record["capture_utc_us"] * 1000
+        return int(utc_ns) - self.utc_minus_monotonic_ns
+
+
+@dataclass(frozen=True)
+class PlaySettings:
+    """What is played and where its files go."""
+
+    sequence: PlayedSequence
+    out: Path
+    model: Path | None = None  # None: the one the daemon ships with
+    uav: str = "uav1"
+
+
+def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
+    """Run the sequence once in real time; `on_record` sees each line of a peer as it comes.
+
+    Raises PlayError if the daemon cannot be made ready, fails, or does not end.
+    """
+    settings.out.mkdir(parents=True, exist_ok=True)
+    for lead_s in LEADS_S:
+        recording = _attempt(settings, lead_s, on_record)
+        if recording is not None:
+            return recording
+    raise PlayError(f"the daemon was not ready within {LEADS_S[-1]:.0f} s; see {settings.out / 'daemon.log'}")
+
+
+def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recording, Record], None]) -> Recording | None:
+    """One run with frame 0 `lead_s` from now; None if the daemon was ready only after that."""
+    start_at_ns = time.monotonic_ns() + round(lead_s * 1e9)
+    utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+    endpoint = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    recording = Recording(start_at_ns, utc_minus_monotonic_ns, _free_port(socket.SOCK_DGRAM), endpoint)
+    config = settings.out / "config.toml"
+    config.write_text(_config_toml(settings, recording), encoding="utf-8")
+    records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()
+    with ExitStack() as stack:
+        daemon = stack.enter_context(_daemon(config, settings.out / "daemon.log"))
+        for name, arguments in _peers(settings, recording).items():
+            stack.enter_context(_peer(name, arguments, records))
+        if not _wait_until_ready(daemon, recording, records, on_record):
+            return None
+        frames_s = len(settings.sequence.scene.images) / settings.sequence.fps
+        deadline_ns = start_at_ns + round((frames_s + _OVERTIME_S) * 1e9)
+        while daemon.poll() is None and time.monotonic_ns() < deadline_ns:
+            _pass_on(records, recording, on_record, timeout_s=0.05)
+        recording.daemon_exit = daemon.poll()
+        settled_ns = time.monotonic_ns() + round(_SETTLE_S * 1e9)
+        while time.monotonic_ns() < settled_ns:
+            _pass_on(records, recording, on_record, timeout_s=0.05)
+    while not records.empty():
+        _pass_on(records, recording, on_record, timeout_s=0.0)
+    if recording.daemon_exit is None:
+        raise PlayError(f"the daemon did not end {_OVERTIME_S:.0f} s after the last frame")
+    if recording.daemon_exit != 0:
+        words = (settings.out / "daemon.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise PlayError(f"the daemon ended with exit code {recording.daemon_exit}: {words[-1] if words else 'silent'}")
+    return recording
+
+
+def _pass_on(
+    records: queue.SimpleQueue[tuple[str, Record]],
+    recording: Recording,
+    on_record: Callable[[Recording, Record], None],
+    timeout_s: float,
+) -> None:
+    try:
+        name, record = records.get(timeout=timeout_s)
+    except queue.Empty:
+        return
+    recording.take(name, record)
+    on_record(recording, record)
+
+
+def _wait_until_ready(
+    daemon: subprocess.Popen[bytes],
+    recording: Recording,
+    records: queue.SimpleQueue[tuple[str, Record]],
+    on_record: Callable[[Recording, Record], None],
+) -> bool:
+    """Whether the daemon reported a state past INIT before frame 0, or ended."""
+    while time.monotonic_ns() < recording.start_at_ns - READY_MARGIN_NS:
+        _pass_on(records, recording, on_record, timeout_s=0.05)
+        if daemon.poll() is not None or any(_state(record) != "INIT" for record in recording.diagnostics):
+            return True
+    return False
+
+
+def _state(record: Record) -> str:
+    return str(record["values"].get("state", "INIT")).upper()
+
+
+def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]:
+    telemetry = str(settings.sequence.telemetry_csv)
+    address = f"127.0.0.1:{recording.mavlink_port}"
+    start = str(recording.start_at_ns)
+    return {
+        "autopilot": ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start],
+        "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav],
+    }
+
+
+@contextmanager
+def _daemon(config: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`uavpose-edge run`, its words in `log`; told to stop at the end if it still runs."""
+    command = Path(sys.executable).parent / "uavpose-edge"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [str(command), "run", "--config", str(config)],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # the terminal's Ctrl-C is for this process, which then stops the others
+        )
+        try:
+            yield process
+        finally:
+            _stop(process)
+
+
+@contextmanager
+def _peer(
+    name: str, arguments: list[str], records: queue.SimpleQueue[tuple[str, Record]]
+) -> Iterator[subprocess.Popen[str]]:
+    """`python -m sim_replay.<name>`, whose lines go to `records`; stopped, and read to its end, at the end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"sim_replay.{name}", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    lines = process.stdout
+
+    def read() -> None:
+        for line in lines:
+            records.put((name, json.loads(line)))
+
+    reader = threading.Thread(target=read, name=f"read {name}", daemon=True)
+    reader.start()
+    try:
+        yield process
+    finally:
+        _stop(process)
+        reader.join(timeout=_STOP_TIMEOUT_S)
+
+
+def _stop(process: subprocess.Popen[Any]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(timeout=_STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _config_toml(settings: PlaySettings, recording: Recording) -> str:
+    """The daemon's configuration for one replay: loopback only."""
+    sequence = settings.sequence
+    # JSON's strings and nested lists are TOML's too.
+    lines = [
+        "[vehicle]",
+        f"name = {json.dumps(settings.uav)}",
+        "[camera]",
+        'type = "sequence"',
+        f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
+        f"fps = {sequence.fps}",
+        f"start_at_ns = {recording.start_at_ns}",
+        "[mount]",
+        f"R_body_cam = {json.dumps(sequence.mount.R_body_cam.tolist())}",
+        f"t_body_cam_m = {json.dumps(sequence.mount.t_body_cam_m.tolist())}",
+        "[zenoh]",
+        f"listen = {json.dumps([recording.zenoh_endpoint])}",
+        "[mavlink]",
+        f'endpoints = ["udpin:127.0.0.1:{recording.mavlink_port}"]',
+    ]
+    if settings.model is not None:
+        lines += ["[model]", f"path = {json.dumps(str(settings.model.resolve()))}"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,108 @@
+"""What a replay came to: the peers' records set against the truth, and score.json made of it. Pure functions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edge.estimator.model import Model
+from msgs.geometry import R_from_q_wxyz
+from sim_replay.ground_truth import PlayedSequence
+from sim_replay.overlay import FrameView
+from sim_replay.play import Record, Recording
+from sim_replay.score import (
+    Match,
+    TargetPose,
+    frame_of,
+    latency_statistics,
+    match_poses,
+    pose_statistics,
+    statistics_by_range,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One replay, judged."""
+
+    matches: tuple[Match, ...]
+    false_poses: int
+    latencies_ms: dict[int, float]  # by frame: capture to the first TARGET_RELATIVE of that frame
+    recording: Recording
+
+
+def pose_of(record: Record, frame: int) -> TargetPose:
+    """The pose in a peer's record."""
+    R_cam_target = R_from_q_wxyz(record["q_cam_target_wxyz"])
+    return TargetPose(frame, R_cam_target, np.array(record["t_cam_target_m"], dtype=np.float64))
+
+
+def frame_of_record(record: Record, recording: Recording, sequence: PlayedSequence) -> int | None:
+    """Index of the frame that a peer's record was measured in."""
+    return frame_of(recording.capture_ns(record), recording.start_at_ns, sequence.fps, len(sequence.scene.images))
+
+
+def latency_ms(record: Record, recording: Recording) -> float:
+    """From capture to the autopilot's receiving a `target_relative`."""
+    return float(record["received_ns"] - recording.capture_ns(record)) * 1e-6
+
+
+def judge(sequence: PlayedSequence, recording: Recording) -> Result:
+    """Set what zenoh brought against the truth, and MAVLink's arrival against the exposure."""
+    estimates, strays = [], 0
+    for record in recording.poses:
+        frame = frame_of_record(record, recording, sequence)
+        if frame is None:
+            strays += 1
+        else:
+            estimates.append(pose_of(record, frame))
+    matches, false_poses = match_poses(sequence.scene.truths, estimates)
+    latencies_ms: dict[int, float] = {}
+    for record in recording.targets:
+        frame = frame_of_record(record, recording, sequence)
+        if frame is not None:
+            latencies_ms.setdefault(frame, latency_ms(record, recording))
+    return Result(tuple(matches), false_poses + strays, latencies_ms, recording)
+
+
+def score_json(sequence: PlayedSequence, result: Result, model: Model) -> dict[str, Any]:
+    """score.json: shares 0..1, degrees, metres, milliseconds; null where there is nothing to tell."""
+    recording = result.recording
+    return {
+        "sequence": sequence.scene.name,
+        "frames": len(sequence.scene.images),
+        "targets": len(result.matches),
+        "poses": len(recording.poses),
+        "false_poses": result.false_poses,
+        **pose_statistics(result.matches),
+        "latency_ms": latency_statistics([latency_ms(record, recording) for record in recording.targets]),
+        "dropped_frames": dropped_frames(recording),
+        "mavlink_received": recording.mavlink.get("received", {}),
+        "mavlink_refused": recording.mavlink.get("refused", {}),
+        "zenoh_received": recording.zenoh.get("received", {}),
+        "zenoh_refused": recording.zenoh.get("refused", {}),
+        "by_range": statistics_by_range(result.matches),
+        "model": {"file": model.path.name, "sha256": model.sha256, "precision": model.contract.precision},
+    }
+
+
+def dropped_frames(recording: Recording) -> int | None:
+    """What the daemon last said it had dropped; None if it never spoke."""
+    counts = [record["values"].get("dropped") for record in recording.diagnostics]
+    known = [int(count) for count in counts if count is not None]
+    return known[-1] if known else None
+
+
+def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
+    """What the overlay draws of each frame: its first target."""
+    by_frame: dict[int, Match] = {}
+    for match in result.matches:
+        by_frame.setdefault(match.truth.frame, match)
+    views = []
+    for frame, K in enumerate(sequence.scene.K):
+        seen = by_frame.get(frame)
+        extents = None if seen is None else sequence.scene.extents[seen.truth.object_id]
+        views.append(FrameView(K, seen, extents, result.latencies_ms.get(frame)))
+    return views
