@@ -236,11 +236,11 @@ class ConfigFile:
 
     @contextmanager
     def blame(self, *key: str) -> Iterator[None]:
-        """Errors raised inside are told as errors of this key, for example blame("model", "path")."""
+        """Errors raised inside are told as errors of this key, unless they know theirs: blame("model", "path")."""
         try:
             yield
         except InputError as error:
-            raise InputError(_sentence(self.path, self.text, key, str(error))) from error
+            raise InputError(_sentence(self.path, self.text, error.key or key, str(error))) from error
 
 
 def load_config(path: Path) -> ConfigFile:

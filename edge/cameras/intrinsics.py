@@ -14,6 +14,8 @@ from edge.config import IntrinsicsSettings
 from edge.errors import InputError
 from edge.types import Array
 
+INTRINSICS_KEY = ("camera", "intrinsics")
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -29,7 +31,8 @@ class Intrinsics:
         if new_w * h != new_h * w:
             raise InputError(
                 f"these intrinsics are for {w}x{h} pixels, but the camera gives {new_w}x{new_h}, "
-                "which is not the same picture scaled"
+                "which is not the same picture scaled",
+                INTRINSICS_KEY,
             )
         scale = new_w / w
         K = self.K.copy()
@@ -80,7 +83,7 @@ def read_calibration(path: Path) -> Intrinsics:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"calibration {path} cannot be read: {error}") from error
+        raise InputError(f"calibration {path} cannot be read: {error}", INTRINSICS_KEY) from error
     if not text.startswith("%YAML"):
         text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")
     try:
@@ -89,13 +92,17 @@ def read_calibration(path: Path) -> Intrinsics:
         K = _matrix(storage.getNode("camera_matrix"))
         distortion = _matrix(storage.getNode("distortion_coefficients"))
     except cv2.error as error:
-        raise InputError(f"calibration {path} is not valid YAML: {error.err}") from error
+        raise InputError(f"calibration {path} is not valid YAML: {error.err}", INTRINSICS_KEY) from error
     if min(size_wh) <= 0:
-        raise InputError(f"calibration {path} has no image_width and image_height")
+        raise InputError(f"calibration {path} has no image_width and image_height", INTRINSICS_KEY)
     if K.size != 9 or not np.all(np.isfinite(K)) or K[0] <= 0 or K[4] <= 0:
-        raise InputError(f"calibration {path} has no camera_matrix of nine numbers with positive focal lengths")
+        raise InputError(
+            f"calibration {path} has no camera_matrix of nine numbers with positive focal lengths", INTRINSICS_KEY
+        )
     if distortion.size not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
-        raise InputError(f"calibration {path}: distortion_coefficients takes 4, 5 or 8 numbers (plumb bob)")
+        raise InputError(
+            f"calibration {path}: distortion_coefficients takes 4, 5 or 8 numbers (plumb bob)", INTRINSICS_KEY
+        )
     return Intrinsics(K.reshape(3, 3), size_wh, tuple(float(d) for d in distortion))
 
 

@@ -28,6 +28,11 @@ class LiveSource:
         self._sequence = 0
         self._fitted: Intrinsics | None = None
 
+    def nominal(self) -> CameraInfo:
+        """What is known before the camera answers: the calibration's."""
+        name = self._settings.device if isinstance(self._settings, DeviceCamera) else self._settings.url
+        return CameraInfo(name, self._intrinsics.image_size_wh, self._intrinsics.K, None)
+
     def open(self) -> CameraInfo:
         """Raises SourceLost while the camera does not answer, InputError if the intrinsics do not fit its picture."""
         if isinstance(self._settings, DeviceCamera):

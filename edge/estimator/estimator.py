@@ -1,0 +1,64 @@
+"""The estimator's two stages: acquire on the whole frame, track in windows of its native pixels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from edge.estimator.decode import decode, distinct, nearest_expected
+from edge.estimator.model import Model
+from edge.estimator.window import cut, fit_frame, window_around
+from edge.types import Array, Estimate, Frame
+
+
+class Estimator:
+    """Poses of the targets in single frames; it remembers nothing between them but counts of what it refused."""
+
+    def __init__(self, model: Model, max_targets: int = 4) -> None:
+        self.model = model
+        self.refused: Counter[str] = Counter()
+        self._max_targets = max_targets
+
+    @property
+    def has_track_stage(self) -> bool:
+        return self.model.contract.track_size_wh is not None
+
+    def acquire(self, frame: Frame, known_boxes: Sequence[Array] = ()) -> list[Estimate]:
+        """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
+
+        Each is refined in a track window of the same frame; one the window does not confirm is no target.
+        """
+        contract = self.model.contract
+        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit)
+        K = pixel_map.intrinsics(frame.K)
+        peaks = self.model.run(image[None], K[None])
+        found = decode(peaks, 0, pixel_map, K, contract, "acquire", self.refused)
+        found = distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
+        if not self.has_track_stage:
+            return found
+        refined = [estimate for estimate in self.track(frame, [f.box_xyxy_px for f in found]) if estimate is not None]
+        self.refused["unconfirmed"] += len(found) - len(refined)
+        return distinct(refined, known_boxes)
+
+    def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array]) -> list[Estimate | None]:
+        """For each expected box the target in the window around it, or None. One inference for all windows."""
+        contract = self.model.contract
+        if contract.track_size_wh is None:
+            raise ValueError("this model has no track stage")
+        if not boxes_xyxy_px:
+            return []
+        size_wh = contract.track_size_wh
+        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh) for box in boxes_xyxy_px]
+        maps = [window.pixel_map(size_wh) for window in windows]
+        K = np.stack([pixel_map.intrinsics(frame.K) for pixel_map in maps])
+        peaks = self.model.run(np.stack([cut(frame.image_bgr, window, size_wh) for window in windows]), K)
+        found = [
+            nearest_expected(decode(peaks, i, pixel_map, K[i], contract, "track", self.refused), boxes_xyxy_px[i])
+            for i, pixel_map in enumerate(maps)
+        ]
+        # Two windows may see the same aircraft; the stronger sight of it counts.
+        kept = {id(e) for e in distinct(sorted(filter(None, found), key=lambda e: -e.score))}
+        return [estimate if id(estimate) in kept else None for estimate in found]

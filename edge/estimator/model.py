@@ -1,0 +1,132 @@
+"""The network: an ONNX file with its contract inside, refused with a sentence when it is not what the daemon flies."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from edge.errors import InputError
+from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
+
+INPUT_TYPES = {"image": ("tensor(uint8)", 4), "K": ("tensor(float)", 3)}
+OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
+    "score": (),
+    "center_px": (2,),
+    "size_px": (2,),
+    "origin_px": (2,),
+    "t_cam_target_m": (3,),
+    "R_cam_target": (3, 3),
+    "sigma": (6,),
+}
+SIZE_STEP_PX = 32
+_LOG_FATAL = 4
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """What the network says of N images, M peaks each, in the images' own pixels (see msgs.contract)."""
+
+    score: NDArray[np.float32]  # [N, M]
+    center_px: NDArray[np.float32]  # [N, M, 2]
+    size_px: NDArray[np.float32]  # [N, M, 2]
+    origin_px: NDArray[np.float32]  # [N, M, 2]
+    t_cam_target_m: NDArray[np.float32]  # [N, M, 3]
+    R_cam_target: NDArray[np.float32]  # [N, M, 3, 3]
+    sigma: NDArray[np.float32]  # [N, M, 6]
+
+
+class Model:
+    """A loaded session. One thread at a time calls `run`."""
+
+    def __init__(self, session: ort.InferenceSession, contract: ModelContract, path: Path, sha256: str) -> None:
+        self._session = session
+        self.contract = contract
+        self.path = path
+        self.sha256 = sha256
+
+    def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
+        """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
+        feeds = {"image": images_bgr, "K": K.astype(np.float32)}
+        return Peaks(*self._session.run(list(OUTPUT_NAMES), feeds))
+
+    def warm_up(self) -> None:
+        """One inference at each size. Raises InputError if the graph does not run or its outputs' shapes are wrong."""
+        contract = self.contract
+        for width, height in filter(None, (contract.acquire_size_wh, contract.track_size_wh)):
+            image = np.zeros((1, height, width, 3), dtype=np.uint8)
+            K = np.array([[[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]])
+            try:
+                peaks = self.run(image, K)
+            except Exception as error:  # ONNX Runtime's errors have no common base of their own
+                raise InputError(f"model {self.path} does not run at {width}x{height}: {error}") from error
+            for name, tail in OUTPUT_TAILS.items():
+                shape, wanted = getattr(peaks, name).shape, (1, contract.max_peaks, *tail)
+                if shape != wanted:
+                    raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
+
+
+def load_model(path: Path, threads: int, spinning: bool = False) -> Model:
+    """Open an ONNX file on the CPU and check it against the contract. Raises InputError: which, and what is wrong."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"model {path} cannot be read: {error.strerror}") from error
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "1" if spinning else "0")
+    options.log_severity_level = _LOG_FATAL
+    try:
+        session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's errors have no common base of their own
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"model {path} is not a loadable ONNX file: {reason}") from error
+    contract = _contract(session.get_modelmeta().custom_metadata_map, path)
+    _check_graph(session, contract, path)
+    return Model(session, contract, path, hashlib.sha256(content).hexdigest())
+
+
+def _contract(metadata: dict[str, str], path: Path) -> ModelContract:
+    if METADATA_KEY not in metadata:
+        raise InputError(f"model {path} carries no contract (metadata key {METADATA_KEY}): not made by uavpose-trainer")
+    try:
+        tree = json.loads(metadata[METADATA_KEY])
+        version = tree.get("version") if isinstance(tree, dict) else None
+        if version != CONTRACT_VERSION:
+            raise InputError(f"model {path} has contract version {version}; this program reads {CONTRACT_VERSION}")
+        contract = ModelContract.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"model {path}: contract key {key}: {first['msg']}") from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"model {path}: its contract is not JSON: {error}") from error
+    for size_wh in filter(None, (contract.acquire_size_wh, contract.track_size_wh)):
+        if any(side <= 0 or side % SIZE_STEP_PX for side in size_wh):
+            raise InputError(f"model {path}: input size {size_wh} is not a multiple of {SIZE_STEP_PX}")
+    return contract
+
+
+def _check_graph(session: ort.InferenceSession, contract: ModelContract, path: Path) -> None:
+    inputs: dict[str, Any] = {node.name: node for node in session.get_inputs()}
+    if set(inputs) != set(INPUT_NAMES):
+        raise InputError(f"model {path} takes inputs {sorted(inputs)}, its contract's are {sorted(INPUT_NAMES)}")
+    for name, (kind, rank) in INPUT_TYPES.items():
+        node = inputs[name]
+        if node.type != kind or len(node.shape) != rank:
+            raise InputError(
+                f"model {path}: input {name} is {node.type} of shape {node.shape}, not {kind} of rank {rank}"
+            )
+    outputs = {node.name for node in session.get_outputs()}
+    missing = [name for name in OUTPUT_NAMES if name not in outputs]
+    if missing:
+        raise InputError(f"model {path} lacks outputs {missing} of contract version {contract.version}")
