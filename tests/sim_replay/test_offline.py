@@ -1,0 +1,55 @@
+"""Scoring a BOP dataset through the estimator and the command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sim_replay.offline import score_dataset
+
+
+def score_command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [Path(sys.executable).parent / "uavpose-replay", "score", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_every_frame_is_judged_by_itself(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    results = score_dataset([dark_spot_scene], dark_spot_model, threads=1)
+    assert [len(result.matches) for result in results] == [1, 1, 1, 1, 0]
+    assert [result.false_poses for result in results] == [0] * 5
+    for result in results[:4]:
+        match = result.matches[0]
+        assert match.rotation_error_deg == pytest.approx(0.0, abs=1e-4)
+        # The spot's darkest pixel lies within its radius of six pixels, 0.5 m at 200 m.
+        assert match.translation_error_m is not None
+        assert match.translation_error_m < 0.75
+
+
+def test_the_command_scores_a_dataset_folder_as_json(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    done = score_command("--dataset", dark_spot_scene.parents[1], "--model", dark_spot_model, "--json")
+    assert done.returncode == 0, done.stderr
+    score = json.loads(done.stdout)
+    assert (score["frames"], score["targets"], score["poses"], score["false_poses"]) == (5, 4, 4, 0)
+    assert score["detection_rate"] == score["pose_10deg_5pct"] == 1.0
+    assert [band["range_m"] for band in score["by_range"]] == [[200.0, 300.0]]
+    assert score["model"]["file"] == "dark-spot.onnx"
+
+
+def test_bad_input_is_told_in_a_sentence_with_exit_code_2(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    poses = json.loads((dark_spot_scene / "scene_gt.json").read_text())
+    del poses["0"][0]["cam_t_m2c"]
+    (dark_spot_scene / "scene_gt.json").write_text(json.dumps(poses))
+    cases = (
+        (["--dataset", dark_spot_scene, "--model", dark_spot_model], ("scene_gt.json", "cam_t_m2c")),
+        (["--dataset", dark_spot_scene / "rgb", "--model", dark_spot_model], ("no BOP scene",)),
+        (["--dataset", dark_spot_scene, "--model", dark_spot_scene / "none.onnx"], ("none.onnx",)),
+    )
+    for arguments, words in cases:
+        done = score_command(*arguments)
+        assert done.returncode == 2
+        assert all(word in done.stderr for word in words), done.stderr
+        assert "Traceback" not in done.stderr
