@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from edge.errors import InputError
 from sim_replay.ground_truth import PlayedSequence
 
 LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
@@ -27,6 +28,7 @@ READY_MARGIN_NS = 100_000_000
 _OVERTIME_S = 20.0
 _STOP_TIMEOUT_S = 5.0
 _SETTLE_S = 0.3
+_EXIT_BAD_INPUT = 2
 
 Record = dict[str, Any]
 
@@ -77,7 +79,7 @@ class PlaySettings:
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
     """Run the sequence once in real time; `on_record` sees each line of a peer as it comes.
 
-    Raises PlayError if the daemon cannot be made ready, fails, or does not end.
+    Raises InputError if the daemon refuses what it is given, PlayError if it is late, fails or does not end.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     for lead_s in LEADS_S:
@@ -112,12 +114,21 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
             _pass_on(records, recording, on_record, timeout_s=0.05)
     while not records.empty():
         _pass_on(records, recording, on_record, timeout_s=0.0)
-    if recording.daemon_exit is None:
-        raise PlayError(f"the daemon did not end {_OVERTIME_S:.0f} s after the last frame")
-    if recording.daemon_exit != 0:
-        words = (settings.out / "daemon.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        raise PlayError(f"the daemon ended with exit code {recording.daemon_exit}: {words[-1] if words else 'silent'}")
+    _check_exit(recording.daemon_exit, settings.out / "daemon.log")
     return recording
+
+
+def _check_exit(code: int | None, log: Path) -> None:
+    """Raise what the daemon's end means, with its last words: InputError for bad input, PlayError otherwise."""
+    if code == 0:
+        return
+    if code is None:
+        raise PlayError(f"the daemon did not end {_OVERTIME_S:.0f} s after the last frame; see {log}")
+    words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    last = words[-1] if words else "it said nothing"
+    if code == _EXIT_BAD_INPUT:
+        raise InputError(last)
+    raise PlayError(f"the daemon ended with exit code {code}: {last}")
 
 
 def _pass_on(
@@ -140,16 +151,12 @@ def _wait_until_ready(
     records: queue.SimpleQueue[tuple[str, Record]],
     on_record: Callable[[Recording, Record], None],
 ) -> bool:
-    """Whether the daemon reported a state past INIT before frame 0, or ended."""
+    """Whether the daemon was up (its first diagnostics came) in time for frame 0, or ended."""
     while time.monotonic_ns() < recording.start_at_ns - READY_MARGIN_NS:
         _pass_on(records, recording, on_record, timeout_s=0.05)
-        if daemon.poll() is not None or any(_state(record) != "INIT" for record in recording.diagnostics):
+        if recording.diagnostics or daemon.poll() is not None:
             return True
     return False
-
-
-def _state(record: Record) -> str:
-    return str(record["values"].get("state", "INIT")).upper()
 
 
 def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]:
