@@ -55,8 +55,8 @@ def pose_covariance(
 ) -> Array:
     """Covariance [6, 6] (x, y, z m, rotation x, y, z rad; cam) from sigma [6] of (u, v, log Z, rotation).
 
-    t = Z K^-1 [u, v, 1], so J = [Z K^-1 e_u, Z K^-1 e_v, t]. `K` is of the pixels that u and v are counted in. Outside the trained range the
-    distance to it, in log Z, is added to the depth's sigma.
+    t = Z K^-1 [u, v, 1], so J = [Z K^-1 e_u, Z K^-1 e_v, t]. `K` is of the pixels that u and v are counted in.
+    Outside the trained range the distance to it, in log Z, is added to the depth's sigma.
     """
     t_m, sigma = np.asarray(t_cam_target_m, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
     K_inverse = np.linalg.inv(np.asarray(K, dtype=np.float64))
