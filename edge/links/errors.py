@@ -1,0 +1,9 @@
+"""What a link says when it cannot do what its settings ask."""
+
+from __future__ import annotations
+
+from edge.errors import InputError
+
+
+class LinkError(InputError):
+    """An endpoint cannot be opened; the text is a whole sentence that names it."""

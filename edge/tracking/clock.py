@@ -1,0 +1,126 @@
+"""The autopilot's clock and UTC against our monotonic one. Pure: every time comes in as an argument.
+
+TIMESYNC (MAVLink 111): we ask with tc1 = 0 and ts1 = our ns; the reply mirrors ts1 and adds the autopilot's ns as tc1.
+offset = tc1 - (ts1 + now) / 2, and its error is at most half the round trip.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+SAMPLES = 32  # of which the one with the least round trip speaks
+ASKED_KEPT = 16
+ROUND_TRIP_MAX_NS = 200_000_000
+JUMP_NS = 100_000_000
+JUMP_AGREEING = 3  # samples in a row that must say so
+STAMP_FUTURE_MAX_NS = 20_000_000
+STAMP_AGE_MAX_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Sample:
+    offset_ns: int  # autopilot minus monotonic
+    round_trip_ns: int
+
+
+class TimesyncEstimator:
+    """Offset of the autopilot's clock (ns since its boot) from ours, by TIMESYNC's two-way exchange."""
+
+    def __init__(self) -> None:
+        self.jumps = 0
+        self._asked: deque[int] = deque(maxlen=ASKED_KEPT)
+        self._samples: deque[Sample] = deque(maxlen=SAMPLES)
+        self._suspects: list[Sample] = []
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Autopilot minus monotonic; None before the first reply."""
+        return self._best().offset_ns if self._samples else None
+
+    @property
+    def uncertainty_ns(self) -> int | None:
+        """Bound of the offset's error: half the best round trip."""
+        return self._best().round_trip_ns // 2 if self._samples else None
+
+    def request(self, now_ns: int) -> int:
+        """The ts1 to ask with; its reply will be known by it."""
+        self._asked.append(now_ns)
+        return now_ns
+
+    def reply(self, tc1_ns: int, ts1_ns: int, now_ns: int) -> bool:
+        """Take in a reply; False if we did not ask for it, if it took too long, or while it may be an outlier."""
+        if ts1_ns not in self._asked:
+            return False
+        self._asked.remove(ts1_ns)
+        round_trip_ns = now_ns - ts1_ns
+        if not 0 <= round_trip_ns <= ROUND_TRIP_MAX_NS:
+            return False
+        sample = Sample(tc1_ns - (ts1_ns + now_ns) // 2, round_trip_ns)
+        offset_ns = self.offset_ns
+        if offset_ns is not None and abs(sample.offset_ns - offset_ns) > JUMP_NS:
+            return self._suspect(sample)
+        self._suspects.clear()
+        self._samples.append(sample)
+        return True
+
+    def clear(self) -> None:
+        """The autopilot has started again."""
+        self._asked.clear()
+        self._samples.clear()
+        self._suspects.clear()
+
+    def _suspect(self, sample: Sample) -> bool:
+        if self._suspects and abs(sample.offset_ns - self._suspects[-1].offset_ns) > JUMP_NS:
+            self._suspects.clear()
+        self._suspects.append(sample)
+        if len(self._suspects) < JUMP_AGREEING:
+            return False
+        self.jumps += 1
+        self._samples.clear()
+        self._samples.extend(self._suspects)
+        self._suspects.clear()
+        return True
+
+    def _best(self) -> Sample:
+        return min(self._samples, key=lambda s: s.round_trip_ns)
+
+
+class BootClock:
+    """The autopilot's boot time to monotonic ns: by TIMESYNC where that fits, else by the quickest arrival so far.
+
+    The quickest arrival knows the offset but for the link's least delay, which is then taken for zero.
+    """
+
+    def __init__(self, timesync: TimesyncEstimator) -> None:
+        self._timesync = timesync
+        self._delays: deque[int] = deque(maxlen=256)
+
+    def monotonic_ns(self, boot_ns: int, arrival_ns: int) -> int:
+        """Monotonic time of a stamp; never later than its arrival."""
+        self._delays.append(arrival_ns - boot_ns)
+        offset_ns = self._timesync.offset_ns
+        if offset_ns is not None:
+            synced = boot_ns - offset_ns
+            # Some peers answer TIMESYNC from another clock than the one in their stamps.
+            if -STAMP_FUTURE_MAX_NS <= arrival_ns - synced <= STAMP_AGE_MAX_NS:
+                return min(synced, arrival_ns)
+        return min(boot_ns + min(self._delays), arrival_ns)
+
+    def clear(self) -> None:
+        self._delays.clear()
+
+
+class RebootDetector:
+    """Whether the autopilot has started again: its boot time fell by more than late datagrams explain."""
+
+    REORDER_MAX_MS = 2000
+
+    def __init__(self) -> None:
+        self._latest_ms: int | None = None
+
+    def rebooted(self, boot_ms: int) -> bool:
+        fell = self._latest_ms is not None and boot_ms < self._latest_ms - self.REORDER_MAX_MS
+        if fell or self._latest_ms is None or boot_ms > self._latest_ms:
+            self._latest_ms = boot_ms
+        return fell

@@ -1,0 +1,37 @@
+"""Small offsets on the WGS 84 ellipsoid: good to centimetres within kilometres of the origin, away from the poles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edge.types import Array
+
+SEMI_MAJOR_M = 6_378_137.0
+FLATTENING = 1.0 / 298.257223563
+
+
+def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
+    """Metres for one radian of latitude, and of longitude."""
+    e2 = FLATTENING * (2.0 - FLATTENING)
+    lat_rad = np.deg2rad(lat_deg)
+    w2 = 1.0 - e2 * np.sin(lat_rad) ** 2
+    meridian = SEMI_MAJOR_M * (1.0 - e2) / w2**1.5
+    prime_vertical = SEMI_MAJOR_M / np.sqrt(w2)
+    return float(meridian + alt_m), float((prime_vertical + alt_m) * np.cos(lat_rad))
+
+
+def lat_lon_alt_from_ned(origin_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -> tuple[float, float, float]:
+    """(degrees, degrees, m) of a point [3] given in the north-east-down axes at the origin."""
+    lat, lon, alt = origin_deg_m
+    north, east, down = (float(x) for x in np.asarray(t_ned_m, dtype=np.float64))
+    per_lat, per_lon = radii_m(lat, alt)
+    return lat + float(np.rad2deg(north / per_lat)), lon + float(np.rad2deg(east / per_lon)), alt - down
+
+
+def ned_from_lat_lon_alt(origin_deg_m: tuple[float, float, float], point_deg_m: tuple[float, float, float]) -> Array:
+    """A point's offset [3] in the north-east-down axes at the origin: the inverse of lat_lon_alt_from_ned."""
+    per_lat, per_lon = radii_m(origin_deg_m[0], origin_deg_m[2])
+    d_lon = (point_deg_m[1] - origin_deg_m[1] + 180.0) % 360.0 - 180.0
+    d_lat = point_deg_m[0] - origin_deg_m[0]
+    return np.array([np.deg2rad(d_lat) * per_lat, np.deg2rad(d_lon) * per_lon, origin_deg_m[2] - point_deg_m[2]])

@@ -1,0 +1,147 @@
+"""Where the camera's own vehicle was when a frame was exposed."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edge.tracking.geodesy import lat_lon_alt_from_ned
+from edge.types import Array, OwnShip
+from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
+
+KEPT = 1024  # samples of each kind: 10 s at 100 Hz
+ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the time between
+ATTITUDE_AHEAD_MAX_NS = 50_000_000
+POSITION_GAP_MAX_NS = 2_000_000_000
+POSITION_AHEAD_MAX_NS = 500_000_000
+GLOBAL_AGE_MAX_NS = 5_000_000_000
+NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class _Attitude:
+    time_ns: int
+    R_ned_body: Array
+    rates_body_radps: Array
+
+
+@dataclass(frozen=True)
+class _Position:
+    time_ns: int
+    t_ned_m: Array
+    v_ned_mps: Array
+
+
+class OwnShipBuffer:
+    """The last seconds of own attitude and position, on the monotonic clock. Safe to use from several threads.
+
+    Each kind must come in rising time: a sample that does not is refused, and the `add_*` method returns False.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
+        self._positions: deque[_Position] = deque(maxlen=KEPT)
+        self._global: tuple[int, tuple[float, float, float]] | None = None
+
+    def add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike) -> bool:
+        """Attitude [4] and body rates [3] (FRD). Raises ValueError on a zero quaternion."""
+        sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), np.array(rates_body_radps, dtype=np.float64))
+        with self._lock:
+            return _append(self._attitudes, sample)
+
+    def add_position(self, time_ns: int, t_ned_m: ArrayLike, v_ned_mps: ArrayLike) -> bool:
+        """Position and velocity [3] of the body origin in the local ned frame."""
+        sample = _Position(time_ns, np.array(t_ned_m, dtype=np.float64), np.array(v_ned_mps, dtype=np.float64))
+        with self._lock:
+            return _append(self._positions, sample)
+
+    def add_global(self, time_ns: int, lat_deg: float, lon_deg: float, alt_m: float) -> bool:
+        """Position on the globe, altitude above mean sea level: it places the ned origin."""
+        with self._lock:
+            if self._global is not None and time_ns <= self._global[0]:
+                return False
+            self._global = (time_ns, (lat_deg, lon_deg, alt_m))
+            return True
+
+    def clear(self) -> None:
+        """Forget all: the autopilot has started again, and its local origin with it."""
+        with self._lock:
+            self._attitudes.clear()
+            self._positions.clear()
+            self._global = None
+
+    def at(self, time_ns: int) -> OwnShip | None:
+        """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 50 ms.
+
+        None without an attitude for that time. Position and velocity are None where the positions do not reach;
+        then the ned origin is the own ship itself.
+        """
+        with self._lock:
+            R_ned_body = _attitude_at(self._attitudes, time_ns)
+            if R_ned_body is None:
+                return None
+            position = _position_at(self._positions, time_ns)
+            t_ned_m, v_ned_mps = position if position is not None else (None, None)
+            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, self._origin(time_ns, t_ned_m is not None))
+
+    def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
+        if self._global is None or abs(time_ns - self._global[0]) > GLOBAL_AGE_MAX_NS:
+            return None
+        fixed_ns, vehicle = self._global
+        if not in_local_ned:
+            return vehicle
+        then = _position_at(self._positions, fixed_ns)
+        return None if then is None else lat_lon_alt_from_ned(vehicle, -then[0])
+
+
+def _append(samples: deque, sample: _Attitude | _Position) -> bool:
+    if samples and sample.time_ns <= samples[-1].time_ns:
+        return False
+    samples.append(sample)
+    return True
+
+
+def _first_after(samples: deque, time_ns: int) -> int:
+    """Index of the first sample later than a time; counted from the end, where the answer is near."""
+    index = len(samples)
+    while index > 0 and samples[index - 1].time_ns > time_ns:
+        index -= 1
+    return index
+
+
+def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
+    after = _first_after(samples, time_ns)
+    if after == 0:
+        return None
+    a = samples[after - 1]
+    elapsed_s = (time_ns - a.time_ns) / NS_PER_S
+    if after == len(samples):
+        if time_ns - a.time_ns > ATTITUDE_AHEAD_MAX_NS:
+            return None
+        return a.R_ned_body @ so3_exp(a.rates_body_radps * elapsed_s)
+    b = samples[after]
+    if b.time_ns - a.time_ns > ATTITUDE_GAP_MAX_NS:
+        return None
+    share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
+    return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
+
+
+def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array] | None:
+    after = _first_after(samples, time_ns)
+    if after == 0:
+        return None
+    a = samples[after - 1]
+    if after == len(samples):
+        if time_ns - a.time_ns > POSITION_AHEAD_MAX_NS:
+            return None
+        return a.t_ned_m + a.v_ned_mps * ((time_ns - a.time_ns) / NS_PER_S), a.v_ned_mps
+    b = samples[after]
+    if b.time_ns - a.time_ns > POSITION_GAP_MAX_NS:
+        return None
+    share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
+    return a.t_ned_m + share * (b.t_ned_m - a.t_ned_m), a.v_ned_mps + share * (b.v_ned_mps - a.v_ned_mps)
