@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from edge.cameras.sequence import read_scene
 from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
 from msgs.geometry import Array
+from sim_replay.bop import BopError, read_models_info, read_scene
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
-
-_MM = 1e-3
+from sim_replay.telemetry import TelemetryError, read_telemetry
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,23 +44,22 @@ class PlayedSequence:
 
 
 def read_scene_truth(folder: Path) -> SceneTruth:
-    """Read a BOP scene folder and the dataset's models_info.json. Raises InputError, naming file and key."""
-    images, K = read_scene(folder)
-    models_path = _models_info(folder)
-    with _blame(models_path):
-        models = {int(key): value for key, value in json.loads(models_path.read_text(encoding="utf-8")).items()}
-        extents = {key: _extents(model) for key, model in models.items()}
-        diameters_m = {key: float(model["diameter"]) * _MM for key, model in models.items()}
+    """Read a BOP scene folder and its dataset's models_info.json. Raises InputError, naming file and key."""
+    try:
+        scene = read_scene(folder)
+        models = read_models_info(_models_folder(folder))
+        images = [scene.image_path(frame) for frame in scene.frames]
+    except BopError as error:
+        raise InputError(str(error)) from error
     truths = []
-    with _blame(folder / "scene_gt.json") as path:
-        poses = json.loads(path.read_text(encoding="utf-8"))
-        for frame, image in enumerate(images):
-            for pose in poses.get(str(int(image.stem)), []):
-                R_cam_target = np.array(pose["cam_R_m2c"], dtype=np.float64).reshape(3, 3)
-                t_cam_target_m = np.array(pose["cam_t_m2c"], dtype=np.float64).reshape(3) * _MM
-                object_id = int(pose["obj_id"])
-                truths.append(Truth(frame, R_cam_target, t_cam_target_m, object_id, diameters_m[object_id]))
-    return SceneTruth(folder, images, K, truths, extents)
+    for index, frame in enumerate(scene.frames):
+        for target in frame.targets:
+            if target.object_id not in models:
+                raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not in models_info.json")
+            diameter_m = models[target.object_id].diameter_m
+            truths.append(Truth(index, target.R_cam_target, target.t_cam_target_m, target.object_id, diameter_m))
+    extents = {object_id: Extents(model.low_m, model.size_m) for object_id, model in models.items()}
+    return SceneTruth(folder, images, [frame.K for frame in scene.frames], truths, extents)
 
 
 def read_sequence(folder: Path) -> PlayedSequence:
@@ -75,21 +69,19 @@ def read_sequence(folder: Path) -> PlayedSequence:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
         mount = MountSettings(R_body_cam=settings["R_body_cam"], t_body_cam_m=settings["t_body_cam_m"]).mount()
         fps = float(settings["fps"])
+    try:
+        read_telemetry(folder / "telemetry.csv")
+    except TelemetryError as error:
+        raise InputError(str(error)) from error
     return PlayedSequence(scene, fps, mount, folder / "telemetry.csv")
 
 
-def _models_info(folder: Path) -> Path:
-    """models_info.json of the dataset that the scene belongs to: BOP has scenes at <dataset>/<split>/<scene>."""
+def _models_folder(folder: Path) -> Path:
+    """The dataset's models/: BOP has scenes at <dataset>/<split>/<scene>; a scene by itself may hold its own."""
     for parent in (folder, *folder.resolve().parents[:2]):
-        path = parent / "models" / "models_info.json"
-        if path.is_file():
-            return path
-    raise InputError(f"{folder}: no models/models_info.json beside the scene or up to two folders above it")
-
-
-def _extents(model: dict[str, Any]) -> Extents:
-    low, size = ([float(model[f"{name}_{axis}"]) * _MM for axis in "xyz"] for name in ("min", "size"))
-    return Extents((low[0], low[1], low[2]), (size[0], size[1], size[2]))
+        if (parent / "models" / "models_info.json").is_file():
+            return parent / "models"
+    raise InputError(f"{folder}: no models/models_info.json in the scene or up to two folders above it")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import queue
+import re
 import signal
 import socket
 import subprocess
@@ -46,6 +47,7 @@ class Recording:
     mavlink_port: int
     zenoh_endpoint: str
     daemon_exit: int | None = None
+    daemon_counters: dict[str, int] = field(default_factory=dict)  # its own, as it said when it stopped
     poses: list[Record] = field(default_factory=list)  # sim_replay.subscriber's `pose`
     targets: list[Record] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
     diagnostics: list[Record] = field(default_factory=list)
@@ -115,7 +117,16 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
     while not records.empty():
         _pass_on(records, recording, on_record, timeout_s=0.0)
     _check_exit(recording.daemon_exit, settings.out / "daemon.log")
+    recording.daemon_counters = last_counters((settings.out / "daemon.log").read_text(encoding="utf-8"))
     return recording
+
+
+def last_counters(log: str) -> dict[str, int]:
+    """The counters of the daemon's `stopped:` line, which leaves out those that are zero. Raises PlayError."""
+    stopped = [line for line in log.splitlines() if "stopped: " in line]
+    if not stopped:
+        raise PlayError("the daemon ended without its `stopped:` line")
+    return {name: int(count) for name, count in re.findall(r"(\w+)=(\d+)", stopped[-1].rpartition("|")[2])}
 
 
 def _check_exit(code: int | None, log: Path) -> None:

@@ -78,7 +78,7 @@ def score_json(sequence: PlayedSequence, result: Result, model: Model) -> dict[s
         "false_poses": result.false_poses,
         **pose_statistics(result.matches),
         "latency_ms": latency_statistics([latency_ms(record, recording) for record in recording.targets]),
-        "dropped_frames": dropped_frames(recording),
+        "dropped_frames": recording.daemon_counters.get("dropped", 0),
         "mavlink_received": recording.mavlink.get("received", {}),
         "mavlink_refused": recording.mavlink.get("refused", {}),
         "zenoh_received": recording.zenoh.get("received", {}),
@@ -86,13 +86,6 @@ def score_json(sequence: PlayedSequence, result: Result, model: Model) -> dict[s
         "by_range": statistics_by_range(result.matches),
         "model": {"file": model.path.name, "sha256": model.sha256, "precision": model.contract.precision},
     }
-
-
-def dropped_frames(recording: Recording) -> int | None:
-    """What the daemon last said it had dropped; None if it never spoke."""
-    counts = [record["values"].get("dropped") for record in recording.diagnostics]
-    known = [int(count) for count in counts if count is not None]
-    return known[-1] if known else None
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:

@@ -1,0 +1,186 @@
+"""The whole chain as a user runs it: the demo's own command, real processes, sockets and sessions, under junk."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import zenoh
+
+from msgs import topics
+from msgs.client import connect
+from sim_replay.demo import BUNDLED_SEQUENCE
+
+BIN = Path(sys.executable).parent
+JUNK_PER_KIND = 40
+
+
+@dataclass(frozen=True)
+class DemoRun:
+    exit_code: int
+    out: Path
+    text: str
+    score: dict[str, Any]
+
+
+def wait_for_config(out: Path, process: subprocess.Popen[str]) -> dict[str, Any]:
+    """The configuration that the demo wrote for the daemon."""
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            config = tomllib.loads((out / "config.toml").read_text())
+            return config if "mavlink" in config else pytest.fail("config.toml has no [mavlink]")
+        except (FileNotFoundError, tomllib.TOMLDecodeError, KeyError):
+            time.sleep(0.05)
+    pytest.fail("the demo wrote no config.toml")
+
+
+def open_session(endpoint: str) -> zenoh.Session:
+    deadline = time.monotonic() + 30
+    while True:
+        try:
+            return connect(endpoint)
+        except ConnectionError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
+
+
+def send_junk(config: dict[str, Any]) -> None:
+    """Random datagrams at the MAVLink port and random payloads on pose keys, while frames are played."""
+    chance = random.Random(5)
+    port = int(config["mavlink"]["endpoints"][0].rpartition(":")[2])
+    with (
+        open_session(config["zenoh"]["listen"][0]) as session,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link,
+    ):
+        while time.monotonic_ns() < config["camera"]["start_at_ns"]:
+            time.sleep(0.02)
+        key = topics.publication_key(topics.POSE, "uav1", "t9")
+        for _ in range(JUNK_PER_KIND):
+            link.sendto(chance.randbytes(chance.randrange(1, 10_000)), ("127.0.0.1", port))
+            # A first byte of MAVLink 2 makes the parser believe a frame begins.
+            link.sendto(b"\xfd" + chance.randbytes(chance.randrange(1, 300)), ("127.0.0.1", port))
+            session.put(key, chance.randbytes(chance.randrange(0, 500)))
+            time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoRun:
+    out = tmp_path_factory.mktemp("demo") / "out"
+    command = [BIN / "uavpose-replay", "demo", "--out", out]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    send_junk(wait_for_config(out, process))
+    text, _ = process.communicate(timeout=120)
+    score_file = out / "score.json"
+    assert score_file.exists(), text
+    return DemoRun(process.returncode, out, text, json.loads(score_file.read_text()))
+
+
+def test_the_demo_succeeds_and_both_peers_got_poses(demo: DemoRun) -> None:
+    assert demo.exit_code == 0, demo.text
+    assert demo.score["mavlink_received"]["TARGET_RELATIVE"] > 0
+    assert demo.score["zenoh_received"]["uav1/target/t0/pose"] > 0
+
+
+def test_the_score_is_complete(demo: DemoRun) -> None:
+    score = demo.score
+    assert score["frames"] == len(list((BUNDLED_SEQUENCE / "rgb").iterdir()))
+    assert 0 < score["poses"] <= score["frames"] * 2
+    assert 0 < score["detection_rate"] <= 1
+    for name in ("rotation_error_deg", "translation_error_m"):
+        assert score[name]["mean"] >= 0
+        assert score[name]["median"] >= 0
+    assert score["depth_error_rel"]["mean"] >= 0
+    assert 0 <= score["pose_10deg_5pct"] <= score["detection_rate"]
+    assert 0 < score["latency_ms"]["p50"] <= score["latency_ms"]["p95"] <= score["latency_ms"]["p99"]
+    assert score["dropped_frames"] >= 0
+    assert set(score["model"]) == {"file", "sha256", "precision"}
+
+
+def test_the_autopilot_heard_the_daemon_as_a_component_of_its_vehicle(demo: DemoRun) -> None:
+    received = demo.score["mavlink_received"]
+    assert {"HEARTBEAT", "TIMESYNC", "CAMERA_TRACKING_IMAGE_STATUS", "TARGET_RELATIVE"} <= set(received)
+    assert demo.score["mavlink_refused"] == {}
+
+
+def test_poses_in_ned_say_that_own_attitude_was_used(demo: DemoRun) -> None:
+    assert demo.score["zenoh_received"]["uav1/target/t0/odom"] > 0
+
+
+def test_junk_on_zenoh_was_refused_by_the_client_and_counted(demo: DemoRun) -> None:
+    assert demo.score["zenoh_received"]["uav1/target/t9/pose"] == JUNK_PER_KIND
+    assert sum(demo.score["zenoh_refused"].values()) >= JUNK_PER_KIND
+
+
+def test_pictures_are_written(demo: DemoRun) -> None:
+    picture = cv2.imread(str(demo.out / "overlay.png"))
+    assert picture is not None
+    assert picture.shape == (1080, 1920, 3)
+    video = cv2.VideoCapture(str(demo.out / "overlay.mp4"))
+    frames = 0
+    while video.grab():
+        frames += 1
+    assert frames == demo.score["frames"]
+
+
+@pytest.fixture
+def running_daemon(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A daemon that plays the bundled sequence for ever, met once it has said how it is."""
+    ports = []
+    for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+        with socket.socket(socket.AF_INET, kind) as probe:
+            probe.bind(("127.0.0.1", 0))
+            ports.append(probe.getsockname()[1])
+    config = tmp_path / "config.toml"
+    config.write_text(
+        f'[camera]\ntype = "sequence"\npath = "{BUNDLED_SEQUENCE}"\nloop = true\n'
+        f'[zenoh]\nlisten = ["tcp/127.0.0.1:{ports[0]}"]\n'
+        f'[mavlink]\nendpoints = ["udpin:127.0.0.1:{ports[1]}"]\n'
+    )
+    process = subprocess.Popen([BIN / "uavpose-edge", "run", "--config", config], stderr=subprocess.DEVNULL)
+    with open_session(f"tcp/127.0.0.1:{ports[0]}") as session:
+        key = topics.subscription_key(topics.DIAGNOSTICS, "uav1")
+        with session.declare_subscriber(key) as diagnostics:
+            diagnostics.recv()
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_daemon_within_two_seconds(
+    running_daemon: subprocess.Popen[bytes], number: signal.Signals
+) -> None:
+    running_daemon.send_signal(number)
+    assert running_daemon.wait(timeout=2.0) == 0
+
+
+def test_the_subscriber_is_built_on_msgs_alone() -> None:
+    program = (
+        "import sys; import sim_replay.subscriber; "
+        "print(*sorted(m for m in sys.modules if m.split('.')[0] in "
+        "('edge', 'trainer', 'sim_replay', 'cv2', 'onnxruntime', 'pymavlink', 'torch')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["sim_replay", "sim_replay.subscriber"]
+
+
+def test_bad_input_is_told_in_a_sentence_with_exit_code_2(tmp_path: Path) -> None:
+    command = [BIN / "uavpose-replay", "demo", "--out", tmp_path / "out", "--model", tmp_path / "missing.onnx"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "missing.onnx" in done.stderr
+    assert "Traceback" not in done.stderr
