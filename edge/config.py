@@ -125,6 +125,11 @@ CameraSettings = Annotated[
 ]
 
 
+def camera_key(camera: CameraSettings) -> tuple[str, str]:
+    """The key that names where a camera's frames are from."""
+    return "camera", {"stream": "url", "device": "device"}.get(camera.type, "path")
+
+
 class MountSettings(Section):
     """How the camera sits on the vehicle: three angles, or the matrix. All zero: it looks along the nose, upright."""
 

@@ -1,0 +1,84 @@
+"""The `uavpose-edge` command."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from edge.errors import InputError
+
+EXIT_BAD_INPUT = 2
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    try:
+        return int(options.act(options))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="uavpose-edge",
+        description="Find another fixed-wing aircraft in one camera's frames; tell its pose over zenoh and MAVLink.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="fly: read the camera and publish poses until told to stop")
+    run.add_argument("--config", type=Path, required=True, help="TOML file; see deploy/ for examples")
+    run.set_defaults(act=_run)
+
+    check = commands.add_parser(
+        "check", help="validate a configuration with its model and camera, and say what is in it"
+    )
+    check.add_argument("--config", type=Path, required=True, help="TOML file")
+    check.set_defaults(act=_check)
+
+    bench = commands.add_parser("bench", help="time acquire and track inference on this machine")
+    bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
+    bench.add_argument("--threads", type=int, default=2, help="CPU threads of one inference (default 2)")
+    bench.add_argument("--runs", type=int, default=100, help="timed inferences of each stage (default 100)")
+    bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
+    bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    bench.set_defaults(act=_bench)
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    from edge.config import load_config
+    from edge.daemon import run
+
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    return run(load_config(options.config), stop)
+
+
+def _check(options: argparse.Namespace) -> int:
+    from edge.check import check
+    from edge.config import load_config
+
+    print("\n".join(check(load_config(options.config))))
+    return 0
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from edge.bench import bench, table, to_json
+
+    if options.runs < 1 or options.threads < 1:
+        raise InputError("--runs and --threads take whole numbers from 1 on")
+    timings = bench(options.models, options.threads, options.spinning, options.runs)
+    print(to_json(timings) if options.json else table(timings))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

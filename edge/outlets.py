@@ -1,0 +1,80 @@
+"""All links as one: what the loop tells goes to each that is on, and none of them makes it wait."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from edge.config import ConfigFile
+from edge.health import HealthSnapshot, HealthState
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import CameraInfo, Report
+
+if TYPE_CHECKING:
+    from edge.links.mavlink_link import MavlinkLink
+    from edge.links.zenoh_link import ZenohLink
+
+# Python's logging levels are those of rcl_interfaces/Log; MAVLink counts the other way (MAV_SEVERITY).
+LEVELS = {HealthState.DEGRADED: logging.WARNING, HealthState.FAULT: logging.ERROR}
+MAV_SEVERITY = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3}
+
+
+class Outlets:
+    """The enabled links, running. Peers may come and go; only our own endpoints must be free."""
+
+    def __init__(self, zenoh: ZenohLink | None, mavlink: MavlinkLink | None) -> None:
+        self._zenoh = zenoh
+        self._mavlink = mavlink
+
+    def publish(self, report: Report) -> None:
+        if self._mavlink is not None:
+            self._mavlink.publish(report)
+        if self._zenoh is not None:
+            self._zenoh.publish(report)
+
+    def set_health(self, state: HealthState) -> None:
+        """Told at every turn of the loop: what follows from it (HEARTBEAT) stops when the loop is stuck."""
+        if self._mavlink is not None:
+            self._mavlink.set_health(state)
+
+    def tell(self, state: HealthState, text: str) -> None:
+        """A change of state, as an event."""
+        level = LEVELS.get(state, logging.INFO)
+        if self._mavlink is not None:
+            self._mavlink.event(MAV_SEVERITY[level], text)
+        if self._zenoh is not None:
+            self._zenoh.publish_event(level, text)
+
+    def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
+        if self._zenoh is not None:
+            self._zenoh.publish_diagnostics(snapshot)
+
+    def counters(self) -> dict[str, int]:
+        links = {"zenoh": self._zenoh, "mavlink": self._mavlink}
+        return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
+
+
+def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo, cleanup: ExitStack) -> Outlets:
+    """Start the enabled links, to be stopped by `cleanup`. A link that is off is not even imported.
+
+    Raises InputError (LinkError) when an endpoint of our own cannot be opened.
+    """
+    config = file.config
+    zenoh: ZenohLink | None = None
+    mavlink: MavlinkLink | None = None
+    if config.zenoh.enabled:
+        from edge.links.zenoh_link import ZenohLink
+
+        with file.blame("zenoh", "listen"):
+            zenoh = ZenohLink(config.zenoh, config.vehicle.name)
+            cleanup.callback(zenoh.stop)
+            zenoh.start()
+    if config.mavlink.enabled:
+        from edge.links.mavlink_link import MavlinkLink
+
+        with file.blame("mavlink", "endpoints"):
+            mavlink = MavlinkLink(config.mavlink, own_ship, camera)
+            cleanup.callback(mavlink.stop)
+            mavlink.start()
+    return Outlets(zenoh, mavlink)
