@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from trainer.depthwise import DepthwiseConv2d
+
 Features = tuple[Tensor, Tensor, Tensor]
 
 
@@ -189,7 +191,7 @@ class MBConvBlock(nn.Module):
             self._expand_conv = nn.Conv2d(inputs, hidden, 1, bias=False)
             self._bn0 = nn.BatchNorm2d(hidden, eps=1e-3)
         padding = kernel // 2 if stride == 1 else 0
-        self._depthwise_conv = nn.Conv2d(hidden, hidden, kernel, stride, padding, groups=hidden, bias=False)
+        self._depthwise_conv = DepthwiseConv2d(hidden, kernel, stride, padding)
         self._bn1 = nn.BatchNorm2d(hidden, eps=1e-3)
         self._project_conv = nn.Conv2d(hidden, outputs, 1, bias=False)
         self._bn2 = nn.BatchNorm2d(outputs, eps=1e-3)

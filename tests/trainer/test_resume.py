@@ -53,9 +53,7 @@ track_window_scale = 2.0
 
 def train(out: Path, steps: int | None, resume: bool = False) -> Trainer:
     config = parse_config(TINY, "tiny.toml")
-    return run_training(
-        config, TINY, out, resume=resume, max_steps=steps, open_sampler=synthetic_sampler.opener
-    )
+    return run_training(config, TINY, out, resume=resume, max_steps=steps, open_sampler=synthetic_sampler.opener)
 
 
 def test_two_and_two_steps_equal_four(tmp_path: Path) -> None:
@@ -77,6 +75,5 @@ def test_a_run_is_not_overwritten_and_another_config_is_refused(tmp_path: Path) 
         train(tmp_path / "run", 1)
     other = TINY.replace("mask = 1.0", "mask = 2.0")
     with pytest.raises(ConfigError, match=r"resume\.pt: has another configuration"):
-        run_training(
-            parse_config(other, "other.toml"), other, tmp_path / "run", resume=True, open_sampler=synthetic_sampler.opener
-        )
+        config = parse_config(other, "other.toml")
+        run_training(config, other, tmp_path / "run", resume=True, open_sampler=synthetic_sampler.opener)
