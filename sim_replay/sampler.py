@@ -81,14 +81,18 @@ def _enlarged(
     hit = (np.abs(noc).sum(axis=-1) > 0).astype(np.float32)
     weight = cv2.resize(hit, (size_px, size_px), interpolation=cv2.INTER_LINEAR)
     sums = cv2.resize(noc.astype(np.float32), (size_px, size_px), interpolation=cv2.INTER_LINEAR)
-    return wide, (sums / np.maximum(weight, 1e-3)[..., None]).astype(np.float16)
+    return np.asarray(wide, np.uint8), (sums / np.maximum(weight, 1e-3)[..., None]).astype(np.float16)
 
 
 class WindowSampler:
     """Windows of `size_px` square with, mostly, one aircraft. Make one in each worker process."""
 
     def __init__(
-        self, seed: int, size_px: int, airframe_ids: Sequence[int] | None = None, acquire_share: float = 0.3,
+        self,
+        seed: int,
+        size_px: int,
+        airframe_ids: Sequence[int] | None = None,
+        acquire_share: float = 0.3,
         empty_share: float = 0.12,
     ) -> None:
         self.seed, self.size_px = seed, size_px
@@ -106,8 +110,9 @@ class WindowSampler:
         out = _labels_blank(count, self.size_px, self.size_px)
         for start in range(0, count, self._renderer.capacity):
             windows = [
-                draw_window(self.seed, first_index + k, self.size_px, self.airframe_ids, self.acquire_share,
-                            self.empty_share)
+                draw_window(
+                    self.seed, first_index + k, self.size_px, self.airframe_ids, self.acquire_share, self.empty_share
+                )
                 for k in range(start, min(start + self._renderer.capacity, count))
             ]
             rendered = self._renderer.draw([window.scene for window in windows])
@@ -125,7 +130,7 @@ class WindowSampler:
         image = exposed(image, sensor_from(rng), window.native_scale, rng)
         camera = window.scene.camera
         if side < size:
-            image = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
+            image = np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.uint8)
             coverage, noc = _enlarged(coverage, noc, size)
             camera = Camera(crop_K(camera.K, 0.0, 0.0, size / side), size, size, camera.R_ned_cam, camera.t_ned_cam_m)
         out["image_bgr"][k], out["K"][k] = image, camera.K
@@ -150,7 +155,8 @@ def render_frame(scene: Scene, sensor: Sensor | None = None) -> SampleBatch:
     out = _labels_blank(1, camera.height_px, camera.width_px)
     chosen = sensor or sensor_from(np.random.default_rng([scene.sensor_seed, 1]))
     out["image_bgr"][0] = exposed(
-        rendered.image_bgr[0], chosen, 1.0, np.random.default_rng([scene.sensor_seed, 2, scene.frame_index]))
+        rendered.image_bgr[0], chosen, 1.0, np.random.default_rng([scene.sensor_seed, 2, scene.frame_index])
+    )
     out["K"][0] = camera.K
     if scene.targets:
         mask = (rendered.coverage[0] >= MASK_COVERAGE_MIN) & (rendered.target[0] == 1)

@@ -95,7 +95,9 @@ def _build(vertices: Array, faces: NDArray[np.int64], part: Part) -> Mesh:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, -1.0])
     return Mesh(
-        vertices.astype(np.float32), normals.astype(np.float32), np.full(len(vertices), part, np.uint8),
+        vertices.astype(np.float32),
+        normals.astype(np.float32),
+        np.full(len(vertices), part, np.uint8),
         faces.astype(np.int32),
     )
 
@@ -138,8 +140,12 @@ def _smooth_interpolation(x_new: Array, x: Array, y: Array) -> Array:
 
 
 def fuselage(
-    stations: Sequence[tuple[float, float, float, float]], exponent: float = 2.2, part: Part = Part.FUSELAGE,
-    y_m: float = 0.0, rings: int = 18, points: int = 14,
+    stations: Sequence[tuple[float, float, float, float]],
+    exponent: float = 2.2,
+    part: Part = Part.FUSELAGE,
+    y_m: float = 0.0,
+    rings: int = 18,
+    points: int = 14,
 ) -> Mesh:
     """A body of superellipse sections. Stations, nose to tail: (x, width, height, z of the centre), metres."""
     table = np.asarray(stations, dtype=np.float64)
@@ -190,7 +196,8 @@ def ellipsoid(centre_m: ArrayLike, semi_axes_m: ArrayLike, part: Part) -> Mesh:
     longitude = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)[None, :]
     unit = np.stack(
         [
-            np.broadcast_to(np.sin(latitude), (8, 10)), np.cos(latitude) * np.cos(longitude),
+            np.broadcast_to(np.sin(latitude), (8, 10)),
+            np.cos(latitude) * np.cos(longitude),
             np.cos(latitude) * np.sin(longitude),
         ],
         axis=-1,
@@ -218,4 +225,6 @@ def propeller_disc(centre_m: ArrayLike, radius_m: float) -> Mesh:
     k = np.arange(24)
     faces = np.stack([k, (k + 1) % 24, np.full(24, 24)], axis=-1)
     normals = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (25, 1))
-    return Mesh(vertices.astype(np.float32), normals, np.full(25, Part.PROPELLER_DISC, np.uint8), faces.astype(np.int32))
+    return Mesh(
+        vertices.astype(np.float32), normals, np.full(25, Part.PROPELLER_DISC, np.uint8), faces.astype(np.int32)
+    )

@@ -77,15 +77,18 @@ def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int]) -> Scene:
     airframe_id = int(rng.choice(np.asarray(airframe_ids)))
     vertices_m = solid_vertices_m(airframe_id)
     range_m = rng.uniform(*RANGE_M) if rng.random() < 0.5 else np.exp(rng.uniform(*np.log(RANGE_M)))
-    R_ned_body = R_from_euler(
-        _clipped_normal(rng, 25, 75), _clipped_normal(rng, 8, 30), rng.uniform(-np.pi, np.pi))
+    R_ned_body = R_from_euler(_clipped_normal(rng, 25, 75), _clipped_normal(rng, 8, 30), rng.uniform(-np.pi, np.pi))
     los = R_from_euler(0.0, _clipped_normal(rng, 13, 40), rng.uniform(-np.pi, np.pi)) @ np.array([1.0, 0.0, 0.0])
     focal = _lens_for(rng, vertices_m, R_ned_body, los, float(range_m))
     anisotropy = np.exp(rng.normal(0.0, 0.003))
     fx, fy = focal * anisotropy, focal / anisotropy
-    K = np.array([
-        [fx, 0, (FRAME_WIDTH_PX - 1) / 2 + rng.normal(0, 12)], [0, fy, (FRAME_HEIGHT_PX - 1) / 2 + rng.normal(0, 12)],
-        [0, 0, 1]])
+    K = np.array(
+        [
+            [fx, 0, (FRAME_WIDTH_PX - 1) / 2 + rng.normal(0, 12)],
+            [0, fy, (FRAME_HEIGHT_PX - 1) / 2 + rng.normal(0, 12)],
+            [0, 0, 1],
+        ]
+    )
     reach_px = 0.55 * focal * np.linalg.norm(np.ptp(vertices_m, axis=0)) / range_m
     margin = np.minimum([reach_px, reach_px], [0.45 * FRAME_WIDTH_PX, 0.45 * FRAME_HEIGHT_PX])
     pixel = rng.uniform(margin, np.array([FRAME_WIDTH_PX, FRAME_HEIGHT_PX]) - margin)
@@ -147,8 +150,12 @@ def draw_window(
     rendered_px = int(np.clip(round(side), 24, size_px))
     scale = rendered_px / side
     camera = Camera(
-        crop_K(frame.camera.K, x0, y0, scale), rendered_px, rendered_px, frame.camera.R_ned_cam,
-        frame.camera.t_ned_cam_m)
+        crop_K(frame.camera.K, x0, y0, scale),
+        rendered_px,
+        rendered_px,
+        frame.camera.R_ned_cam,
+        frame.camera.t_ned_cam_m,
+    )
     targets = () if empty else frame.targets
     share = visible_share(outline_px(targets[0], camera), rendered_px, rendered_px) if targets else 0.0
     if share == 0.0:

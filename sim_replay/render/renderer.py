@@ -71,19 +71,27 @@ def clip_from_cam(K: Array, x0: int, y0: int, width: int, height: int, near_m: f
     """[4, 4] projection of a crop at (x0, y0): pixel centres at integers, row 0 first in the framebuffer."""
     fx, fy, skew, cx, cy = K[0, 0], K[1, 1], K[0, 1], K[0, 2] - x0, K[1, 2] - y0
     depth = far_m - near_m
-    return np.array([
-        [2 * fx / width, 2 * skew / width, 2 * (cx + 0.5) / width - 1, 0],
-        [0, 2 * fy / height, 2 * (cy + 0.5) / height - 1, 0],
-        [0, 0, (far_m + near_m) / depth, -2 * far_m * near_m / depth],
-        [0, 0, 1, 0],
-    ])
+    return np.array(
+        [
+            [2 * fx / width, 2 * skew / width, 2 * (cx + 0.5) / width - 1, 0],
+            [0, 2 * fy / height, 2 * (cy + 0.5) / height - 1, 0],
+            [0, 0, (far_m + near_m) / depth, -2 * far_m * near_m / depth],
+            [0, 0, 1, 0],
+        ]
+    )
 
 
 def _packed_environment(e: Environment) -> NDArray[np.float32]:
     rows = [
-        [*e.sun_ned, e.cloud_threshold], [*e.sun_colour, e.cloud_softness], [*e.zenith, e.cloud_base_m],
-        [*e.horizon, e.haze_per_m], [*e.cloud, e.cirrus], [*e.ground[0], float(e.ground_kind)],
-        [*e.ground[1], e.field_m], [*e.ground[2], e.ground_turn_rad], [*e.noise_offset, e.cloud_scale_m, e.glow],
+        [*e.sun_ned, e.cloud_threshold],
+        [*e.sun_colour, e.cloud_softness],
+        [*e.zenith, e.cloud_base_m],
+        [*e.horizon, e.haze_per_m],
+        [*e.cloud, e.cirrus],
+        [*e.ground[0], float(e.ground_kind)],
+        [*e.ground[1], e.field_m],
+        [*e.ground[2], e.ground_turn_rad],
+        [*e.noise_offset, e.cloud_scale_m, e.glow],
     ]
     return np.asarray(rows, dtype=np.float32)
 
@@ -92,7 +100,8 @@ def _packed_livery(seed: int) -> NDArray[np.float32]:
     paint = livery_from_seed(seed)
     rows = [[*rgb, paint.gloss] for rgb in paint.palette]
     rows += [
-        [*paint.camouflage, paint.camouflage_share], [*paint.marking, paint.tip_from],
+        [*paint.camouflage, paint.camouflage_share],
+        [*paint.marking, paint.tip_from],
         [paint.band_x, paint.band_width, *paint.noise_offset],
     ]
     return np.asarray(rows, dtype=np.float32)
@@ -114,18 +123,15 @@ class Renderer:
         self.width_px, self.height_px, self.columns, self.rows = width_px, height_px, columns, rows
         # Twice the window: a target that fills it is sampled 2 x 2, a small one up to 4 x 4.
         self._fine_px = max(min(2 * max(width_px, height_px), 2048), width_px, height_px)
-        self._context = moderngl.create_context(standalone=True, backend="egl")
-        source = {name: files("sim_replay").joinpath("shaders", name).read_text() for name in
-                  ("aircraft.vert", "aircraft.frag", "surroundings.vert", "surroundings.frag")}
-        self._aircraft = self._context.program(source["aircraft.vert"], source["aircraft.frag"])
-        self._surroundings = self._context.program(source["surroundings.vert"], source["surroundings.frag"])
+        self._context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
+        self._aircraft = self._program("aircraft")
+        self._surroundings = self._program("surroundings")
         self._fine = self._framebuffer(self._fine_px * columns, self._fine_px * rows, depth=True)
         self._image = self._framebuffer(width_px * columns, height_px * rows, depth=False)
         noise = noise_texture()
         texture = self._context.texture(noise.shape[1::-1], 4, noise.tobytes(), dtype="f2")
         texture.build_mipmaps()
         texture.use(0)
-        self._noise = texture
         for unit, attachment in enumerate(self._fine.color_attachments, start=1):
             attachment.use(unit)
         self._aircraft["noise"].value = 0
@@ -140,12 +146,16 @@ class Renderer:
         """Scenes that one call of `draw` takes."""
         return self.columns * self.rows
 
+    def _program(self, name: str) -> Any:
+        folder = files("sim_replay").joinpath("shaders")
+        stages = (folder.joinpath(f"{name}.{kind}").read_text(encoding="utf-8") for kind in ("vert", "frag"))
+        return self._context.program(*stages)
+
     def _framebuffer(self, width: int, height: int, depth: bool) -> Any:
         textures = [self._context.texture((width, height), 4, dtype=dtype) for dtype in ("f1", "f2")]
         for texture in textures:
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        return self._context.framebuffer(
-            textures, self._context.depth_renderbuffer((width, height)) if depth else None)
+        return self._context.framebuffer(textures, self._context.depth_renderbuffer((width, height)) if depth else None)
 
     def _mesh(self, airframe_id: int) -> Any:
         if airframe_id not in self._meshes:
@@ -155,28 +165,39 @@ class Renderer:
             order = np.argsort(mesh.part[mesh.faces[:, 0]] == Part.PROPELLER_DISC, kind="stable")
             self._meshes[airframe_id] = self._context.vertex_array(
                 self._aircraft,
-                [(self._context.buffer(vertex.astype(np.float32).tobytes()), "3f 3f 1f",
-                  "in_position", "in_normal", "in_part")],
-                self._context.buffer(mesh.faces[order].astype(np.int32).tobytes()))
+                [
+                    (
+                        self._context.buffer(vertex.astype(np.float32).tobytes()),
+                        "3f 3f 1f",
+                        "in_position",
+                        "in_normal",
+                        "in_part",
+                    )
+                ],
+                self._context.buffer(mesh.faces[order].astype(np.int32).tobytes()),
+            )
         return self._meshes[airframe_id]
 
     def draw(self, scenes: Sequence[Scene]) -> Rendered:
         """Up to `capacity` scenes; pixels beyond a scene's own width and height are undefined."""
         if len(scenes) > self.capacity:
             raise ValueError(f"{len(scenes)} scenes do not fit {self.capacity} tiles")
-        self._fine.use()
-        self._fine.clear()
-        self._context.enable_only(moderngl.DEPTH_TEST)
-        crops = [self._draw_targets(k, scene) for k, scene in enumerate(scenes)]
-        self._image.use()
-        self._context.enable_only(moderngl.NOTHING)
-        for k, (scene, (crop, samples)) in enumerate(zip(scenes, crops, strict=True)):
-            self._draw_surroundings(k, scene, crop, samples)
-        colour = self._tiles(self._image.read(components=4, attachment=0, dtype="f1"), np.dtype(np.uint8))[: len(scenes)]
-        place = self._tiles(self._image.read(components=4, attachment=1, dtype="f2"), np.dtype(np.float16))[: len(scenes)]
+        # A process may hold several renderers, each with a context of its own.
+        with self._context:
+            self._fine.use()
+            self._fine.clear()
+            self._context.enable_only(moderngl.DEPTH_TEST)
+            crops = [self._draw_targets(k, scene) for k, scene in enumerate(scenes)]
+            self._image.use()
+            self._context.enable_only(moderngl.NOTHING)
+            for k, (scene, (crop, samples)) in enumerate(zip(scenes, crops, strict=True)):
+                self._draw_surroundings(k, scene, crop, samples)
+            colour = self._tiles(0, "f1", np.dtype(np.uint8))[: len(scenes)]
+            place = self._tiles(1, "f2", np.dtype(np.float16))[: len(scenes)]
         return Rendered(colour[..., :3], colour[..., 3], place[..., :3], (place[..., 3] + 0.5).astype(np.uint8))
 
-    def _tiles(self, raw: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
+    def _tiles(self, attachment: int, kind: str, dtype: np.dtype[Any]) -> NDArray[Any]:
+        raw = self._image.read(components=4, attachment=attachment, dtype=kind)
         grid = np.frombuffer(raw, dtype=dtype).reshape(self.rows, self.height_px, self.columns, self.width_px, 4)
         return grid.swapaxes(1, 2).reshape(self.capacity, self.height_px, self.width_px, 4)
 
@@ -214,8 +235,14 @@ class Renderer:
         cam_from_body = np.eye(4)
         cam_from_body[:3, :3], cam_from_body[:3, 3] = R_cam_body, t_cam_body_m
         projection = clip_from_cam(
-            camera.K, crop[0], crop[1], crop[2] - crop[0], crop[3] - crop[1],
-            t_cam_body_m[2] - diameter_m, t_cam_body_m[2] + diameter_m)
+            camera.K,
+            crop[0],
+            crop[1],
+            crop[2] - crop[0],
+            crop[3] - crop[1],
+            t_cam_body_m[2] - diameter_m,
+            t_cam_body_m[2] + diameter_m,
+        )
         program = self._aircraft
         program["clip_from_body"].write(_columns(projection @ cam_from_body))
         program["ned_from_body"].write(_columns(target.R_ned_body))

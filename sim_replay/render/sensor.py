@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,15 +52,13 @@ def _motion_kernel(motion_px: tuple[float, float]) -> NDArray[np.float32] | None
         x, y = half + t * motion_px[0], half + t * motion_px[1]
         i, j = int(y), int(x)
         fy, fx = y - i, x - j
-        kernel[i:i + 2, j:j + 2] += np.outer([1 - fy, fy], [1 - fx, fx]).astype(np.float32)
+        kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx]).astype(np.float32)
     return kernel / kernel.sum()
 
 
-def exposed(
-    image_bgr: NDArray[np.uint8], sensor: Sensor, scale: float, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def exposed(image_bgr: NDArray[np.uint8], sensor: Sensor, scale: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """The picture [H, W, 3] as this camera would deliver it; `scale` is picture pixels per native pixel, at most 1."""
-    image = image_bgr.astype(np.float32) * np.float32(1 / 255)
+    image: Any = image_bgr.astype(np.float32) * np.float32(1 / 255)
     sigma = sensor.blur_sigma_px * scale
     if sigma > 0.2:
         image = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
@@ -87,14 +86,24 @@ def _bird(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
     span = rng.uniform(3.0, 0.22 * side)
     flap, turn = rng.uniform(-0.5, 0.5), rng.uniform(0, 2 * np.pi)
     chord, bend = rng.uniform(0.08, 0.2), rng.uniform(0.0, 0.25)
-    outline = np.array([
-        [-0.5, flap - 0.02], [-0.2, bend * flap - chord / 2], [0, -0.35 * chord], [0.2, bend * flap - chord / 2],
-        [0.5, flap - 0.02], [0.22, bend * flap + chord / 2], [0.03, chord], [-0.03, chord], [-0.22, bend * flap + chord / 2],
-    ])
+    elbow = bend * flap
+    outline = np.array(
+        [
+            [-0.5, flap - 0.02],
+            [-0.2, elbow - chord / 2],
+            [0, -0.35 * chord],
+            [0.2, elbow - chord / 2],
+            [0.5, flap - 0.02],
+            [0.22, elbow + chord / 2],
+            [0.03, chord],
+            [-0.03, chord],
+            [-0.22, elbow + chord / 2],
+        ]
+    )
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     points = span * outline @ rotation.T + rng.uniform(0, side, 2)
     cv2.fillPoly(alpha, [np.round(points * 16).astype(np.int32)], 255, cv2.LINE_AA, shift=4)
-    return alpha.astype(np.float32) / 255
+    return np.asarray(alpha.astype(np.float32) / 255, np.float32)
 
 
 def _blob(rng: np.random.Generator, side: int, radius: tuple[float, float]) -> NDArray[np.float32]:
@@ -120,6 +129,6 @@ def add_distractors(
             alpha, level = _blob(rng, side, (0.6, 2.5)), rng.uniform(0, 255) * np.ones(3)
         else:
             alpha, level = 0.7 * _blob(rng, side, (0.03 * side, 0.2 * side)), rng.uniform(140, 235) * np.ones(3)
-        alpha = (alpha * behind)[..., None]
-        image += alpha * (level.astype(np.float32) - image)
+        seen = (alpha * behind)[..., None]
+        image += seen * (level.astype(np.float32) - image)
     return np.clip(image, 0, 255).astype(np.uint8)
