@@ -108,17 +108,19 @@ class WindowSampler:
         if self._renderer is None:
             self._renderer = Renderer(self.size_px, self.size_px, *TILES)
         out = _labels_blank(count, self.size_px, self.size_px)
-        for start in range(0, count, self._renderer.capacity):
-            windows = [
-                draw_window(
-                    self.seed, first_index + k, self.size_px, self.airframe_ids, self.acquire_share, self.empty_share
-                )
-                for k in range(start, min(start + self._renderer.capacity, count))
-            ]
-            rendered = self._renderer.draw([window.scene for window in windows])
+        index, stop = first_index, first_index + count
+        while index < stop:
+            tile = index % self._renderer.capacity
+            chunk = range(index, min(stop, index + self._renderer.capacity - tile))
+            windows = [self._window(i) for i in chunk]
+            rendered = self._renderer.draw([window.scene for window in windows], tile)
             for k, window in enumerate(windows):
-                self._finish(out, start + k, window, rendered, k)
+                self._finish(out, index - first_index + k, window, rendered, k)
+            index = chunk.stop
         return SampleBatch(**out)
+
+    def _window(self, index: int) -> Window:
+        return draw_window(self.seed, index, self.size_px, self.airframe_ids, self.acquire_share, self.empty_share)
 
     def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:
         side, size = window.scene.camera.width_px, self.size_px

@@ -148,8 +148,8 @@ class Renderer:
 
     def _program(self, name: str) -> Any:
         folder = files("sim_replay").joinpath("shaders")
-        stages = (folder.joinpath(f"{name}.{kind}").read_text(encoding="utf-8") for kind in ("vert", "frag"))
-        return self._context.program(*stages)
+        vertex, fragment = (folder.joinpath(f"{name}.{kind}").read_text(encoding="utf-8") for kind in ("vert", "frag"))
+        return self._context.program(vertex, fragment)
 
     def _framebuffer(self, width: int, height: int, depth: bool) -> Any:
         textures = [self._context.texture((width, height), 4, dtype=dtype) for dtype in ("f1", "f2")]
@@ -178,22 +178,26 @@ class Renderer:
             )
         return self._meshes[airframe_id]
 
-    def draw(self, scenes: Sequence[Scene]) -> Rendered:
-        """Up to `capacity` scenes; pixels beyond a scene's own width and height are undefined."""
-        if len(scenes) > self.capacity:
-            raise ValueError(f"{len(scenes)} scenes do not fit {self.capacity} tiles")
+    def draw(self, scenes: Sequence[Scene], first_tile: int = 0) -> Rendered:
+        """Scenes in the tiles from `first_tile` on; pixels beyond a scene's own width and height are undefined.
+
+        Interpolation rounds by a tile's place, so only the same tile gives the same coordinates to the last bit.
+        """
+        stop = first_tile + len(scenes)
+        if stop > self.capacity:
+            raise ValueError(f"{len(scenes)} scenes from tile {first_tile} do not fit {self.capacity} tiles")
         # A process may hold several renderers, each with a context of its own.
         with self._context:
             self._fine.use()
             self._fine.clear()
             self._context.enable_only(moderngl.DEPTH_TEST)
-            crops = [self._draw_targets(k, scene) for k, scene in enumerate(scenes)]
+            crops = [self._draw_targets(k, scene) for k, scene in enumerate(scenes, first_tile)]
             self._image.use()
             self._context.enable_only(moderngl.NOTHING)
-            for k, (scene, (crop, samples)) in enumerate(zip(scenes, crops, strict=True)):
+            for k, (scene, (crop, samples)) in enumerate(zip(scenes, crops, strict=True), first_tile):
                 self._draw_surroundings(k, scene, crop, samples)
-            colour = self._tiles(0, "f1", np.dtype(np.uint8))[: len(scenes)]
-            place = self._tiles(1, "f2", np.dtype(np.float16))[: len(scenes)]
+            colour = self._tiles(0, "f1", np.dtype(np.uint8))[first_tile:stop]
+            place = self._tiles(1, "f2", np.dtype(np.float16))[first_tile:stop]
         return Rendered(colour[..., :3], colour[..., 3], place[..., :3], (place[..., 3] + 0.5).astype(np.uint8))
 
     def _tiles(self, attachment: int, kind: str, dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -222,6 +226,7 @@ class Renderer:
         corner = (tile % self.columns * self._fine_px, tile // self.columns * self._fine_px)
         self._fine.viewport = (*corner, width * samples, height * samples)
         _write_rows(self._aircraft["environment"], _packed_environment(scene.environment))
+        self._aircraft["corner"].value = corner
         for number, target in enumerate(scene.targets, start=1):
             self._draw_target(target, scene.camera, crop, number)
         return crop, samples

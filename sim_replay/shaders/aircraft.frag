@@ -6,6 +6,7 @@ uniform vec4 livery[11];       // 0-7 palette and gloss; 8 camouflage, share; 9 
 uniform mat3 ned_from_body;
 uniform vec3 camera_body_m;
 uniform vec4 extent;           // 1/diameter, half span m, length m, target number
+uniform ivec2 corner;          // of this crop in the supersampled buffer
 in vec3 body_m;
 in vec3 normal_ned;
 flat in int part;
@@ -29,7 +30,7 @@ vec3 paint() {
 void main() {
     if (part == PROPELLER_DISC) {
         // Screen-door: a turning propeller leaves about an eighth of its disc, less than half of any pixel.
-        float hash = fract(52.9829189 * fract(dot(floor(gl_FragCoord.xy), vec2(0.06711056, 0.00583715))));
+        float hash = fract(52.9829189 * fract(dot(floor(gl_FragCoord.xy) - vec2(corner), vec2(0.06711056, 0.00583715))));
         if (hash > 0.13) discard;
     }
     vec3 to_camera = camera_body_m - body_m;
