@@ -32,7 +32,7 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
     return {
         "seed": config.data.seed,
         "commit": _commit(),
-        "torch": torch.__version__,
+        "torch": str(torch.__version__),
         "numpy": np.__version__,
         "python": platform.python_version(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),

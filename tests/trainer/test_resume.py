@@ -74,6 +74,6 @@ def test_a_run_is_not_overwritten_and_another_config_is_refused(tmp_path: Path) 
     with pytest.raises(ConfigError, match="--resume"):
         train(tmp_path / "run", 1)
     other = TINY.replace("mask = 1.0", "mask = 2.0")
+    config = parse_config(other, "other.toml")
     with pytest.raises(ConfigError, match=r"resume\.pt: has another configuration"):
-        config = parse_config(other, "other.toml")
         run_training(config, other, tmp_path / "run", resume=True, open_sampler=synthetic_sampler.opener)

@@ -1,0 +1,126 @@
+"""ONNX graphs: write a network as one, quantise it, run it, and read and write the contract it carries."""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import torch
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+from msgs.contract import INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
+from trainer.backbones import fuse_branches
+from trainer.config import ConfigError
+from trainer.data import TrainingBatch
+from trainer.evaluate import Predictions, Predictor
+from trainer.model import PoseNet
+
+OPSET = 17
+QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
+# Soft-argmax, ray, sampling, depth and rotation stay in float, and so does the last layer of each head.
+QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/")
+
+
+def write_graph(model: PoseNet, path: Path) -> None:
+    """The network as ONNX with msgs.contract's inputs and outputs; N, H and W are free."""
+    image = torch.randint(0, 255, (2, 128, 192, 3), dtype=torch.uint8)
+    K = torch.tensor([[900.0, 0, 96], [0, 900, 64], [0, 0, 1]]).repeat(2, 1, 1)
+    free = {"image": {0: "N", 1: "H", 2: "W"}, "K": {0: "N"}, **{name: {0: "N"} for name in OUTPUT_NAMES}}
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # the tracer warns of shapes that it does trace
+        torch.onnx.export(
+            fuse_branches(model),
+            (image, K),
+            str(path),
+            input_names=list(INPUT_NAMES),
+            output_names=list(OUTPUT_NAMES),
+            dynamic_axes=free,
+            opset_version=OPSET,
+            dynamo=False,
+        )
+
+
+class _Batches(CalibrationDataReader):
+    """Calibration inputs, one image at a time."""
+
+    def __init__(self, batches: list[TrainingBatch]) -> None:
+        self._inputs = self._each(batches)
+
+    @staticmethod
+    def _each(batches: list[TrainingBatch]) -> Iterator[dict[str, np.ndarray]]:
+        for batch in batches:
+            for image, K in zip(batch.image_bgr, batch.K, strict=True):
+                yield {"image": image[None], "K": K[None]}
+
+    def get_next(self) -> dict[str, np.ndarray] | None:
+        return next(self._inputs, None)
+
+
+def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
+    """Static INT8: QDQ, U8 activations, S8 weights for each channel, calibrated on `calibration`."""
+    with tempfile.TemporaryDirectory() as folder:
+        prepared = Path(folder) / "prepared.onnx"
+        quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
+        graph = onnx.load(str(prepared)).graph
+        nodes = [n.name for n in graph.node if n.op_type in QUANTISED_OPS and n.name.startswith(QUANTISED_PARTS)]
+        quantize_static(
+            str(prepared),
+            str(destination),
+            _Batches(calibration),
+            quant_format=QuantFormat.QDQ,
+            op_types_to_quantize=QUANTISED_OPS,
+            nodes_to_quantize=nodes,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            calibrate_method=CalibrationMethod.MinMax,
+            extra_options={"QDQKeepRemovableActivations": False},
+        )
+
+
+def write_contract(path: Path, contract: ModelContract) -> None:
+    """Put the contract into the model file's metadata."""
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
+    onnx.save(model, str(path))
+
+
+def read_contract(path: Path) -> ModelContract:
+    """The contract a model file carries. Raises ConfigError naming the file."""
+    metadata = open_session(path).get_modelmeta().custom_metadata_map
+    if METADATA_KEY not in metadata:
+        raise ConfigError(f"{path}: carries no {METADATA_KEY}: not a model of this program")
+    try:
+        return ModelContract.model_validate_json(metadata[METADATA_KEY])
+    except ValueError as error:
+        raise ConfigError(f"{path}: {METADATA_KEY}: {error}") from None
+
+
+def open_session(path: Path, threads: int = 2) -> ort.InferenceSession:
+    """An ONNX Runtime session on the CPU. Raises ConfigError when the file is no model."""
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such model file")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise ConfigError(f"{path}: ONNX Runtime cannot load it: {str(error).splitlines()[0]}") from None
+
+
+def onnx_predictor(path: Path) -> Predictor:
+    """A predictor that runs a model file in ONNX Runtime."""
+    session = open_session(path)
+
+    def predict(image_bgr: np.ndarray, K: np.ndarray) -> Predictions:
+        outputs = session.run(list(OUTPUT_NAMES), {"image": image_bgr, "K": K})
+        return Predictions(*(value[:, 0] for value in outputs))
+
+    return predict
