@@ -91,8 +91,8 @@ def read_calibration(path: Path) -> Intrinsics:
         size_wh = (int(storage.getNode("image_width").real()), int(storage.getNode("image_height").real()))
         K = _matrix(storage.getNode("camera_matrix"))
         distortion = _matrix(storage.getNode("distortion_coefficients"))
-    except cv2.error as error:
-        raise InputError(f"calibration {path} is not valid YAML: {error.err}", INTRINSICS_KEY) from error
+    except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
+        raise InputError(f"calibration {path} is not valid YAML", INTRINSICS_KEY) from error
     if min(size_wh) <= 0:
         raise InputError(f"calibration {path} has no image_width and image_height", INTRINSICS_KEY)
     if K.size != 9 or not np.all(np.isfinite(K)) or K[0] <= 0 or K[4] <= 0:

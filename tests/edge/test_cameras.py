@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+import http.server
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.cameras.capture import Capture
+from edge.cameras.file import FileSource
+from edge.cameras.intrinsics import Intrinsics, Undistorter
+from edge.cameras.live import LiveSource, exposure_ns
+from edge.cameras.reconnect import LONGEST_WAIT_NS, LinkState, Reconnect
+from edge.cameras.sequence import SequenceSource
+from edge.cameras.source import EndOfStream
+from edge.config import FileCamera, IntrinsicsSettings, SequenceCamera, StreamCamera
+from edge.errors import InputError
+from edge.types import Frame
+
+from .toy_scene import write_scene
+
+VIDEO_WH = (320, 180)
+INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=VIDEO_WH[0], height=VIDEO_WH[1])
+
+
+def play(source: SequenceSource | FileSource | LiveSource) -> list[Frame]:
+    """Every frame until the end, as a reader gets it that is always in time."""
+    frames = []
+    with closing(source):
+        source.open()
+        try:
+            while True:
+                frames.append(source.read(threading.Event()))
+        except EndOfStream:
+            return frames
+
+
+def write_video(path: Path, frames: int, fps: float) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, VIDEO_WH)
+    for index in range(frames):
+        writer.write(np.full((VIDEO_WH[1], VIDEO_WH[0], 3), 10 * index, np.uint8))
+    writer.release()
+    return path
+
+
+def test_a_sequence_hands_over_each_frame_at_its_exposure_and_not_before(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "000001", frames=6)
+    start_ns = time.monotonic_ns() + 300_000_000
+    frames = play(SequenceSource(SequenceCamera(type="sequence", path=scene, fps=20, start_at_ns=start_ns)))
+    assert [frame.meta.capture_ns for frame in frames] == [start_ns + 50_000_000 * k for k in range(6)]
+    assert [frame.meta.sequence for frame in frames] == list(range(6))
+    assert all(frame.meta.arrival_ns >= frame.meta.capture_ns for frame in frames)
+    left_edges = [int(np.argmax(frame.image_bgr.any(axis=(0, 2)))) for frame in frames]
+    assert np.diff(left_edges).tolist() == [8] * 5  # each picture once, in order
+
+
+def test_a_sequence_entered_late_begins_where_a_camera_would_be(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "000001", frames=6)
+    start_ns = time.monotonic_ns() - 1_100_000_000
+    capture = Capture(SequenceSource(SequenceCamera(type="sequence", path=scene, fps=4, start_at_ns=start_ns)), False)
+    capture.start()
+    frame = capture.newest(5.0)
+    capture.stop()
+    assert frame is not None
+    assert frame.meta.sequence >= 4
+    assert capture.counters()["dropped"] == frame.meta.sequence
+
+
+def test_a_looping_sequence_goes_on_in_time(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "000001", frames=3)
+    source = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=20, loop=True))
+    with closing(source):
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(5)]
+    np.testing.assert_array_equal(frames[0].image_bgr, frames[3].image_bgr)
+    assert frames[3].meta.capture_ns - frames[0].meta.capture_ns == 150_000_000
+
+
+def test_a_slow_reader_gets_the_newest_frame_and_every_drop_is_counted(scene: Path) -> None:
+    capture = Capture(SequenceSource(SequenceCamera(type="sequence", path=scene, fps=60)), False)
+    capture.start()
+    taken = []
+    while not taken or taken[-1] < 39:
+        frame = capture.newest(5.0)
+        assert frame is not None
+        taken.append(frame.meta.sequence)
+        threading.Event().wait(0.1)  # a reader six times too slow
+    with pytest.raises(EndOfStream):
+        capture.newest(5.0)
+    capture.stop()
+    assert len(taken) <= 10
+    assert np.diff(taken).min() >= 1
+    assert capture.counters()["dropped"] == 40 - len(taken)
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (lambda folder: (folder / "scene_camera.json").unlink(), "scene_camera.json"),
+        (lambda folder: (folder / "scene_camera.json").write_text('{"0": {}}'), "scene_camera.json"),
+        (lambda folder: (folder / "scene_camera.json").write_text("{}"), "scene_camera.json"),
+        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(b"junk"), "000000.png"),
+    ],
+)
+def test_a_damaged_scene_names_the_file(tmp_path: Path, damage: object, named: str) -> None:
+    folder = write_scene(tmp_path / "000001", frames=1)
+    assert callable(damage)
+    damage(folder)
+    with pytest.raises(InputError, match=named):
+        SequenceSource(SequenceCamera(type="sequence", path=folder)).open()
+
+
+def test_a_video_plays_at_its_own_rate(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "flight.mp4", frames=8, fps=20)
+    frames = play(FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS)))
+    steps_ns = np.diff([frame.meta.capture_ns for frame in frames])
+    assert [frame.meta.sequence for frame in frames] == list(range(8))
+    np.testing.assert_allclose(steps_ns, 50e6, atol=1)
+    assert [round(float(frame.image_bgr.mean()) / 10) for frame in frames] == list(range(8))
+
+
+@contextmanager
+def streaming(folder: Path, port: int = 0) -> Iterator[int]:
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", port), handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+    thread.start()
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends(tmp_path: Path) -> None:
+    write_video(tmp_path / "live.mp4", frames=5, fps=30)
+    with streaming(tmp_path) as port:
+        pass  # the port is known, and nobody answers on it
+    settings = StreamCamera(type="stream", url=f"http://127.0.0.1:{port}/live.mp4", intrinsics=INTRINSICS)
+    capture = Capture(LiveSource(settings), False)
+    capture.start()
+    try:
+        assert capture.newest(0.3) is None
+        with streaming(tmp_path, port):
+            last = capture.newest(10.0)
+            assert last is not None
+            while last.meta.sequence < 8:  # more than the stream's five frames: it was opened again
+                newer = capture.newest(10.0)
+                assert newer is not None
+                assert newer.meta.sequence > last.meta.sequence
+                last = newer
+    finally:
+        capture.stop()
+    assert capture.counters()["reconnects"] >= 2
+
+
+@given(st.lists(st.sampled_from(["lost", "delivered"]), max_size=30))
+def test_waits_between_tries_grow_to_a_cap_and_a_frame_forgives(events: list[str]) -> None:
+    link, wait_before_ns = Reconnect(), 0
+    for now_ns, event in enumerate(events):
+        if event == "delivered":
+            link, wait_before_ns = link.delivered(), 0
+            assert link.state is LinkState.STREAMING
+        else:
+            link = link.lost(now_ns)
+            wait_ns = link.retry_at_ns - now_ns
+            assert link.state is LinkState.CLOSED
+            assert wait_ns == (min(2 * wait_before_ns, LONGEST_WAIT_NS) if wait_before_ns else 250_000_000)
+            wait_before_ns = wait_ns
+
+
+def test_a_drivers_stamp_is_used_only_where_it_is_plausible() -> None:
+    now_ns = 5_000_000_000_000
+    assert exposure_ns(now_ns, now_ns / 1e6 - 20.0, 0) == now_ns - 20_000_000
+    assert exposure_ns(now_ns, 0.0, 7_000_000) == now_ns - 7_000_000  # no stamp
+    assert exposure_ns(now_ns, 1.7e12, 0) == now_ns  # another clock's
+
+
+@given(
+    st.integers(1, 8),
+    st.integers(1, 8),
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+)
+def test_scaled_intrinsics_see_the_same_ray_through_the_same_spot(up: int, down: int, ray: tuple[float, float]) -> None:
+    small = Intrinsics(np.array([[700.0, 0, 310.25], [0, 705.0, 250.5], [0, 0, 1.0]]), (640, 480))
+    large = small.scaled_to((640 * up, 480 * up)).scaled_to((80 * down, 60 * down))
+    scale = 80 * down / 640
+    point = small.K @ [*ray, 1.0]
+    np.testing.assert_allclose((large.K @ [*ray, 1.0])[:2], (point[:2] + 0.5) * scale - 0.5, atol=1e-9)
+
+
+def test_undistorted_pixels_lie_where_the_pinhole_puts_them() -> None:
+    lens = Intrinsics(np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1.0]]), (640, 480), (-0.2, 0.05, 0, 0))
+    point = np.array([[[0.45, -0.3, 1.0]]])
+    distorted, _ = cv2.projectPoints(point, np.zeros(3), np.zeros(3), lens.K, np.array(lens.distortion))
+    image = np.zeros((480, 640, 3), np.uint8)
+    cv2.circle(image, tuple(round(c * 16) for c in distorted.ravel()), 4 * 16, (255,) * 3, -1, cv2.LINE_AA, 4)
+    weights = Undistorter(lens)(image)[..., 0].astype(float)
+    rows, columns = np.indices(weights.shape)
+    seen = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+    np.testing.assert_allclose(seen, (lens.K @ point.ravel())[:2], atol=0.2)
+    assert np.linalg.norm(distorted.ravel() - seen) > 10  # there was something to take out
+
+
+def test_a_frame_of_another_size_than_the_intrinsics_is_refused(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "flight.mp4", frames=2, fps=20)
+    other = IntrinsicsSettings(fx=300, fy=300, cx=1, cy=1, width=640, height=480)
+    source = FileSource(FileCamera(type="file", path=path, intrinsics=other))
+    with pytest.raises(InputError, match=f"640x480.*{VIDEO_WH[0]}x{VIDEO_WH[1]}"):
+        source.open()

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.cameras.intrinsics import read_calibration
+from edge.config import load_config
+from edge.errors import InputError
+
+CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "config.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (CAMERA + "fps = -3", "config.toml:4: [camera] fps: Input should be greater than 0"),
+        (CAMERA + "[zenoh]\nlisten_on = 3", "config.toml:5: [zenoh] listen_on: unknown key"),
+        ("[vehicle]\nname = 'uav1'", "config.toml: [camera]: is missing"),
+        ("[camera]\npath = 'x'", "config.toml:1: [camera]: needs type = one of"),
+        ("[camera]\ntype = 'film'", "config.toml:1: [camera]: type must be one of"),
+        ("[camera]\ntype = 'file'\npath = 'x.mp4'", "config.toml:1: [camera] intrinsics: is missing"),
+        (CAMERA + "[camera.intrinsics]\nfx = 1000", "config.toml:4: [camera] intrinsics: needs file, or all of"),
+        (CAMERA + "[mavlink]\nendpoints = ['udpin:1.2.3.4:14550', 'tcp:1']", "config.toml:5: [mavlink] endpoints[1]: "),
+        (CAMERA + "[mount]\nR_body_cam = [[1,0,0],[0,1,0],[0,0,-1]]", "[mount]: R_body_cam is not a rotation"),
+        (CAMERA + "[mount]\nyaw_deg = 3\nR_body_cam = [[1,0,0],[0,1,0],[0,0,1]]", "[mount]: give either the angles or"),
+        ("[camera\n", "config.toml: not valid TOML: "),
+    ],
+)
+def test_a_fault_is_told_with_file_line_and_key(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(InputError) as error:
+        load_config(write(tmp_path, text))
+    assert sentence in str(error.value)
+
+
+def test_every_fault_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        load_config(write(tmp_path, CAMERA + "fps = 0\n[model]\nthreads = 0\n"))
+    assert [line.split(": ")[1] for line in str(error.value).splitlines()] == ["[camera] fps", "[model] threads"]
+
+
+def test_paths_are_taken_from_the_folder_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/")
+    config = load_config(write(tmp_path, CAMERA)).config
+    assert config.camera.type == "sequence"
+    assert config.camera.path == tmp_path / "scene"
+
+
+@pytest.mark.parametrize(
+    ("angles", "axis_cam", "axis_body"),
+    [
+        ("", (0, 0, 1), (1, 0, 0)),  # it looks along the nose,
+        ("", (1, 0, 0), (0, 1, 0)),  # its right is the vehicle's right
+        ("yaw_deg = 90", (0, 0, 1), (0, 1, 0)),  # turned to the right
+        ("pitch_deg = -90", (0, 0, 1), (0, 0, 1)),  # looking down
+        ("roll_deg = 90", (1, 0, 0), (0, 0, 1)),  # its right side down
+    ],
+)
+def test_mount_angles_turn_the_camera_as_described(
+    tmp_path: Path, angles: str, axis_cam: tuple[int, ...], axis_body: tuple[int, ...]
+) -> None:
+    mount = load_config(write(tmp_path, CAMERA + "[mount]\n" + angles)).config.mount.mount()
+    np.testing.assert_allclose(mount.R_body_cam @ np.array(axis_cam), axis_body, atol=1e-12)
+
+
+@given(st.floats(0.5, 0.999), st.integers(0, 2))
+def test_a_written_matrix_becomes_exactly_orthonormal(noise: float, axis: int) -> None:
+    from edge.config import MountSettings
+
+    R = np.eye(3)
+    R[axis, (axis + 1) % 3] = 4e-4 * noise  # as a person rounds it
+    mount = MountSettings(R_body_cam=R.tolist()).mount()
+    np.testing.assert_allclose(mount.R_body_cam @ mount.R_body_cam.T, np.eye(3), atol=1e-12)
+
+
+ROS_CALIBRATION = """\
+image_width: 1280
+image_height: 720
+camera_name: nose
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [1100.5, 0.0, 640.25, 0.0, 1101.0, 359.75, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.1, 0.02, 0.001, -0.002, 0.0]
+"""
+OPENCV_CALIBRATION = """\
+%YAML:1.0
+---
+image_width: 1280
+image_height: 720
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1100.5, 0., 640.25, 0., 1101., 359.75, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ -0.1, 0.02, 0.001, -0.002, 0. ]
+"""
+
+
+@pytest.mark.parametrize("text", [ROS_CALIBRATION, OPENCV_CALIBRATION], ids=["ros", "opencv"])
+def test_calibrations_of_ros_and_opencv_are_read(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "nose.yaml"
+    path.write_text(text)
+    intrinsics = read_calibration(path)
+    assert intrinsics.image_size_wh == (1280, 720)
+    assert intrinsics.K.tolist() == [[1100.5, 0, 640.25], [0, 1101.0, 359.75], [0, 0, 1]]
+    assert intrinsics.distortion == (-0.1, 0.02, 0.001, -0.002, 0.0)
+
+
+@pytest.mark.parametrize("text", ["", "image_width: 10\n", "{[", ROS_CALIBRATION.replace("1100.5", "-3")])
+def test_a_broken_calibration_is_told(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "nose.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"nose\.yaml"):
+        read_calibration(path)

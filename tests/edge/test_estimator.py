@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from edge.errors import InputError
+from edge.estimator.decode import decode, overlap, pose_covariance
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import Peaks, load_model
+from edge.estimator.window import PixelMap, cut, fit_frame, window_around
+from edge.types import Frame, FrameMeta
+from msgs.contract import ModelContract
+
+from .toy_model import CONTRACT, GRAPH, write_toy_model
+from .toy_scene import SIZE_WH, TARGET_WH, K, draw, true_t_cam_target_m
+
+TRACK_WH = (256, 256)
+boxes = st.tuples(st.floats(-50, 1900), st.floats(-50, 1060), st.floats(4, 700), st.floats(4, 500)).map(
+    lambda b: np.array([b[0], b[1], b[0] + b[2], b[1] + b[3]])
+)
+points = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(60, 500)).map(np.array)
+
+
+def frame_of(image: np.ndarray) -> Frame:
+    return Frame(FrameMeta(0, 0, 0), image, K)
+
+
+def project(K_px: np.ndarray, point_m: np.ndarray) -> np.ndarray:
+    return (K_px @ point_m)[:2] / point_m[2]
+
+
+@given(boxes, points)
+def test_a_window_is_the_same_camera_with_other_pixels(box: np.ndarray, point_m: np.ndarray) -> None:
+    pixel_map = window_around(box, 2.0, TRACK_WH, SIZE_WH).pixel_map(TRACK_WH)
+    on_network = project(pixel_map.intrinsics(K), point_m)
+    np.testing.assert_allclose(pixel_map.to_frame(on_network), project(K, point_m), atol=0.01)
+    np.testing.assert_allclose(on_network, pixel_map.to_network(project(K, point_m)), atol=0.01)
+
+
+@given(boxes)
+def test_a_window_holds_its_box_and_stays_in_the_frame_where_it_fits(box: np.ndarray) -> None:
+    window = window_around(box, 2.0, TRACK_WH, SIZE_WH)
+    box_in_frame = np.clip(box, 0, [1919, 1079, 1919, 1079])
+    assume(np.all(box_in_frame == box))
+    for start, length, limit, low, high in (
+        (window.left, window.width, SIZE_WH[0], box[0], box[2]),
+        (window.top, window.height, SIZE_WH[1], box[1], box[3]),
+    ):
+        assert start - 0.5 <= low
+        assert high <= start + length - 0.5
+        if length <= limit:
+            assert start >= 0
+            assert start + length <= limit
+
+
+@pytest.mark.parametrize("fit", ["letterbox", "squash"])
+@pytest.mark.parametrize("size_wh", [(640, 384), (640, 640)])
+def test_a_fitted_frame_shows_a_target_where_its_map_says(fit: str, size_wh: tuple[int, int]) -> None:
+    center = (1500.5, 300.5)
+    image, pixel_map = fit_frame(draw(center), size_wh, fit)  # type: ignore[arg-type]
+    weights = image[..., 0].astype(float)
+    rows, columns = np.indices(weights.shape)
+    seen = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+    np.testing.assert_allclose(seen, pixel_map.to_network(center), atol=0.02)
+    if fit == "letterbox":
+        assert pixel_map.scale_xy[0] == pytest.approx(pixel_map.scale_xy[1], rel=0.01)
+
+
+@pytest.mark.parametrize("center", [(900.5, 500.5), (70.5, 40.5), (1850.5, 1040.5)])
+def test_a_cut_window_shows_a_target_where_its_map_says(center: tuple[float, float]) -> None:
+    box = np.array([center[0] - 60, center[1] - 30, center[0] + 60, center[1] + 30])
+    window = window_around(box, 2.0, TRACK_WH, SIZE_WH)
+    weights = cut(draw(center), window, TRACK_WH)[..., 0].astype(float)
+    rows, columns = np.indices(weights.shape)
+    seen = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+    np.testing.assert_allclose(seen, window.pixel_map(TRACK_WH).to_network(center), atol=0.05)
+
+
+@given(points, st.floats(0.1, 3), st.floats(0.1, 3), st.floats(0.01, 0.2))
+def test_covariance_is_what_sampling_the_uncertainty_gives(t_m: np.ndarray, su: float, sv: float, slz: float) -> None:
+    sigma = np.array([su, sv, slz, 0.1, 0.2, 0.3])
+    covariance = pose_covariance(t_m, sigma, K, (50.0, 600.0))
+    # Derivatives of t = Z K^-1 [u, v, 1] by central differences, as an independent way to the same matrix.
+    u, v = project(K, t_m)
+
+    def t_of(du: float, dv: float, dlz: float) -> np.ndarray:
+        return t_m[2] * np.exp(dlz) * np.linalg.inv(K) @ [u + du, v + dv, 1.0]
+
+    step = 1e-4
+    J = np.column_stack([(t_of(*(step * e)) - t_of(*(-step * e))) / (2 * step) for e in np.eye(3)])
+    np.testing.assert_allclose(covariance[:3, :3], J @ np.diag(sigma[:3] ** 2) @ J.T, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(covariance[3:, 3:], np.diag([0.01, 0.04, 0.09]))
+    assert np.linalg.eigvalsh(covariance).min() > -1e-9 * np.linalg.eigvalsh(covariance).max()
+
+
+def peaks_of(*, score: float = 0.9, z_m: float = 300.0, n: int = 1, apart_px: float = 0.0) -> Peaks:
+    center = np.array([[[100.0 + apart_px * k, 100.0] for k in range(n)]], np.float32)
+    return Peaks(
+        score=np.array([[score - 0.1 * k for k in range(n)]], np.float32),
+        center_px=center,
+        size_px=np.full((1, n, 2), 40.0, np.float32),
+        origin_px=center,
+        t_cam_target_m=np.tile(np.array([1.0, 2.0, z_m], np.float32), (1, n, 1)),
+        R_cam_target=np.tile(np.eye(3, dtype=np.float32), (1, n, 1, 1)),
+        sigma=np.full((1, n, 6), 0.05, np.float32),
+    )
+
+
+def accepted(peaks: Peaks) -> tuple[int, Counter[str]]:
+    refused: Counter[str] = Counter()
+    contract = ModelContract(**CONTRACT)
+    return len(decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused)), refused
+
+
+def test_what_is_no_pose_is_refused_and_counted() -> None:
+    nan, mirror, flat = peaks_of(), peaks_of(), peaks_of()
+    nan.t_cam_target_m[0, 0, 0] = np.nan
+    mirror.R_cam_target[0, 0, 0, 0] = -1
+    flat.sigma[0, 0, 2] = 0
+    assert accepted(peaks_of()) == (1, Counter())
+    assert accepted(peaks_of(score=0.4)) == (0, Counter())
+    assert accepted(nan) == (0, Counter(not_finite=1))
+    assert accepted(mirror) == (0, Counter(no_rotation=1))
+    assert accepted(flat) == (0, Counter(no_size=1))
+    assert accepted(peaks_of(z_m=-5.0)) == (0, Counter(out_of_range=1))
+    assert accepted(peaks_of(z_m=1201.0)) == (0, Counter(out_of_range=1))
+
+
+def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
+    sigma = np.full(6, 0.05)
+    inside, outside = (pose_covariance([0, 0, z], sigma, K, (50, 600))[2, 2] ** 0.5 / z for z in (599.0, 900.0))
+    assert inside == pytest.approx(0.05, rel=1e-6)
+    assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
+
+
+def test_two_peaks_on_one_aircraft_are_one_target_and_two_apart_are_two() -> None:
+    assert accepted(peaks_of(n=2, apart_px=8.0))[0] == 1
+    assert accepted(peaks_of(n=2, apart_px=60.0))[0] == 2
+
+
+@given(boxes, boxes)
+def test_overlap_is_symmetric_and_one_for_a_box_inside_another(a: np.ndarray, b: np.ndarray) -> None:
+    assert overlap(a, b) == pytest.approx(overlap(b, a))
+    assert 0 <= overlap(a, b) <= 1 + 1e-9
+    assert overlap(a, np.array([a[0] - 5, a[1] - 5, a[2] + 5, a[3] + 5])) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("center", [(960.5, 540.5), (150.5, 90.5), (1800.5, 1000.5)])
+def test_acquire_finds_a_target_anywhere_and_refines_it_to_native_accuracy(
+    toy_model: Path, center: tuple[float, float]
+) -> None:
+    (estimate,) = Estimator(load_model(toy_model, 1)).acquire(frame_of(draw(center)))
+    assert estimate.stage == "track"
+    truth_m = true_t_cam_target_m(center)
+    np.testing.assert_allclose(estimate.t_cam_target_m, truth_m, rtol=0.02, atol=0.2)
+    half = np.array(TARGET_WH) / 2
+    np.testing.assert_allclose(estimate.box_xyxy_px, [*(center - half), *(center + half)], atol=1.0)
+
+
+def test_track_says_none_where_the_window_holds_no_target(toy_model: Path) -> None:
+    frame = frame_of(draw((500.5, 500.5)))
+    expected = [np.array([450.0, 480.0, 570.0, 540.0]), np.array([1500.0, 200.0, 1620.0, 260.0])]
+    seen, missed = Estimator(load_model(toy_model, 1)).track(frame, expected)
+    assert seen is not None
+    assert missed is None
+    np.testing.assert_allclose(seen.t_cam_target_m, true_t_cam_target_m((500.5, 500.5)), rtol=0.02, atol=0.2)
+
+
+def test_a_known_target_is_not_acquired_again_nor_one_seen_by_two_windows_twice(toy_model: Path) -> None:
+    estimator = Estimator(load_model(toy_model, 1))
+    frame = frame_of(draw((500.5, 500.5)))
+    (found,) = estimator.acquire(frame)
+    assert estimator.acquire(frame, [found.box_xyxy_px]) == []
+    seen = estimator.track(frame, [found.box_xyxy_px, found.box_xyxy_px + 20])
+    assert sum(estimate is not None for estimate in seen) == 1
+
+
+def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path) -> None:
+    changes = {"track_size_wh": None, "acquire_size_wh": (640, 640), "acquire_fit": "squash"}
+    model = load_model(write_toy_model(tmp_path / "paper.onnx", **changes), 1)
+    (estimate,) = Estimator(model).acquire(frame_of(draw((700.5, 300.5))))
+    assert estimate.stage == "acquire"
+    np.testing.assert_allclose(estimate.t_cam_target_m, true_t_cam_target_m((700.5, 300.5)), rtol=0.03, atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda path: None, "cannot be read"),
+        (lambda path: path.write_bytes(b"\x08\x07junk"), "not a loadable ONNX file"),
+        (lambda path: write_toy_model(path, metadata="{"), "contract is not JSON"),
+        (lambda path: write_toy_model(path, metadata="[]"), "contract version None"),
+        (lambda path: write_toy_model(path, metadata='{"version": 7}'), "contract version 7; this program reads 1"),
+        (lambda path: write_toy_model(path, metadata='{"version": 1}'), "contract key name"),
+        (lambda path: write_toy_model(path, acquire_size_wh=(640, 380)), "not a multiple of 32"),
+        (lambda path: write_toy_model(path, graph=GRAPH.replace("uint8[N", "int8[N")), "input image is tensor(int8)"),
+        (
+            lambda path: write_toy_model(path, graph=GRAPH.replace(" image", " picture").replace("(image", "(picture")),
+            "takes inputs ['K', 'picture']",
+        ),
+        (
+            lambda path: write_toy_model(path, graph=GRAPH.replace("sigma)", "spread)").replace("sigma =", "spread =")),
+            "['sigma']",
+        ),
+        (lambda path: write_toy_model(path, max_peaks=4), "output score has shape (1, 1), its contract says (1, 4)"),
+    ],
+)
+def test_a_model_that_does_not_fit_is_refused_with_what_is_wrong(tmp_path: Path, make: object, sentence: str) -> None:
+    path = tmp_path / "model.onnx"
+    assert callable(make)
+    make(path)
+    with pytest.raises(InputError) as error:
+        load_model(path, 1).warm_up()
+    assert "model.onnx" in str(error.value)
+    assert sentence in str(error.value)
