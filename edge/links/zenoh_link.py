@@ -1,0 +1,196 @@
+"""The link to the ground: what each report says, put on the topic table's keys by a thread of its own.
+
+The loop only leaves the newest report in a mailbox. The session is a peer: it opens whether or not the ground is
+there, and zenoh goes on connecting.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+import numpy as np
+import zenoh
+
+from edge.config import ZenohSettings
+from edge.health import HealthSnapshot
+from edge.links import zenoh_messages as ros
+from edge.links.errors import LinkError
+from edge.links.outgoing import UtcClock, sendable
+from edge.types import Report
+from msgs import topics
+from msgs.cdr import Log, Payload
+from msgs.publish import Node, TopicPublisher
+from msgs.session import peer_config
+from msgs.topics import Topic
+
+log = logging.getLogger(__name__)
+
+EVENTS_WAITING = 64
+STOP_TIMEOUT_S = 5.0
+
+
+@dataclass
+class Mailbox:
+    """What waits for the worker: the newest of each kind, and events in their order."""
+
+    report: Report | None = None
+    snapshot: HealthSnapshot | None = None
+    events: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_WAITING))
+    stopping: bool = False
+
+    def empty(self) -> bool:
+        return self.report is None and self.snapshot is None and not self.events
+
+
+class ZenohLink:
+    """Publishes reports, diagnostics and events of one vehicle. The publish methods never block."""
+
+    def __init__(self, settings: ZenohSettings, vehicle_name: str) -> None:
+        self._settings = settings
+        self._vehicle_name = vehicle_name
+        self._waiting = threading.Condition()
+        self._mailbox = Mailbox()
+        self._counters: Counter[str] = Counter()
+        self._worker: threading.Thread | None = None
+        self._session: zenoh.Session | None = None
+
+    def start(self) -> None:
+        """Open the session and begin. Raises LinkError if an endpoint cannot be listened on."""
+        endpoints = ", ".join(self._settings.listen) or "none"
+        try:
+            config = peer_config(self._settings.listen, self._settings.connect)
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise LinkError(f"zenoh cannot listen on {endpoints}: {error}") from error
+        self._worker = threading.Thread(target=self._work, args=(self._session,), name="zenoh", daemon=True)
+        self._worker.start()
+
+    def publish(self, report: Report) -> None:
+        """Leave a report for the worker; one it has not taken yet is replaced and counted."""
+        with self._waiting:
+            self._counters["reports_replaced"] += self._mailbox.report is not None
+            self._mailbox.report = report
+            self._waiting.notify()
+
+    def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
+        with self._waiting:
+            self._mailbox.snapshot = snapshot
+            self._waiting.notify()
+
+    def publish_event(self, level: int, text: str) -> None:
+        """`level` counts as in rcl_interfaces/Log: 10 debug, 20 info, 30 warn, 40 error, 50 fatal."""
+        with self._waiting:
+            self._counters["events_lost"] += len(self._mailbox.events) == EVENTS_WAITING
+            self._mailbox.events.append((time.monotonic_ns(), level, text))
+            self._waiting.notify()
+
+    def stop(self) -> None:
+        """Send what waits, then close the session. May be called twice, or without start."""
+        with self._waiting:
+            self._mailbox.stopping = True
+            self._waiting.notify()
+        if self._worker is not None:
+            self._worker.join(STOP_TIMEOUT_S)
+            self._worker = None
+        if self._session is not None:
+            # An open session keeps the process from leaving.
+            self._session.close()
+            self._session = None
+
+    def counters(self) -> dict[str, int]:
+        with self._waiting:
+            return dict(self._counters)
+
+    def _take(self) -> Mailbox:
+        with self._waiting:
+            self._waiting.wait_for(lambda: self._mailbox.stopping or not self._mailbox.empty())
+            taken, self._mailbox = self._mailbox, Mailbox(stopping=self._mailbox.stopping)
+            return taken
+
+    def _work(self, session: zenoh.Session) -> None:
+        node = Node(
+            session,
+            self._vehicle_name,
+            domain=self._settings.domain,
+            distribution=self._settings.ros_distribution,
+        )
+        desk = Desk(node, self._vehicle_name, self._settings.max_age_ms)
+        with node:
+            while True:
+                mail = self._take()
+                counted = self._deliver(desk, mail)
+                with self._waiting:
+                    self._counters.update(counted)
+                    if mail.stopping and self._mailbox.empty():
+                        return
+
+    def _deliver(self, desk: Desk, mail: Mailbox) -> Counter[str]:
+        try:
+            if mail.report is not None:
+                desk.put_report(mail.report)
+            if mail.snapshot is not None:
+                desk.put_diagnostics(mail.snapshot)
+            for time_ns, level, text in mail.events:
+                desk.put_event(time_ns, level, text)
+        except (zenoh.ZError, ValueError, OverflowError) as error:
+            # One report that cannot go out must not end the link.
+            desk.counted["failed"] += 1
+            log.warning("zenoh: not published: %s", error)
+        counted, desk.counted = desk.counted, Counter()
+        return counted
+
+
+class Desk:
+    """The publishers, used by the worker alone."""
+
+    def __init__(self, node: Node, vehicle_name: str, max_age_ms: float) -> None:
+        self.counted: Counter[str] = Counter()
+        self._node = node
+        self._vehicle_name = vehicle_name
+        self._max_age_ms = max_age_ms
+        self._clock = UtcClock()
+        self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
+        self._intrinsics: tuple[bytes, tuple[int, int]] | None = None
+        shared = (topics.DETECTIONS, topics.TF, topics.CAMERA_INFO, topics.DIAGNOSTICS, topics.EVENTS)
+        for topic in shared:
+            self._publisher(topic, None)
+
+    def put_report(self, report: Report) -> None:
+        stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
+        tracks = sendable(report, time.monotonic_ns(), self._max_age_ms)
+        self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
+        for track in tracks:
+            name = ros.target_name(track)
+            self._put(topics.POSE, ros.pose(track, stamp_ns), name)
+            if report.own_ship is not None:
+                odometry = ros.odometry(track, report.own_ship, stamp_ns)
+                if odometry is not None:
+                    self._put(topics.ODOM, odometry, name)
+        self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
+        if report.own_ship is not None:
+            self._put(topics.TF, ros.transforms(report.own_ship, stamp_ns))
+        intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh)
+        if intrinsics != self._intrinsics:
+            self._put(topics.CAMERA_INFO, ros.camera_info(report, stamp_ns))
+            self._intrinsics = intrinsics
+
+    def put_diagnostics(self, snapshot: HealthSnapshot) -> None:
+        stamp_ns = self._clock.utc_ns(snapshot.time_ns)
+        self._put(topics.DIAGNOSTICS, ros.diagnostics(snapshot, self._vehicle_name, stamp_ns))
+
+    def put_event(self, time_ns: int, level: int, text: str) -> None:
+        self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))
+
+    def _put(self, topic: Topic, message: Payload, target: str | None = None) -> None:
+        self._publisher(topic, target).put(message.encode())
+        self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
+
+    def _publisher(self, topic: Topic, target: str | None) -> TopicPublisher:
+        key = (topic.name, target)
+        if key not in self._publishers:
+            self._publishers[key] = self._node.publisher(topic, target)
+        return self._publishers[key]

@@ -1,0 +1,103 @@
+"""Tracks, own ship, camera and health as ROS 2 messages. Pure; stamps are UTC ns."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edge.health import HealthSnapshot, HealthState
+from edge.types import Array, OwnShip, Report, Track
+from msgs import cdr, topics
+from msgs.geometry import q_wxyz_from_R
+
+# ned axes at the own ship: where targets are told when its position is not known, moving with it.
+FRAME_BODY_NED = "base_link_ned"
+CLASS_FIXED_WING = "fixed_wing"
+# A twist's part that is not estimated: ROS has no other way to say so than a variance that outweighs any use.
+NOT_ESTIMATED = 1e6
+DIAGNOSTIC_LEVEL = {HealthState.DEGRADED: 1, HealthState.FAULT: 2}
+
+
+def q_xyzw(R: ArrayLike) -> Array:
+    """[3, 3] to the quaternion [4] as ROS writes it."""
+    return np.roll(q_wxyz_from_R(R), -1)
+
+
+def target_name(track: Track) -> str:
+    """The topic's `tN`."""
+    return f"t{track.track_id}"
+
+
+def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
+    """The target in `cam`."""
+    q = q_xyzw(track.R_cam_target)
+    return cdr.PoseWithCovarianceStamped(stamp_ns, topics.FRAME_CAMERA, track.t_cam_target_m, q, track.covariance)
+
+
+def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | None:
+    """The target in `ned`; in FRAME_BODY_NED, velocity relative, without own position. None: no own attitude."""
+    R, t_m, v_mps, P = track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned
+    if R is None or t_m is None or v_mps is None or P is None:
+        return None
+    pose_index = np.r_[0:3, 6:9]
+    twist = np.diag([NOT_ESTIMATED] * 6)
+    twist[:3, :3] = R.T @ P[3:6, 3:6] @ R
+    return cdr.Odometry(
+        stamp_ns=stamp_ns,
+        frame_id=topics.FRAME_NED if own_ship.t_ned_body_m is not None else FRAME_BODY_NED,
+        child_frame_id=topics.FRAME_TARGET,
+        t_ned_target_m=t_m,
+        q_ned_target_xyzw=q_xyzw(R),
+        covariance=P[np.ix_(pose_index, pose_index)],
+        v_target_mps=R.T @ v_mps,
+        omega_target_radps=np.zeros(3),
+        covariance_twist=0.5 * (twist + twist.T),
+    )
+
+
+def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
+    """All targets of one frame in `cam`; an empty array says that none was seen."""
+    found = []
+    for track in tracks:
+        t_m, q = track.t_cam_target_m, q_xyzw(track.R_cam_target)
+        one = cdr.Hypothesis(CLASS_FIXED_WING, track.score, t_m, q, track.covariance)
+        found.append(cdr.Detection3D(stamp_ns, topics.FRAME_CAMERA, (one,), t_m, q, np.zeros(3), target_name(track)))
+    return cdr.Detection3DArray(stamp_ns, topics.FRAME_CAMERA, tuple(found))
+
+
+def transforms(own_ship: OwnShip, stamp_ns: int) -> cdr.TFMessage:
+    """The own ship: its body in ned axes at itself, and those in `ned` when its position is known."""
+    q = q_xyzw(own_ship.R_ned_body)
+    chain = [cdr.TransformStamped(stamp_ns, FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q)]
+    if own_ship.t_ned_body_m is not None:
+        upright = np.array([0.0, 0.0, 0.0, 1.0])
+        place = cdr.TransformStamped(stamp_ns, topics.FRAME_NED, FRAME_BODY_NED, own_ship.t_ned_body_m, upright)
+        chain.insert(0, place)
+    return cdr.TFMessage(tuple(chain))
+
+
+def camera_info(report: Report, stamp_ns: int) -> cdr.CameraInfo:
+    """The intrinsics of the frame the poses belong to, whose pixels are free of distortion."""
+    width_px, height_px = report.image_size_wh
+    P = np.hstack([report.K, np.zeros((3, 1))])
+    return cdr.CameraInfo(
+        stamp_ns, topics.FRAME_CAMERA, height_px, width_px, "plumb_bob", np.zeros(5), report.K, np.eye(3), P
+    )
+
+
+def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> cdr.DiagnosticArray:
+    """Health as one status: its state and reasons, counters and latencies."""
+    values = {
+        "tracks": str(snapshot.tracks),
+        "frame_rate_hz": f"{snapshot.frame_rate_hz:.1f}",
+        **{name: str(count) for name, count in snapshot.counters.items()},
+        **{
+            f"latency_ms/{stage}/{name}": f"{value:.2f}"
+            for stage, p in snapshot.latency_ms.items()
+            for name, value in (("p50", p.p50), ("p95", p.p95), ("p99", p.p99))
+        },
+    }
+    message = "; ".join((snapshot.state.value, *snapshot.reasons))
+    level = DIAGNOSTIC_LEVEL.get(snapshot.state, 0)
+    status = cdr.DiagnosticStatus(level, topics.NODE_NAME, message, vehicle_name, tuple(values.items()))
+    return cdr.DiagnosticArray(stamp_ns, "", (status,))
