@@ -33,7 +33,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="fly: read the camera and publish poses until told to stop")
-    run.add_argument("--config", type=Path, required=True, help="TOML file; see deploy/ for examples")
+    run.add_argument("--config", type=Path, required=True, help="TOML file")
     run.set_defaults(act=_run)
 
     check = commands.add_parser(

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from .conftest import Cli
+from .toy_model import write_toy_model
+
+OFF = "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
+
+
+@pytest.fixture
+def text(scene: Path, toy_model: Path) -> str:
+    """A configuration that flies."""
+    return f'[camera]\ntype = "sequence"\npath = "{scene}"\nfps = 60\n[model]\npath = "{toy_model}"\n'
+
+
+@pytest.fixture
+def taken_ports() -> Iterator[tuple[int, int]]:
+    """A TCP and a UDP port of the loopback that somebody else holds."""
+    with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+        tcp.bind(("127.0.0.1", 0))
+        tcp.listen()
+        udp.bind(("127.0.0.1", 0))
+        yield tcp.getsockname()[1], udp.getsockname()[1]
+
+
+def refusal(cli: Cli, tmp_path: Path, text: str, command: str = "run") -> str:
+    """What the command says of a configuration it refuses, with exit code 2 and without a traceback."""
+    (tmp_path / "config.toml").write_text(text)
+    done = cli(command, "--config", "config.toml")
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr.strip().splitlines()[-1]
+
+
+def test_a_configuration_that_flies_is_checked_and_flown(cli: Cli, tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.toml").write_text(text + OFF)
+    checked = cli("check", "--config", "config.toml")
+    assert checked.returncode == 0, checked.stderr
+    assert "1920x1080" in checked.stdout
+    assert "toy fp32" in checked.stdout
+    flown = cli("run", "--config", "config.toml")
+    assert flown.returncode == 0, flown.stderr
+    assert "captured=" in flown.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_model_that_does_not_do_is_named(cli: Cli, tmp_path: Path, text: str, toy_model: Path, command: str) -> None:
+    corrupt, strange = tmp_path / "corrupt.onnx", tmp_path / "strange.onnx"
+    corrupt.write_bytes(toy_model.read_bytes()[:300])
+    write_toy_model(strange, metadata='{"version": 99}')
+    for path, reason in (
+        (tmp_path / "none.onnx", "No such file"),
+        (corrupt, "not a loadable ONNX file"),
+        (strange, "contract version 99"),
+    ):
+        sentence = refusal(cli, tmp_path, text.replace(str(toy_model), str(path)) + OFF, command)
+        assert sentence.startswith("config.toml:6: [model] path: ")
+        assert path.name in sentence
+        assert reason in sentence
+
+
+def test_an_unknown_key_is_named(cli: Cli, tmp_path: Path, text: str) -> None:
+    assert refusal(cli, tmp_path, text + OFF + "baud = 1\n") == "config.toml:11: [mavlink] baud: unknown key"
+
+
+def test_intrinsics_for_another_resolution_are_refused(cli: Cli, tmp_path: Path, text: str) -> None:
+    intrinsics = "[camera.intrinsics]\nfx = 800\nfy = 800\ncx = 320\ncy = 240\nwidth = 640\nheight = 480\n"
+    sentence = refusal(cli, tmp_path, text + intrinsics + OFF)
+    assert sentence.startswith("config.toml:7: [camera] intrinsics: ")
+    assert "640x480" in sentence
+    assert "1920x1080" in sentence
+
+
+def test_an_unreadable_video_is_named(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    (tmp_path / "flight.mp4").write_bytes(b"no video" * 100)
+    intrinsics = "[camera.intrinsics]\nfx = 800\nfy = 800\ncx = 320\ncy = 240\nwidth = 640\nheight = 480\n"
+    camera = '[camera]\ntype = "file"\npath = "flight.mp4"\n' + intrinsics
+    sentence = refusal(cli, tmp_path, camera + f'[model]\npath = "{toy_model}"\n' + OFF)
+    assert sentence.startswith("config.toml:3: [camera] path: ")
+    assert "flight.mp4 is not a readable video" in sentence
+
+
+def test_a_zenoh_port_that_is_taken_is_named(cli: Cli, tmp_path: Path, text: str, taken_ports: tuple[int, int]) -> None:
+    endpoint = f"tcp/127.0.0.1:{taken_ports[0]}"
+    links = f'[zenoh]\nlisten = ["{endpoint}"]\n[mavlink]\nenabled = false\n'
+    sentence = refusal(cli, tmp_path, text + links)
+    assert sentence.startswith("config.toml:8: [zenoh] listen: ")
+    assert endpoint in sentence
+
+
+def test_a_mavlink_port_that_is_taken_is_named(
+    cli: Cli, tmp_path: Path, text: str, taken_ports: tuple[int, int]
+) -> None:
+    links = f'[zenoh]\nenabled = false\n[mavlink]\nendpoints = ["udpin:127.0.0.1:{taken_ports[1]}"]\n'
+    sentence = refusal(cli, tmp_path, text + links)
+    assert sentence.startswith("config.toml:10: [mavlink] endpoints: ")
+    assert str(taken_ports[1]) in sentence
+
+
+def test_bench_times_both_stages_and_compares_precisions(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8")
+    done = cli("bench", toy_model, int8, "--runs", "5", "--threads", "1", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert [model["precision"] for model in result["models"]] == ["fp32", "int8"]
+    for model in result["models"]:
+        for stage in ("acquire_ms", "track_ms"):
+            assert 0 < model[stage]["p50"] <= model[stage]["p99"]
+    fp32, quantised = result["models"]
+    ratio = quantised["track_ms"]["p50"] / fp32["track_ms"]["p50"]
+    assert result["int8_over_fp32"]["track"] == pytest.approx(ratio)
+
+
+def test_the_daemon_needs_no_torch_and_nothing_of_the_trainer_or_the_replay() -> None:
+    code = (
+        "import sys, edge.daemon, edge.check, edge.bench, edge.cli\n"
+        "print([m for m in sys.modules if m.split('.')[0] in ('torch', 'onnx', 'trainer', 'sim_replay')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

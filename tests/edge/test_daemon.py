@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.health import Health, HealthState, judge, percentiles_ms
+from edge.types import Track, TrackState
+from msgs.client import connect, subscribe
+
+from .toy_scene import center_of, true_t_cam_target_m
+
+FRAMES = 40
+FPS = 20
+
+
+def config_toml(scene: Path, model: Path, camera: str = "", links: str = "") -> str:
+    off = "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
+    return (
+        f'[camera]\ntype = "sequence"\npath = "{scene}"\nfps = {FPS}\n{camera}'
+        f'[model]\npath = "{model}"\nthreads = 1\n{links or off}'
+    )
+
+
+@contextmanager
+def flying(tmp_path: Path, text: str) -> Iterator[tuple[subprocess.Popen[str], list[str]]]:
+    """The daemon as a process that has said it is ready, and its words so far."""
+    config = tmp_path / "config.toml"
+    config.write_text(text)
+    command = [sys.executable, "-m", "edge.cli", "run", "--config", str(config)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as daemon:
+        assert daemon.stderr is not None
+        lines: list[str] = []
+        for line in daemon.stderr:
+            lines.append(line)
+            if "ready: " in line:
+                break
+        try:
+            yield daemon, lines
+        finally:
+            daemon.kill()
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(
+    tmp_path: Path, scene: Path, toy_model: Path
+) -> None:
+    start_ns = time.monotonic_ns() + 4_000_000_000
+    utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
+    endpoint = free_endpoint()
+    links = f'[zenoh]\nlisten = ["{endpoint}"]\n[mavlink]\nenabled = false\n'
+    text = config_toml(scene, toy_model, camera=f"start_at_ns = {start_ns}\n", links=links)
+    errors_m, frames = [], []
+    with flying(tmp_path, text) as (daemon, _), connect(endpoint) as session, subscribe(session, "uav1") as poses:
+        for target in poses:
+            frame = (target.stamp_ns - utc_minus_monotonic_ns - start_ns) * FPS / 1e9
+            frames.append(frame)
+            truth_m = true_t_cam_target_m(center_of(round(frame)))
+            errors_m.append(np.linalg.norm(target.pose.t_cam_target_m - truth_m) / truth_m[2])
+            if round(frame) >= FRAMES - 5:
+                break
+        assert daemon.wait(timeout=20) == 0  # the recording is over, and so is the daemon
+        assert daemon.stderr is not None
+        words = daemon.stderr.read()
+    assert len(frames) > FRAMES // 2
+    np.testing.assert_allclose(frames, np.round(frames), atol=0.1)
+    assert max(errors_m) < 0.03
+    stopped = re.search(r"stopped: .*captured=(\d+)", words)
+    assert stopped is not None
+    assert int(stopped[1]) == FRAMES
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_the_daemon_within_two_seconds(
+    tmp_path: Path, scene: Path, toy_model: Path, number: signal.Signals
+) -> None:
+    text = config_toml(scene, toy_model, camera="loop = true\n")
+    with flying(tmp_path, text) as (daemon, _):
+        assert daemon.stderr is not None
+        assert any("tracking" in line for line in daemon.stderr)
+        told_s = time.monotonic()
+        daemon.send_signal(number)
+        assert daemon.wait(timeout=10) == 0
+        assert time.monotonic() - told_s < 2.0
+        assert "stopped: tracking" in daemon.stderr.read()
+
+
+def test_a_daemon_whose_camera_is_absent_starts_says_so_and_stops(tmp_path: Path, toy_model: Path) -> None:
+    camera = (
+        '[camera]\ntype = "stream"\nurl = "http://127.0.0.1:9/none"\n[camera.intrinsics]\n'
+        "fx = 1000\nfy = 1000\ncx = 320\ncy = 240\nwidth = 640\nheight = 480\n"
+    )
+    text = camera + f'[model]\npath = "{toy_model}"\n[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n'
+    with flying(tmp_path, text) as (daemon, _):
+        assert daemon.stderr is not None
+        assert any("init (waiting for the camera)" in line for line in daemon.stderr)
+        daemon.terminate()
+        assert daemon.wait(timeout=2) == 0
+
+
+def track_in(state: TrackState) -> Track:
+    zero = np.zeros(3)
+    return Track(0, state, 0, 0, 1.0, np.zeros(4), np.eye(3), zero, np.eye(6), None, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("states", "frame_age_s", "drops", "attitude", "state"),
+    [
+        ([], None, 0.0, False, HealthState.INIT),
+        ([], 0.05, 0.0, True, HealthState.SEARCHING),
+        ([TrackState.TENTATIVE], 0.05, 0.0, True, HealthState.SEARCHING),
+        ([TrackState.COASTING], 0.05, 0.0, True, HealthState.COASTING),
+        ([TrackState.COASTING, TrackState.CONFIRMED], 0.05, 0.0, True, HealthState.TRACKING),
+        ([TrackState.CONFIRMED], 0.05, 0.0, False, HealthState.DEGRADED),
+        ([TrackState.CONFIRMED], 0.05, 0.3, True, HealthState.DEGRADED),
+        ([TrackState.CONFIRMED], 2.5, 0.3, False, HealthState.FAULT),
+    ],
+)
+def test_health_follows_from_what_is_seen(
+    states: list[TrackState], frame_age_s: float | None, drops: float, attitude: bool, state: HealthState
+) -> None:
+    age_ns = None if frame_age_s is None else round(frame_age_s * 1e9)
+    judged, reasons = judge([track_in(s) for s in states], age_ns, drops, attitude, wants_attitude=True)
+    assert judged is state
+    assert bool(reasons) == (state in (HealthState.INIT, HealthState.DEGRADED, HealthState.FAULT))
+
+
+def test_a_snapshot_tells_rate_and_latency_and_notices_a_stuck_pipeline() -> None:
+    health = Health(wants_attitude=False)
+    for k in range(50):
+        stages = {"track": 8_000_000, "total": (10 + (k == 49)) * 1_000_000}
+        health.frame_done(k, stages, (track_in(TrackState.CONFIRMED),), False, k * 50_000_000)
+    snapshot = health.snapshot(50 * 50_000_000, {"dropped": 0})
+    assert snapshot.state is HealthState.TRACKING
+    assert snapshot.frame_rate_hz == pytest.approx(20.0)
+    assert snapshot.latency_ms["track"].p99 == 8.0
+    assert snapshot.latency_ms["total"].p50 == 10.0
+    assert 10.0 < snapshot.latency_ms["total"].p99 < 11.0
+    assert health.assess(49 * 50_000_000 + 2_100_000_000)[0] is HealthState.FAULT
+
+
+def test_percentiles_agree_with_counting() -> None:
+    percentiles = percentiles_ms(range(0, 101_000_000, 1_000_000))
+    assert (percentiles.p50, percentiles.p95, percentiles.p99) == (50.0, 95.0, 99.0)
