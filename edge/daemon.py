@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 
+import numpy as np
+
 from edge.cameras import open_source
 from edge.cameras.capture import Capture
 from edge.cameras.source import EndOfStream
@@ -26,7 +28,7 @@ from edge.health import Health, HealthSnapshot, HealthState
 from edge.outlets import Outlets, start_outlets
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.tracking.tracker import Tracker
-from edge.types import Estimate, Frame, OwnShip, Report, Track, TrackState
+from edge.types import CameraInfo, Estimate, Frame, FrameMeta, OwnShip, Report, Track, TrackState
 
 log = logging.getLogger(__name__)
 
@@ -47,12 +49,13 @@ def run(file: ConfigFile, stop: threading.Event) -> int:
         cleanup.callback(capture.stop)
         own_ship = OwnShipBuffer()
         outlets = start_outlets(file, own_ship, camera_info, cleanup)
+        pipeline = Pipeline(config, model, own_ship, outlets, capture)
+        pipeline.warm_up(camera_info)
         # What lives by now lives to the end: the collector need not walk it between frames.
         gc.collect()
         gc.freeze()
         log.info("ready: %s (%s), camera %s", model.contract.name, model.contract.precision, camera_info.name)
         capture.start()
-        pipeline = Pipeline(config, model, own_ship, outlets, capture)
         with file.blame(*camera_key(config.camera)):
             pipeline.fly(stop)
         log.info("stopped: %s", pipeline.snapshot().line())
@@ -77,6 +80,12 @@ class Pipeline:
         self._since_acquire = 0
         self._told: HealthState | None = None
         self._snapshot_due_ns = 0
+
+    def warm_up(self, camera: CameraInfo) -> None:
+        """Estimate on a black picture: first calls allocate, and should not cost a frame."""
+        width, height = camera.image_size_wh
+        black = np.zeros((height, width, 3), dtype=np.uint8)
+        self._estimator.warm_up(Frame(FrameMeta(0, 0, 0), black, camera.K))
 
     def fly(self, stop: threading.Event) -> None:
         """The loop. Returns when `stop` is set or the recording is over. Raises InputError from the camera."""

@@ -49,6 +49,7 @@ class SequenceSource:
         self._decoder = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
         self._start_ns, self._next = self._settings.start_at_ns, 0
         self._ahead.clear()
+        self._decode_ahead(self._next)
         return CameraInfo(folder.name, self._image_size_wh, self._K[0], self._settings.fps)
 
     def read(self, stop: threading.Event) -> Frame:

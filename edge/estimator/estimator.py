@@ -25,6 +25,14 @@ class Estimator:
     def has_track_stage(self) -> bool:
         return self.model.contract.track_size_wh is not None
 
+    def warm_up(self, frame: Frame) -> None:
+        """Go through both stages once with an empty frame of the camera's size, so that the first real one is fast."""
+        width, height = frame.image_bgr.shape[1], frame.image_bgr.shape[0]
+        self.acquire(frame)
+        if self.has_track_stage:
+            self.track(frame, [np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])])
+        self.refused.clear()
+
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = ()) -> list[Estimate]:
         """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
 
