@@ -26,9 +26,10 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
 
 
 def _whole(track: Track) -> bool:
-    in_cam = (track.box_xyxy_px, track.R_cam_target, track.t_cam_target_m, track.covariance)
-    in_ned = (track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned)
-    if not all(value is None or np.all(np.isfinite(value)) for value in (*in_cam, *in_ned)):
+    in_cam = [track.box_xyxy_px, track.R_cam_target, track.t_cam_target_m, track.covariance]
+    in_ned = [track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned]
+    values = in_cam + [value for value in in_ned if value is not None]
+    if not all(np.all(np.isfinite(value)) for value in values):
         return False
     range_m = float(np.linalg.norm(track.t_cam_target_m))
     if track.t_cam_target_m[2] <= 0.0 or not is_covariance(track.covariance):

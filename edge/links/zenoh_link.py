@@ -65,7 +65,8 @@ class ZenohLink:
             config = peer_config(self._settings.listen, self._settings.connect)
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise LinkError(f"zenoh cannot listen on {endpoints}: {error}") from error
+            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+            raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
         self._worker = threading.Thread(target=self._work, args=(self._session,), name="zenoh", daemon=True)
         self._worker.start()
 

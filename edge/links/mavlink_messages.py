@@ -1,0 +1,142 @@
+"""Reports as MAVLink messages. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edge.health import HealthState
+from edge.tracking.geodesy import lat_lon_alt_from_ned
+from edge.types import Array, CameraInfo, Report, Track, TrackState
+from msgs.geometry import euler_from_R, q_wxyz_from_R
+from msgs.mavlink import dialect, pack_target_relative
+
+NAN = math.nan
+# Fields whose definition gives NaN the meaning "not known".
+IMAGE_STATUS_UNKNOWN = ("point_x", "point_y", "radius", "rec_top_x", "rec_top_y", "rec_bottom_x", "rec_bottom_y")
+GEO_STATUS_UNKNOWN = ("h_acc", "v_acc", "vel_n", "vel_e", "vel_d", "vel_acc", "hdg", "hdg_acc")
+CAMERA_INFORMATION_UNKNOWN = ("focal_length", "sensor_size_h", "sensor_size_v")
+STATUSTEXT_BYTES = 50
+VENDOR = b"MF-UAVPose6D"
+
+SYSTEM_STATUS = {
+    HealthState.INIT: dialect.MAV_STATE_BOOT,
+    HealthState.SEARCHING: dialect.MAV_STATE_STANDBY,
+    HealthState.FAULT: dialect.MAV_STATE_CRITICAL,
+}
+TRACKING_STATUS = {
+    TrackState.CONFIRMED: dialect.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
+    TrackState.COASTING: dialect.CAMERA_TRACKING_STATUS_FLAGS_COASTING,
+}
+
+
+def heartbeat(kind: int, state: HealthState) -> Any:
+    """HEARTBEAT (0) of one of our components: MAV_TYPE `kind`, no autopilot."""
+    status = SYSTEM_STATUS.get(state, dialect.MAV_STATE_ACTIVE)
+    return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, status, 3)
+
+
+def primary(tracks: Sequence[Track]) -> Track | None:
+    """The one target that the camera protocol has room for: seen before coasting, then the lowest number."""
+    return min(tracks, key=lambda t: (t.state is not TrackState.CONFIRMED, t.track_id), default=None)
+
+
+def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
+    """TARGET_RELATIVE (511), packed: the full pose in `cam`; its timestamp is UNIX time of the exposure, µs."""
+    R_ned_cam = None if track.R_ned_target is None else track.R_ned_target @ track.R_cam_target.T
+    variance = np.diag(track.covariance)
+    return pack_target_relative(
+        mav,
+        utc_us=utc_us,
+        target_id=track.track_id,
+        t_cam_target_m=track.t_cam_target_m.tolist(),
+        position_std_m=np.sqrt(variance[:3]).tolist(),
+        attitude_std_rad=float(np.sqrt(np.mean(variance[3:]))),
+        q_cam_target_wxyz=q_wxyz_from_R(track.R_cam_target).tolist(),
+        q_ned_cam_wxyz=None if R_ned_cam is None else q_wxyz_from_R(R_ned_cam).tolist(),
+    )
+
+
+def image_status(report: Report, track: Track | None) -> Any:
+    """CAMERA_TRACKING_IMAGE_STATUS (275): the box as shares of the picture, 0..1; idle without a track."""
+    if track is None:
+        idle = (dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE, dialect.CAMERA_TRACKING_MODE_NONE, 0)
+        return dialect.MAVLink_camera_tracking_image_status_message(*idle, *[NAN] * 7)
+    # Pixel centres are integers, so the picture's edge lies half a pixel before 0.
+    shares = (track.box_xyxy_px.reshape(2, 2) + 0.5) / np.array(report.image_size_wh)
+    (left, top), (right, bottom) = np.clip(shares, 0.0, 1.0).tolist()
+    return dialect.MAVLink_camera_tracking_image_status_message(
+        TRACKING_STATUS[track.state],
+        dialect.CAMERA_TRACKING_MODE_RECTANGLE,
+        dialect.CAMERA_TRACKING_TARGET_DATA_IN_STATUS,
+        0.5 * (left + right),
+        0.5 * (top + bottom),
+        NAN,
+        left,
+        top,
+        right,
+        bottom,
+    )
+
+
+def geo_status(report: Report, track: Track) -> Any | None:
+    """CAMERA_TRACKING_GEO_STATUS (276): the target on the globe; None without own attitude and global position."""
+    own_ship = report.own_ship
+    t_m, R, P = track.t_ned_target_m, track.R_ned_target, track.covariance_ned
+    if own_ship is None or own_ship.lat_lon_alt is None or t_m is None or R is None or P is None:
+        return None
+    lat, lon, alt = lat_lon_alt_from_ned(own_ship.lat_lon_alt, t_m)
+    velocity, vel_acc = [NAN] * 3, NAN
+    # Without own position the velocity is relative to the own ship, which this message cannot say.
+    if own_ship.t_ned_body_m is not None and track.v_ned_target_mps is not None:
+        velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
+    _, _, yaw_rad = euler_from_R(R)
+    return dialect.MAVLink_camera_tracking_geo_status_message(
+        TRACKING_STATUS[track.state],
+        round(lat * 1e7),
+        round(lon * 1e7),
+        alt,
+        _largest_std(P[:2, :2]),
+        math.sqrt(P[2, 2]),
+        *velocity,
+        vel_acc,
+        float(np.linalg.norm(track.t_cam_target_m)),
+        float(yaw_rad) % (2.0 * math.pi),
+        math.sqrt(P[8, 8]),
+    )
+
+
+def camera_information(camera: CameraInfo, boot_ms: int) -> Any:
+    """CAMERA_INFORMATION (259). Millimetres of lens and sensor are not known from pixels, and not made up."""
+    width_px, height_px = camera.image_size_wh
+    name = camera.name.encode()[:32]
+    return dialect.MAVLink_camera_information_message(
+        boot_ms,
+        list(VENDOR.ljust(32, b"\0")),
+        list(name.ljust(32, b"\0")),
+        0,
+        NAN,
+        NAN,
+        NAN,
+        width_px,
+        height_px,
+        0,
+        dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS,
+        0,
+        b"",
+    )
+
+
+def statustexts(severity: int, text: str, text_id: int) -> list[Any]:
+    """STATUSTEXT (253), in chunks of 50 bytes if need be; `text_id` 1..65535 ties them together."""
+    data = text.encode()
+    chunks = [data[i : i + STATUSTEXT_BYTES] for i in range(0, len(data), STATUSTEXT_BYTES)] or [b""]
+    shared = text_id if len(chunks) > 1 else 0
+    return [dialect.MAVLink_statustext_message(severity, chunk, shared, i) for i, chunk in enumerate(chunks)]
+
+
+def _largest_std(P: Array) -> float:
+    return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

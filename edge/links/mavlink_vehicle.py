@@ -1,0 +1,144 @@
+"""The autopilot as seen from here: heard or not, which one, started again, and how often it tells what we asked for.
+
+A pure state machine: every time comes in as an argument, nothing goes out but decisions.
+
+    WAITING --autopilot heartbeat--> HEARD --no heartbeat for 5 s--> LOST --heartbeat--> HEARD
+
+Rates are asked for one message at a time by MAV_CMD_SET_MESSAGE_INTERVAL, and again when one falls: another peer may
+have overwritten it. Refusals and silence are met with a growing pause, at most RETRY_MAX_NS.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum
+
+from edge.tracking.clock import RebootDetector
+
+LOST_NS = 5_000_000_000
+ACK_TIMEOUT_NS = 1_000_000_000
+RETRY_NS = 3_000_000_000
+RETRY_MAX_NS = 30_000_000_000
+RATE_WINDOW_NS = 2_000_000_000
+RATE_ENOUGH = 0.7  # of what was asked
+
+
+class Contact(Enum):
+    WAITING = "waiting"
+    HEARD = "heard"
+    LOST = "lost"
+
+
+@dataclass
+class Stream:
+    """One message we want at a rate."""
+
+    message_id: int
+    rate_hz: float
+    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
+    asked_ns: int | None = None
+    pause_ns: int = RETRY_NS
+
+    def measured_hz(self, now_ns: int) -> float:
+        while self.arrivals_ns and now_ns - self.arrivals_ns[0] > RATE_WINDOW_NS:
+            self.arrivals_ns.popleft()
+        return len(self.arrivals_ns) * 1e9 / RATE_WINDOW_NS
+
+    def due(self, now_ns: int) -> bool:
+        """Whether to ask: never asked, or asked long enough ago and still too slow."""
+        if self.asked_ns is None:
+            return True
+        if self.measured_hz(now_ns) >= RATE_ENOUGH * self.rate_hz:
+            self.pause_ns = RETRY_NS
+            return False
+        return now_ns - self.asked_ns >= self.pause_ns
+
+    def asked(self, now_ns: int) -> None:
+        if self.asked_ns is not None:
+            self.pause_ns = min(2 * self.pause_ns, RETRY_MAX_NS)
+        self.asked_ns = now_ns
+
+
+class Vehicle:
+    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that was lost."""
+
+    def __init__(self, system_id: int | None, rates_hz: dict[int, float]) -> None:
+        self.contact = Contact.WAITING
+        self.system_id = system_id
+        self.autopilot: int | None = None  # MAV_AUTOPILOT
+        self.reboots = 0
+        self.asked_again = 0
+        self.refusals = 0  # answers other than ACCEPTED
+        self._fixed = system_id is not None
+        self._heartbeat_ns: int | None = None
+        self._boot = RebootDetector()
+        self._rates_hz = dict(rates_hz)
+        self._streams = self._new_streams()
+        self._in_flight: tuple[int, int] | None = None  # message id, asked ns
+
+    def heartbeat(self, system_id: int, autopilot: int, now_ns: int) -> bool:
+        """An autopilot's heartbeat; False if it is another vehicle's."""
+        if self.system_id is not None and system_id != self.system_id:
+            if self._fixed or self.contact is Contact.HEARD:
+                return False
+            self._forget()
+        self.system_id = system_id
+        self.autopilot = autopilot
+        self._heartbeat_ns = now_ns
+        self.contact = Contact.HEARD
+        return True
+
+    def boot_time(self, boot_ms: int) -> bool:
+        """A stamp of the autopilot's; True if it says that the autopilot has started again."""
+        if not self._boot.rebooted(boot_ms):
+            return False
+        self.reboots += 1
+        self._streams = self._new_streams()
+        self._in_flight = None
+        return True
+
+    def arrived(self, message_id: int, now_ns: int) -> None:
+        if message_id in self._streams:
+            self._streams[message_id].arrivals_ns.append(now_ns)
+
+    def measured_hz(self, message_id: int, now_ns: int) -> float:
+        """How often a message we asked for came in the last two seconds."""
+        return self._streams[message_id].measured_hz(now_ns)
+
+    def acknowledged(self, accepted: bool) -> None:
+        """The answer to the request in flight."""
+        if self._in_flight is not None:
+            self.refusals += not accepted
+            self._in_flight = None
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        if self.contact is Contact.HEARD and self._heartbeat_ns is not None and now_ns - self._heartbeat_ns > LOST_NS:
+            self.contact = Contact.LOST
+            # Whoever comes back may have forgotten what we asked.
+            self._streams = self._new_streams()
+            self._in_flight = None
+
+    def request(self, now_ns: int) -> tuple[int, float] | None:
+        """(message id, Hz) to ask for now, or None."""
+        if self.contact is not Contact.HEARD:
+            return None
+        if self._in_flight is not None and now_ns - self._in_flight[1] < ACK_TIMEOUT_NS:
+            return None
+        self._in_flight = None
+        for stream in self._streams.values():
+            if stream.due(now_ns):
+                self.asked_again += stream.asked_ns is not None
+                stream.asked(now_ns)
+                self._in_flight = (stream.message_id, now_ns)
+                return stream.message_id, stream.rate_hz
+        return None
+
+    def _forget(self) -> None:
+        self._boot = RebootDetector()
+        self._streams = self._new_streams()
+        self._in_flight = None
+
+    def _new_streams(self) -> dict[int, Stream]:
+        return {message_id: Stream(message_id, rate_hz) for message_id, rate_hz in self._rates_hz.items()}
