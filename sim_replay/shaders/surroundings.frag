@@ -13,6 +13,8 @@ uniform ivec2 crop_at;         // its corner in the supersampled buffer
 layout(location = 0) out vec4 colour;
 layout(location = 1) out vec4 coordinate;
 
+const mat2 turn = mat2(0.80, 0.60, -0.60, 0.80);
+
 vec3 sky(vec3 d) {
     float up = max(-d.z, 0.0);
     vec3 c = mix(environment[2].rgb, environment[3].rgb, pow(1.0 - up, 4.0));
@@ -24,8 +26,12 @@ vec3 sky(vec3 d) {
     float cirrus = smoothstep(0.4, 0.8, texture(noise, high * vec2(1.0, 2.7)).g) * environment[4].a;
     c = mix(c, environment[4].rgb * 1.1, cirrus * fade);
     vec2 p = (camera_ned_m.xy + plane * (environment[2].a + camera_ned_m.z)) / environment[8].z + environment[8].xy;
-    float n = 0.56 * texture(noise, p).r + 0.27 * texture(noise, p * 3.3).r + 0.17 * texture(noise, p * 11.7).b;
-    float shade = n - texture(noise, p + 0.02 * environment[0].xy).r * 0.56 - 0.22;
+    // Octaves turned against each other, and a slow swell, so that the texture's period does not show.
+    vec2 p3 = turn * p * 3.3;
+    float swell = texture(noise, turn * p * 0.173).g;
+    float n = 0.30 * swell + 0.32 * texture(noise, p).r + 0.23 * texture(noise, p3).r
+        + 0.15 * texture(noise, turn * p3 * 3.5).b;
+    float shade = 0.6 * (n - 0.30 * swell - 0.32 * texture(noise, p + 0.02 * environment[0].xy).r - 0.18);
     float a = smoothstep(environment[0].a, environment[0].a + environment[1].a, n) * fade;
     vec3 cloud = environment[4].rgb * clamp(1.0 + 1.6 * shade - 0.35 * a * (n - environment[0].a), 0.45, 1.3);
     return mix(c, mix(cloud, environment[3].rgb, 0.6 * (1.0 - smoothstep(0.0, 0.4, up))), a);
@@ -39,7 +45,7 @@ vec3 ground(vec3 d) {
     float a = environment[7].a;
     g = mat2(cos(a), sin(a), -sin(a), cos(a)) * g;
     float wide = texture(noise, g / 9000.0 + environment[8].xy).r;
-    float near = texture(noise, g / 700.0).r;
+    float near = 0.5 + 0.7 * (texture(noise, g / 700.0).r + texture(noise, turn * g / 1130.0).g - 1.0);
     float fine = texture(noise, g / 110.0).b;
     vec3 c;
     if (environment[5].a < 0.5) {

@@ -1,0 +1,242 @@
+"""Generates the bundled sequence: one aircraft crosses and opens from an own ship whose fixed camera follows it.
+
+    python -m sim_replay.sequence --out sim_replay/data/crossing --seed 34
+
+The folder is a BOP scene with its models, the own ship's telemetry.csv and sequence.toml. The world is local NED.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.tracking.geodesy import lat_lon_alt_from_ned
+from msgs.geometry import R_from_euler, q_wxyz_from_R, so3_log
+from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.bop import BopFrame, BopTarget, SceneWriter, write_camera, write_models
+from sim_replay.render.placing import outline_px
+from sim_replay.render.renderer import extents_px
+from sim_replay.render.scene import Camera, Environment, Scene, Target, environment_from_seed
+from sim_replay.render.sensor import Sensor
+from sim_replay.sample import SampleBatch
+from sim_replay.sampler import render_frame
+from sim_replay.telemetry import Telemetry, write_telemetry
+
+Array = NDArray[np.float64]
+FPS = 30.0
+FRAMES = 150
+LEAD_S = 1.0  # of telemetry before the first frame and after the last
+TELEMETRY_HZ = 50.0
+GRAVITY_MPS2 = 9.80665
+AIRFRAME = "twin_boom_inverted_v"
+LIVERY_SEED = 8
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 1920, 1080, 2700.0
+ORIGIN_DEG_M = (47.3977, 8.5456, 488.0)  # of the NED world, on the ground
+MOUNT_PITCH_RAD = np.radians(4.0)
+R_BODY_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+R_BODY_CAM = R_from_euler(0.0, MOUNT_PITCH_RAD, 0.0) @ R_BODY_FORWARD_CAM
+T_BODY_CAM_M = np.array([0.45, 0.0, 0.12])
+SENSOR = Sensor(
+    blur_sigma_px=0.6,
+    motion_px=(0.0, 0.0),
+    gain=1.0,
+    contrast=1.0,
+    saturation=1.0,
+    cast_bgr=(1.0, 1.0, 1.0),
+    noise=0.003,
+    read_noise=0.002,
+    jpeg_quality=None,
+)
+
+Profile = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A point-mass flight in coordinated turns: heading rate = g tan(bank) / V, no slip, constant climb angle."""
+
+    t_ned_start_m: tuple[float, float, float]  # where it is when the first frame is exposed
+    speed_mps: float
+    heading_rad: float  # at that instant
+    climb_rad: float
+    incidence_rad: float  # nose above the path
+    bank_rad: Profile  # of time, s
+    shake_rad: Profile  # [N] to [N, 3]: roll, pitch, yaw of the airframe in turbulence
+
+    def states(self, t_s: Array) -> tuple[Array, Array, Array]:
+        """R_ned_body [N, 3, 3], t_ned_body_m [N, 3] and v_ned_body_mps [N, 3] at times [N], seconds."""
+        grid = np.arange(-LEAD_S - 0.1, FRAMES / FPS + LEAD_S + 0.1, 1e-3)
+        turn = GRAVITY_MPS2 * np.tan(self.bank_rad(grid)) / self.speed_mps
+        heading = self.heading_rad + _integral(turn, grid)
+        velocity = self._velocity(heading)
+        track = np.stack([_integral(velocity[:, k], grid) for k in range(3)], axis=-1) + self.t_ned_start_m
+        heading_t = np.interp(t_s, grid, heading)
+        position = np.stack([np.interp(t_s, grid, track[:, k]) for k in range(3)], axis=-1)
+        shake = self.shake_rad(t_s)
+        pitch = np.full_like(t_s, self.climb_rad + self.incidence_rad) + shake[:, 1]
+        R_ned_body = R_from_euler(self.bank_rad(t_s) + shake[:, 0], pitch, heading_t + shake[:, 2])
+        return R_ned_body, position, self._velocity(heading_t)
+
+    def rates_body_radps(self, t_s: Array) -> Array:
+        """Angular rates p, q, r [N, 3] by central differences of the attitude over 2 ms."""
+        step_s = 1e-3
+        before, after = self.states(t_s - step_s)[0], self.states(t_s + step_s)[0]
+        return so3_log(np.swapaxes(before, -1, -2) @ after) / (2.0 * step_s)
+
+    def _velocity(self, heading: Array) -> Array:
+        level = np.cos(self.climb_rad)
+        down = np.full_like(heading, -np.sin(self.climb_rad))
+        return self.speed_mps * np.stack([level * np.cos(heading), level * np.sin(heading), down], axis=-1)
+
+
+def _integral(rate: Array, t_s: Array) -> Array:
+    """Trapezoidal integral that is zero at t = 0."""
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(t_s)
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    return total - np.interp(0.0, t_s, total)
+
+
+def _shake(rng: np.random.Generator, amplitude_rad: float) -> Profile:
+    """Turbulence: five sinusoids of 0.3 to 2.5 Hz on each axis."""
+    frequency_hz = rng.uniform(0.3, 2.5, (5, 3))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (5, 3))
+    size = amplitude_rad * rng.uniform(0.2, 1.0, (5, 3)) / np.sqrt(5.0)
+
+    def at(t_s: Array) -> Array:
+        angle = 2.0 * np.pi * frequency_hz * np.asarray(t_s)[:, None, None] + phase
+        return np.sum(size * np.sin(angle), axis=1)
+
+    return at
+
+
+def own_flight(seed: int) -> Flight:
+    """A small own ship at 20 m/s that turns gently to the right to keep the target ahead."""
+    rng = np.random.default_rng([seed, 1])
+    return Flight(
+        t_ned_start_m=(0.0, 0.0, -300.0),
+        speed_mps=20.0,
+        heading_rad=np.radians(-8.0),
+        climb_rad=0.0,
+        incidence_rad=np.radians(3.0),
+        bank_rad=lambda t_s: np.radians(9.5 + 2.0 * np.sin(0.9 * t_s)),
+        shake_rad=_shake(rng, np.radians(0.5)),
+    )
+
+
+def target_flight(seed: int) -> Flight:
+    """A target at 61 m/s that crosses to the right, turns away to the left and rolls out."""
+    rng = np.random.default_rng([seed, 2])
+    return Flight(
+        t_ned_start_m=(144.0, -36.0, -322.0),
+        speed_mps=61.0,
+        heading_rad=np.radians(48.0),
+        climb_rad=np.radians(2.5),
+        incidence_rad=np.radians(2.0),
+        bank_rad=lambda t_s: np.radians(-24.0 - 14.0 / (1.0 + np.exp((np.asarray(t_s) - 3.2) / 0.5))),
+        shake_rad=_shake(rng, np.radians(0.25)),
+    )
+
+
+def scenes(seed: int) -> list[Scene]:
+    """The frames' scenes, exposed at k / FPS seconds."""
+    t_s = np.arange(FRAMES) / FPS
+    own, target = own_flight(seed).states(t_s), target_flight(seed).states(t_s)
+    K = np.array([[FOCAL_PX, 0, (WIDTH_PX - 1) / 2], [0, FOCAL_PX, (HEIGHT_PX - 1) / 2], [0, 0, 1]])
+    environment: Environment = environment_from_seed(seed)
+    out = []
+    for k in range(FRAMES):
+        R_ned_own, t_ned_own_m = own[0][k], own[1][k]
+        camera = Camera(K, WIDTH_PX, HEIGHT_PX, R_ned_own @ R_BODY_CAM, t_ned_own_m + R_ned_own @ T_BODY_CAM_M)
+        seen = Target(airframe_id(AIRFRAME), LIVERY_SEED, target[0][k], target[1][k])
+        out.append(Scene(camera, (seen,), environment, sensor_seed=seed, frame_index=k))
+    return out
+
+
+def telemetry(seed: int) -> Telemetry:
+    """The own ship's state at 50 Hz, from LEAD_S before the first frame to LEAD_S after the last."""
+    flight = own_flight(seed)
+    rows = round((FRAMES / FPS + 2 * LEAD_S) * TELEMETRY_HZ) + 1
+    t_ns = np.round((np.arange(rows) / TELEMETRY_HZ - LEAD_S) * 1e9).astype(np.int64)
+    t_s = t_ns.astype(np.float64) * 1e-9
+    R_ned_body, position, velocity = flight.states(t_s)
+    place = np.array([lat_lon_alt_from_ned(ORIGIN_DEG_M, p) for p in position])
+    values = np.hstack([q_wxyz_from_R(R_ned_body), flight.rates_body_radps(t_s), position, velocity, place])
+    return Telemetry(t_ns, values)
+
+
+def bop_frame(scene: Scene, batch: SampleBatch, object_id: int) -> BopFrame:
+    """The BOP record of a rendered frame whose only target nothing hides."""
+    camera, target = scene.camera, scene.targets[0]
+    R_cam_ned = camera.R_ned_cam.T
+    R_cam_target, t_cam_target_m = target.pose_in(camera)
+    outline = extents_px(outline_px(target, camera))
+    visible = bool(batch.present[0])
+    seen = BopTarget(
+        object_id,
+        R_cam_target,
+        t_cam_target_m,
+        box_visible_xyxy_px=batch.box_xyxy_px[0].astype(np.float64) if visible else None,
+        box_whole_xyxy_px=None if outline is None else np.asarray(outline),
+        visible_px=int(batch.mask[0].sum()),
+    )
+    return BopFrame(scene.frame_index, camera.K, (seen,), R_cam_ned, -R_cam_ned @ camera.t_ned_cam_m)
+
+
+def _sequence_toml(seed: int, command: str) -> str:
+    matrix = ", ".join("[" + ", ".join(f"{v + 0.0:.9f}" for v in row) + "]" for row in R_BODY_CAM)
+    lever = ", ".join(f"{v:.3f}" for v in T_BODY_CAM_M)
+    return "\n".join(
+        [
+            f"# Made by: {command}",
+            f'command = "{command}"',
+            f"seed = {seed}",
+            f"fps = {FPS}",
+            "t0_ns = 0  # exposure of frame 0 on telemetry.csv's clock",
+            f'airframe = "{AIRFRAME}"',
+            "# The camera is fixed to the own ship: R_body_cam turns optical axes into body (FRD).",
+            f"R_body_cam = [{matrix}]",
+            f"t_body_cam_m = [{lever}]",
+            "# World of cam_R_w2c: north-east-down at this point, degrees and metres above sea.",
+            f"origin_lat_lon_alt = [{ORIGIN_DEG_M[0]}, {ORIGIN_DEG_M[1]}, {ORIGIN_DEG_M[2]}]",
+            "",
+        ]
+    )
+
+
+def generate(folder: Path, seed: int, jpeg_quality: int, command: str) -> None:
+    """Write the whole sequence into `folder`."""
+    shown = scenes(seed)
+    object_id = airframe_id(AIRFRAME) + 1
+    with SceneWriter(folder, jpeg_quality) as writer:
+        for scene in shown:
+            batch = render_frame(scene, SENSOR)
+            writer.add(bop_frame(scene, batch, object_id), batch.image_bgr[0], [batch.mask[0]])
+    write_models(folder / "models", {object_id: AIRFRAMES[object_id - 1].mesh()})
+    write_camera(folder / "camera.json", shown[0].camera.K, WIDTH_PX, HEIGHT_PX)
+    write_telemetry(folder / "telemetry.csv", telemetry(seed))
+    (folder / "sequence.toml").write_text(_sequence_toml(seed, command), encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Generate the bundled sequence: a BOP scene with own-ship telemetry.")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    parser.add_argument("--seed", type=int, default=34, help="light, ground and turbulence (default %(default)s)")
+    parser.add_argument("--jpeg-quality", type=int, default=84, metavar="Q", help="1 to 100 (default %(default)s)")
+    options = parser.parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    generate(
+        options.out, options.seed, options.jpeg_quality, shlex.join(["python", "-m", "sim_replay.sequence", *given])
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
