@@ -112,6 +112,11 @@ def _inside(start: int, length: int, limit: int) -> int:
 
 
 def _resize(image_bgr: Image, size_wh: tuple[int, int]) -> Image:
-    shrinks = size_wh[0] < image_bgr.shape[1]
-    resized = cv2.resize(image_bgr, size_wh, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    """Area averages when it shrinks, bilinear when it grows. Halving first is the cheap way to the same averages."""
+    pixels = image_bgr
+    while pixels.shape[1] >= 2 * size_wh[0] and pixels.shape[0] >= 2 * size_wh[1]:
+        half_wh = (pixels.shape[1] // 2, pixels.shape[0] // 2)
+        pixels = np.asarray(cv2.resize(pixels, half_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    shrinks = size_wh[0] < pixels.shape[1]
+    resized = cv2.resize(pixels, size_wh, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     return np.asarray(resized, dtype=np.uint8)
