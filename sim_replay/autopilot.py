@@ -231,7 +231,9 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m sim_replay.autopilot", description=__doc__.splitlines()[0])
     parser.add_argument("--telemetry", type=Path, required=True, help="telemetry.csv of the sequence")
     parser.add_argument("--endpoint", type=_address, required=True, help="HOST:PORT the daemon listens on (udpin)")
-    parser.add_argument("--start-at-ns", type=int, required=True, help="monotonic ns of frame 0's exposure")
+    parser.add_argument(
+        "--start-at-ns", type=int, required=True, help="monotonic ns at which the telemetry's t_ns is 0"
+    )
     args = parser.parse_args(argv)
     try:
         telemetry = read_telemetry(args.telemetry)

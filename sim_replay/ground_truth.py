@@ -41,6 +41,7 @@ class PlayedSequence:
     fps: float
     mount: Mount
     telemetry_csv: Path
+    frame0_ns: int  # exposure of the first frame on the telemetry's clock
 
 
 def read_scene_truth(folder: Path) -> SceneTruth:
@@ -69,11 +70,12 @@ def read_sequence(folder: Path) -> PlayedSequence:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
         mount = MountSettings(R_body_cam=settings["R_body_cam"], t_body_cam_m=settings["t_body_cam_m"]).mount()
         fps = float(settings["fps"])
+        frame0_ns = int(settings["t0_ns"])
     try:
         read_telemetry(folder / "telemetry.csv")
     except TelemetryError as error:
         raise InputError(str(error)) from error
-    return PlayedSequence(scene, fps, mount, folder / "telemetry.csv")
+    return PlayedSequence(scene, fps, mount, folder / "telemetry.csv", frame0_ns)
 
 
 def _models_folder(folder: Path) -> Path:

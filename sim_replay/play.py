@@ -173,7 +173,7 @@ def _wait_until_ready(
 def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]:
     telemetry = str(settings.sequence.telemetry_csv)
     address = f"127.0.0.1:{recording.mavlink_port}"
-    start = str(recording.start_at_ns)
+    start = str(recording.start_at_ns - settings.sequence.frame0_ns)
     return {
         "autopilot": ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start],
         "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav],

@@ -45,7 +45,7 @@ def target_relative(frame: int, received_after_ms: float) -> dict[str, object]:
 @pytest.fixture
 def sequence(dark_spot_scene: Path) -> PlayedSequence:
     mount = Mount(np.eye(3), np.zeros(3))
-    return PlayedSequence(read_scene_truth(dark_spot_scene), FPS, mount, dark_spot_scene / "telemetry.csv")
+    return PlayedSequence(read_scene_truth(dark_spot_scene), FPS, mount, dark_spot_scene / "telemetry.csv", 0)
 
 
 @pytest.fixture
