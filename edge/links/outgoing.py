@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -35,7 +36,7 @@ def _whole(track: Track) -> bool:
     if track.t_cam_target_m[2] <= 0.0 or not is_covariance(track.covariance):
         return False
     along = track.t_cam_target_m / range_m
-    range_std_m = float(np.sqrt(max(along @ track.covariance[:3, :3] @ along, 0.0)))
+    range_std_m = math.sqrt(max(float(along @ track.covariance[:3, :3] @ along), 0.0))
     orthonormal = np.allclose(track.R_cam_target @ track.R_cam_target.T, np.eye(3), atol=ROTATION_TOLERANCE)
     return bool(orthonormal and range_std_m <= UNSURE_RANGE_SHARE * range_m)
 

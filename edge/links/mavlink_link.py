@@ -1,0 +1,217 @@
+"""The link to the autopilot: one thread that owns the sockets and drives the station.
+
+A `udpin` endpoint belongs to the first address that shows an autopilot's heartbeat, until that falls silent; whatever
+comes from elsewhere is counted and dropped, and nothing is ever sent there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from edge.config import MavlinkSettings
+from edge.health import HealthState
+from edge.links.mavlink_station import Station
+from edge.links.mavlink_vehicle import LOST_NS, Contact
+from edge.links.transport import Address, Udp
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import CameraInfo, Report
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+DATAGRAMS_A_TURN = 256  # so that a flood cannot keep reports from going out
+EVENTS_WAITING = 64
+STOP_TIMEOUT_S = 5.0
+
+
+@dataclass
+class Endpoint:
+    """A socket and whom it talks with."""
+
+    transport: Udp
+    peer: Address | None
+    fixed: bool  # the peer was given, not found
+    heard_ns: int = 0
+
+
+class MavlinkLink:
+    """Speaks MAVLink on the endpoints of `settings`. None of the methods but start and stop ever blocks."""
+
+    def __init__(self, settings: MavlinkSettings, own_ship: OwnShipBuffer, camera_info: CameraInfo) -> None:
+        self._settings = settings
+        self._station = Station(settings, own_ship, camera_info)
+        self._endpoints: list[Endpoint] = []
+        self._station_lock = threading.Lock()
+        self._mail_lock = threading.Lock()
+        self._report: Report | None = None
+        self._state: HealthState | None = None
+        self._events: deque[tuple[int, str]] = deque(maxlen=EVENTS_WAITING)
+        self._replaced = self._lost_events = 0
+        self._stopping = threading.Event()
+        self._wake, self._woken = socket.socketpair()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
+        for name in self._settings.endpoints:
+            transport = Udp(name)
+            self._endpoints.append(Endpoint(transport, transport.peer, transport.peer is not None))
+        for end in (self._wake, self._woken):
+            end.setblocking(False)
+        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+        self._thread.start()
+
+    def publish(self, report: Report) -> None:
+        """Leave a report for the thread; one it has not taken yet is replaced and counted."""
+        with self._mail_lock:
+            self._replaced += self._report is not None
+            self._report = report
+        self._poke()
+
+    def set_health(self, state: HealthState) -> None:
+        """To be called at every turn of the loop: HEARTBEAT stops when it is not."""
+        with self._mail_lock:
+            self._state = state
+
+    def event(self, severity: int, text: str) -> None:
+        """Tell the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info)."""
+        with self._mail_lock:
+            self._lost_events += len(self._events) == EVENTS_WAITING
+            self._events.append((severity, text))
+        self._poke()
+
+    def stop(self) -> None:
+        """End the thread and close the sockets. May be called twice, or without start."""
+        self._stopping.set()
+        self._poke()
+        if self._thread is not None:
+            self._thread.join(STOP_TIMEOUT_S)
+            self._thread = None
+        for endpoint in self._endpoints:
+            endpoint.transport.close()
+        self._endpoints.clear()
+        self._wake.close()
+        self._woken.close()
+
+    def counters(self) -> dict[str, int]:
+        with self._station_lock:
+            station = self._station
+            counted = {
+                **station.counters,
+                **{f"refused_{reason}": count for reason, count in station.refused.items()},
+                "reboots": station.vehicle.reboots,
+                "rates_asked_again": station.vehicle.asked_again,
+                "rates_refused": station.vehicle.refusals,
+                "timesync_jumps": station.timesync.jumps,
+            }
+            uncertainty_ns = station.timesync.uncertainty_ns
+        if uncertainty_ns is not None:
+            counted["timesync_uncertainty_us"] = uncertainty_ns // 1000
+        with self._mail_lock:
+            return {**counted, "reports_replaced": self._replaced, "events_lost": self._lost_events}
+
+    @property
+    def ports(self) -> list[int]:
+        """Local UDP port of each endpoint, in the settings' order."""
+        return [endpoint.transport.port for endpoint in self._endpoints]
+
+    def _poke(self) -> None:
+        # Full: the thread has been told often enough. Closed: it is gone.
+        with contextlib.suppress(OSError):
+            self._wake.send(b"\0")
+
+    def _run(self) -> None:
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._woken, selectors.EVENT_READ)
+            for endpoint in self._endpoints:
+                selector.register(endpoint.transport, selectors.EVENT_READ, endpoint)
+            next_tick_ns = 0
+            while not self._stopping.is_set():
+                wait_s = max(0.0, (next_tick_ns - time.monotonic_ns()) / 1e9)
+                ready = [key.data for key, _ in selector.select(wait_s)]
+                with self._station_lock:
+                    self._deliver()
+                    for endpoint in ready:
+                        self._hear(endpoint)
+                    now_ns = time.monotonic_ns()
+                    if now_ns >= next_tick_ns:
+                        next_tick_ns = now_ns + round(TICK_S * 1e9)
+                        self._tick(now_ns)
+
+    def _deliver(self) -> None:
+        """Send what the loop left."""
+        with contextlib.suppress(BlockingIOError):
+            self._woken.recv(65536)
+        with self._mail_lock:
+            report, self._report = self._report, None
+            state, self._state = self._state, None
+            events = list(self._events)
+            self._events.clear()
+        now_ns = time.monotonic_ns()
+        if state is not None:
+            self._station.health(state, now_ns)
+        if report is not None:
+            try:
+                self._send(self._station.report(report, now_ns))
+            except ValueError as error:
+                # A number that no field holds: this report is not sent, the next may be.
+                self._station.counters["unpackable"] += 1
+                log.warning("mavlink: not sent: %s", error)
+        for severity, text in events:
+            self._send(self._station.event(severity, text))
+
+    def _hear(self, endpoint: Endpoint | None) -> None:
+        if endpoint is None:
+            return
+        for _ in range(DATAGRAMS_A_TURN):
+            received = endpoint.transport.receive()
+            if received is None:
+                return
+            datagram, sender = received
+            now_ns = time.monotonic_ns()
+            if not self._trusted(endpoint, datagram, sender, now_ns):
+                continue
+            endpoint.heard_ns = now_ns
+            for reply in self._station.take(datagram, now_ns):
+                endpoint.transport.send(reply, sender)
+
+    def _trusted(self, endpoint: Endpoint, datagram: bytes, sender: Address, now_ns: int) -> bool:
+        refused = self._station.refused
+        if endpoint.peer is not None:
+            refused["address"] += sender != endpoint.peer
+            return sender == endpoint.peer
+        if self._settings.allowed_hosts and sender[0] not in self._settings.allowed_hosts:
+            refused["host"] += 1
+            return False
+        if not self._station.introduces(datagram, now_ns):
+            refused["stranger"] += 1
+            return False
+        endpoint.peer = sender
+        log.info("mavlink: %s: autopilot at %s", endpoint.transport.endpoint, sender)
+        return True
+
+    def _tick(self, now_ns: int) -> None:
+        for endpoint in self._endpoints:
+            silent = endpoint.peer is not None and now_ns - endpoint.heard_ns > LOST_NS
+            if silent and not endpoint.fixed:
+                log.warning("mavlink: %s: nothing heard from %s", endpoint.transport.endpoint, endpoint.peer)
+                endpoint.peer = None
+        was = self._station.vehicle.contact
+        out = self._station.tick(now_ns)
+        if was is Contact.HEARD and self._station.vehicle.contact is Contact.LOST:
+            log.warning("mavlink: the autopilot's heartbeat has stopped")
+        self._send(out)
+
+    def _send(self, datagrams: Iterable[bytes]) -> None:
+        for datagram in datagrams:
+            for endpoint in self._endpoints:
+                if endpoint.peer is not None and not endpoint.transport.send(datagram, endpoint.peer):
+                    self._station.counters["send_failed"] += 1
