@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -46,6 +47,8 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; 2 when something that a person gave must be corrected."""
     arguments = _parser().parse_args(argv)
+    # OpenMP threads that spin while they wait cost a busy machine most of its speed. Read when torch is first imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         arguments.run(arguments)
     except ConfigError as error:

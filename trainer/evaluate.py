@@ -100,3 +100,27 @@ def measure(
         "score_auc": ranking_auc(est.score, empty),
         "score_median": float(np.median(est.score)),
     }
+
+
+def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> float:
+    """Score below which a peak is no target: the middle of where recall less false alarms is highest, of 0.05..0.95."""
+    present = np.concatenate([batch.present for batch in batches])
+    steps = np.arange(5, 96) / 100.0
+    recall = (predicted.score[present][:, None] >= steps).mean(axis=0)
+    alarms = (predicted.score[~present][:, None] >= steps).mean(axis=0)
+    gain = recall - alarms
+    return float(np.median(steps[gain >= gain.max() - 1e-9]))
+
+
+def difference(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> dict[str, float]:
+    """How far two predictors are apart on the same windows: medians and 95th percentiles over those with a target."""
+    rotation_deg = metrics.rotation_error_deg(a.R_cam_target, b.R_cam_target)[present]
+    depth_rel = np.abs(a.t_cam_target_m[present, 2] / b.t_cam_target_m[present, 2] - 1.0)
+    center_px = np.linalg.norm(a.center_px - b.center_px, axis=-1)[present]
+    score = np.abs(a.score - b.score)
+    values = {"rotation_deg": rotation_deg, "depth_rel": depth_rel, "center_px": center_px, "score": score}
+    return {
+        f"{name}_{label}": float(np.percentile(value, percentile))
+        for name, value in values.items()
+        for label, percentile in (("median", 50), ("p95", 95))
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,13 +63,33 @@ class _Batches(CalibrationDataReader):
         return next(self._inputs, None)
 
 
+def fold_pads(graph: onnx.GraphProto) -> None:
+    """Give each convolution the zero padding of the Pad before it: between INT8 layers a Pad would stay in float."""
+    constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    users = Counter(name for node in graph.node for name in node.input)
+    pads = {node.output[0]: node for node in graph.node if node.op_type == "Pad" and users[node.output[0]] == 1}
+    for conv in graph.node:
+        pad = pads.get(conv.input[0]) if conv.op_type == "Conv" else None
+        if pad is None or pad.input[1] not in constants or any(constants.get(name, 0.0) for name in pad.input[2:3]):
+            continue
+        before_n_c_h_w, after_n_c_h_w = np.split(constants[pad.input[1]], 2)
+        attribute = next(a for a in conv.attribute if a.name == "pads")
+        added = [*before_n_c_h_w[2:], *after_n_c_h_w[2:]]
+        attribute.ints[:] = [int(old + new) for old, new in zip(attribute.ints, added, strict=True)]
+        conv.input[0] = pad.input[0]
+        graph.node.remove(pad)
+
+
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
     """Static INT8: QDQ, U8 activations, S8 weights for each channel, calibrated on `calibration`."""
     with tempfile.TemporaryDirectory() as folder:
         prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
-        graph = onnx.load(str(prepared)).graph
-        nodes = [n.name for n in graph.node if n.op_type in QUANTISED_OPS and n.name.startswith(QUANTISED_PARTS)]
+        prepared_model = onnx.load(str(prepared))
+        fold_pads(prepared_model.graph)
+        onnx.save(prepared_model, str(prepared))
+        ours = [node for node in prepared_model.graph.node if node.name.startswith(QUANTISED_PARTS)]
+        nodes = [node.name for node in ours if node.op_type in QUANTISED_OPS]
         quantize_static(
             str(prepared),
             str(destination),

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, write_atomic
-from trainer.config import ConfigError, ScheduleConfig, TrainerConfig
+from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
 from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors, window_sampler
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
@@ -182,11 +182,17 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def resume_run(out: Path, trainer: Trainer, config_text: str) -> float:
-    """Restore `trainer` from the run folder and return the seconds already used. Raises ConfigError."""
-    state = load_file(out / RESUME_NAME)
-    if state["config"] != config_text:
-        raise ConfigError(f"{out / RESUME_NAME}: has another configuration; give the same --config or another --out")
+def resume_run(out: Path, trainer: Trainer) -> float:
+    """Restore `trainer` from the run folder and return the seconds already used. Raises ConfigError.
+
+    Only what the weights do not depend on, [run] and [contract], may differ from the configuration of the checkpoint.
+    """
+    path = out / RESUME_NAME
+    state = load_file(path)
+    earlier = parse_config(state["config"], f"{path} (config)")
+    for section in ("model", "loss", "data", "schedule"):
+        if getattr(earlier, section) != getattr(trainer.config, section):
+            raise ConfigError(f"{path}: [{section}] differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
     return float(state["used_s"])
 
@@ -212,7 +218,7 @@ def run_training(
     trainer = Trainer(config, device)
     if not resume and (out / RESUME_NAME).exists():
         raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
-    used_before_s = resume_run(out, trainer, config_text) if resume else 0.0
+    used_before_s = resume_run(out, trainer) if resume else 0.0
     budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
     loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
     with stop_on_signals() as stopped:

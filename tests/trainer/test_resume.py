@@ -75,5 +75,5 @@ def test_a_run_is_not_overwritten_and_another_config_is_refused(tmp_path: Path) 
         train(tmp_path / "run", 1)
     other = TINY.replace("mask = 1.0", "mask = 2.0")
     config = parse_config(other, "other.toml")
-    with pytest.raises(ConfigError, match=r"resume\.pt: has another configuration"):
+    with pytest.raises(ConfigError, match=r"resume\.pt: \[loss\] differs"):
         run_training(config, other, tmp_path / "run", resume=True, open_sampler=synthetic_sampler.opener)
