@@ -227,27 +227,25 @@ class Renderer:
         self._fine.viewport = (*corner, width * samples, height * samples)
         _write_rows(self._aircraft["environment"], _packed_environment(scene.environment))
         self._aircraft["corner"].value = corner
-        for number, target in enumerate(scene.targets, start=1):
-            self._draw_target(target, scene.camera, crop, number)
+        # One depth range for all targets, so that the nearer hides the farther.
+        reach = [(t.pose_in(scene.camera)[1][2], AIRFRAMES[t.airframe_id].diameter_m()) for t in scene.targets]
+        ahead = [z - size >= NEAREST_VERTEX_M for z, size in reach]
+        if not any(ahead):
+            return crop, samples
+        near_m = min(z - size for (z, size), drawn in zip(reach, ahead, strict=True) if drawn)
+        far_m = max(z + size for z, size in reach)
+        projection = clip_from_cam(scene.camera.K, crop[0], crop[1], width, height, near_m, far_m)
+        for number, (target, drawn) in enumerate(zip(scene.targets, ahead, strict=True), start=1):
+            if drawn:
+                self._draw_target(target, scene.camera, projection, number)
         return crop, samples
 
-    def _draw_target(self, target: Target, camera: Camera, crop: tuple[int, int, int, int], number: int) -> None:
+    def _draw_target(self, target: Target, camera: Camera, projection: Array, number: int) -> None:
         airframe = AIRFRAMES[target.airframe_id]
         R_cam_body, t_cam_body_m = target.pose_in(camera)
         diameter_m = airframe.diameter_m()
-        if t_cam_body_m[2] < diameter_m + NEAREST_VERTEX_M:
-            return
         cam_from_body = np.eye(4)
         cam_from_body[:3, :3], cam_from_body[:3, 3] = R_cam_body, t_cam_body_m
-        projection = clip_from_cam(
-            camera.K,
-            crop[0],
-            crop[1],
-            crop[2] - crop[0],
-            crop[3] - crop[1],
-            t_cam_body_m[2] - diameter_m,
-            t_cam_body_m[2] + diameter_m,
-        )
         program = self._aircraft
         program["clip_from_body"].write(_columns(projection @ cam_from_body))
         program["ned_from_body"].write(_columns(target.R_ned_body))

@@ -76,7 +76,7 @@ void main() {
     vec3 background = ray.z > 0.0 ? ground(ray) : sky(ray);
     vec3 sum = vec3(0.0);
     vec4 body = vec4(0.0);
-    float covered = 0.0, hit = 0.0;
+    float covered = 0.0, hit = 0.0, number = 0.0, share = 0.0;
     coordinate = vec4(0.0);
     if (all(greaterThanEqual(pixel, crop.xy)) && all(lessThan(pixel, crop.zw))) {
         ivec2 corner = crop_at + (pixel - crop.xy) * tile.z;
@@ -85,12 +85,20 @@ void main() {
             vec4 b = texelFetch(aircraft_coordinate, corner + ivec2(i, j), 0);
             sum += c.a * c.rgb * c.rgb;
             covered += c.a;
-            if (b.w > 0.5) { body.xyz += b.xyz; body.w = max(body.w, b.w); hit += 1.0; }
+            if (b.w > 0.5) {
+                hit += 1.0;
+                // Majority vote (Boyer and Moore): a pixel that two targets share belongs to one of them.
+                if (share == 0.0) number = b.w;
+                share += b.w == number ? 1.0 : -1.0;
+            }
+        }
+        for (int j = 0; j < tile.z && hit > 0.0; ++j) for (int i = 0; i < tile.z; ++i) {
+            vec4 b = texelFetch(aircraft_coordinate, corner + ivec2(i, j), 0);
+            if (b.w == number) body += vec4(b.xyz, 1.0);
         }
         float samples = float(tile.z * tile.z);
-        sum /= samples; covered /= samples;
-        if (hit > 0.0) coordinate = vec4(body.xyz / hit, body.w);
-        hit /= samples;
+        sum /= samples; covered /= samples; hit /= samples;
+        if (body.w > 0.0) coordinate = vec4(body.xyz / body.w, number);
     }
     // Blue first, as OpenCV stores it; alpha is the share of the pixel that the aircraft covers.
     colour = vec4(sqrt(clamp(sum + (1.0 - covered) * background, 0.0, 1.0)).bgr, hit);

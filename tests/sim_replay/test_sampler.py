@@ -1,0 +1,168 @@
+"""Training windows: reproducible to the bit, and labelled as they look."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing as mp
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from msgs.geometry import so3_log
+from sim_replay.airframes import AIRFRAMES
+from sim_replay.render.placing import (
+    FOCAL_PX,
+    FRAME_HEIGHT_PX,
+    FRAME_WIDTH_PX,
+    RANGE_M,
+    draw_window,
+    frame_scene,
+    outline_px,
+)  # fmt: skip
+from sim_replay.render.renderer import extents_px
+from sim_replay.sample import SampleBatch
+from sim_replay.sampler import WindowSampler, main, render_frame
+
+SIZE = 96
+
+
+@pytest.fixture(scope="module")
+def sampler() -> WindowSampler:
+    return WindowSampler(seed=7, size_px=SIZE)
+
+
+@pytest.fixture(scope="module")
+def batch(sampler: WindowSampler) -> SampleBatch:
+    return sampler.batch(0, 96)
+
+
+def _digest(sample: SampleBatch) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(vars(sample)):
+        digest.update(np.ascontiguousarray(getattr(sample, name)).tobytes())
+    return digest.hexdigest()
+
+
+def _digest_in_a_process(sampler: WindowSampler, out: mp.SimpleQueue) -> None:
+    out.put(_digest(sampler.batch(37, 6)))
+
+
+def test_a_window_is_the_same_in_any_batch_and_any_process(sampler: WindowSampler, batch: SampleBatch) -> None:
+    again = sampler.batch(37, 6)
+    for name, values in vars(again).items():
+        np.testing.assert_array_equal(values, getattr(batch, name)[37:43], err_msg=name)
+    context = mp.get_context("spawn")
+    out = context.SimpleQueue()
+    process = context.Process(target=_digest_in_a_process, args=(pickle.loads(pickle.dumps(sampler)), out))
+    process.start()
+    assert out.get() == _digest(again)
+    process.join()
+
+
+def test_samplers_of_two_sizes_live_in_one_process(sampler: WindowSampler, batch: SampleBatch) -> None:
+    small = WindowSampler(seed=7, size_px=64).batch(0, 4)
+    assert small.image_bgr.shape == (4, 64, 64, 3)
+    np.testing.assert_array_equal(sampler.batch(0, 4).image_bgr, batch.image_bgr[:4])
+
+
+def test_coordinates_pose_and_intrinsics_agree(batch: SampleBatch) -> None:
+    errors = []
+    for k in np.flatnonzero(batch.present):
+        inside = cv2.erode(batch.mask[k].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        rows, columns = np.nonzero(inside)
+        if len(rows) < 10:
+            continue
+        points = batch.noc[k][rows, columns].astype(np.float64) * float(batch.diameter_m[k])
+        R, t, K = (a[k].astype(np.float64) for a in (batch.R_cam_target, batch.t_cam_target_m, batch.K))
+        pixels = cv2.projectPoints(points, so3_log(R), t, K, None)[0][:, 0]
+        errors.append(np.median(np.linalg.norm(pixels - np.stack([columns, rows], axis=-1), axis=1)))
+    assert len(errors) > 40
+    assert np.max(errors) < 0.75
+    assert np.median(errors) < 0.2
+
+
+def test_boxes_hold_their_masks(batch: SampleBatch) -> None:
+    checked = 0
+    for k in np.flatnonzero(batch.present):
+        x, y = np.flatnonzero(batch.mask[k].any(axis=0)), np.flatnonzero(batch.mask[k].any(axis=1))
+        seen = np.array([x[0] - 0.5, y[0] - 0.5, x[-1] + 0.5, y[-1] + 0.5])
+        assert np.all(batch.box_xyxy_px[k] >= -0.5)
+        assert np.all(batch.box_xyxy_px[k] <= SIZE - 0.5)
+        checked += int(np.abs(batch.box_xyxy_px[k] - seen).max() <= 1.5)
+    # Hair-thin tips cover less than a mask's share of their pixels, so a few boxes reach further.
+    assert checked > 0.9 * batch.present.sum()
+
+
+def test_without_a_target_labels_are_blank(batch: SampleBatch) -> None:
+    absent = ~batch.present
+    assert 0.03 < absent.mean() < 0.35
+    assert not batch.mask[absent].any()
+    assert not batch.noc[absent].any()
+    assert np.all(batch.airframe_id[absent] == -1)
+    np.testing.assert_array_equal(batch.R_cam_target[absent], np.tile(np.eye(3), (absent.sum(), 1, 1)))
+    assert np.all(batch.airframe_id[batch.present] >= 0)
+
+
+def test_the_target_shows_in_the_picture(sampler: WindowSampler) -> None:
+    """The masked pixels differ from their surroundings far more than the background does from itself."""
+    sample = sampler.batch(200, 64)
+    contrast = []
+    for k in np.flatnonzero(sample.present):
+        grey = cv2.cvtColor(sample.image_bgr[k], cv2.COLOR_BGR2GRAY).astype(float)
+        ring = cv2.dilate(sample.mask[k].astype(np.uint8), np.ones((9, 9))) - sample.mask[k].astype(np.uint8) > 0
+        contrast.append(np.abs(grey[sample.mask[k]] - np.median(grey[ring])).mean())
+    assert np.median(contrast) > 12
+
+
+def test_frames_follow_the_benchmark_statistics() -> None:
+    rng = np.random.default_rng(3)
+    share, ranges = [], []
+    for _ in range(500):
+        scene = frame_scene(rng, range(len(AIRFRAMES)))
+        box = extents_px(outline_px(scene.targets[0], scene.camera))
+        assert box is not None
+        share.append((box[2] - box[0]) * (box[3] - box[1]) / (FRAME_WIDTH_PX * FRAME_HEIGHT_PX))
+        ranges.append(np.linalg.norm(scene.targets[0].t_ned_body_m - scene.camera.t_ned_cam_m))
+        fx, fy = scene.camera.K[0, 0], scene.camera.K[1, 1]
+        assert FOCAL_PX[0] * 0.98 < min(fx, fy) <= max(fx, fy) < FOCAL_PX[1] * 1.02
+        assert abs(np.log(fx / fy)) < 0.03
+    assert 0.008 < np.mean(share) < 0.016
+    assert RANGE_M[0] <= min(ranges) < 110
+    assert 500 < max(ranges) <= RANGE_M[1]
+
+
+def test_windows_show_targets_as_large_as_the_stages_will() -> None:
+    track, acquire = [], []
+    for index in range(300):
+        window = draw_window(1, index, 128, range(len(AIRFRAMES)), 0.3, 0.0)
+        box = extents_px(outline_px(window.scene.targets[0], window.scene.camera)) if window.scene.targets else None
+        if box is None or window.visible_share < 0.999:
+            continue
+        side = max(box[2] - box[0], box[3] - box[1]) / window.scene.camera.width_px
+        (acquire if window.kind == "acquire" else track).append(side)
+    assert 1 / (1.8 * 1.34) < min(track) < 0.47
+    assert 0.7 < max(track) < 1 / (1.8 * 0.74)
+    assert min(acquire) * 128 < 16
+    assert max(acquire) * 128 > 80
+
+
+def test_only_the_airframes_asked_for_appear() -> None:
+    sample = WindowSampler(seed=2, size_px=64, airframe_ids=(1, 4), empty_share=0.0, acquire_share=0.0).batch(0, 16)
+    assert set(sample.airframe_id[sample.present].tolist()) == {1, 4}
+
+
+def test_a_whole_frame_differs_from_the_next_by_its_noise_alone() -> None:
+    scene = frame_scene(np.random.default_rng(5), [0])
+    a, b = (render_frame(type(scene)(scene.camera, scene.targets, scene.environment, 9, frame)) for frame in (0, 1))
+    assert a.image_bgr.shape == (1, FRAME_HEIGHT_PX, FRAME_WIDTH_PX, 3)
+    np.testing.assert_array_equal(a.mask, b.mask)
+    difference = a.image_bgr.astype(np.int16) - b.image_bgr
+    assert 0.0 < np.abs(difference).mean() < 12
+    assert abs(difference.mean()) < 0.05
+
+
+def test_the_bench_prints_a_rate(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--size", "48", "--count", "16"]) == 0
+    assert int(capsys.readouterr().out.split()[0]) > 0
