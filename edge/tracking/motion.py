@@ -266,6 +266,8 @@ def correct(motion: Motion, seen: Innovation) -> Motion:
     # Joseph's form keeps P positive semi-definite whatever the gain.
     keep = np.eye(DIMENSION) - gain @ H
     P = _symmetric(keep @ motion.P @ keep.T + gain @ noise @ gain.T)
+    if motion.kind == "cam":
+        P = _follow_sight_line(P, motion.t_m, change)
     turn_rate = float(np.clip(motion.turn_rate_radps + change[TURN_RATE], -TURN_RATE_MAX, TURN_RATE_MAX))
     return replace(
         motion,
@@ -314,6 +316,21 @@ def _acceleration_density(motion: Motion) -> Array:
     along = np.outer(motion.t_m, motion.t_m) / max(range_m**2, 1.0)
     across = (APPARENT_ACCELERATION * range_m) ** 2 * (np.eye(3) - along)
     return ACCELERATION["ned_relative"] ** 2 * along + across
+
+
+def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
+    """P after a correction in `cam`: errors of range move with the sight line and scale its rate.
+
+    What turns the sight line there is mostly the camera, so a change across it must not be read as parallax, from
+    which a filter in Cartesian coordinates would infer range.
+    """
+    range_m = float(np.linalg.norm(t_m))
+    along = t_m / range_m
+    T = np.eye(DIMENSION)
+    for part in (POSITION, VELOCITY):
+        across = change[part] - (change[part] @ along) * along
+        T[part, POSITION] += np.outer(across, along) / range_m
+    return _symmetric(T @ P @ T.T)
 
 
 def _speed_variance(kind: FrameKind, range_m: float) -> float:
