@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,8 @@ class LiveFigures:
 
     def _take_pose(self, recording: Recording, record: Record) -> None:
         self.frame = frame_of_record(record, recording, self.sequence)
-        self.captures_ns.append(recording.capture_ns(record))
+        if not self.captures_ns or recording.capture_ns(record) > self.captures_ns[-1]:
+            self.captures_ns.append(recording.capture_ns(record))
         self.range_m = float(np.linalg.norm(record["t_cam_target_m"]))
         self.range_error_m = self.rotation_error_deg = None
         if self.frame is None:
@@ -71,7 +73,7 @@ class LiveFigures:
 
     @property
     def rate_hz(self) -> float | None:
-        """Poses a second over the last thirty."""
+        """Frames with a pose a second, over the last thirty."""
         if len(self.captures_ns) < 2 or self.captures_ns[-1] <= self.captures_ns[0]:
             return None
         return (len(self.captures_ns) - 1) * 1e9 / (self.captures_ns[-1] - self.captures_ns[0])
@@ -117,7 +119,7 @@ class LiveView:
         elif time.monotonic() - self._printed_s >= _PLAIN_PERIOD_S:
             self._printed_s = time.monotonic()
             cells = self._figures.cells().items()
-            self._console.print("  ".join(f"{name} {value}" for name, value in cells), highlight=False)
+            self._console.print("  ".join(f"{n} {v}" for n, v in cells), highlight=False, soft_wrap=True)
 
     def _table(self) -> Table:
         table = Table(title=f"{self._figures.sequence.scene.name}, live", title_justify="left")
@@ -138,16 +140,18 @@ def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> 
         InputError, PlayError, OSError.
     """
     loaded = load_model(model, threads=1)
-    console.print(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}", highlight=False)
+    say = partial(console.print, highlight=False, soft_wrap=True)
+    say(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}")
     figures = LiveFigures(sequence)
     with LiveView(console, figures) as view:
         recording = play(PlaySettings(sequence, out, model), view.on_record)
     result = judge(sequence, recording)
     score = score_json(sequence, result, loaded)
     (out / "score.json").write_text(json.dumps(score, indent=2) + "\n", encoding="utf-8")
-    _draw(sequence, result, out, console)
     console.print(summary_table(score))
-    console.print(f"written to {out}: score.json, overlay.mp4, overlay.png, daemon.log, config.toml", highlight=False)
+    say(f"drawing {len(sequence.scene.images)} frames")
+    _draw(sequence, result, out, console)
+    say(f"written to {out}: score.json, overlay.mp4, overlay.png, daemon.log, config.toml")
     return bool(recording.poses) and bool(recording.targets)
 
 
