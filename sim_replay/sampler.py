@@ -68,7 +68,7 @@ def _write_target(
     out["box_xyxy_px"][k] = box
     out["R_cam_target"][k], out["t_cam_target_m"][k] = target.pose_in(camera)
     out["mask"][k] = mask
-    out["noc"][k] = noc * mask[..., None]
+    out["noc"][k][mask] = noc[mask]
     out["airframe_id"][k] = target.airframe_id
     out["diameter_m"][k] = AIRFRAMES[target.airframe_id].diameter_m()
 
