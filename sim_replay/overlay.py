@@ -121,7 +121,7 @@ class Overlay:
     def _draw_poses(self, canvas: Image, view: FrameView, K: Array, thickness: int) -> None:
         if view.match is None or view.extents is None:
             return
-        draw_pose(canvas, K, view.match.truth, view.extents, TRUTH_BGR, thickness + self._px(2))
+        draw_pose(canvas, K, view.match.truth, view.extents, TRUTH_BGR, thickness + self._px(1))
         if view.match.estimate is not None:
             draw_pose(canvas, K, view.match.estimate, view.extents, ESTIMATE_BGR, thickness)
 
