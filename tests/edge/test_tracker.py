@@ -1,0 +1,327 @@
+"""The tracker against simulated flights whose noise is known: a turning target, seen from a turning own ship."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edge.tracking.tracker import COAST_MAX_S, PERSISTENT, Tracker
+from edge.types import Estimate, Mount, OwnShip, Track, TrackState
+from msgs.geometry import rotation_angle
+
+FORWARD = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.5, 0.0, 0.2]))
+K = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
+SIZE_WH = (1920, 1080)
+RATE_HZ = 30
+BEARING_STD_PX = 2.0
+LOG_RANGE_STD = 0.05
+ROTATION_STD_RAD = np.deg2rad(6.0)
+BIAS_SHARE, BIAS_TIME_S = 0.7, 2.0  # of range errors: the rest is new in each frame
+
+
+@dataclass
+class Instant:
+    """The truth of one frame, and a noisy estimate of it."""
+
+    time_ns: int
+    own_ship: OwnShip
+    t_cam_target_m: np.ndarray
+    R_cam_target: np.ndarray
+    v_ned_target_mps: np.ndarray
+    box_xyxy_px: np.ndarray
+    estimate: Estimate
+
+
+def euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+
+
+def flight(
+    seed: int,
+    frames: int = 240,
+    offset_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    bias_share: float = BIAS_SHARE,
+) -> Iterator[Instant]:
+    """A target in a steady turn at 25 m/s; the own ship follows at 20 m/s, rolling and yawing."""
+    rng = np.random.default_rng(seed)
+    bias = rng.normal()
+    memory = np.exp(-1.0 / RATE_HZ / BIAS_TIME_S)
+    speed_mps, turn_radps = 25.0, 0.1
+    for i in range(frames):
+        t = i / RATE_HZ
+        yaw = turn_radps * t
+        radius_m = speed_mps / turn_radps
+        target_m = np.array([250 + radius_m * np.sin(yaw), radius_m * (1 - np.cos(yaw)), -100.0]) + offset_ned_m
+        v_mps = speed_mps * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        own_m = np.array([20.0 * t, 0.0, -100.0])
+        towards = np.arctan2(target_m[1] - own_m[1], target_m[0] - own_m[0])
+        R_ned_body = euler(0.3 * np.sin(t), 0.05 * np.sin(2 * t), 0.1 * np.sin(0.7 * t) + towards)
+        R_cam_ned = (R_ned_body @ FORWARD.R_body_cam).T
+        t_cam = R_cam_ned @ (target_m - own_m - R_ned_body @ FORWARD.t_body_cam_m)
+        R_cam_target = R_cam_ned @ euler(0.3, 0.05, yaw)
+        own_ship = OwnShip(1 + round(t * 1e9), R_ned_body, own_m, np.array([20.0, 0.0, 0.0]), None)
+        bias = memory * bias + np.sqrt(1.0 - memory**2) * rng.normal()
+        log_range_error = LOG_RANGE_STD * (np.sqrt(bias_share) * bias + np.sqrt(1 - bias_share) * rng.normal())
+        yield Instant(own_ship.time_ns, own_ship, t_cam, R_cam_target, v_mps, box_at(t_cam), seen(
+            rng, t_cam, R_cam_target, log_range_error
+        ))  # fmt: skip
+
+
+def box_at(t_cam_m: np.ndarray) -> np.ndarray:
+    center = (K @ t_cam_m)[:2] / t_cam_m[2]
+    half = K[0, 0] * np.array([4.0, 1.5]) / t_cam_m[2]
+    return np.concatenate([center - half, center + half])
+
+
+def seen(rng: np.random.Generator, t_cam_m: np.ndarray, R_cam_target: np.ndarray, log_range_error: float) -> Estimate:
+    across_std_m = BEARING_STD_PX / K[0, 0] * np.linalg.norm(t_cam_m)
+    along = t_cam_m / np.linalg.norm(t_cam_m)
+    across = np.eye(3) - np.outer(along, along)
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = across_std_m**2 * across + LOG_RANGE_STD**2 * np.outer(t_cam_m, t_cam_m)
+    covariance[3:, 3:] = ROTATION_STD_RAD**2 * np.eye(3)
+    measured_m = (1 + log_range_error) * t_cam_m + across @ rng.normal(scale=across_std_m, size=3)
+    R = Rotation.from_rotvec(rng.normal(scale=ROTATION_STD_RAD, size=3)).as_matrix() @ R_cam_target
+    return Estimate(0.9, box_at(t_cam_m) + rng.normal(scale=1.0), R, measured_m, covariance, "track")
+
+
+def known(kind: str, own_ship: OwnShip) -> OwnShip | None:
+    """What is left of the own ship's state."""
+    if kind == "cam":
+        return None
+    return own_ship if kind == "ned" else replace(own_ship, t_ned_body_m=None, v_ned_body_mps=None)
+
+
+def update(tracker: Tracker, now: Instant, kind: str, estimates: list[Estimate] | None = None) -> tuple[Track, ...]:
+    found = [now.estimate] if estimates is None else estimates
+    return tracker.update(now.time_ns, found, known(kind, now.own_ship), K, SIZE_WH)
+
+
+def predict(tracker: Tracker, now: Instant, kind: str) -> list[Track]:
+    return tracker.predict(now.time_ns, known(kind, now.own_ship), K, SIZE_WH)
+
+
+@pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
+@pytest.mark.parametrize(("bias_share", "at_most"), [(BIAS_SHARE, 0.95), (0.0, 0.7)], ids=["biased", "white"])
+def test_tracks_are_better_than_single_frames_and_know_how_good_they_are(
+    kind: str, bias_share: float, at_most: float
+) -> None:
+    """A bias cannot be averaged away: sqrt(0.7) = 0.84 of the error stays whatever a filter does."""
+    m2, raw_m2, rad2, raw_rad2, nees = [], [], [], [], []
+    for seed in range(6):
+        tracker = Tracker(4, FORWARD)
+        for i, now in enumerate(flight(seed, bias_share=bias_share)):
+            (track,) = update(tracker, now, kind)
+            if i < RATE_HZ:
+                continue
+            error_m = track.t_cam_target_m - now.t_cam_target_m
+            error_rad = Rotation.from_matrix(now.R_cam_target @ track.R_cam_target.T).as_rotvec()
+            raw_m = now.estimate.t_cam_target_m - now.t_cam_target_m
+            m2.append(error_m @ error_m)
+            raw_m2.append(raw_m @ raw_m)
+            rad2.append(error_rad @ error_rad)
+            raw_rad2.append(float(rotation_angle(now.estimate.R_cam_target, now.R_cam_target)) ** 2)
+            nees.append(
+                [
+                    error_m @ np.linalg.solve(track.covariance[:3, :3], error_m),
+                    error_rad @ np.linalg.solve(track.covariance[3:, 3:], error_rad),
+                ]
+            )
+    assert np.sqrt(np.mean(m2) / np.mean(raw_m2)) < at_most
+    assert np.sqrt(np.mean(rad2) / np.mean(raw_rad2)) < 0.7
+    # Three degrees of freedom each: 3 is consistent, less is cautious, more overconfident.
+    assert np.all(np.mean(nees, axis=0) < 4.5)
+    if bias_share:
+        assert np.all(np.mean(nees, axis=0) > 0.5)
+
+
+@pytest.mark.parametrize(("kind", "tolerance_px"), [("ned", 4.0), ("ned_relative", 4.0), ("cam", 12.0)])
+def test_the_box_is_predicted_while_the_own_ship_turns(kind: str, tolerance_px: float) -> None:
+    tracker = Tracker(4, FORWARD)
+    errors_px = []
+    for i, now in enumerate(flight(5)):
+        expected = predict(tracker, now, kind)
+        if i > 10:
+            errors_px.append(np.abs(expected[0].box_xyxy_px - now.box_xyxy_px).max())
+        update(tracker, now, kind)
+    assert np.percentile(errors_px, 95) < tolerance_px
+
+
+def test_with_own_attitude_a_target_missed_for_a_second_is_still_where_it_is_looked_for() -> None:
+    tracker = Tracker(4, FORWARD)
+    for i, now in enumerate(flight(6)):
+        if 90 <= i < 120:
+            (expected,) = predict(tracker, now, "ned")
+            (track,) = update(tracker, now, "ned", [])
+            assert track.state is TrackState.COASTING
+            # Within the box's own length: a search window around it holds the target.
+            assert np.abs(expected.box_xyxy_px - now.box_xyxy_px).max() < now.box_xyxy_px[2] - now.box_xyxy_px[0]
+        else:
+            update(tracker, now, "ned")
+
+
+def test_velocity_in_ned_is_the_targets_own() -> None:
+    tracker = Tracker(4, FORWARD)
+    errors_mps = []
+    for i, now in enumerate(flight(7)):
+        (track,) = update(tracker, now, "ned")
+        assert track.v_ned_target_mps is not None
+        if i > 120:
+            errors_mps.append(np.linalg.norm(track.v_ned_target_mps - now.v_ned_target_mps))
+    assert np.median(errors_mps) < 8.0
+
+
+def test_a_track_lives_through_gaining_and_losing_own_attitude_and_position() -> None:
+    tracker = Tracker(4, FORWARD)
+    kinds = ["cam", "ned", "ned_relative", "ned", "cam", "ned_relative", "cam"]
+    for i, now in enumerate(flight(8, frames=20 * len(kinds))):
+        kind = kinds[i // 20]
+        (track,) = update(tracker, now, kind)
+        assert track.track_id == 0
+        assert (track.R_ned_target is None) == (kind == "cam")
+        if i > 10:
+            assert track.state is TrackState.CONFIRMED
+            assert np.linalg.norm(track.t_cam_target_m - now.t_cam_target_m) < 60.0
+            across = (track.t_cam_target_m / track.t_cam_target_m[2] - now.t_cam_target_m / now.t_cam_target_m[2])[:2]
+            assert np.abs(across).max() * K[0, 0] < 25.0
+
+
+def test_states_follow_what_is_seen() -> None:
+    tracker = Tracker(4, FORWARD)
+    states = []
+    lost_at_ns = None
+    last_seen_ns = 0
+    for i, now in enumerate(flight(9, frames=120)):
+        tracks = update(tracker, now, "ned", None if i < 10 else [])
+        states.append(tracks[0].state if tracks else None)
+        last_seen_ns = now.time_ns if i < 10 else last_seen_ns
+        if not tracks and lost_at_ns is None:
+            lost_at_ns = now.time_ns
+    assert states[:4] == [TrackState.TENTATIVE, TrackState.TENTATIVE, TrackState.CONFIRMED, TrackState.CONFIRMED]
+    assert states[10] is TrackState.COASTING
+    assert lost_at_ns is not None
+    assert COAST_MAX_S < (lost_at_ns - last_seen_ns) / 1e9 < COAST_MAX_S + 0.1
+
+
+def test_uncertainty_grows_while_coasting() -> None:
+    tracker = Tracker(4, FORWARD)
+    sizes = [
+        np.linalg.det(update(tracker, now, "ned", None if i < 30 else [])[0].covariance[:3, :3])
+        for i, now in enumerate(flight(10, frames=60))
+    ]
+    assert np.all(np.diff(sizes[30:]) > 0)
+
+
+def test_one_false_detection_never_becomes_a_track() -> None:
+    tracker = Tracker(4, FORWARD)
+    for i, now in enumerate(flight(11, frames=30)):
+        tracks = update(tracker, now, "ned", None if i == 0 else [])
+    assert tracks == ()
+
+
+def test_a_frame_from_the_past_changes_nothing() -> None:
+    tracker = Tracker(4, FORWARD)
+    history = list(flight(12, frames=20))
+    for now in history:
+        tracks = update(tracker, now, "ned")
+    again = update(tracker, history[10], "ned")
+    assert again is tracks
+    assert tracker.out_of_order == 1
+
+
+def test_a_rotation_turned_over_once_is_ignored_and_one_that_stays_is_believed() -> None:
+    tracker = Tracker(4, FORWARD)
+    about_nose = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    for i, now in enumerate(flight(13, frames=60 + PERSISTENT)):
+        truth = now.R_cam_target
+        estimate = now.estimate
+        if i == 40 or i >= 60:
+            truth, estimate = truth @ about_nose, replace(estimate, R_cam_target=estimate.R_cam_target @ about_nose)
+        (track,) = update(tracker, now, "ned", [estimate])
+        if 20 < i < 60 or i == 65:
+            assert rotation_angle(track.R_cam_target, truth if i == 65 else now.R_cam_target) < np.deg2rad(25.0)
+
+
+def test_a_range_that_stays_elsewhere_is_believed_without_a_new_number() -> None:
+    tracker = Tracker(4, FORWARD)
+    for i, now in enumerate(flight(14, frames=60)):
+        far = 2.5 if i >= 40 else 1.0
+        (track,) = update(
+            tracker, now, "ned", [replace(now.estimate, t_cam_target_m=far * now.estimate.t_cam_target_m)]
+        )
+    assert track.track_id == 0
+    assert track.t_cam_target_m[2] == pytest.approx(2.5 * now.t_cam_target_m[2], rel=0.2)
+
+
+def test_two_targets_keep_their_numbers_when_estimates_change_places() -> None:
+    tracker = Tracker(4, FORWARD)
+    ids = set()
+    for i, (a, b) in enumerate(zip(flight(15), flight(16, offset_ned_m=(40.0, 30.0, -10.0)), strict=True)):
+        pair = [a.estimate, b.estimate] if i % 2 else [b.estimate, a.estimate]
+        tracks = update(tracker, a, "ned", pair)
+        assert len(tracks) == 2
+        nearest = [int(np.argmin([np.linalg.norm(t.box_xyxy_px - now.box_xyxy_px) for t in tracks])) for now in (a, b)]
+        ids.add(tuple(tracks[k].track_id for k in nearest))
+    assert len(ids) == 1
+
+
+def test_one_target_seen_by_two_windows_is_one_track_and_no_more_targets_than_allowed() -> None:
+    tracker = Tracker(2, FORWARD)
+    for now in flight(17, frames=10):
+        twice = [now.estimate, replace(now.estimate, score=0.5)]
+        elsewhere = [
+            replace(now.estimate, box_xyxy_px=now.estimate.box_xyxy_px + 100 * k, t_cam_target_m=t)
+            for k, t in ((1, np.array([-50.0, -20.0, 300.0])), (2, np.array([60.0, 30.0, 300.0])))
+        ]
+        tracks = update(tracker, now, "ned", twice + elsewhere)
+    assert [track.track_id for track in tracks] == [0, 1]
+
+
+def test_an_estimate_that_is_not_finite_is_dropped_and_counted() -> None:
+    tracker = Tracker(4, FORWARD)
+    for now in flight(18, frames=5):
+        tracks = update(tracker, now, "ned", [now.estimate, replace(now.estimate, t_cam_target_m=np.full(3, np.nan))])
+    assert len(tracks) == 1
+    assert tracker.not_finite == 5
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    plan=st.lists(
+        st.tuples(
+            st.sampled_from(["ned", "ned_relative", "cam"]),
+            st.integers(1, 400),  # ms since the last frame
+            st.booleans(),  # whether the target is seen
+            st.floats(-9.0, 3.0),  # log10 of the covariance's scale
+        ),
+        min_size=3,
+        max_size=25,
+    ),
+)
+def test_covariances_stay_symmetric_positive_semi_definite(seed: int, plan: list[tuple[str, int, bool, float]]) -> None:
+    rng = np.random.default_rng(seed)
+    tracker = Tracker(4, FORWARD)
+    time_ns = 1
+    for kind, step_ms, visible, scale in plan:
+        time_ns += step_ms * 1_000_000
+        own = OwnShip(
+            time_ns, Rotation.random(rng=rng).as_matrix(), 500 * rng.normal(size=3), 30 * rng.normal(size=3), None
+        )
+        factor = rng.normal(size=(6, 6))
+        t_cam = np.array([20.0 * rng.normal(), 20.0 * rng.normal(), 100 + 400 * rng.random()])
+        R = Rotation.random(rng=rng).as_matrix()
+        estimate = Estimate(0.9, box_at(t_cam), R, t_cam, 10.0**scale * factor @ factor.T, "acquire")
+        for track in tracker.update(time_ns, [estimate] if visible else [], known(kind, own), K, SIZE_WH):
+            for P in (track.covariance, track.covariance_ned):
+                if P is not None:
+                    assert np.all(np.isfinite(P))
+                    np.testing.assert_array_equal(P, P.T)
+                    assert np.linalg.eigvalsh(P)[0] >= -1e-9 * np.trace(P)
+            np.testing.assert_allclose(track.R_cam_target @ track.R_cam_target.T, np.eye(3), atol=1e-9)
