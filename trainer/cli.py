@@ -21,6 +21,7 @@ def _train(arguments: argparse.Namespace) -> None:
         budget_s=None if arguments.budget_minutes is None else 60.0 * arguments.budget_minutes,
         resume=arguments.resume,
         samples=arguments.samples,
+        start_from=arguments.start_from,
     )
 
 
@@ -39,6 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--out", type=Path, required=True, help="run folder")
     train.add_argument("--budget-minutes", type=float, help="wall-clock limit of this start; fits the schedule into it")
     train.add_argument("--samples", type=int, help="planned samples in all, instead of the configuration's")
+    train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="begin with another run's weights.pt")
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
     return parser

@@ -31,6 +31,9 @@ class ModelConfig(_Section):
     focal: Literal["mean", "geometric"] = Field(description="(fx + fy) / 2 or sqrt(fx fy)")
     depth: Literal["plain", "rotation_aware"] = Field(description="APDD's scale: free, or latent extents seen from R")
     uncertainty: bool = Field(description="train the sigma heads")
+    hypotheses: int = Field(
+        1, ge=1, description="rotations proposed for a target, each for headings around its own; the likeliest is said"
+    )
     dense: bool = Field(description="train the mask and object-coordinate heads, which export drops")
     max_peaks: int = Field(4, ge=1, description="M: targets decoded for each image")
 
@@ -52,6 +55,7 @@ class LossConfig(_Section):
     planar: float = Field(50.0, ge=0, description="mu_2, on T_xy / Z")
     depth_beta: float = Field(1.0, gt=0, description="where SmoothL1 of log Z turns from square to linear")
     rotation_6d: float = Field(5.0, ge=0, description="eta")
+    hypothesis: float = Field(0.0, ge=0, description="cross-entropy of the rotation hypotheses")
     center: float = Field(0.0, ge=0, description="soft-argmax centre, in cells")
     origin: float = Field(0.0, ge=0, description="projected body origin, in longer box sides")
     mask: float = Field(0.0, ge=0)

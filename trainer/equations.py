@@ -77,6 +77,13 @@ def gram_schmidt(r_6d: Tensor) -> Tensor:
     return torch.stack([x, y, z], dim=-1)
 
 
+def heading_anchors(count: int) -> Tensor:
+    """r_6D [count, 6] of a level aircraft at evenly spaced headings, as seen along the ray: z is image down."""
+    heading = 2 * torch.pi * torch.arange(count) / count
+    zero = torch.zeros(count)
+    return torch.stack([zero, zero + 1, zero, torch.sin(heading), zero, torch.cos(heading)], dim=-1)
+
+
 def focal_length(K: Tensor, kind: str) -> Tensor:
     """f [...] in pixels: the paper's "mean", or "geometric", with which APDD survives an anisotropic resize."""
     fx, fy = K[..., 0, 0], K[..., 1, 1]

@@ -19,6 +19,7 @@ from trainer.config import LossConfig
 from trainer.model import Decoded
 
 SMALLEST_SIZE_PX = 2.0
+HYPOTHESIS_SPREAD_RAD = 0.35
 
 
 class Labels(NamedTuple):
@@ -78,13 +79,27 @@ def rotation_residual(R_est: Tensor, R_true: Tensor) -> Tensor:
     return F.normalize(axis, dim=-1) * eq.rotation_angle(R_est, R_true)[..., None]
 
 
+def hypothesis_share(R_allo_true: Tensor, count: int) -> Tensor:
+    """How much each hypothesis answers for a true rotation [N, 3, 3]: [N, count], near 1 at its own heading."""
+    anchors = eq.gram_schmidt(eq.heading_anchors(count)).to(R_allo_true)
+    angle = eq.rotation_angle(R_allo_true[:, None], anchors)
+    return torch.softmax(-0.5 * (angle / HYPOTHESIS_SPREAD_RAD) ** 2, dim=-1)
+
+
+def _error_6d(R_allo: Tensor, R_allo_true: Tensor) -> Tensor:
+    """L_6D [...]: mean over the two columns that Gram-Schmidt takes."""
+    return F.smooth_l1_loss(R_allo[..., ::2], R_allo_true[..., ::2].expand_as(R_allo[..., ::2]), reduction="none").mean(
+        (-1, -2)
+    )
+
+
 def _laplace_nll(residual: Tensor, log_scale: Tensor) -> Tensor:
     return residual.abs() * torch.exp(-log_scale) + log_scale
 
 
 def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, Tensor]:
     """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels."""
-    center, log_size, origin, log_Z, R_allo, R_ego, log_sigma = (value[:, 0] for value in out)
+    center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma = (value[:, 0] for value in out)
     t, K = labels.t_cam_target_m, labels.K
     Z = torch.clamp(t[:, 2], min=1.0)
     true_plane = t[:, :2] / Z[:, None]
@@ -95,12 +110,14 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, T
     t_xy = eq.back_project(eq.image_plane_point(origin, K), torch.exp(log_Z))[:, :2]
     R_allo_true = eq.ray_rotation(eq.unit_ray(true_plane)).transpose(-1, -2) @ labels.R_cam_target
 
+    share = hypothesis_share(R_allo_true, logits.shape[-1])
     terms = {
         "size": F.smooth_l1_loss(log_size, true_log_size, reduction="none", beta=0.1).sum(-1),
         "depth": F.smooth_l1_loss(log_Z, torch.log(Z), reduction="none", beta=weights.depth_beta),
         "planar": F.smooth_l1_loss(t_xy, t[:, :2], reduction="none").sum(-1) / Z,
-        "geodesic": eq.rotation_angle(R_ego, labels.R_cam_target) / math.pi,
-        "rotation_6d": F.smooth_l1_loss(R_allo[..., ::2], R_allo_true[..., ::2], reduction="none").mean((-1, -2)),
+        "geodesic": (share * eq.rotation_angle(R_ego_k, labels.R_cam_target[:, None])).sum(-1) / math.pi,
+        "rotation_6d": (share * _error_6d(R_allo_k, R_allo_true[:, None])).sum(-1),
+        "hypothesis": -(share * F.log_softmax(logits, dim=-1)).sum(-1),
         "center": F.smooth_l1_loss(center, labels.center_px, reduction="none", beta=2.0).sum(-1) / eq.STRIDE,
         "origin": F.smooth_l1_loss(origin / longer, true_origin / longer, reduction="none", beta=0.02).sum(-1),
     }
@@ -143,7 +160,7 @@ def joint_loss(
     L_rot = terms["geodesic"] + weights.rotation_6d * terms["rotation_6d"]
     total = weights.heatmap * terms["heatmap"] + weights.size * terms["size"]
     total = total + weights.translation * L_trans + weights.rotation * L_rot
-    for name in ("center", "origin", "mask", "noc", "uncertainty"):
+    for name in ("hypothesis", "center", "origin", "mask", "noc", "uncertainty"):
         if name in terms:
             total = total + getattr(weights, name) * terms[name]
     return total, terms

@@ -32,8 +32,10 @@ class Decoded(NamedTuple):
     log_size: Tensor  # [N, M, 2], log (w, h) in log pixels
     origin_px: Tensor  # [N, M, 2]
     log_Z: Tensor  # [N, M], not clamped
-    R_allo: Tensor  # [N, M, 3, 3]
-    R_ego: Tensor  # [N, M, 3, 3]
+    hypothesis_logits: Tensor  # [N, M, K]
+    R_allo_k: Tensor  # [N, M, K, 3, 3], every hypothesis
+    R_ego_k: Tensor  # [N, M, K, 3, 3]
+    R_ego: Tensor  # [N, M, 3, 3], the likeliest
     log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), log Z, rotation x y z in rad
 
 
@@ -123,7 +125,8 @@ class PoseNet(nn.Module):
         self.fuse_t, self.fuse_r = GatedFusion(geo, hidden), GatedFusion(geo, hidden)
         self.mlp_t, self.mlp_r = (nn.Sequential(mlp(hidden, hidden, hidden), nn.ReLU(inplace=True)) for _ in range(2))
         self.head_trans = nn.Linear(hidden, 3)
-        self.head_rot = nn.Linear(hidden, 6)
+        self.head_rot = nn.Linear(hidden, 6 * config.hypotheses)
+        self.head_hypothesis = nn.Linear(hidden, config.hypotheses) if config.hypotheses > 1 else None
         self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
         self.head_sigma_t = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
         self.head_sigma_r = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
@@ -142,7 +145,10 @@ class PoseNet(nn.Module):
             if head is not None:
                 head.weight.mul_(0.1)
                 head.bias.zero_()
-        self.head_rot.bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.1]))
+        if self.head_hypothesis is not None:
+            self.head_rot.bias.copy_(eq.heading_anchors(self.config.hypotheses).flatten())
+        else:
+            self.head_rot.bias.copy_(torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0, 0.1]))
         if self.head_extents is not None:
             self.head_extents.bias.copy_(torch.log(torch.tensor([4.5, 5.5, 1.5])))
         else:
@@ -179,15 +185,26 @@ class PoseNet(nn.Module):
         f_trans = self.mlp_t(self.fuse_t(f_reg, f_geo))
         f_rot = self.mlp_r(self.fuse_r(f_reg, f_geo))
 
-        R_allo = eq.gram_schmidt(self.head_rot(f_rot))
+        R_allo_k = eq.gram_schmidt(self.head_rot(f_rot).unflatten(-1, (self.config.hypotheses, 6)))
+        logits, R_allo = self._likeliest(f_rot, R_allo_k)
         o_xy, s = self.head_trans(f_trans).split([2, 1], dim=-1)
         origin_px = center_px + self.config.origin_range * size_px * torch.tanh(o_xy)
         S = torch.exp(s[..., 0])
         if self.head_extents is not None:
             S = S * eq.seen_scale(torch.exp(self.head_extents(f_trans)), R_allo.detach())
         log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
-        R_ego = eq.ray_rotation(eq.unit_ray(eq.image_plane_point(origin_px, K))) @ R_allo
-        return Decoded(center_px, log_size, origin_px, log_Z, R_allo, R_ego, self._log_sigma(f_trans, f_rot))
+        R_ray = eq.ray_rotation(eq.unit_ray(eq.image_plane_point(origin_px, K)))
+        log_sigma = self._log_sigma(f_trans, f_rot)
+        R_ego_k = R_ray[:, :, None] @ R_allo_k
+        return Decoded(center_px, log_size, origin_px, log_Z, logits, R_allo_k, R_ego_k, R_ray @ R_allo, log_sigma)
+
+    def _likeliest(self, f_rot: Tensor, R_allo_k: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits [N, M, K] and the rotation [N, M, 3, 3] of the highest: one mode, never a mean of two."""
+        if self.head_hypothesis is None:
+            return torch.zeros_like(R_allo_k[..., 0, 0]), R_allo_k[:, :, 0]
+        logits = self.head_hypothesis(f_rot)
+        best = logits.argmax(-1)[..., None, None, None].expand(-1, -1, 1, 3, 3)
+        return logits, torch.gather(R_allo_k, 2, best)[:, :, 0]
 
     def _log_sigma(self, f_trans: Tensor, f_rot: Tensor) -> Tensor:
         """From detached features: the uncertainty never pulls at the means."""

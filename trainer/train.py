@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from trainer import equations as eq
-from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, write_atomic
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
 from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors, window_sampler
 from trainer.evaluate import measure, predict_all, torch_predictor
@@ -95,6 +95,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr)
         self.steps = 0
         self.samples = 0
+        self.started_from = "public ImageNet weights" if config.model.pretrained else "scratch"
 
     def _parameter_groups(self) -> list[dict[str, Any]]:
         """Vectors (norms, biases) do not decay; a pretrained backbone learns at its own share of the rate."""
@@ -152,7 +153,19 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "steps": self.steps,
             "samples": self.samples,
+            "started_from": self.started_from,
         }
+
+    def start_from(self, weights: Path) -> None:
+        """Begin with another run's weights where name and shape agree. Raises ConfigError if none does."""
+        given = load_file(weights).get("weights", {})
+        self.started_from = f"weights {weights_sha256(given)[:16]}"
+        own = self.model.state_dict()
+        fitting = {key: value for key, value in given.items() if key in own and own[key].shape == value.shape}
+        if not fitting:
+            raise ConfigError(f"{weights}: holds no weights that fit this network")
+        for network in (self.model, self.average):
+            network.load_state_dict(fitting, strict=False)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take the state of an earlier run with the same network."""
@@ -160,6 +173,7 @@ class Trainer:
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.steps, self.samples = state["steps"], state["samples"]
+        self.started_from = state["started_from"]
 
 
 @torch.no_grad()
@@ -207,6 +221,7 @@ def run_training(
     samples: int | None = None,
     open_sampler: OpenSampler | None = None,
     max_steps: int | None = None,
+    start_from: Path | None = None,
 ) -> Trainer:
     """Train until the planned samples, the budget, `max_steps` of this start, or a signal; leave a checkpoint.
 
@@ -218,6 +233,8 @@ def run_training(
     trainer = Trainer(config, device)
     if not resume and (out / RESUME_NAME).exists():
         raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+    if start_from is not None:
+        trainer.start_from(start_from)
     used_before_s = resume_run(out, trainer) if resume else 0.0
     budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
     loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
@@ -297,7 +314,12 @@ class _Loop:
     def save(self) -> None:
         """Both files; the weights first, so that resume.pt never knows more than weights.pt."""
         state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
-        training = {**self.provenance, "samples": self.trainer.samples, "steps": self.trainer.steps}
+        training = {
+            **self.provenance,
+            "started_from": self.trainer.started_from,
+            "samples": self.trainer.samples,
+            "steps": self.trainer.steps,
+        }
         training["resolution_px"] = size_at(self.config.schedule, min(self.progress(), 1.0))
         save_weights(self.out / WEIGHTS_NAME, self.trainer.average, self.config_text, training)
         write_atomic(self.out / RESUME_NAME, state)
