@@ -22,6 +22,7 @@ import zenoh
 from msgs import topics
 from msgs.client import connect
 from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.play import last_counters
 
 BIN = Path(sys.executable).parent
 JUNK_PER_KIND = 40
@@ -118,6 +119,14 @@ def test_the_autopilot_heard_the_daemon_as_a_component_of_its_vehicle(demo: Demo
 
 def test_poses_in_ned_say_that_own_attitude_was_used(demo: DemoRun) -> None:
     assert demo.score["zenoh_received"]["uav1/target/t0/odom"] > 0
+
+
+def test_junk_at_the_mavlink_port_was_counted_and_survived(demo: DemoRun) -> None:
+    counters = last_counters((demo.out / "daemon.log").read_text())
+    refused = sum(count for name, count in counters.items() if name.startswith("mavlink_refused_"))
+    # A datagram may be lost before the daemon's socket, never after it.
+    assert refused >= JUNK_PER_KIND
+    assert counters["mavlink_sent_TARGET_RELATIVE"] >= demo.score["mavlink_received"]["TARGET_RELATIVE"] > 0
 
 
 def test_junk_on_zenoh_was_refused_by_the_client_and_counted(demo: DemoRun) -> None:
