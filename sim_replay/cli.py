@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 from pathlib import Path
 
@@ -80,6 +81,8 @@ def _score(args: argparse.Namespace, console: Console) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit codes: 0 done, 1 the replay failed, 2 bad input, 130 interrupted."""
     args = _parser().parse_args(argv)
+    # As with Ctrl-C: the processes of a replay are stopped on the way out.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return _run(args)
     except InputError as error:

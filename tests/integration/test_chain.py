@@ -145,6 +145,20 @@ def test_pictures_are_written(demo: DemoRun) -> None:
     assert frames == demo.score["frames"]
 
 
+def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [BIN / "uavpose-replay", "demo", "--out", out]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True)
+    config = wait_for_config(out, process)
+    with open_session(config["zenoh"]["listen"][0]):
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=15) == 130
+    with pytest.raises(ConnectionError):
+        connect(config["zenoh"]["listen"][0])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(("127.0.0.1", int(config["mavlink"]["endpoints"][0].rpartition(":")[2])))
+
+
 @pytest.fixture
 def running_daemon(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A daemon that plays the bundled sequence for ever, met once it has said how it is."""
@@ -185,6 +199,12 @@ def test_the_subscriber_is_built_on_msgs_alone() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["sim_replay", "sim_replay.subscriber"]
+
+
+def test_the_demo_needs_neither_torch_nor_gl() -> None:
+    program = "import sys; import sim_replay.cli; print(*({'torch', 'moderngl', 'onnx', 'trainer'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 def test_bad_input_is_told_in_a_sentence_with_exit_code_2(tmp_path: Path) -> None:
