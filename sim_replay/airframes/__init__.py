@@ -61,10 +61,10 @@ AIRFRAMES: tuple[Airframe, ...] = (
     ),
     Airframe(
         "tactical_inverted_v",
-        "RQ-7B-Shadow-class tactical, twin boom, inverted V-tail",
-        4.27,
-        3.41,
-        "AAI RQ-7B Shadow 200: wingspan 14 ft (4.27 m), length 11 ft 2 in (3.41 m)",
+        "RQ-7Bv2-Shadow-class tactical, twin boom, inverted V-tail",
+        6.1,
+        3.4,
+        "RQ-7Bv2 Shadow: wingspan 20 ft (US Army release in Army Times, 3 February 2017), length 3.4 m",
         fleet.tactical_inverted_v,
     ),
     Airframe(

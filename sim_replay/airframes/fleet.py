@@ -99,7 +99,7 @@ def twin_boom_inverted_v() -> Mesh:
 
 
 def tactical_inverted_v() -> Mesh:
-    """4 m class: boxy pod, straight untapered wing, two thin booms, inverted V-tail, fixed tricycle gear."""
+    """6 m class: boxy pod, straight untapered wing, two thin booms, inverted V-tail, fixed tricycle gear."""
     body = fuselage(
         [
             (1.45, 0.15, 0.15, 0.1),
