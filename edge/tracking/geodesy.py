@@ -1,4 +1,4 @@
-"""Small offsets on the WGS 84 ellipsoid: good to centimetres within kilometres of the origin, away from the poles."""
+"""Small offsets on the WGS 84 ellipsoid, the earth taken as flat: within 3 m at 2 km, below 75 degrees of latitude."""
 
 from __future__ import annotations
 

@@ -1,0 +1,228 @@
+"""Own-ship state at a frame's exposure, and the clocks that stamps pass through."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, TimesyncEstimator
+from edge.tracking.geodesy import lat_lon_alt_from_ned, ned_from_lat_lon_alt
+from edge.tracking.own_ship import OwnShipBuffer
+from msgs.geometry import rotation_angle
+
+MS = 1_000_000
+
+
+def q_wxyz(rotation: Rotation) -> np.ndarray:
+    return np.roll(rotation.as_quat(), 1)
+
+
+@given(share=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
+def test_attitude_between_samples_is_their_slerp(share: float, seed: int) -> None:
+    rotations = Rotation.random(2, rng=np.random.default_rng(seed))
+    buffer = OwnShipBuffer()
+    for time_ns, rotation in zip((0, 20 * MS), rotations, strict=True):
+        assert buffer.add_attitude(time_ns, q_wxyz(rotation), np.zeros(3))
+    time_ns = round(share * 20 * MS)
+    own_ship = buffer.at(time_ns)
+    assert own_ship is not None
+    expected = Slerp([0, 20 * MS], rotations)(time_ns).as_matrix()
+    assert rotation_angle(own_ship.R_ned_body, expected) < 1e-6
+
+
+def test_attitude_goes_on_by_body_rates_for_fifty_milliseconds_and_then_is_unknown() -> None:
+    start = Rotation.from_euler("ZYX", [1.0, 0.2, -0.4])
+    rates_radps = np.array([0.5, -0.3, 0.2])
+    buffer = OwnShipBuffer()
+    buffer.add_attitude(1_000 * MS, q_wxyz(start), rates_radps)
+    own_ship = buffer.at(1_050 * MS)
+    assert own_ship is not None
+    # Body rates turn the vehicle about its own axes: they stand on the right.
+    expected = (start * Rotation.from_rotvec(0.05 * rates_radps)).as_matrix()
+    np.testing.assert_allclose(own_ship.R_ned_body, expected, atol=1e-12)
+    assert buffer.at(1_051 * MS) is None
+    assert buffer.at(999 * MS) is None
+
+
+def test_attitude_is_not_invented_across_a_long_gap() -> None:
+    buffer = OwnShipBuffer()
+    for time_ns in (0, 2_000 * MS):
+        buffer.add_attitude(time_ns, [1, 0, 0, 0], np.zeros(3))
+    assert buffer.at(1_000 * MS) is None
+    assert buffer.at(2_000 * MS) is not None
+
+
+def test_position_is_interpolated_extrapolated_and_then_unknown_while_attitude_stays() -> None:
+    buffer = OwnShipBuffer()
+    for k in range(100):
+        buffer.add_attitude(k * 20 * MS, [1, 0, 0, 0], np.zeros(3))
+    for k in range(11):
+        buffer.add_position(k * 100 * MS, [2.5 * k, 0, -100], [25, 0, 0])
+    between, after, long_after = buffer.at(450 * MS), buffer.at(1_200 * MS), buffer.at(1_800 * MS)
+    assert between is not None
+    assert after is not None
+    assert long_after is not None
+    np.testing.assert_allclose(between.t_ned_body_m, [11.25, 0, -100])
+    np.testing.assert_allclose(after.t_ned_body_m, [30.0, 0, -100])
+    assert long_after.t_ned_body_m is None
+    assert long_after.v_ned_body_mps is None
+
+
+def test_samples_out_of_order_are_refused() -> None:
+    buffer = OwnShipBuffer()
+    assert buffer.add_attitude(20 * MS, [1, 0, 0, 0], np.zeros(3))
+    assert not buffer.add_attitude(20 * MS, [0, 1, 0, 0], np.zeros(3))
+    assert not buffer.add_attitude(10 * MS, [0, 1, 0, 0], np.zeros(3))
+    own_ship = buffer.at(20 * MS)
+    assert own_ship is not None
+    np.testing.assert_allclose(own_ship.R_ned_body, np.eye(3))
+
+
+def ecef_m(lat_deg: float, lon_deg: float, alt_m: float) -> np.ndarray:
+    lat, lon = np.deg2rad([lat_deg, lon_deg])
+    a, e2 = 6378137.0, 6.69437999014e-3
+    n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    return np.array(
+        [
+            (n + alt_m) * np.cos(lat) * np.cos(lon),
+            (n + alt_m) * np.cos(lat) * np.sin(lon),
+            (n * (1 - e2) + alt_m) * np.sin(lat),
+        ]
+    )
+
+
+@given(
+    lat=st.floats(-75, 75),
+    lon=st.floats(-180, 180),
+    alt=st.floats(-100, 5000),
+    ned=st.tuples(st.floats(-1500, 1500), st.floats(-1500, 1500), st.floats(-500, 500)),
+)
+def test_offsets_on_the_globe_agree_with_earth_centred_coordinates(
+    lat: float, lon: float, alt: float, ned: tuple[float, float, float]
+) -> None:
+    origin = (lat, lon, alt)
+    phi, lam = np.deg2rad([lat, lon])
+    R_ecef_ned = np.array(
+        [
+            [-np.sin(phi) * np.cos(lam), -np.sin(lam), -np.cos(phi) * np.cos(lam)],
+            [-np.sin(phi) * np.sin(lam), np.cos(lam), -np.cos(phi) * np.sin(lam)],
+            [np.cos(phi), 0.0, -np.sin(phi)],
+        ]
+    )
+    expected_m = ecef_m(*origin) + R_ecef_ned @ np.array(ned)
+    point = lat_lon_alt_from_ned(origin, ned)
+    # Two kilometres of flat earth: its curvature alone is 0.35 m there, meridians converge by up to a few metres.
+    assert np.linalg.norm(ecef_m(*point) - expected_m) < 3.0
+    np.testing.assert_allclose(ned_from_lat_lon_alt(origin, point), ned, atol=1e-5)
+
+
+def test_the_origin_on_the_globe_is_where_local_and_global_position_meet() -> None:
+    origin = (47.0, 8.0, 400.0)
+    buffer = OwnShipBuffer()
+    for k in range(20):
+        t_ned_m = np.array([30.0 * k, -10.0 * k, -50.0 - k])
+        buffer.add_attitude(k * 100 * MS, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_position(k * 100 * MS, t_ned_m, [300, -100, -10])
+        buffer.add_global(k * 100 * MS, *lat_lon_alt_from_ned(origin, t_ned_m))
+    own_ship = buffer.at(1_850 * MS)
+    assert own_ship is not None
+    assert own_ship.lat_lon_alt is not None
+    np.testing.assert_allclose(ned_from_lat_lon_alt(origin, own_ship.lat_lon_alt), 0.0, atol=0.1)
+
+
+def test_a_writer_and_a_reader_do_not_disturb_each_other() -> None:
+    buffer = OwnShipBuffer()
+    failures: list[BaseException] = []
+    done = threading.Event()
+
+    def read() -> None:
+        try:
+            while not done.is_set():
+                own_ship = buffer.at(10_000 * MS)
+                assert own_ship is None or np.isfinite(own_ship.R_ned_body).all()
+        except BaseException as error:
+            failures.append(error)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for k in range(3000):
+        buffer.add_attitude(k * 10 * MS, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_position(k * 10 * MS, np.zeros(3), np.zeros(3))
+    done.set()
+    reader.join()
+    assert not failures
+
+
+def exchange(sync: TimesyncEstimator, now_ns: int, offset_ns: int, out_ns: int, back_ns: int) -> bool:
+    """One request and its reply over a link with these delays."""
+    ts1 = sync.request(now_ns)
+    return sync.reply(now_ns + out_ns + offset_ns, ts1, now_ns + out_ns + back_ns)
+
+
+@given(
+    offset_ns=st.integers(-(10**15), 10**15),
+    delays=st.lists(st.tuples(st.integers(0, 50 * MS), st.integers(0, 50 * MS)), min_size=1, max_size=40),
+)
+def test_the_clock_offset_is_within_its_uncertainty(offset_ns: int, delays: list[tuple[int, int]]) -> None:
+    sync = TimesyncEstimator()
+    for k, (out_ns, back_ns) in enumerate(delays):
+        assert exchange(sync, k * 200 * MS, offset_ns, out_ns, back_ns)
+    assert sync.offset_ns is not None
+    assert sync.uncertainty_ns is not None
+    assert abs(sync.offset_ns - offset_ns) <= sync.uncertainty_ns + 1
+    assert sync.uncertainty_ns == min(sum(pair) for pair in delays[-32:]) // 2
+
+
+def test_replies_we_did_not_ask_for_are_refused() -> None:
+    sync = TimesyncEstimator()
+    ts1 = sync.request(1_000)
+    assert not sync.reply(5_000, ts1 + 1, 2_000)
+    assert sync.reply(5_000, ts1, 2_000)
+    assert not sync.reply(9_000, ts1, 2_000), "an answer counts once"
+    late = sync.request(10_000)
+    assert not sync.reply(5_000, late, 10_000 + 300 * MS)
+
+
+def test_one_odd_reply_is_an_outlier_and_several_are_a_jump() -> None:
+    sync = TimesyncEstimator()
+    for k in range(10):
+        exchange(sync, k * 200 * MS, 5_000 * MS, MS, MS)
+    assert not exchange(sync, 2_000 * MS, 9_000 * MS, MS, MS)
+    assert sync.offset_ns == 5_000 * MS
+    exchange(sync, 2_200 * MS, 5_000 * MS, MS, MS)
+    for k in range(JUMP_AGREEING):
+        exchange(sync, (2_400 + 200 * k) * MS, 9_000 * MS, MS, MS)
+    assert sync.offset_ns == 9_000 * MS
+    assert sync.jumps == 1
+
+
+def test_stamps_become_monotonic_time_by_timesync() -> None:
+    sync = TimesyncEstimator()
+    clock = BootClock(sync)
+    offset_ns = -7_000 * MS  # booted seven seconds after our clock began
+    exchange(sync, 10_000 * MS, offset_ns, MS, MS)
+    sampled_ns = 12_000 * MS
+    assert clock.monotonic_ns(sampled_ns + offset_ns, sampled_ns + 15 * MS) == sampled_ns
+
+
+def test_stamps_from_another_clock_than_timesyncs_fall_back_to_the_quickest_arrival() -> None:
+    sync = TimesyncEstimator()
+    clock = BootClock(sync)
+    exchange(sync, 0, 1_700_000_000_000 * MS, MS, MS)  # a peer that answers with UTC
+    for k, delay_ms in enumerate((9, 3, 30, 12)):
+        time_ns = clock.monotonic_ns(k * 20 * MS, (5_000 + k * 20 + delay_ms) * MS)
+    assert time_ns == (5_000 + 3 * 20 + 3) * MS
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "reboots"),
+    [([100_000, 100_020, 100_010, 100_040], 0), ([100_000, 500, 520], 1), ([3_000, 2_990, 3_020], 0)],
+)
+def test_a_boot_time_that_falls_is_a_reboot_and_a_late_datagram_is_not(stamps_ms: list[int], reboots: int) -> None:
+    detector = RebootDetector()
+    assert sum(detector.rebooted(stamp_ms) for stamp_ms in stamps_ms) == reboots
