@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
 import sys
 from pathlib import Path
 
-from trainer.config import ConfigError, load_config
+from trainer.config import ConfigError, RenderingError, load_config
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -23,6 +25,39 @@ def _train(arguments: argparse.Namespace) -> None:
         samples=arguments.samples,
         start_from=arguments.start_from,
     )
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from trainer.export import export_models
+
+    export_models(
+        arguments.checkpoint,
+        arguments.out,
+        float_out=arguments.float_out,
+        contract=load_config(arguments.config).contract if arguments.config else None,
+        tolerance_deg=arguments.tolerance,
+        samples=arguments.samples,
+        say=lambda text: print(text, flush=True),
+    )
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from trainer.held_out import Request, evaluate_file
+
+    request = Request(
+        arguments.checkpoint, arguments.onnx, arguments.samples, arguments.seed, arguments.stage, arguments.size
+    )
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("rendering", total=arguments.samples)
+        metrics = evaluate_file(request, rendered=lambda count: progress.update(task, completed=count))
+    if arguments.json:
+        print(json.dumps({name: value if math.isfinite(value) else None for name, value in metrics.items()}, indent=2))
+        return
+    for name, value in metrics.items():
+        print(f"{name:22} {value:.4g}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -43,7 +78,54 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="begin with another run's weights.pt")
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
+    _add_evaluate(commands)
+    _add_export(commands)
     return parser
+
+
+def _add_evaluate(commands: argparse._SubParsersAction) -> None:
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="measure a checkpoint or a model file on rendered windows",
+        description="Measure a checkpoint or a model file on windows that training never saw: the paper's errors over "
+        "every window with a target, found or not, and how well targets are found. A seed gives the same windows again.",
+    )
+    source = evaluate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--checkpoint", type=Path, help="run folder or its weights.pt")
+    source.add_argument("--onnx", type=Path, metavar="FILE", help="exported model file")
+    evaluate.add_argument("--samples", type=int, default=1000, help="windows (default %(default)s)")
+    evaluate.add_argument("--seed", type=int, default=930001, help="seed of the windows (default %(default)s)")
+    evaluate.add_argument("--stage", choices=("track", "acquire"), default="track", help="windows as it sees them")
+    evaluate.add_argument("--size", type=int, help="side of the windows in pixels; default: the model's")
+    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
+    evaluate.set_defaults(run=_evaluate)
+
+
+def _add_export(commands: argparse._SubParsersAction) -> None:
+    export = commands.add_parser(
+        "export",
+        help="write a checkpoint as FP32 and INT8 model files",
+        description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics measured on windows of "
+        "a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch.",
+    )
+    export.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
+    export.add_argument("--out", type=Path, required=True, help="folder for the INT8 file")
+    export.add_argument("--float-out", type=Path, help="folder for the FP32 file; default: --out")
+    export.add_argument("--config", type=Path, help="take [contract] from this TOML, not from the checkpoint")
+    export.add_argument(
+        "--samples",
+        type=int,
+        default=300,
+        help="track windows to calibrate and to compare on, and half as many acquire windows (default %(default)s)",
+    )
+    export.add_argument(
+        "--tolerance",
+        type=float,
+        default=2.0,
+        metavar="DEG",
+        help="refuse an INT8 file whose median rotation differs from FP32's by more degrees (default %(default)s)",
+    )
+    export.set_defaults(run=_export)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -56,6 +138,9 @@ def main(argv: list[str] | None = None) -> int:
     except ConfigError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 2
+    except RenderingError as error:
+        print(f"uavpose-trainer: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

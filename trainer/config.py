@@ -15,6 +15,10 @@ class ConfigError(ValueError):
     """A configuration that a person must correct; the message names the file and the key."""
 
 
+class RenderingError(RuntimeError):
+    """A rendering process failed; the message carries its traceback."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from sim_replay.sample import SampleBatch
-from trainer.config import DataConfig
+from trainer.config import DataConfig, RenderingError
 from trainer.losses import Labels
 
 DENSE_STRIDE = 4
@@ -31,10 +31,6 @@ class Sampler(Protocol):
     """What a feed needs of sim_replay.sampler.WindowSampler."""
 
     def batch(self, first_index: int, count: int) -> SampleBatch: ...
-
-
-class FeedError(RuntimeError):
-    """A rendering process failed; the message carries its traceback."""
 
 
 class TrainingBatch(NamedTuple):
@@ -151,7 +147,7 @@ class Feed:
             self._processes.append(process)
 
     def next(self) -> TrainingBatch:
-        """The next batch in index order. Raises FeedError when its renderer failed."""
+        """The next batch in index order. Raises RenderingError when its renderer failed."""
         source, process = self._queues[self._turn], self._processes[self._turn]
         while True:
             try:
@@ -159,9 +155,9 @@ class Feed:
                 break
             except queue.Empty:
                 if not process.is_alive():
-                    raise FeedError(f"{process.name} ended with exit code {process.exitcode}") from None
+                    raise RenderingError(f"{process.name} ended with exit code {process.exitcode}") from None
         if isinstance(batch, str):
-            raise FeedError(f"{process.name} failed:\n{batch}")
+            raise RenderingError(f"{process.name} failed:\n{batch}")
         self._turn = (self._turn + 1) % len(self._queues)
         return batch
 
@@ -181,7 +177,17 @@ class Feed:
         self.close()
 
 
-def render_once(open_sampler: Callable[[], Sampler], count: int, chunk: int = 16) -> list[TrainingBatch]:
-    """Samples 0..count-1 (rounded up to whole chunks) through a renderer of their own, kept in memory."""
+def render_once(
+    open_sampler: Callable[[], Sampler], count: int, chunk: int = 16, rendered: Callable[[int], None] | None = None
+) -> list[TrainingBatch]:
+    """Samples 0..count-1 (rounded up to whole chunks) through a renderer of their own, kept in memory.
+
+    `rendered` hears how many there are after each chunk.
+    """
+    batches = []
     with Feed(open_sampler, chunk, 0) as feed:
-        return [feed.next() for _ in range((count + chunk - 1) // chunk)]
+        for index in range((count + chunk - 1) // chunk):
+            batches.append(feed.next())
+            if rendered is not None:
+                rendered((index + 1) * chunk)
+    return batches

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msgs.contract import ModelContract
+from msgs.contract import CONTRACT_VERSION, ModelContract
 from trainer.checkpoint import load_model
-from trainer.config import ConfigError, DataConfig, TrainerConfig
+from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfig
 from trainer.data import Sampler, TrainingBatch, render_once, window_sampler
-from trainer.evaluate import Predictions, choose_threshold, difference, measure, predict_all, torch_predictor
+from trainer.evaluate import Predictions, Predictor, choose_threshold, difference, measure, predict_all, torch_predictor
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
 
 CALIBRATION_SEED = 910_001
@@ -54,8 +54,7 @@ def render_views(config: TrainerConfig, seed: int, samples: int, open_view: Open
     return Views(windows, render_once(open_view(seed + 1, crop_px, 1.0), max(samples // 2, 16)))
 
 
-def _predict(path: Path, views: Views) -> Measured:
-    predict = onnx_predictor(path)
+def _predict(predict: Predictor, views: Views) -> Measured:
     return Measured(predict_all(predict, views.track) if views.track else None, predict_all(predict, views.acquire))
 
 
@@ -85,6 +84,7 @@ def make_contract(
     box_px = np.concatenate([batch.size_px.max(axis=1) for batch in batches])[on]
     contract = config.contract
     return ModelContract(
+        version=CONTRACT_VERSION,
         name=contract.name,
         configuration=config.model.configuration,
         backbone=config.model.backbone,
@@ -113,21 +113,20 @@ def airframe_names(ids: list[int] | None) -> list[str]:
     return [AIRFRAMES[i].name for i in (range(len(AIRFRAMES)) if ids is None else ids)]
 
 
-def comparison_table(views: Views, pairs: dict[str, tuple[Measured, Measured]]) -> tuple[str, float]:
-    """Differences of each named pair as text, and the largest median rotation difference, degrees."""
-    lines = [f"{'pair':24} {'stage':8} {'rotation deg':>16} {'depth %':>16} {'centre px':>16} {'score':>16}"]
-    worst = 0.0
-    for name, (a, b) in pairs.items():
-        stages = [("track", a.track, b.track, views.track), ("acquire", a.acquire, b.acquire, views.acquire)]
-        for stage, one, other, batches in stages:
-            if one is None or other is None:
-                continue
-            d = difference(one, other, np.concatenate([batch.present for batch in batches]))
-            worst = max(worst, d["rotation_deg_median"])
-            cells = [("rotation_deg", 1), ("depth_rel", 100), ("center_px", 1), ("score", 1)]
-            text = "".join(f" {s * d[f'{k}_median']:7.3f} /{s * d[f'{k}_p95']:7.3f}" for k, s in cells)
-            lines.append(f"{name:24} {stage:8}{text}")
-    return "\n".join(lines) + "\n(median / 95th percentile over windows with a target)", worst
+def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tuple[str, float]:
+    """Differences of two predictors as text, and the largest median rotation difference of the stages, degrees."""
+    lines = [f"{title:24}{'rotation deg':>18}{'depth %':>18}{'centre px':>18}{'score':>18}"]
+    worst_deg = 0.0
+    stages = (("track", a.track, b.track, views.track), ("acquire", a.acquire, b.acquire, views.acquire))
+    for stage, one, other, batches in stages:
+        if one is None or other is None:
+            continue
+        d = difference(one, other, np.concatenate([batch.present for batch in batches]))
+        worst_deg = max(worst_deg, d["rotation_deg_median"])
+        scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "score": 1}
+        cells = (f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items())
+        lines.append(f"  {stage:22}" + "".join(cells))
+    return "\n".join([*lines, "  (median / 95th percentile over windows with a target)"]), worst_deg
 
 
 def export_models(
@@ -135,6 +134,7 @@ def export_models(
     out: Path,
     *,
     float_out: Path | None = None,
+    contract: ContractConfig | None = None,
     tolerance_deg: float = TOLERANCE_DEG,
     samples: int = 300,
     open_view: OpenView | None = None,
@@ -142,9 +142,12 @@ def export_models(
 ) -> tuple[Path, Path]:
     """Write NAME-fp32.onnx into `float_out` (default `out`) and NAME-int8.onnx into `out`; returns their paths.
 
-    Raises ConfigError, and leaves no INT8 file, when its median rotation differs from FP32's by more than the tolerance.
+    `contract` replaces the [contract] section that the checkpoint was trained with. Raises ConfigError, and leaves no
+    INT8 file, when INT8's median rotation differs from FP32's by more than the tolerance.
     """
     model, config, training, sha256 = load_model(checkpoint)
+    if contract is not None:
+        config = config.model_copy(update={"contract": contract})
     view = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share))
     float_path = (float_out or out) / f"{config.contract.name}-fp32.onnx"
     int8_path = out / f"{config.contract.name}-int8.onnx"
@@ -156,36 +159,46 @@ def export_models(
     comparison = render_views(config, COMPARISON_SEED, samples, view)
 
     write_graph(model, float_path)
-    floats = _predict(float_path, comparison)
+    floats = _predict(onnx_predictor(float_path), comparison)
     acquire_min = choose_threshold(floats.acquire, comparison.acquire)
     track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
     thresholds = (acquire_min, track_min)
-    contract = make_contract(config, training, sha256, comparison, thresholds)
-    float_metrics = _metrics(floats, comparison, thresholds)
-    write_contract(float_path, contract.model_copy(update={"metrics": float_metrics}))
+    promise = make_contract(config, training, sha256, comparison, thresholds)
+    write_contract(float_path, promise.model_copy(update={"metrics": _metrics(floats, comparison, thresholds)}))
+    by_torch = _predict(torch_predictor(model), comparison)
+    say(comparison_table(comparison, "FP32 against PyTorch", floats, by_torch)[0])
 
     say("quantising")
-    partial = int8_path.with_suffix(".part")
+    _quantise(float_path, int8_path, promise, calibration, comparison, floats, tolerance_deg, say)
+    say(f"wrote {float_path} and {int8_path}")
+    return float_path, int8_path
+
+
+def _quantise(
+    float_path: Path,
+    int8_path: Path,
+    promise: ModelContract,
+    calibration: Views,
+    comparison: Views,
+    floats: Measured,
+    tolerance_deg: float,
+    say: Callable[[str], None],
+) -> None:
+    """Write the INT8 file beside its place, compare it with FP32, and only then move it there."""
+    unproved = int8_path.with_suffix(".part")
     try:
-        quantise_graph(float_path, partial, [*calibration.track, *calibration.acquire])
-        int8 = _predict(partial, comparison)
-        reference = torch_predictor(model)
-        by_torch = Measured(
-            predict_all(reference, comparison.track) if comparison.track else None,
-            predict_all(reference, comparison.acquire),
-        )
-        say(comparison_table(comparison, {"FP32 against PyTorch": (floats, by_torch)})[0])
-        table, strayed_deg = comparison_table(comparison, {"INT8 against FP32": (int8, floats)})
+        quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire])
+        int8 = _predict(onnx_predictor(unproved), comparison)
+        table, strayed_deg = comparison_table(comparison, "INT8 against FP32", int8, floats)
         say(table)
         if not strayed_deg <= tolerance_deg:
             raise ConfigError(
                 f"{int8_path}: not written: median rotation differs from FP32's by {strayed_deg:.2f} degrees, "
                 f"more than --tolerance {tolerance_deg:g}"
             )
-        int8_metrics = _metrics(int8, comparison, thresholds)
-        write_contract(partial, contract.model_copy(update={"precision": "int8", "metrics": int8_metrics}))
-        partial.replace(int8_path)
+        thresholds = (promise.acquire_score_min, promise.track_score_min)
+        measured = {"precision": "int8", "metrics": _metrics(int8, comparison, thresholds)}
+        write_contract(unproved, promise.model_copy(update=measured))
+        unproved.replace(int8_path)
     finally:
-        partial.unlink(missing_ok=True)
-    say(f"wrote {float_path} and {int8_path}")
-    return float_path, int8_path
+        unproved.unlink(missing_ok=True)

@@ -78,6 +78,9 @@ def fold_pads(graph: onnx.GraphProto) -> None:
         attribute.ints[:] = [int(old + new) for old, new in zip(attribute.ints, added, strict=True)]
         conv.input[0] = pad.input[0]
         graph.node.remove(pad)
+    still_read = {name for node in graph.node for name in node.input}
+    for tensor in [tensor for tensor in graph.initializer if tensor.name not in still_read]:
+        graph.initializer.remove(tensor)
 
 
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:

@@ -1,0 +1,82 @@
+"""Evaluate a checkpoint or a model file on windows of a seed that training did not use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from trainer.checkpoint import load_model
+from trainer.config import ConfigError, DataConfig
+from trainer.data import render_once
+from trainer.evaluate import SCORE_THRESHOLD, Predictor, measure, predict_all, torch_predictor
+from trainer.export import ACQUIRE_CROP_PX, OpenView, airframe_names, stage_sampler
+from trainer.graph import onnx_predictor, read_contract
+
+
+class Request(NamedTuple):
+    """What to measure: one of `checkpoint` and `onnx`, and which windows."""
+
+    checkpoint: Path | None
+    onnx: Path | None
+    samples: int
+    seed: int
+    stage: Literal["track", "acquire"]
+    size_px: int | None = None
+
+
+class _Subject(NamedTuple):
+    """A network with what its file says of itself."""
+
+    predict: Predictor
+    data: DataConfig
+    training_seed: int | None
+    track_px: int | None
+    acquire_px: int
+    thresholds: dict[str, float]
+
+
+def _checkpoint(path: Path) -> _Subject:
+    model, config, _, _ = load_model(path)
+    track, acquire = config.contract.track_size_wh, config.contract.acquire_size_wh
+    thresholds = {"track": SCORE_THRESHOLD, "acquire": SCORE_THRESHOLD}
+    return _Subject(
+        torch_predictor(model), config.data, config.data.seed, track[0] if track else None, min(acquire), thresholds
+    )
+
+
+def _model_file(path: Path, seed: int) -> _Subject:
+    contract = read_contract(path)
+    every = airframe_names(None)
+    ids = [every.index(name) for name in contract.airframes if name in every] or None
+    data = DataConfig.model_validate({"seed": seed, "validation_seed": seed + 1, "batch_size": 16, "airframe_ids": ids})
+    trained = contract.training.get("seed")
+    thresholds = {"track": contract.track_score_min, "acquire": contract.acquire_score_min}
+    track = contract.track_size_wh[0] if contract.track_size_wh else None
+    training_seed = trained if isinstance(trained, int) else None
+    return _Subject(onnx_predictor(path), data, training_seed, track, min(contract.acquire_size_wh), thresholds)
+
+
+def evaluate_file(
+    request: Request, *, open_view: OpenView | None = None, rendered: Callable[[int], None] | None = None
+) -> dict[str, float]:
+    """Metrics of trainer.evaluate.measure at the file's own threshold. Raises ConfigError when asked the impossible."""
+    if request.checkpoint is not None:
+        subject = _checkpoint(request.checkpoint)
+    elif request.onnx is not None:
+        subject = _model_file(request.onnx, request.seed)
+    else:
+        raise ConfigError("give --checkpoint or --onnx")
+    if request.seed == subject.training_seed:
+        raise ConfigError(f"--seed {request.seed}: is the training seed; give another")
+    size_px = request.size_px or (subject.track_px if request.stage == "track" else None)
+    size_px = size_px or min(ACQUIRE_CROP_PX, subject.acquire_px)
+    if size_px < 32 or size_px % 32:
+        raise ConfigError(f"--size {size_px}: must be a multiple of 32")
+    if request.samples < 16:
+        raise ConfigError(f"--samples {request.samples}: must be at least 16")
+    view = open_view or (lambda seed, size, share: stage_sampler(subject.data, seed, size, share))
+    opener = view(request.seed, size_px, 0.0 if request.stage == "track" else 1.0)
+    batches = render_once(opener, request.samples, rendered=rendered)
+    measured = measure(predict_all(subject.predict, batches), batches, subject.thresholds[request.stage])
+    return {"size_px": float(size_px), "score_min": subject.thresholds[request.stage], **measured}
