@@ -1,0 +1,315 @@
+"""The zenoh link as a tool on board and a router on the ground see it: real sessions on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from edge.config import ZenohSettings
+from edge.health import HealthSnapshot, HealthState, Percentiles
+from edge.links.errors import LinkError
+from edge.links.zenoh_link import ZenohLink
+from edge.types import TrackState
+from msgs import topics
+from msgs.client import connect, subscribe, subscribe_all
+from msgs.session import router_config
+
+from .reports import OWN_NED_M, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, V_NED_MPS, K
+from .reports import make_report as report
+from .reports import make_track as track
+
+DEADLINE_S = 15.0
+ROS = get_typestore(Stores.ROS2_JAZZY)
+# rosbags does not carry vision_msgs; these are the package's own definitions.
+VISION_MSGS = {
+    "ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "Detection3D": "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n",
+    "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+for _name, _definition in VISION_MSGS.items():
+    ROS.register(get_types_from_msg(_definition, f"vision_msgs/msg/{_name}"))
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def linked(endpoint: str, **settings: Any) -> Iterator[ZenohLink]:
+    link = ZenohLink(ZenohSettings(listen=[endpoint], **settings), "uav1")
+    link.start()
+    try:
+        yield link
+    finally:
+        link.stop()
+
+
+class Samples:
+    """The newest sample of each topic, decoded by rosbags."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.came = threading.Condition()
+        self.newest: dict[str, Any] = {}
+        handler = zenoh.handlers.Callback(self._take, indirect=False)
+        self._subscriber = session.declare_subscriber("0/uav1/**", handler)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        row = topics.parse_key(str(sample.key_expr), "uav1")
+        if row is None:
+            return
+        message = ROS.deserialize_cdr(sample.payload.to_bytes(), row[0].ros_type)
+        with self.came:
+            self.newest[topics.topic_name(row[0], "uav1", row[1])] = message
+            self.came.notify_all()
+
+    def wait(self, *names: str, each: Callable[[], None]) -> None:
+        """Until all of these topics came; `each` is called again and again."""
+        deadline = time.monotonic() + DEADLINE_S
+        while True:
+            each()
+            with self.came:
+                if self.came.wait_for(lambda: all(name in self.newest for name in names), 0.05):
+                    return
+            assert time.monotonic() < deadline, f"only {sorted(self.newest)} came in {DEADLINE_S} s"
+
+
+def wait_until(condition: Callable[[], bool], what: str, each: Callable[[], None] = lambda: None) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"{what} did not happen in {DEADLINE_S} s"
+        each()
+        threading.Event().wait(0.02)
+
+
+def test_a_report_arrives_on_every_topic_as_ros_reads_it() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+        stamps_ns = []
+
+        def publish() -> None:
+            stamps_ns.append(time.time_ns())
+            link.publish(report(track(time.monotonic_ns())))
+
+        pose_name, odom_name = "uav1/target/t0/pose", "uav1/target/t0/odom"
+        samples.wait(pose_name, odom_name, "uav1/target/detections", "uav1/tf", each=publish)
+        pose, odom = samples.newest[pose_name], samples.newest[odom_name]
+        found, tf = samples.newest["uav1/target/detections"], samples.newest["uav1/tf"]
+    stamp_ns = pose.header.stamp.sec * 1_000_000_000 + pose.header.stamp.nanosec
+    assert min(abs(stamp_ns - at_ns) for at_ns in stamps_ns) < 5_000_000
+    assert pose.header.frame_id == "camera_optical_frame"
+    np.testing.assert_allclose(vector(pose.pose.pose.position), T_CAM_TARGET_M)
+    np.testing.assert_allclose(matrix(pose.pose.pose.orientation), R_CAM_TARGET, atol=1e-12)
+    np.testing.assert_allclose(pose.pose.covariance.reshape(6, 6), np.diag([0.09, 0.16, 144.0, 0.01, 0.02, 0.03]))
+
+    assert (odom.header.frame_id, odom.child_frame_id) == ("ned", "target_frd")
+    np.testing.assert_allclose(vector(odom.pose.pose.position), OWN_NED_M + R_NED_CAM @ T_CAM_TARGET_M)
+    R_ned_target = matrix(odom.pose.pose.orientation)
+    np.testing.assert_allclose(R_ned_target @ vector(odom.twist.twist.linear), V_NED_MPS, atol=1e-9)
+    np.testing.assert_allclose(np.diag(odom.pose.covariance.reshape(6, 6)), [4.0, 9.0, 16.0, 0.01, 0.02, 0.09])
+    twist = odom.twist.covariance.reshape(6, 6)
+    np.testing.assert_allclose(R_ned_target @ twist[:3, :3] @ R_ned_target.T, np.diag([1.0, 4.0, 2.0]), atol=1e-9)
+
+    (one,) = found.detections
+    assert (one.id, one.results[0].hypothesis.score) == ("t0", 0.87)
+    frames = [(t.header.frame_id, t.child_frame_id) for t in tf.transforms]
+    assert frames == [("ned", "base_link_ned"), ("base_link_ned", "base_link_frd")]
+    np.testing.assert_allclose(vector(tf.transforms[0].transform.translation), OWN_NED_M)
+
+
+def test_without_own_attitude_there_is_a_pose_but_nothing_in_ned() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+        in_cam_only = {"R_ned_target": None, "t_ned_target_m": None, "v_ned_target_mps": None, "covariance_ned": None}
+        samples.wait(
+            "uav1/target/t0/pose",
+            "uav1/target/detections",
+            each=lambda: link.publish(report(track(time.monotonic_ns(), **in_cam_only), own_ship=False)),
+        )
+        assert "sent_odom" not in link.counters()
+        assert "sent_tf" not in link.counters()
+
+
+def test_tentative_stale_broken_and_unsure_tracks_never_leave() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint, max_age_ms=500.0) as link, connect(endpoint) as session:
+        samples = Samples(session)
+
+        def publish() -> None:
+            now_ns = time.monotonic_ns()
+            link.publish(
+                report(
+                    track(now_ns, track_id=1, state=TrackState.TENTATIVE),
+                    track(now_ns, track_id=2, state=TrackState.COASTING, measured_ns=now_ns - 600_000_000),
+                    track(now_ns, track_id=3, R_cam_target=np.full((3, 3), np.nan)),
+                    track(now_ns, track_id=4, R_cam_target=np.ones((3, 3))),
+                    track(now_ns, track_id=5, covariance=np.diag([1.0, 1.0, -9.0, 1.0, 1.0, 1.0])),
+                    track(now_ns, track_id=6, covariance=np.diag([1.0, 1.0, 250.0**2, 1.0, 1.0, 1.0])),
+                    track(now_ns, track_id=7, state=TrackState.COASTING, measured_ns=now_ns - 100_000_000),
+                )
+            )
+
+        samples.wait("uav1/target/t7/pose", "uav1/target/detections", each=publish)
+        (only,) = samples.newest["uav1/target/detections"].detections
+        poses = {name for name in samples.newest if name.endswith(("pose", "odom"))}
+    assert only.id == "t7"
+    assert poses == {"uav1/target/t7/pose", "uav1/target/t7/odom"}
+
+
+def test_a_report_that_waited_too_long_is_withheld_when_it_is_sent() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        link.publish(report(track(time.monotonic_ns() - 700_000_000)))
+        wait_until(lambda: link.counters().get("tracks_withheld") == 1, "withholding")
+        assert "sent_pose" not in link.counters()
+
+
+def test_the_typed_client_takes_every_pose_it_gets() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session, subscribe(session, "uav1", depth=64) as poses:
+        taken = []
+
+        def turn() -> None:
+            link.publish(report(track(time.monotonic_ns())))
+            while (pose := poses.poll()) is not None:
+                taken.append(pose)
+
+        wait_until(lambda: len(taken) >= 20, "20 poses", turn)
+        assert not poses.refused
+    assert all(a.stamp_ns < b.stamp_ns for a, b in itertools.pairwise(taken))
+    assert all(pose.age_s < 0.5 for pose in taken)
+
+
+def test_who_joins_late_gets_intrinsics_and_events_from_the_cache() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        link.publish(report(track(time.monotonic_ns())))
+        for text in ("searching", "tracking"):
+            link.publish_event(20, text)
+        wait_until(lambda: link.counters().get("sent_events") == 2, "events")
+        assert link.counters()["sent_camera_info"] == 1
+        with connect(endpoint) as session, subscribe_all(session, "uav1") as counts:
+            wait_until(
+                lambda: counts.counts().get("uav1/events", 0) >= 2 and counts.counts().get("uav1/camera_info", 0) >= 1,
+                "history",
+            )
+
+
+def test_intrinsics_are_told_again_only_when_they_change() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+        zoomed = K * np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 1.0]])
+        steps = [report(track(time.monotonic_ns())), report(track(time.monotonic_ns()))]
+        steps.append(type(steps[0])(**{**vars(steps[0]), "K": zoomed}))
+        for count, step in enumerate(steps, start=1):
+            link.publish(step)
+            wait_until(lambda count=count: link.counters().get("sent_detections") == count, "report")  # type: ignore[misc]
+        assert link.counters()["sent_camera_info"] == 2
+        samples.wait("uav1/camera_info", each=lambda: link.publish(report(track(time.monotonic_ns()))))
+        info = samples.newest["uav1/camera_info"]
+    assert (info.width, info.height) == SIZE_WH
+    assert info.k[0] in (K[0, 0], zoomed[0, 0])
+
+
+def test_health_arrives_as_diagnostics() -> None:
+    endpoint = free_endpoint()
+    snapshot = HealthSnapshot(
+        time.monotonic_ns(),
+        HealthState.DEGRADED,
+        ("no own attitude",),
+        1,
+        29.97,
+        {"capture_dropped": 3},
+        {"track": Percentiles(6.0, 7.0, 8.5)},
+    )
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+        samples.wait("uav1/diagnostics", each=lambda: link.publish_diagnostics(snapshot))
+        (status,) = samples.newest["uav1/diagnostics"].status
+    values = {pair.key: pair.value for pair in status.values}
+    assert status.message == "degraded; no own attitude"
+    assert status.hardware_id == "uav1"
+    assert values["capture_dropped"] == "3"
+    assert values["latency_ms/track/p99"] == "8.50"
+    assert (
+        int(np.frombuffer(bytes([status.level]) if isinstance(status.level, int) else status.level, np.uint8)[0]) == 1
+    )
+
+
+def test_the_ground_may_come_later_than_the_daemon_and_come_again() -> None:
+    ground = free_endpoint()
+    with linked(free_endpoint(), connect=[ground]) as link:
+        for _ in range(2):
+            with zenoh.open(router_config([ground])) as router:
+                came = threading.Event()
+                handler = zenoh.handlers.Callback(lambda _, came=came: came.set(), indirect=False)
+                subscriber = router.declare_subscriber("0/uav1/target/**", handler)
+                wait_until(came.is_set, "a sample", lambda: link.publish(report(track(time.monotonic_ns()))))
+                subscriber.undeclare()
+
+
+def test_publishing_never_waits_and_the_newest_wins() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        one = report(track(time.monotonic_ns()))
+        worst_s = 0.0
+        for _ in range(2000):
+            began = time.perf_counter()
+            link.publish(one)
+            worst_s = max(worst_s, time.perf_counter() - began)
+        wait_until(
+            lambda: link.counters()["reports_replaced"] + link.counters().get("sent_detections", 0) == 2000, "delivery"
+        )
+        assert link.counters()["reports_replaced"] > 0
+    assert worst_s < 0.5
+
+
+def test_a_port_that_is_taken_is_a_sentence() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint):
+        second = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1")
+        with pytest.raises(LinkError, match=f"zenoh cannot listen on {endpoint}: .*[Aa]ddress already in use"):
+            second.start()
+        second.stop()
+
+
+def test_the_process_ends_when_the_link_is_stopped() -> None:
+    script = (
+        "import sys\n"
+        "from edge.config import ZenohSettings\n"
+        "from edge.links.zenoh_link import ZenohLink\n"
+        "link = ZenohLink(ZenohSettings(listen=[sys.argv[1]]), 'uav1')\n"
+        "link.start()\n"
+        "link.publish_event(20, 'bye')\n"
+        "link.stop()\n"
+        "assert link.counters()['sent_events'] == 1, 'what waited was sent'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, free_endpoint()], timeout=60, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def vector(v: Any) -> np.ndarray:
+    return np.array([v.x, v.y, v.z])
+
+
+def matrix(q: Any) -> np.ndarray:
+    return Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
