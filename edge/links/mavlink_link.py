@@ -158,15 +158,15 @@ class MavlinkLink:
         now_ns = time.monotonic_ns()
         if state is not None:
             self._station.health(state, now_ns)
-        if report is not None:
-            try:
+        try:
+            if report is not None:
                 self._send(self._station.report(report, now_ns))
-            except ValueError as error:
-                # A number that no field holds: this report is not sent, the next may be.
-                self._station.counters["unpackable"] += 1
-                log.warning("mavlink: not sent: %s", error)
-        for severity, text in events:
-            self._send(self._station.event(severity, text))
+            for severity, text in events:
+                self._send(self._station.event(severity, text))
+        except ValueError as error:
+            # A value that no field holds: this is not sent, the next may be.
+            self._station.counters["unpackable"] += 1
+            log.warning("mavlink: not sent: %s", error)
 
     def _hear(self, endpoint: Endpoint | None) -> None:
         if endpoint is None:

@@ -28,6 +28,7 @@ FrameKind = Literal["ned", "ned_relative", "cam"]
 POSITION, VELOCITY, ROTATION = slice(0, 3), slice(3, 6), slice(6, 9)
 TURN_RATE, RANGE_BIAS = 9, 10
 DIMENSION = 11
+POSE_BLOCK = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])
 
 NS_PER_S = 1e9
 
@@ -134,7 +135,7 @@ def begin(estimate: Estimate, K: Array, view: View) -> Motion:
     R = view.R_frame_cam
     t_cam = estimate.t_cam_target_m
     P = np.zeros((DIMENSION, DIMENSION))
-    block = np.kron(np.eye(2), R)
+    block = _twice(R)
     placed = block @ noise @ block.T
     ray = R @ t_cam
     P[POSITION, POSITION] = placed[:3, :3] + bias_variance * np.outer(ray, ray)
@@ -179,7 +180,10 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
     F[RANGE_BIAS, RANGE_BIAS] = decay
 
     Q = np.zeros((DIMENSION, DIMENSION))
-    Q[:6, :6] = np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], _acceleration_density(motion))
+    density = _acceleration_density(motion)
+    Q[POSITION, POSITION] = dt**3 / 3.0 * density
+    Q[POSITION, VELOCITY] = Q[VELOCITY, POSITION] = dt**2 / 2.0 * density
+    Q[VELOCITY, VELOCITY] = dt * density
     Q[ROTATION, ROTATION] = (R * (ROTATION_WALK**2 * dt)) @ R.T
     Q[TURN_RATE, TURN_RATE] = TURN_RATE_WALK**2 * dt if motion.kind == "ned" else 0.0
     Q[RANGE_BIAS, RANGE_BIAS] = (1.0 - decay**2) * motion.bias_variance
@@ -295,10 +299,14 @@ def with_rotation_of(motion: Motion, estimate: Estimate, K: Array, view: View) -
 def in_cam(motion: Motion, view: View) -> tuple[Array, Array, Array]:
     """(t_cam_target_m [3], R_cam_target [3, 3], covariance [6, 6]) in `cam`."""
     R = view.R_frame_cam.T
-    block = np.kron(np.eye(2), R)
-    index = np.r_[POSITION, ROTATION]
-    covariance = _symmetric(block @ motion.P[np.ix_(index, index)] @ block.T)
-    return R @ (motion.t_m - view.t_frame_cam_m), R @ motion.R_frame_target, covariance
+    block = _twice(R)
+    covariance = _symmetric(block @ motion.P[POSE_BLOCK] @ block.T)
+    return t_in_cam(motion, view), R @ motion.R_frame_target, covariance
+
+
+def t_in_cam(motion: Motion, view: View) -> Array:
+    """t_cam_target_m [3]."""
+    return view.R_frame_cam.T @ (motion.t_m - view.t_frame_cam_m)
 
 
 def _turning_radps(motion: Motion) -> Array:
@@ -335,6 +343,13 @@ def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
 
 def _speed_variance(kind: FrameKind, range_m: float) -> float:
     return max(SPEED_STD_MPS, APPARENT_RATE_STD * range_m if kind == "cam" else 0.0) ** 2
+
+
+def _twice(R: Array) -> Array:
+    """[3, 3] to the [6, 6] that turns position and rotation alike."""
+    block = np.zeros((6, 6))
+    block[:3, :3] = block[3:, 3:] = R
+    return block
 
 
 def _symmetric(P: Array) -> Array:

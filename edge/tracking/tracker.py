@@ -192,7 +192,7 @@ def _taken_over(target: Target, spare: list[Estimate], K: Array, view: View) -> 
 
 
 def _seen(target: Target, estimate: Estimate, K: Array, view: View) -> None:
-    target.box = BoxModel.measured(estimate.box_xyxy_px, ekf.in_cam(target.motion, view)[0], K)
+    target.box = BoxModel.measured(estimate.box_xyxy_px, ekf.t_in_cam(target.motion, view), K)
     target.score = estimate.score
     target.measured_ns = view.time_ns
     target.hits += 1
@@ -216,7 +216,7 @@ def _alive(target: Target, K: Array, view: View, image_size_wh: Size) -> bool:
 
 
 def _box(target: Target, view: View, K: Array) -> Array:
-    return target.box.box_xyxy_px(ekf.in_cam(target.motion, view)[0], K)
+    return target.box.box_xyxy_px(ekf.t_in_cam(target.motion, view), K)
 
 
 def _track(target: Target, motion: Motion, view: View, K: Array) -> Track:
