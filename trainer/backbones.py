@@ -47,7 +47,7 @@ def _absorb_norm(weight: Tensor, bias: Tensor, bn: nn.BatchNorm2d) -> tuple[Tens
 def _conv_like(conv: nn.Conv2d, weight: Tensor, bias: Tensor) -> nn.Conv2d:
     kernel = (weight.shape[2], weight.shape[3])
     stride, padding = (conv.stride[0], conv.stride[1]), (kernel[0] // 2, kernel[1] // 2)
-    out = nn.Conv2d(conv.in_channels, conv.out_channels, kernel, stride, padding, groups=conv.groups)
+    out = nn.Conv2d(conv.in_channels, conv.out_channels, kernel, stride, padding, groups=conv.groups).to(weight)
     out.weight.data.copy_(weight)
     assert out.bias is not None
     out.bias.data.copy_(bias)

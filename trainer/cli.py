@@ -50,7 +50,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     request = Request(
         arguments.checkpoint, arguments.onnx, arguments.samples, arguments.seed, arguments.stage, arguments.size
     )
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("rendering", total=arguments.samples)
         metrics = evaluate_file(request, rendered=lambda count: progress.update(task, completed=count))
     if arguments.json:
@@ -87,8 +87,9 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     evaluate = commands.add_parser(
         "evaluate",
         help="measure a checkpoint or a model file on rendered windows",
-        description="Measure a checkpoint or a model file on windows that training never saw: the paper's errors over "
-        "every window with a target, found or not, and how well targets are found. A seed gives the same windows again.",
+        description="Measure a checkpoint or a model file on windows that training never saw: the paper's errors "
+        "over every window with a target, found or not, and how well targets are found. A seed always gives the same "
+        "windows.",
     )
     source = evaluate.add_mutually_exclusive_group(required=True)
     source.add_argument("--checkpoint", type=Path, help="run folder or its weights.pt")
@@ -105,8 +106,8 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
     export = commands.add_parser(
         "export",
         help="write a checkpoint as FP32 and INT8 model files",
-        description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics measured on windows of "
-        "a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch.",
+        description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics measured on windows "
+        "of a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch.",
     )
     export.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     export.add_argument("--out", type=Path, required=True, help="folder for the INT8 file")

@@ -169,12 +169,12 @@ def export_models(
     say(comparison_table(comparison, "FP32 against PyTorch", floats, by_torch)[0])
 
     say("quantising")
-    _quantise(float_path, int8_path, promise, calibration, comparison, floats, tolerance_deg, say)
+    write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance_deg, say)
     say(f"wrote {float_path} and {int8_path}")
     return float_path, int8_path
 
 
-def _quantise(
+def write_int8(
     float_path: Path,
     int8_path: Path,
     promise: ModelContract,
@@ -184,7 +184,10 @@ def _quantise(
     tolerance_deg: float,
     say: Callable[[str], None],
 ) -> None:
-    """Write the INT8 file beside its place, compare it with FP32, and only then move it there."""
+    """Write the INT8 file beside its place, compare it with FP32 on `comparison`, and only then move it there.
+
+    `promise` is the FP32 file's contract, `floats` its predictions. Raises ConfigError when INT8 strays too far.
+    """
     unproved = int8_path.with_suffix(".part")
     try:
         quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire])

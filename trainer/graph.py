@@ -68,7 +68,7 @@ def fold_pads(graph: onnx.GraphProto) -> None:
     constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
     users = Counter(name for node in graph.node for name in node.input)
     pads = {node.output[0]: node for node in graph.node if node.op_type == "Pad" and users[node.output[0]] == 1}
-    for conv in graph.node:
+    for conv in list(graph.node):
         pad = pads.get(conv.input[0]) if conv.op_type == "Conv" else None
         if pad is None or pad.input[1] not in constants or any(constants.get(name, 0.0) for name in pad.input[2:3]):
             continue

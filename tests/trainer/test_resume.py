@@ -1,79 +1,77 @@
-"""A stopped and resumed run is the unbroken run, bit for bit."""
+"""A stopped and resumed run is the unbroken run, bit for bit; other ways to begin are refused or recorded."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 import synthetic_sampler
+import tiny
 import torch
 
+from trainer.checkpoint import load_model
 from trainer.config import ConfigError, parse_config
 from trainer.train import Trainer, run_training
 
-TINY = """
-[model]
-configuration = "edge"
-backbone = "repvit_small"
-pretrained = false
-channels = 16
-hidden = 32
-soft_argmax_sigma_cells = 1.0
-box_anchor_px = 32.0
-origin_range = 0.5
-focal = "geometric"
-depth = "rotation_aware"
-uncertainty = true
-dense = true
-[loss]
-heatmap = 1.0
-mask = 1.0
-noc = 1.0
-uncertainty = 0.1
-[data]
-seed = 3
-validation_seed = 4
-batch_size = 4
-validation_samples = 16
-[schedule]
-samples = 16
-warmup_samples = 8
-sizes = [{ from_progress = 0.0, size_px = 64 }, { from_progress = 0.7, size_px = 96 }]
-[run]
-threads = 1
-log_every_steps = 1
-[contract]
-name = "tiny"
-acquire_size_wh = [128, 96]
-acquire_fit = "letterbox"
-track_size_wh = [64, 64]
-track_window_scale = 2.0
-"""
+
+def train(out: Path, steps: int | None, text: str = tiny.TOML, **options: object) -> Trainer:
+    config = parse_config(text, "tiny.toml")
+    return run_training(config, text, out, max_steps=steps, open_sampler=synthetic_sampler.opener, **options)
 
 
-def train(out: Path, steps: int | None, resume: bool = False) -> Trainer:
-    config = parse_config(TINY, "tiny.toml")
-    return run_training(config, TINY, out, resume=resume, max_steps=steps, open_sampler=synthetic_sampler.opener)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trainer]:
+    out = tmp_path_factory.mktemp("whole")
+    return out, train(out, None)
 
 
-def test_two_and_two_steps_equal_four(tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole", None)
-    train(tmp_path / "parts", 2)
-    parts = train(tmp_path / "parts", None, resume=True)
-    assert whole.steps == parts.steps == 4
-    assert whole.samples == parts.samples == 16
-    for ours, theirs in ((whole.model, parts.model), (whole.average, parts.average)):
+def test_two_and_two_steps_equal_four(whole: tuple[Path, Trainer], tmp_path: Path) -> None:
+    _, unbroken = whole
+    train(tmp_path, 2)
+    parts = train(tmp_path, None, resume=True)
+    assert unbroken.steps == parts.steps == 4
+    assert unbroken.samples == parts.samples == 16
+    for ours, theirs in ((unbroken.model, parts.model), (unbroken.average, parts.average)):
         for (name, a), b in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
             assert torch.equal(a, b), name
-    lines = (tmp_path / "parts" / "log.jsonl").read_text().splitlines()
-    assert len([line for line in lines if '"train"' in line]) == 4
+    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records if record["kind"] == "train"] == [1, 2, 3, 4]
+    assert [record["size_px"] for record in records if record["kind"] == "validation"] == [64, 96]
 
 
-def test_a_run_is_not_overwritten_and_another_config_is_refused(tmp_path: Path) -> None:
-    train(tmp_path / "run", 1)
+def test_a_run_is_neither_overwritten_nor_resumed_with_other_losses(whole: tuple[Path, Trainer]) -> None:
+    out, _ = whole
     with pytest.raises(ConfigError, match="--resume"):
-        train(tmp_path / "run", 1)
-    other = TINY.replace("mask = 1.0", "mask = 2.0")
-    config = parse_config(other, "other.toml")
+        train(out, 1)
     with pytest.raises(ConfigError, match=r"resume\.pt: \[loss\] differs"):
-        run_training(config, other, tmp_path / "run", resume=True, open_sampler=synthetic_sampler.opener)
+        train(out, 1, tiny.TOML.replace("mask = 1.0", "mask = 2.0"), resume=True)
+
+
+def test_the_weights_file_is_the_averaged_network_in_half_precision(whole: tuple[Path, Trainer]) -> None:
+    out, trainer = whole
+    model, config, training, sha256 = load_model(out)
+    assert config.contract.name == "tiny"
+    assert training["samples"] == 16
+    assert len(sha256) == 64
+    averaged = trainer.average.state_dict()
+    for name, value in model.state_dict().items():
+        torch.testing.assert_close(value, averaged[name], rtol=1e-3, atol=1e-4)
+
+
+def test_weights_of_another_run_start_a_network_with_another_head(whole: tuple[Path, Trainer], tmp_path: Path) -> None:
+    out, earlier = whole
+    text = tiny.TOML.replace("hypotheses = 4", "hypotheses = 2")
+    started = Trainer(parse_config(text, "two.toml"), torch.device("cpu"))
+    untouched = started.model.head_rot.weight.clone()
+    started.start_from(out / "weights.pt")
+    kept, given = started.model.state_dict(), earlier.average.state_dict()
+    torch.testing.assert_close(
+        kept["neck.fuse.0.weight"], given["neck.fuse.0.weight"], rtol=1e-3, atol=1e-4, check_dtype=False
+    )
+    assert torch.equal(started.model.head_rot.weight, untouched)
+    assert started.started_from.startswith("weights ")
+
+    torch.save({"weights": {"elsewhere": torch.zeros(1)}}, tmp_path / "other.pt")
+    with pytest.raises(ConfigError, match="no weights that fit"):
+        started.start_from(tmp_path / "other.pt")

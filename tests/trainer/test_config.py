@@ -1,0 +1,57 @@
+"""Wrong configurations and commands are answered with one sentence that names what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import tiny
+
+import trainer
+from trainer.cli import main
+from trainer.config import ConfigError, load_config, parse_config
+
+CONFIGS = Path(trainer.__file__).parent / "configs"
+
+
+def test_shipped_configurations_are_valid_and_say_which_they_are() -> None:
+    assert load_config(CONFIGS / "edge.toml").model.configuration == "edge"
+    paper = load_config(CONFIGS / "paper.toml")
+    assert paper.model.backbone == "repvit_m0_9"
+    assert (paper.loss.heatmap, paper.loss.size, paper.loss.translation, paper.loss.rotation) == (50, 4, 4, 25)
+    assert (paper.loss.depth, paper.loss.planar, paper.loss.rotation_6d, paper.model.origin_range) == (20, 50, 5, 1.25)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("channels = 16", "chanels = 16", "model.chanels"),
+        ("batch_size = 4", 'batch_size = "many"', "data.batch_size"),
+        ("validation_seed = 4", "validation_seed = 3", "data: "),
+        ("size_px = 96", "size_px = 100", "schedule.sizes.1.size_px"),
+        ("pretrained = false", "pretrained = true", "repvit_small"),
+        ("[contract]", "[contract", "not valid TOML"),
+    ],
+)
+def test_a_mistake_is_named_with_its_file_and_key(old: str, new: str, named: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(tiny.TOML.replace(old, new), "mine.toml")
+    assert str(caught.value).startswith("mine.toml: ")
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "--config", "{tmp}/none.toml", "--out", "{tmp}/run"],
+        ["export", "--checkpoint", "{tmp}/none", "--out", "{tmp}/models"],
+        ["evaluate", "--onnx", "{tmp}/none.onnx"],
+    ],
+)
+def test_commands_end_with_2_and_a_sentence(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main([word.format(tmp=tmp_path) for word in arguments]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"uavpose-trainer: {tmp_path}/none")
+    assert message.count("\n") == 1

@@ -1,0 +1,121 @@
+"""Exported files compute what the network computes, carry their contract, and take any size."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from synthetic_sampler import PlateSampler
+
+from msgs.contract import OUTPUT_NAMES
+from trainer.checkpoint import load_model, save_weights
+from trainer.config import ConfigError
+from trainer.data import TrainingBatch, training_batch
+from trainer.evaluate import measure, predict_all
+from trainer.export import Measured, Views, export_models, write_int8
+from trainer.graph import onnx_predictor, open_session, read_contract
+from trainer.held_out import Request, evaluate_file
+
+
+def open_view(seed: int, size_px: int, acquire_share: float) -> partial:
+    return partial(PlateSampler, seed, size_px, empty_share=0.3)
+
+
+class Exported:
+    def __init__(self, folder: Path) -> None:
+        self.run = folder / "run"
+        save_weights(self.run / "weights.pt", tiny.network(), tiny.TOML, {"seed": 3, "samples": 0, "commit": "unknown"})
+        self.said: list[str] = []
+        self.fp32, self.int8 = export_models(
+            self.run, folder / "models", samples=16, tolerance_deg=180.0, open_view=open_view, say=self.said.append
+        )
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return Exported(tmp_path_factory.mktemp("export"))
+
+
+def inputs(count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    image = np.random.default_rng(1).integers(0, 255, (count, height, width, 3), dtype=np.uint8)
+    K = np.array([[900.0, 0, width / 2], [0, 880, height / 2], [0, 0, 1]], np.float32)
+    return image, np.repeat(K[None], count, 0)
+
+
+@pytest.mark.parametrize("shape", [(1, 64, 64), (3, 128, 96), (1, 384, 640)])
+def test_fp32_file_equals_the_network(exported: Exported, shape: tuple[int, int, int]) -> None:
+    image, K = inputs(*shape)
+    model, *_ = load_model(exported.run)
+    with torch.no_grad():
+        expected = model(torch.from_numpy(image), torch.from_numpy(K))
+    got = open_session(exported.fp32).run(list(OUTPUT_NAMES), {"image": image, "K": K})
+    for name, a, b in zip(OUTPUT_NAMES, got, expected, strict=True):
+        assert a.shape == tuple(b.shape), name
+        np.testing.assert_allclose(
+            a, b.numpy(), rtol=1e-4, atol=2e-3 if name.endswith(("_px", "_m")) else 1e-4, err_msg=name
+        )
+
+
+@pytest.mark.parametrize("shape", [(1, 128, 128), (2, 192, 192), (1, 256, 256), (1, 384, 640)])
+def test_int8_file_takes_every_size_and_returns_poses(exported: Exported, shape: tuple[int, int, int]) -> None:
+    image, K = inputs(*shape)
+    out = dict(
+        zip(OUTPUT_NAMES, open_session(exported.int8).run(list(OUTPUT_NAMES), {"image": image, "K": K}), strict=True)
+    )
+    R = out["R_cam_target"]
+    np.testing.assert_allclose(R @ np.swapaxes(R, -1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-4)
+    assert np.all((out["t_cam_target_m"][..., 2] >= 49.9) & (out["t_cam_target_m"][..., 2] <= 600.1))
+    assert np.all(np.diff(out["score"], axis=1) <= 0)
+    assert np.all(out["sigma"] > 0)
+    for array in out.values():
+        assert array.shape[:2] == (shape[0], 4)
+        assert np.isfinite(array).all()
+
+
+def test_int8_file_is_quantised_and_near_the_float_one(exported: Exported) -> None:
+    assert exported.int8.stat().st_size < 0.7 * exported.fp32.stat().st_size
+    image, K = inputs(4, 96, 96)
+    one, other = onnx_predictor(exported.int8)(image, K), onnx_predictor(exported.fp32)(image, K)
+    np.testing.assert_allclose(one.score, other.score, atol=0.05)
+
+
+def test_both_files_carry_a_contract_with_what_was_measured(exported: Exported) -> None:
+    fp32, int8 = read_contract(exported.fp32), read_contract(exported.int8)
+    assert (fp32.precision, int8.precision) == ("fp32", "int8")
+    assert fp32.weights_sha256 == int8.weights_sha256 == load_model(exported.run)[3]
+    assert fp32.track_size_wh == (64, 64)
+    assert fp32.airframes
+    assert int8.metrics["track_windows"] == 16.0
+    assert 0 <= int8.metrics["acquire_E_r_median_deg"] <= 180
+    assert any("INT8 against FP32" in text for text in exported.said)
+
+
+def windows(seed: int, size_px: int) -> TrainingBatch:
+    return training_batch(open_view(seed, size_px, 0.0)().batch(0, 16))
+
+
+def test_an_int8_file_that_strays_is_not_written(exported: Exported, tmp_path: Path) -> None:
+    views = Views([windows(1, 64)], [windows(2, 96)])
+    predict = onnx_predictor(exported.fp32)
+    floats = Measured(predict_all(predict, views.track), predict_all(predict, views.acquire))
+    destination = tmp_path / "strays.onnx"
+    with pytest.raises(ConfigError, match=r"strays\.onnx: not written: .* --tolerance 0"):
+        write_int8(
+            exported.fp32, destination, read_contract(exported.fp32), views, views, floats, 0.0, exported.said.append
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None:
+    request = Request(checkpoint=None, onnx=exported.fp32, samples=16, seed=77, stage="track")
+    got = evaluate_file(request, open_view=open_view)
+    batches = [windows(77, 64)]
+    threshold = read_contract(exported.fp32).track_score_min
+    expected = measure(predict_all(onnx_predictor(exported.fp32), batches), batches, threshold)
+    assert got == pytest.approx({"size_px": 64.0, "score_min": threshold, **expected}, nan_ok=True)
+    with pytest.raises(ConfigError, match="training seed"):
+        evaluate_file(request._replace(seed=3), open_view=open_view)
