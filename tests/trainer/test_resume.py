@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -75,3 +78,24 @@ def test_weights_of_another_run_start_a_network_with_another_head(whole: tuple[P
     torch.save({"weights": {"elsewhere": torch.zeros(1)}}, tmp_path / "other.pt")
     with pytest.raises(ConfigError, match="no weights that fit"):
         started.start_from(tmp_path / "other.pt")
+
+
+def test_sigterm_ends_a_run_between_steps_with_a_checkpoint(tmp_path: Path) -> None:
+    text = tiny.TOML.replace("[schedule]\nsamples = 16", "[schedule]\nsamples = 1000000")
+    log = tmp_path / "log.jsonl"
+    ended = threading.Event()
+
+    def terminate_after_the_first_step() -> None:
+        while not (log.exists() and '"train"' in log.read_text()) and not ended.wait(0.05):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    watcher = threading.Thread(target=terminate_after_the_first_step)
+    watcher.start()
+    try:
+        trainer = train(tmp_path, 500, text)
+    finally:
+        ended.set()
+        watcher.join()
+    assert 1 <= trainer.steps < 500
+    assert load_model(tmp_path)[2]["steps"] == trainer.steps
