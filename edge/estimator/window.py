@@ -76,10 +76,11 @@ def window_around(
 ) -> Window:
     """The window of the network's aspect around a box, its shorter side window_scale times the box's longer.
 
-    It is moved into the frame where it fits there: real pixels say more than a border.
+    It is moved into the frame where it fits there: real pixels say more than a border. It never outgrows the frame's
+    longer side: the box of a target predicted at arm's length has no bounds, and the memory for its window has.
     """
     x0, y0, x1, y1 = np.asarray(box_xyxy_px, dtype=np.float64)
-    side = window_scale * max(x1 - x0, y1 - y0, 1.0)
+    side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(image_size_wh)))
     shorter = min(size_wh)
     width, height = max(round(side * size_wh[0] / shorter), 2), max(round(side * size_wh[1] / shorter), 2)
     # Outermost pixel centres lie half a pixel inside the box's edges.

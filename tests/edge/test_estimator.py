@@ -42,6 +42,12 @@ def test_a_window_is_the_same_camera_with_other_pixels(box: np.ndarray, point_m:
     np.testing.assert_allclose(on_network, pixel_map.to_network(project(K, point_m)), atol=0.01)
 
 
+def test_the_window_of_a_target_about_to_collide_is_no_larger_than_the_picture() -> None:
+    window = window_around(np.array([-14_000.0, -9_000.0, 16_000.0, 10_000.0]), 2.0, TRACK_WH, SIZE_WH)
+    assert max(window.width, window.height) <= max(SIZE_WH)
+    assert cut(np.zeros((SIZE_WH[1], SIZE_WH[0], 3), dtype=np.uint8), window, TRACK_WH).shape == (256, 256, 3)
+
+
 @given(boxes)
 def test_a_window_holds_its_box_and_stays_in_the_frame_where_it_fits(box: np.ndarray) -> None:
     window = window_around(box, 2.0, TRACK_WH, SIZE_WH)
