@@ -8,8 +8,7 @@ import time
 from collections import Counter
 
 from edge.cameras.reconnect import LinkState, Reconnect
-from edge.cameras.source import EndOfStream, Source, SourceLost, wait_until
-from edge.errors import InputError
+from edge.cameras.source import Source, SourceLost, wait_until
 from edge.types import Frame
 
 log = logging.getLogger(__name__)
@@ -24,7 +23,7 @@ class Capture:
         self._stop = threading.Event()
         self._fresh = threading.Condition()
         self._newest: Frame | None = None
-        self._end: EndOfStream | InputError | None = None
+        self._end: Exception | None = None
         self._last_sequence: int | None = None
         self._counts: Counter[str] = Counter(captured=0, dropped=0, reconnects=0)
         self._link = Reconnect()
@@ -36,7 +35,8 @@ class Capture:
     def newest(self, timeout_s: float) -> Frame | None:
         """The newest frame not yet taken, waiting up to `timeout_s`; None when none came.
 
-        Raises EndOfStream after the last frame was taken, InputError when the source can never deliver.
+        Raises EndOfStream after the last frame was taken, InputError when the source can never deliver, and whatever
+        else ended the thread: without it the daemon would wait for ever.
         """
         with self._fresh:
             self._fresh.wait_for(lambda: self._newest is not None or self._end is not None, timeout_s)
@@ -72,7 +72,7 @@ class Capture:
                 frame = self._source.read(self._stop)
             except SourceLost as error:
                 self._lose(error)
-            except (EndOfStream, InputError) as end:
+            except Exception as end:
                 with self._fresh:
                     self._end = end
                     self._fresh.notify_all()

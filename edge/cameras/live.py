@@ -42,8 +42,11 @@ class LiveSource:
         if not capture.isOpened():
             capture.release()
             raise SourceLost(f"{name} does not open")
-        self._capture = capture
         size_wh = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        if min(size_wh) <= 0:
+            capture.release()
+            raise SourceLost(f"{name} does not say the size of its picture")
+        self._capture = capture
         self._fit(size_wh)
         assert self._fitted is not None
         fps = capture.get(cv2.CAP_PROP_FPS)
@@ -58,7 +61,10 @@ class LiveSource:
         if stop.is_set():
             raise EndOfStream
         driver_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC) if isinstance(self._settings, DeviceCamera) else 0.0
-        retrieved, image_bgr = self._capture.retrieve() if grabbed else (False, None)
+        try:
+            retrieved, image_bgr = self._capture.retrieve() if grabbed else (False, None)
+        except cv2.error as error:
+            raise SourceLost(f"a picture cannot be decoded: {error}") from error
         if not retrieved or image_bgr is None:
             raise SourceLost("the camera gives no more frames")
         size_wh = (image_bgr.shape[1], image_bgr.shape[0])

@@ -101,6 +101,25 @@ def test_a_slow_reader_gets_the_newest_frame_and_every_drop_is_counted(scene: Pa
     assert capture.counters()["dropped"] == 40 - len(taken)
 
 
+class Broken(SequenceSource):
+    """Fails as no camera should after its first frame."""
+
+    def read(self, stop: threading.Event) -> Frame:
+        frame = super().read(stop)
+        if frame.meta.sequence > 0:
+            raise MemoryError("no room for a picture")
+        return frame
+
+
+def test_a_capture_thread_that_breaks_ends_the_loop_instead_of_leaving_it_to_wait(scene: Path) -> None:
+    capture = Capture(Broken(SequenceCamera(type="sequence", path=scene, fps=60)), False)
+    capture.start()
+    assert capture.newest(5.0) is not None
+    with pytest.raises(MemoryError):
+        capture.newest(5.0)
+    capture.stop()
+
+
 @pytest.mark.parametrize(
     ("damage", "named"),
     [
