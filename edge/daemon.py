@@ -24,7 +24,7 @@ from edge.cameras.source import EndOfStream
 from edge.config import Config, ConfigFile, camera_key
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model, load_model
-from edge.health import Health, HealthSnapshot, HealthState
+from edge.health import Announcer, Health, HealthSnapshot
 from edge.outlets import Outlets, start_outlets
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.tracking.tracker import Tracker
@@ -78,7 +78,8 @@ class Pipeline:
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         self._health = Health(wants_attitude=config.mavlink.enabled)
         self._since_acquire = 0
-        self._told: HealthState | None = None
+        self._out_of_order = 0
+        self._announcer = Announcer()
         self._snapshot_due_ns = 0
 
     def warm_up(self, camera: CameraInfo) -> None:
@@ -101,12 +102,18 @@ class Pipeline:
     def snapshot(self) -> HealthSnapshot:
         counters = {
             **self._capture.counters(),
+            "out_of_order": self._out_of_order,
             **{f"refused_{reason}": count for reason, count in self._estimator.refused.items()},
+            "refused_by_tracker": self._tracker.not_finite,
             **self._outlets.counters(),
         }
         return self._health.snapshot(time.monotonic_ns(), counters)
 
     def _process(self, frame: Frame) -> None:
+        if self._tracker.is_late(frame.meta.capture_ns):
+            # The tracks are valid at a later time than this frame's: told with its stamp they would be wrong.
+            self._out_of_order += 1
+            return
         clock = StageClock(frame.meta.capture_ns)
         clock.lap("wait")
         capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
@@ -142,17 +149,16 @@ class Pipeline:
         self._outlets.publish(Report(frame.meta, frame.K, size_wh, tracks, own_ship, self._model.sha256))
 
     def _supervise(self) -> None:
-        """Tell the links how the daemon is: its state at every turn, changes as events, all of it once a second."""
+        """Tell the links how the daemon is: its state at every turn, changes as events, counters once a second."""
         now_ns = time.monotonic_ns()
         state, reasons = self._health.assess(now_ns)
         self._outlets.set_health(state)
-        if state is not self._told:
-            self._told = state
+        if self._announcer.due(state, now_ns):
             self._outlets.tell(state, f"{state.value}: {'; '.join(reasons)}" if reasons else state.value)
         if now_ns >= self._snapshot_due_ns:
             self._snapshot_due_ns = now_ns + SNAPSHOT_PERIOD_NS
             snapshot = self.snapshot()
-            log.info("%s", snapshot.line())
+            log.info("%s", snapshot.brief())
             self._outlets.publish_diagnostics(snapshot)
 
 

@@ -14,6 +14,7 @@ from edge.types import Track, TrackState
 WINDOW_FRAMES = 900  # half a minute at 30 frames a second
 NO_FRAME_NS = 2_000_000_000
 DROPS_TOLERATED = 0.1
+ANNOUNCE_NS = 1_000_000_000
 
 
 class HealthState(Enum):
@@ -23,6 +24,16 @@ class HealthState(Enum):
     COASTING = "coasting"  # confirmed targets, none seen just now
     DEGRADED = "degraded"  # works, but less well than it should: see the reasons
     FAULT = "fault"  # gives nothing: see the reasons
+
+
+BEST_TO_WORST = (
+    HealthState.TRACKING,
+    HealthState.COASTING,
+    HealthState.SEARCHING,
+    HealthState.INIT,
+    HealthState.DEGRADED,
+    HealthState.FAULT,
+)
 
 
 @dataclass(frozen=True)
@@ -46,15 +57,48 @@ class HealthSnapshot:
     counters: Mapping[str, int]
     latency_ms: Mapping[str, Percentiles]  # by stage; `total` is exposure to handed to the links
 
+    def brief(self) -> str:
+        """For the log each second: state, tracks, rate, latency from exposure to the links, frames dropped."""
+        total = self.latency_ms.get("total")
+        latency = f", {total.p50:.0f}/{total.p95:.0f}/{total.p99:.0f} ms p50/p95/p99" if total is not None else ""
+        return f"{self._head()}{latency}, dropped={self.counters.get('dropped', 0)}"
+
     def line(self) -> str:
-        """One line for the log."""
-        because = f" ({'; '.join(self.reasons)})" if self.reasons else ""
+        """All of it, for the log when the daemon stops."""
         latency = " ".join(f"{stage} {p.p50:.1f}/{p.p95:.1f}/{p.p99:.1f}" for stage, p in self.latency_ms.items())
         counters = " ".join(f"{name}={count}" for name, count in self.counters.items() if count)
-        return (
-            f"{self.state.value}{because} tracks={self.tracks} {self.frame_rate_hz:.1f} Hz | "
-            f"ms p50/p95/p99: {latency or 'none'} | {counters}"
-        )
+        return f"{self._head()} | ms p50/p95/p99: {latency or 'none'} | {counters}"
+
+    def _head(self) -> str:
+        because = f" ({'; '.join(self.reasons)})" if self.reasons else ""
+        return f"{self.state.value}{because} tracks={self.tracks} {self.frame_rate_hz:.1f} Hz"
+
+
+class Announcer:
+    """When a change of state is worth telling an operator: a state that flickers must not flood a telemetry radio.
+
+    A worse state is told at once, a better one when it has lasted ANNOUNCE_NS; never two within that time but for a
+    fault.
+    """
+
+    def __init__(self) -> None:
+        self._told: HealthState | None = None
+        self._told_ns = 0
+        self._current: HealthState | None = None
+        self._since_ns = 0
+
+    def due(self, state: HealthState, now_ns: int) -> bool:
+        """Whether to tell `state`, which holds at `now_ns`, now; it then counts as told. Call it at every turn."""
+        if state is not self._current:
+            self._current, self._since_ns = state, now_ns
+        if state is self._told:
+            return False
+        if self._told is not None and state is not HealthState.FAULT:
+            worse = BEST_TO_WORST.index(state) > BEST_TO_WORST.index(self._told)
+            if now_ns - (self._told_ns if worse else max(self._told_ns, self._since_ns)) < ANNOUNCE_NS:
+                return False
+        self._told, self._told_ns = state, now_ns
+        return True
 
 
 def judge(

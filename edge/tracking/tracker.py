@@ -87,6 +87,10 @@ class Tracker:
                 expected.append(track)
         return expected
 
+    def is_late(self, capture_ns: int) -> bool:
+        """Whether a frame is not later than the last: nothing of it can be used."""
+        return self._view is not None and capture_ns <= self._view.time_ns
+
     def update(
         self, capture_ns: int, estimates: list[Estimate], own_ship: OwnShip | None, K: Array, image_size_wh: Size
     ) -> tuple[Track, ...]:
@@ -94,7 +98,7 @@ class Tracker:
 
         A frame not later than the last is dropped and counted: the tracks stay as they were.
         """
-        if self._view is not None and capture_ns <= self._view.time_ns:
+        if self.is_late(capture_ns):
             self.out_of_order += 1
             return self._tracks
         view = View.of(capture_ns, own_ship, self.mount)

@@ -5,16 +5,25 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edge.health import Health, HealthState, judge, percentiles_ms
-from edge.types import Track, TrackState
+from edge.cameras.capture import Capture
+from edge.cameras.sequence import SequenceSource
+from edge.config import Config, SequenceCamera
+from edge.daemon import Pipeline
+from edge.estimator.model import load_model
+from edge.health import Announcer, Health, HealthSnapshot, HealthState, Percentiles, judge, percentiles_ms
+from edge.outlets import Outlets
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import CameraInfo, Frame, Report, Track, TrackState
 from msgs.client import connect, subscribe
 
 from .toy_scene import center_of, true_t_cam_target_m
@@ -156,3 +165,79 @@ def test_a_snapshot_tells_rate_and_latency_and_notices_a_stuck_pipeline() -> Non
 def test_percentiles_agree_with_counting() -> None:
     percentiles = percentiles_ms(range(0, 101_000_000, 1_000_000))
     assert (percentiles.p50, percentiles.p95, percentiles.p99) == (50.0, 95.0, 99.0)
+
+
+def told_in(states: list[HealthState], period_s: float) -> list[HealthState]:
+    announcer = Announcer()
+    return [state for k, state in enumerate(states) if announcer.due(state, round(k * period_s * 1e9))]
+
+
+def test_a_state_that_flickers_is_told_once_and_the_worse_of_the_two() -> None:
+    flicker = [HealthState.TRACKING, HealthState.DEGRADED] * 300  # attitude at 15 Hz, frames at 30
+    told = told_in([HealthState.TRACKING] * 60 + flicker, 1 / 30)
+    assert told == [HealthState.TRACKING, HealthState.DEGRADED]
+
+
+def test_a_target_that_is_lost_is_told_at_once_and_one_that_is_held_within_a_second() -> None:
+    announcer = Announcer()
+    assert announcer.due(HealthState.SEARCHING, 0)
+    assert not announcer.due(HealthState.TRACKING, 5_000_000_000)
+    assert announcer.due(HealthState.TRACKING, 6_000_000_000)
+    assert announcer.due(HealthState.COASTING, 9_000_000_000)
+    assert announcer.due(HealthState.FAULT, 9_100_000_000)
+
+
+def test_the_line_of_each_second_is_short_and_the_last_one_holds_every_counter() -> None:
+    counters = {"dropped": 7, **{f"mavlink_sent_{k}": 1 for k in range(40)}}
+    stages = {"track": Percentiles(8.0, 9.0, 10.0), "total": Percentiles(12.0, 15.0, 20.0)}
+    snapshot = HealthSnapshot(0, HealthState.TRACKING, (), 1, 30.0, counters, stages)
+    assert snapshot.brief() == "tracking tracks=1 30.0 Hz, 12/15/20 ms p50/p95/p99, dropped=7"
+    assert all(f"{name}={count}" in snapshot.line().split() for name, count in counters.items())
+
+
+class Recorder(Outlets):
+    """Both links off; keeps what the loop publishes."""
+
+    def __init__(self) -> None:
+        super().__init__(None, None)
+        self.reports: list[Report] = []
+
+    def publish(self, report: Report) -> None:
+        self.reports.append(report)
+
+
+class FrozenStamp:
+    """A camera whose driver's stamp stands still from the fifth frame on."""
+
+    def __init__(self, scene: Path) -> None:
+        self._scene = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=FPS))
+        self._last_ns = 0
+
+    def open(self) -> CameraInfo:
+        return self._scene.open()
+
+    def read(self, stop: threading.Event) -> Frame:
+        frame = self._scene.read(stop)
+        self._last_ns = frame.meta.capture_ns if frame.meta.sequence <= 5 else self._last_ns
+        return replace(frame, meta=replace(frame.meta, capture_ns=self._last_ns))
+
+    def close(self) -> None:
+        self._scene.close()
+
+
+def test_a_frame_that_is_not_later_than_the_last_is_counted_and_its_pose_not_sent_again(
+    scene: Path, toy_model: Path
+) -> None:
+    config = Config.model_validate({
+        "camera": {"type": "sequence", "path": scene}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
+    })  # fmt: skip
+    capture, outlets = Capture(FrozenStamp(scene), False), Recorder()
+    pipeline = Pipeline(config, load_model(toy_model, 1), OwnShipBuffer(), outlets, capture)
+    capture.start()
+    pipeline.fly(threading.Event())
+    capture.stop()
+    stamps_ns = [report.meta.capture_ns for report in outlets.reports]
+    assert len(stamps_ns) >= 2
+    assert np.all(np.diff(stamps_ns) > 0)
+    counters = pipeline.snapshot().counters
+    assert counters["out_of_order"] == counters["captured"] - counters["dropped"] - len(stamps_ns) > 10
