@@ -50,6 +50,8 @@ class Station:
         self._own_ship = own_ship
         self._camera = camera
         self._receiver = Receiver(self.refused)
+        # Strangers have a rate limit of their own: their flood must not use up the autopilot's.
+        self._stranger_receiver = Receiver(self.refused)
         self._boot_clock = BootClock(self.timesync)
         self._utc = UtcClock()
         components = (settings.component_id, settings.camera_component_id)
@@ -71,7 +73,7 @@ class Station:
         fixed = self._settings.system_id
         return any(
             is_autopilot_heartbeat(message) and fixed in (None, message.get_srcSystem())
-            for message in self._receiver.take(datagram, now_ns)
+            for message in self._stranger_receiver.take(datagram, now_ns)
         )
 
     def take(self, datagram: bytes, now_ns: int) -> list[bytes]:
@@ -79,7 +81,10 @@ class Station:
         replies: list[bytes] = []
         for message in self._receiver.take(datagram, now_ns):
             if is_autopilot_heartbeat(message):
+                before = self.vehicle.system_id
                 known = self.vehicle.heartbeat(message.get_srcSystem(), message.autopilot, now_ns)
+                if before not in (None, self.vehicle.system_id):
+                    self._forget()  # another vehicle's clock, attitude and origin
                 self._count(message, None if known else "not_our_autopilot")
                 continue
             vehicle_id = self.vehicle.system_id
@@ -154,10 +159,7 @@ class Station:
 
     def _telemetry(self, message: Any, now_ns: int) -> None:
         if self.vehicle.boot_time(message.time_boot_ms):
-            self._own_ship.clear()
-            self._boot_clock.clear()
-            self.timesync.clear()
-            self._quaternion_ns = None
+            self._forget()
         time_ns = self._boot_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
         message_id = message.get_msgId()
         taken = True
@@ -175,8 +177,16 @@ class Station:
         # 0, 0 is how an autopilot without a fix says so.
         elif message_id == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
             place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
-            taken = self._own_ship.add_global(time_ns, *place)
+            v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+            taken = self._own_ship.add_global(time_ns, place, v_ned_mps)
         self.refused["late"] += not taken
+
+    def _forget(self) -> None:
+        """What was heard holds no more: the autopilot has started again, or it is another."""
+        self._own_ship.clear()
+        self._boot_clock.clear()
+        self.timesync.clear()
+        self._quaternion_ns = None
 
     def _obey(self, command: Any, now_ns: int) -> list[bytes]:
         reply = answer(command)

@@ -22,11 +22,12 @@ def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
 
 
 def lat_lon_alt_from_ned(origin_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -> tuple[float, float, float]:
-    """(degrees, degrees, m) of a point [3] given in the north-east-down axes at the origin."""
+    """(degrees, degrees in -180..180, m) of a point [3] given in the north-east-down axes at the origin."""
     lat, lon, alt = origin_deg_m
     north, east, down = (float(x) for x in np.asarray(t_ned_m, dtype=np.float64))
     per_lat, per_lon = radii_m(lat, alt)
-    return lat + float(np.rad2deg(north / per_lat)), lon + float(np.rad2deg(east / per_lon)), alt - down
+    lon_deg = (lon + float(np.rad2deg(east / per_lon)) + 180.0) % 360.0 - 180.0
+    return lat + float(np.rad2deg(north / per_lat)), lon_deg, alt - down
 
 
 def ned_from_lat_lon_alt(origin_deg_m: tuple[float, float, float], point_deg_m: tuple[float, float, float]) -> Array:

@@ -36,6 +36,13 @@ class _Position:
     v_ned_mps: Array
 
 
+@dataclass(frozen=True)
+class _Global:
+    time_ns: int
+    lat_lon_alt: tuple[float, float, float]
+    v_ned_mps: Array
+
+
 class OwnShipBuffer:
     """The last seconds of own attitude and position, on the monotonic clock. Safe to use from several threads.
 
@@ -46,7 +53,7 @@ class OwnShipBuffer:
         self._lock = threading.Lock()
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
         self._positions: deque[_Position] = deque(maxlen=KEPT)
-        self._global: tuple[int, tuple[float, float, float]] | None = None
+        self._global: _Global | None = None
 
     def add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike) -> bool:
         """Attitude [4] and body rates [3] (FRD). Raises ValueError on a zero quaternion."""
@@ -60,12 +67,14 @@ class OwnShipBuffer:
         with self._lock:
             return _append(self._positions, sample)
 
-    def add_global(self, time_ns: int, lat_deg: float, lon_deg: float, alt_m: float) -> bool:
-        """Position on the globe, altitude above mean sea level: it places the ned origin."""
+    def add_global(
+        self, time_ns: int, lat_lon_alt: tuple[float, float, float], v_ned_mps: tuple[float, float, float]
+    ) -> bool:
+        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: it places the ned origin."""
         with self._lock:
-            if self._global is not None and time_ns <= self._global[0]:
+            if self._global is not None and time_ns <= self._global.time_ns:
                 return False
-            self._global = (time_ns, (lat_deg, lon_deg, alt_m))
+            self._global = _Global(time_ns, lat_lon_alt, np.array(v_ned_mps, dtype=np.float64))
             return True
 
     def clear(self) -> None:
@@ -90,13 +99,17 @@ class OwnShipBuffer:
             return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, self._origin(time_ns, t_ned_m is not None))
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
-        if self._global is None or abs(time_ns - self._global[0]) > GLOBAL_AGE_MAX_NS:
+        """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
+        if self._global is None:
             return None
-        fixed_ns, vehicle = self._global
+        place, age_ns = self._global.lat_lon_alt, time_ns - self._global.time_ns
         if not in_local_ned:
-            return vehicle
-        then = _position_at(self._positions, fixed_ns)
-        return None if then is None else lat_lon_alt_from_ned(vehicle, -then[0])
+            flown_m = self._global.v_ned_mps * (age_ns / NS_PER_S)
+            return lat_lon_alt_from_ned(place, flown_m) if abs(age_ns) <= POSITION_AHEAD_MAX_NS else None
+        then = _position_at(self._positions, self._global.time_ns)
+        if then is None or abs(age_ns) > GLOBAL_AGE_MAX_NS:
+            return None
+        return lat_lon_alt_from_ned(place, -then[0])
 
 
 def _append(samples: deque, sample: _Attitude | _Position) -> bool:

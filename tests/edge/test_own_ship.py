@@ -128,11 +128,26 @@ def test_the_origin_on_the_globe_is_where_local_and_global_position_meet() -> No
         t_ned_m = np.array([30.0 * k, -10.0 * k, -50.0 - k])
         buffer.add_attitude(k * 100 * MS, [1, 0, 0, 0], np.zeros(3))
         buffer.add_position(k * 100 * MS, t_ned_m, [300, -100, -10])
-        buffer.add_global(k * 100 * MS, *lat_lon_alt_from_ned(origin, t_ned_m))
+        buffer.add_global(k * 100 * MS, lat_lon_alt_from_ned(origin, t_ned_m), (300.0, -100.0, -10.0))
     own_ship = buffer.at(1_850 * MS)
     assert own_ship is not None
     assert own_ship.lat_lon_alt is not None
     np.testing.assert_allclose(ned_from_lat_lon_alt(origin, own_ship.lat_lon_alt), 0.0, atol=0.1)
+
+
+def test_without_local_position_the_own_ship_is_where_it_has_flown_to_and_soon_nowhere() -> None:
+    fix = (-17.0, 179.9999, 400.0)  # beside the antimeridian
+    buffer = OwnShipBuffer()
+    for k in range(100):
+        buffer.add_attitude(k * 20 * MS, [1, 0, 0, 0], np.zeros(3))
+    buffer.add_global(1_000 * MS, fix, (0.0, 50.0, -5.0))
+    soon, later = buffer.at(1_400 * MS), buffer.at(1_600 * MS)
+    assert soon is not None
+    assert soon.lat_lon_alt is not None
+    np.testing.assert_allclose(ned_from_lat_lon_alt(fix, soon.lat_lon_alt), [0.0, 20.0, -2.0], atol=1e-6)
+    assert -180.0 <= soon.lat_lon_alt[1] < -179.99, "a longitude beyond 180 degrees is none"
+    assert later is not None
+    assert later.lat_lon_alt is None, "25 m of unknown flight are no place to tell"
 
 
 def test_a_writer_and_a_reader_do_not_disturb_each_other() -> None:
