@@ -191,7 +191,9 @@ class ZenohSettings(Section):
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
         default="jazzy", description="whose keys and type hashes"
     )
-    max_age_ms: float = Field(default=500.0, gt=0, description="an older measurement is not published as a pose")
+    max_age_ms: float = Field(
+        default=500.0, gt=0, allow_inf_nan=False, description="an older measurement is not published as a pose"
+    )
 
 
 class MavlinkSettings(Section):
@@ -204,8 +206,10 @@ class MavlinkSettings(Section):
     system_id: int | None = Field(
         default=None, ge=1, le=255, description="the vehicle's; default: taken from its heartbeat"
     )
-    component_id: int = Field(default=191, ge=1, le=255, description="ours; 191 is the onboard computer")
-    camera_component_id: int = Field(default=100, ge=1, le=255, description="the camera's; 100 is the first")
+    component_id: int = Field(
+        default=191, ge=2, le=255, description="ours; 191 is the onboard computer, 1 is the autopilot's own"
+    )
+    camera_component_id: int = Field(default=100, ge=2, le=255, description="the camera's; 100 is the first")
     allowed_hosts: list[str] = Field(
         default_factory=list,
         description="addresses heard on udpin; empty: the first that sends a valid autopilot heartbeat",
@@ -218,7 +222,15 @@ class MavlinkSettings(Section):
     tracking_rate_hz: float = Field(default=10.0, ge=5, le=20, description="rate of CAMERA_TRACKING_* messages")
     attitude_rate_hz: float = Field(default=50.0, gt=0, le=400, description="asked of the autopilot")
     position_rate_hz: float = Field(default=20.0, gt=0, le=100, description="asked of the autopilot")
-    max_age_ms: float = Field(default=200.0, gt=0, description="an older measurement is never sent")
+    max_age_ms: float = Field(
+        default=200.0, gt=0, allow_inf_nan=False, description="an older measurement is never sent"
+    )
+
+    @model_validator(mode="after")
+    def _two_components(self) -> MavlinkSettings:
+        if self.component_id == self.camera_component_id:
+            raise ValueError("component_id and camera_component_id must differ")
+        return self
 
 
 class Config(Section):

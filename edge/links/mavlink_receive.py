@@ -14,6 +14,15 @@ RATE_MAX_HZ = 2000
 MAGIC = (0xFD, 0xFE)  # MAVLink 2 and 1
 QUATERNION_TOLERANCE = 1e-2
 AUTOPILOT_COMPONENT = 1
+# Types that fly with nobody's camera; an antenna tracker runs an autopilot's firmware as component 1.
+NOT_VEHICLES = (
+    dialect.MAV_TYPE_GCS,
+    dialect.MAV_TYPE_ANTENNA_TRACKER,
+    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+    dialect.MAV_TYPE_GIMBAL,
+    dialect.MAV_TYPE_ADSB,
+    dialect.MAV_TYPE_CAMERA,
+)
 
 TELEMETRY = (
     dialect.MAVLINK_MSG_ID_HEARTBEAT,
@@ -48,7 +57,7 @@ def is_autopilot_heartbeat(message: Any) -> bool:
         and message.get_srcSystem() != 0
         and message.get_srcComponent() == AUTOPILOT_COMPONENT
         and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
-        and message.type != dialect.MAV_TYPE_GCS
+        and message.type not in NOT_VEHICLES
     )
 
 

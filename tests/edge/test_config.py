@@ -33,6 +33,9 @@ def write(tmp_path: Path, text: str) -> Path:
         (CAMERA + "[mavlink]\nendpoints = ['udpin:1.2.3.4:14550', 'tcp:1']", "config.toml:5: [mavlink] endpoints[1]: "),
         (CAMERA + "[mount]\nR_body_cam = [[1,0,0],[0,1,0],[0,0,-1]]", "[mount]: R_body_cam is not a rotation"),
         (CAMERA + "[mount]\nyaw_deg = 3\nR_body_cam = [[1,0,0],[0,1,0],[0,0,1]]", "[mount]: give either the angles or"),
+        (CAMERA + "[mavlink]\ncomponent_id = 1", "config.toml:5: [mavlink] component_id: Input should be greater"),
+        (CAMERA + "[mavlink]\ncomponent_id = 100", "config.toml:4: [mavlink]: component_id and camera_component_id"),
+        (CAMERA + "[zenoh]\nmax_age_ms = inf", "config.toml:5: [zenoh] max_age_ms: Input should be a finite number"),
         ("[camera\n", "config.toml: not valid TOML: "),
     ],
 )
