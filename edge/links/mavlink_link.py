@@ -49,7 +49,7 @@ class MavlinkLink:
         self._settings = settings
         self._station = Station(settings, own_ship, camera_info)
         self._endpoints: list[Endpoint] = []
-        self._station_lock = threading.Lock()
+        self._counted = self._count()  # replaced whole by the thread, so that nobody waits for it
         self._mail_lock = threading.Lock()
         self._report: Report | None = None
         self._state: HealthState | None = None
@@ -102,21 +102,9 @@ class MavlinkLink:
         self._woken.close()
 
     def counters(self) -> dict[str, int]:
-        with self._station_lock:
-            station = self._station
-            counted = {
-                **station.counters,
-                **{f"refused_{reason}": count for reason, count in station.refused.items()},
-                "reboots": station.vehicle.reboots,
-                "rates_asked_again": station.vehicle.asked_again,
-                "rates_refused": station.vehicle.refusals,
-                "timesync_jumps": station.timesync.jumps,
-            }
-            uncertainty_ns = station.timesync.uncertainty_ns
-        if uncertainty_ns is not None:
-            counted["timesync_uncertainty_us"] = uncertainty_ns // 1000
+        """As of the thread's last tick."""
         with self._mail_lock:
-            return {**counted, "reports_replaced": self._replaced, "events_lost": self._lost_events}
+            return {**self._counted, "reports_replaced": self._replaced, "events_lost": self._lost_events}
 
     @property
     def ports(self) -> list[int]:
@@ -137,7 +125,7 @@ class MavlinkLink:
             while not self._stopping.is_set():
                 wait_s = max(0.0, (next_tick_ns - time.monotonic_ns()) / 1e9)
                 ready = [key.data for key, _ in selector.select(wait_s)]
-                with self._station_lock:
+                try:
                     self._deliver()
                     for endpoint in ready:
                         self._hear(endpoint)
@@ -145,6 +133,24 @@ class MavlinkLink:
                     if now_ns >= next_tick_ns:
                         next_tick_ns = now_ns + round(TICK_S * 1e9)
                         self._tick(now_ns)
+                        self._counted = self._count()
+                except Exception:
+                    # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
+                    self._station.counters["failed"] += 1
+                    log.exception("mavlink: a turn of the link failed")
+
+    def _count(self) -> dict[str, int]:
+        station = self._station
+        counted = {
+            **station.counters,
+            **{f"refused_{reason}": count for reason, count in station.refused.items()},
+            "reboots": station.vehicle.reboots,
+            "rates_asked_again": station.vehicle.asked_again,
+            "rates_refused": station.vehicle.refusals,
+            "timesync_jumps": station.timesync.jumps,
+        }
+        uncertainty_ns = station.timesync.uncertainty_ns
+        return counted if uncertainty_ns is None else {**counted, "timesync_uncertainty_us": uncertainty_ns // 1000}
 
     def _deliver(self) -> None:
         """Send what the loop left."""

@@ -137,10 +137,10 @@ class ZenohLink:
                 desk.put_diagnostics(mail.snapshot)
             for time_ns, level, text in mail.events:
                 desk.put_event(time_ns, level, text)
-        except (zenoh.ZError, ValueError, OverflowError) as error:
-            # One report that cannot go out must not end the link.
+        except Exception as error:
+            # One message that cannot go out, whatever is wrong with it, must not silently end the link.
             desk.counted["failed"] += 1
-            log.warning("zenoh: not published: %s", error)
+            log.warning("zenoh: not published: %r", error)
         counted, desk.counted = desk.counted, Counter()
         return counted
 

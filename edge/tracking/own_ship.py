@@ -70,7 +70,7 @@ class OwnShipBuffer:
     def add_global(
         self, time_ns: int, lat_lon_alt: tuple[float, float, float], v_ned_mps: tuple[float, float, float]
     ) -> bool:
-        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: it places the ned origin."""
+        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: they place ned's."""
         with self._lock:
             if self._global is not None and time_ns <= self._global.time_ns:
                 return False

@@ -283,6 +283,17 @@ def test_publishing_never_waits_and_the_newest_wins() -> None:
     assert worst_s < 0.5
 
 
+def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+        now_ns = time.monotonic_ns()
+        after_2038_ns = now_ns + 30 * 365 * 86_400 * 1_000_000_000
+        link.publish_diagnostics(HealthSnapshot(after_2038_ns, HealthState.TRACKING, (), 1, 30.0, {}, {}))
+        wait_until(lambda: link.counters().get("failed", 0) == 1, "failure")
+        samples.wait("uav1/target/t0/pose", each=lambda: link.publish(report(track(time.monotonic_ns()))))
+
+
 def test_a_port_that_is_taken_is_a_sentence() -> None:
     endpoint = free_endpoint()
     with linked(endpoint):
