@@ -182,7 +182,6 @@ class EstimatorSettings(Section):
 
 class ZenohSettings(Section):
     enabled: bool = Field(default=True, description="publish over zenoh")
-    mode: Literal["peer"] = Field(default="peer", description="the daemon is a peer; the ground runs the router")
     listen: list[str] = Field(
         default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
     )

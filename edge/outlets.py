@@ -67,7 +67,7 @@ def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo,
         from edge.links.zenoh_link import ZenohLink
 
         with file.blame("zenoh", "listen"):
-            zenoh = ZenohLink(config.zenoh, config.vehicle.name)
+            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount())
             cleanup.callback(zenoh.stop)
             zenoh.start()
     if config.mavlink.enabled:

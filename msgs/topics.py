@@ -184,6 +184,11 @@ def node_token(zid: str, node_id: int, uav: str, *, domain: int = 0, node: str =
     return f"@ros2_lv/{domain}/{zid}/{node_id}/{node_id}/NN/%/{_mangle('/' + uav)}/{node}"
 
 
+def alive_token(uav: str) -> str:
+    """Liveliness token of the UAV's daemon, there while its link is, with or without ROS."""
+    return f"uavpose/@v1/{check_uav_name(uav)}/alive"
+
+
 def qos_chunk(topic: Topic) -> str:
     """rmw_zenoh's shorthand: reliability, durability, history and depth, deadline, lifespan, liveliness.
 

@@ -20,7 +20,7 @@ from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
 from edge.links.outgoing import UtcClock, sendable
-from edge.types import Report
+from edge.types import Mount, Report
 from msgs import topics
 from msgs.cdr import Log, Payload
 from msgs.publish import Node, TopicPublisher
@@ -49,9 +49,10 @@ class Mailbox:
 class ZenohLink:
     """Publishes reports, diagnostics and events of one vehicle. The publish methods never block."""
 
-    def __init__(self, settings: ZenohSettings, vehicle_name: str) -> None:
+    def __init__(self, settings: ZenohSettings, vehicle_name: str, mount: Mount) -> None:
         self._settings = settings
         self._vehicle_name = vehicle_name
+        self._mount = mount
         self._waiting = threading.Condition()
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
@@ -119,8 +120,8 @@ class ZenohLink:
             domain=self._settings.domain,
             distribution=self._settings.ros_distribution,
         )
-        desk = Desk(node, self._vehicle_name, self._settings.max_age_ms)
-        with node:
+        desk = Desk(node, self._vehicle_name, self._mount, self._settings.max_age_ms)
+        with node, session.liveliness().declare_token(topics.alive_token(self._vehicle_name)):
             while True:
                 mail = self._take()
                 counted = self._deliver(desk, mail)
@@ -148,10 +149,11 @@ class ZenohLink:
 class Desk:
     """The publishers, used by the worker alone."""
 
-    def __init__(self, node: Node, vehicle_name: str, max_age_ms: float) -> None:
+    def __init__(self, node: Node, vehicle_name: str, mount: Mount, max_age_ms: float) -> None:
         self.counted: Counter[str] = Counter()
         self._node = node
         self._vehicle_name = vehicle_name
+        self._mount = mount
         self._max_age_ms = max_age_ms
         self._clock = UtcClock()
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
@@ -173,7 +175,7 @@ class Desk:
                     self._put(topics.ODOM, odometry, name)
         self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
         if report.own_ship is not None:
-            self._put(topics.TF, ros.transforms(report.own_ship, stamp_ns))
+            self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns))
         intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh)
         if intrinsics != self._intrinsics:
             self._put(topics.CAMERA_INFO, ros.camera_info(report, stamp_ns))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edge.health import HealthSnapshot, HealthState
-from edge.types import Array, OwnShip, Report, Track
+from edge.types import Array, Mount, OwnShip, Report, Track
 from msgs import cdr, topics
 from msgs.geometry import q_wxyz_from_R
 
@@ -65,10 +65,13 @@ def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
     return cdr.Detection3DArray(stamp_ns, topics.FRAME_CAMERA, tuple(found))
 
 
-def transforms(own_ship: OwnShip, stamp_ns: int) -> cdr.TFMessage:
-    """The own ship: its body in ned axes at itself, and those in `ned` when its position is known."""
-    q = q_xyzw(own_ship.R_ned_body)
-    chain = [cdr.TransformStamped(stamp_ns, FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q)]
+def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
+    """The own ship: its camera on its body, that in ned axes at itself, and those in `ned` if its position is known."""
+    q, q_camera = q_xyzw(own_ship.R_ned_body), q_xyzw(mount.R_body_cam)
+    chain = [
+        cdr.TransformStamped(stamp_ns, FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q),
+        cdr.TransformStamped(stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, mount.t_body_cam_m, q_camera),
+    ]
     if own_ship.t_ned_body_m is not None:
         upright = np.array([0.0, 0.0, 0.0, 1.0])
         place = cdr.TransformStamped(stamp_ns, topics.FRAME_NED, FRAME_BODY_NED, own_ship.t_ned_body_m, upright)

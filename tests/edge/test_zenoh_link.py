@@ -22,7 +22,7 @@ from edge.config import ZenohSettings
 from edge.health import HealthSnapshot, HealthState, Percentiles
 from edge.links.errors import LinkError
 from edge.links.zenoh_link import ZenohLink
-from edge.types import TrackState
+from edge.types import Mount, TrackState
 from msgs import topics
 from msgs.client import connect, subscribe, subscribe_all
 from msgs.session import router_config
@@ -32,6 +32,7 @@ from .reports import make_report as report
 from .reports import make_track as track
 
 DEADLINE_S = 15.0
+MOUNT = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.5, 0.0, 0.2]))
 ROS = get_typestore(Stores.ROS2_JAZZY)
 # rosbags does not carry vision_msgs; these are the package's own definitions.
 VISION_MSGS = {
@@ -53,7 +54,7 @@ def free_endpoint() -> str:
 
 @contextlib.contextmanager
 def linked(endpoint: str, **settings: Any) -> Iterator[ZenohLink]:
-    link = ZenohLink(ZenohSettings(listen=[endpoint], **settings), "uav1")
+    link = ZenohLink(ZenohSettings(listen=[endpoint], **settings), "uav1", MOUNT)
     link.start()
     try:
         yield link
@@ -130,7 +131,13 @@ def test_a_report_arrives_on_every_topic_as_ros_reads_it() -> None:
     (one,) = found.detections
     assert (one.id, one.results[0].hypothesis.score) == ("t0", 0.87)
     frames = [(t.header.frame_id, t.child_frame_id) for t in tf.transforms]
-    assert frames == [("ned", "base_link_ned"), ("base_link_ned", "base_link_frd")]
+    chain = ["ned", "base_link_ned", "base_link_frd", "camera_optical_frame"]
+    assert frames == list(itertools.pairwise(chain))
+    # Up the chain, a point on the optical axis of a camera that looks along the nose lies ahead.
+    point_m = np.array([0.0, 0.0, 10.0])
+    for step in reversed(tf.transforms):
+        point_m = matrix(step.transform.rotation) @ point_m + vector(step.transform.translation)
+    np.testing.assert_allclose(point_m, OWN_NED_M + np.array([10.5, 0.0, 0.2]), atol=1e-9)
     np.testing.assert_allclose(vector(tf.transforms[0].transform.translation), OWN_NED_M)
 
 
@@ -283,6 +290,18 @@ def test_publishing_never_waits_and_the_newest_wins() -> None:
     assert worst_s < 0.5
 
 
+def test_the_ground_sees_that_the_daemon_is_there_and_that_it_has_gone() -> None:
+    endpoint, tool = free_endpoint(), free_endpoint()
+    with zenoh.open(router_config([tool])) as ground:
+
+        def alive() -> list[str]:
+            return [str(reply.ok.key_expr) for reply in ground.liveliness().get("uavpose/@v1/*/alive") if reply.ok]
+
+        with linked(endpoint, connect=[tool]):
+            wait_until(lambda: alive() == ["uavpose/@v1/uav1/alive"], "sight of the daemon")
+        wait_until(lambda: alive() == [], "its going")
+
+
 def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link, connect(endpoint) as session:
@@ -297,7 +316,7 @@ def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
 def test_a_port_that_is_taken_is_a_sentence() -> None:
     endpoint = free_endpoint()
     with linked(endpoint):
-        second = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1")
+        second = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
         with pytest.raises(LinkError, match=f"zenoh cannot listen on {endpoint}: .*[Aa]ddress already in use"):
             second.start()
         second.stop()
@@ -306,9 +325,9 @@ def test_a_port_that_is_taken_is_a_sentence() -> None:
 def test_the_process_ends_when_the_link_is_stopped() -> None:
     script = (
         "import sys\n"
-        "from edge.config import ZenohSettings\n"
+        "from edge.config import MountSettings, ZenohSettings\n"
         "from edge.links.zenoh_link import ZenohLink\n"
-        "link = ZenohLink(ZenohSettings(listen=[sys.argv[1]]), 'uav1')\n"
+        "link = ZenohLink(ZenohSettings(listen=[sys.argv[1]]), 'uav1', MountSettings().mount())\n"
         "link.start()\n"
         "link.publish_event(20, 'bye')\n"
         "link.stop()\n"
