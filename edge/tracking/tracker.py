@@ -2,7 +2,8 @@
 
 A target is tentative until it was seen CONFIRM_HITS times, coasts on prediction when it is missed, and is lost, and
 its number free again, after COAST_MAX_S. What keeps disagreeing with the filter wins after PERSISTENT frames: a
-rotation turned over, or a position outside the gate but under the same box.
+rotation turned over, or a position outside the gate but under the same box. Until then the covariance of what is told
+grows by the share of rotations that disagree.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
 POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as the soft gate is inside it
 SAME_BOX_IOU = 0.3
+FLIP_MEMORY = 30  # frames over which disagreeing rotations are counted
 RANGE_MIN_M = 1.0  # nearer, a projection is meaningless
 
 Size = tuple[int, int]
@@ -46,6 +48,36 @@ class BoxModel:
         return np.concatenate([center - half, center + half])
 
 
+@dataclass(frozen=True)
+class Doubt:
+    """How often measured rotations were lately turned over against the filter's, and how: its own P cannot tell.
+
+    If the other is true with probability p, rotations spread by p w w^T about the filter's. p follows from the share s
+    as if two frames had to agree, s^2 / (s^2 + (1 - s)^2): one odd frame says little, as many as not say all.
+    """
+
+    share: float = 0.0  # of the last FLIP_MEMORY frames, fading
+    w_target_rad: Array = field(default_factory=lambda: np.zeros(3))  # [3] from the filter's to the other, target axes
+
+    def after(self, seen: Innovation, R_cam_target: Array) -> Doubt:
+        """With one more measurement, `seen` against R_cam_target."""
+        if seen.rotation_rad <= ekf.ROTATION_GATE_RAD:
+            return Doubt(self.share * (1.0 - 1.0 / FLIP_MEMORY), self.w_target_rad)
+        return Doubt(self.share + (1.0 - self.share) / FLIP_MEMORY, R_cam_target.T @ seen.residual[3:])
+
+    def changed_sides(self) -> Doubt:
+        """When the other rotation is taken for the filter's."""
+        return Doubt(min(1.0 - self.share, 0.5), -self.w_target_rad)
+
+    def added_to(self, P: Array, R_frame_target: Array) -> Array:
+        """P [n, n], whose last three are the rotation in the frame, with this."""
+        w = R_frame_target @ self.w_target_rad
+        probability = self.share**2 / (self.share**2 + (1.0 - self.share) ** 2)
+        widened = P.copy()
+        widened[-3:, -3:] += probability * np.outer(w, w)
+        return widened
+
+
 @dataclass
 class Target:
     """One target between frames."""
@@ -60,6 +92,7 @@ class Target:
     misses: int = 0
     rotation_disagreements: int = 0
     position_disagreements: int = 0
+    doubt: Doubt = field(default_factory=Doubt)
 
 
 @dataclass
@@ -172,11 +205,13 @@ def _associate(
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:
+    target.doubt = target.doubt.after(seen, view.R_frame_cam.T @ target.motion.R_frame_target)
     target.motion = ekf.correct(target.motion, seen)
     turned_over = seen.rotation_rad > ekf.ROTATION_GATE_RAD
     target.rotation_disagreements = target.rotation_disagreements + 1 if turned_over else 0
     if target.rotation_disagreements >= PERSISTENT:
         target.motion = ekf.with_rotation_of(target.motion, estimate, K, view)
+        target.doubt = target.doubt.changed_sides()
         target.rotation_disagreements = 0
     _seen(target, estimate, K, view)
 
@@ -235,11 +270,11 @@ def _track(target: Target, motion: Motion, view: View, K: Array) -> Track:
         box_xyxy_px=target.box.box_xyxy_px(t_cam, K),
         R_cam_target=R_cam,
         t_cam_target_m=t_cam,
-        covariance=covariance,
+        covariance=target.doubt.added_to(covariance, R_cam),
         R_ned_target=motion.R_frame_target if in_ned else None,
         t_ned_target_m=motion.t_m if in_ned else None,
         v_ned_target_mps=motion.v_mps if in_ned else None,
-        covariance_ned=motion.P[:9, :9] if in_ned else None,
+        covariance_ned=target.doubt.added_to(motion.P[:9, :9], motion.R_frame_target) if in_ned else None,
     )
 
 

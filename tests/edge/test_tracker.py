@@ -248,6 +248,25 @@ def test_a_rotation_turned_over_once_is_ignored_and_one_that_stays_is_believed()
             assert rotation_angle(track.R_cam_target, truth if i == 65 else now.R_cam_target) < np.deg2rad(25.0)
 
 
+@pytest.mark.parametrize("kind", ["ned", "cam"])
+def test_a_rotation_that_turns_over_again_and_again_is_told_as_unsure_about_that_axis(kind: str) -> None:
+    tracker = Tracker(4, FORWARD)
+    tail_for_nose = Rotation.from_euler("z", 180, degrees=True).as_matrix()
+    stds_rad = []
+    for i, now in enumerate(flight(19, frames=240)):
+        estimate = now.estimate
+        if 60 <= i < 120 and i % 2:
+            estimate = replace(estimate, R_cam_target=estimate.R_cam_target @ tail_for_nose)
+        (track,) = update(tracker, now, kind, [estimate])
+        in_target = track.R_cam_target.T @ track.covariance[3:, 3:] @ track.R_cam_target
+        stds_rad.append(np.sqrt(np.diag(in_target)))
+    sure, torn, sure_again = stds_rad[59], stds_rad[119], stds_rad[239]
+    # Either way round with equal chance: the error is pi half of the time.
+    assert 0.4 * np.pi < torn[2] < 0.9 * np.pi
+    assert torn[2] > 4 * max(torn[:2])
+    assert sure_again[2] < 3 * sure[2] < 0.2
+
+
 def test_a_range_that_stays_elsewhere_is_believed_without_a_new_number() -> None:
     tracker = Tracker(4, FORWARD)
     for i, now in enumerate(flight(14, frames=60)):
