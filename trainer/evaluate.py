@@ -102,6 +102,18 @@ def measure(
     }
 
 
+def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:
+    """Errors of the best answer that looks at no picture: one rotation and one depth, chosen on these very windows."""
+    labels = TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
+    R, Z = labels.R_cam_target[labels.present].astype(np.float64), labels.t_cam_target_m[labels.present, 2]
+    u, _, vt = np.linalg.svd(R.mean(axis=0))
+    guess = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return {
+        "constant_E_r_mean_deg": float(metrics.rotation_error_deg(np.broadcast_to(guess, R.shape), R).mean()),
+        "constant_depth_rel_mean": float(np.mean(np.abs(np.median(Z) / Z - 1.0))),
+    }
+
+
 def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> float:
     """Score below which a peak is no target: the middle of where recall less false alarms is highest, of 0.05..0.95."""
     present = np.concatenate([batch.present for batch in batches])

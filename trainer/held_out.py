@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from trainer.checkpoint import load_model
 from trainer.config import ConfigError, DataConfig
 from trainer.data import render_once
-from trainer.evaluate import SCORE_THRESHOLD, Predictor, measure, predict_all, torch_predictor
+from trainer.evaluate import SCORE_THRESHOLD, Predictor, constant_guess, measure, predict_all, torch_predictor
 from trainer.export import ACQUIRE_CROP_PX, OpenView, airframe_names, stage_sampler
 from trainer.graph import onnx_predictor, read_contract
 
@@ -79,4 +79,5 @@ def evaluate_file(
     opener = view(request.seed, size_px, 0.0 if request.stage == "track" else 1.0)
     batches = render_once(opener, request.samples, rendered=rendered)
     measured = measure(predict_all(subject.predict, batches), batches, subject.thresholds[request.stage])
-    return {"size_px": float(size_px), "score_min": subject.thresholds[request.stage], **measured}
+    settings = {"size_px": float(size_px), "score_min": subject.thresholds[request.stage]}
+    return {**settings, **measured, **constant_guess(batches)}

@@ -12,10 +12,11 @@ import torch
 from synthetic_sampler import PlateSampler
 
 from msgs.contract import OUTPUT_NAMES
+from msgs.geometry import R_from_euler
 from trainer.checkpoint import load_model, save_weights
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch, training_batch
-from trainer.evaluate import measure, predict_all
+from trainer.evaluate import constant_guess, measure, predict_all
 from trainer.export import Measured, Views, export_models, write_int8
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
@@ -116,6 +117,19 @@ def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None
     batches = [windows(77, 64)]
     threshold = read_contract(exported.fp32).track_score_min
     expected = measure(predict_all(onnx_predictor(exported.fp32), batches), batches, threshold)
-    assert got == pytest.approx({"size_px": 64.0, "score_min": threshold, **expected}, nan_ok=True)
+    expected |= {"size_px": 64.0, "score_min": threshold, **constant_guess(batches)}
+    assert got == pytest.approx(expected, nan_ok=True)
     with pytest.raises(ConfigError, match="training seed"):
         evaluate_file(request._replace(seed=3), open_view=open_view)
+
+
+def test_the_constant_guess_lies_midway() -> None:
+    """Headings of -30, 0 and 30 degrees at 100, 200 and 400 m: level at 200 m errs by 20 degrees and by half."""
+    batch = windows(5, 64)
+    on = np.zeros(len(batch.present), dtype=bool)
+    on[:3] = True
+    R, t = batch.R_cam_target.copy(), batch.t_cam_target_m.copy()
+    R[:3] = R_from_euler(0.0, 0.0, np.deg2rad([-30.0, 0.0, 30.0]))
+    t[:3, 2] = [100.0, 200.0, 400.0]
+    got = constant_guess([batch._replace(present=on, R_cam_target=R, t_cam_target_m=t)])
+    assert got == pytest.approx({"constant_E_r_mean_deg": 20.0, "constant_depth_rel_mean": 0.5}, abs=1e-4)
