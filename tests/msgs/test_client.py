@@ -80,12 +80,24 @@ def test_a_slow_reader_gets_the_newest_poses(network: Network) -> None:
         publisher = Node(network.daemon, "uav1").publisher(POSE, "t0")
         until(lambda: poses.poll() is not None, lambda: publisher.put(pose_now().encode()))
         tool.declare_subscriber("0/last", zenoh.handlers.Callback(lambda _: arrived.set(), indirect=False))
+        # Best effort: on a busy machine not all that is put arrives.
+        came: list[int] = []
+        every = zenoh.handlers.Callback(lambda s: came.append(sequence_of(s)), indirect=False)
+        tool.declare_subscriber(publisher.key, every)
         for _ in range(50):
             publisher.put(pose_now().encode())
         # The marker takes the same way at the same priority, so it comes after the poses.
         until(arrived.is_set, lambda: network.daemon.put("0/last", b"", priority=zenoh.Priority.REAL_TIME))
         numbers = [pose.sequence for pose in iter(poses.poll, None)]
-    assert numbers == [publisher.sequence - 1, publisher.sequence]
+    assert len(came) > 2
+    assert numbers == came[-2:]
+
+
+def sequence_of(sample: zenoh.Sample) -> int:
+    assert sample.attachment is not None
+    parsed = topics.parse_attachment(sample.attachment.to_bytes())
+    assert parsed is not None
+    return parsed[0]
 
 
 def test_closing_ends_the_iteration(network: Network) -> None:
