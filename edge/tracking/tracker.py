@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge.tracking import motion as ekf
+from edge.tracking.heading import flown_nose_first
 from edge.tracking.motion import Innovation, Motion, View
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
 
@@ -143,7 +144,11 @@ class Tracker:
         self.not_finite += len(estimates) - len(finite)
         pairs = _associate(self._targets, finite, K, view)
         for target_index, estimate_index, seen in pairs:
-            _hit(self._targets[target_index], finite[estimate_index], seen, K, view)
+            target, estimate = self._targets[target_index], finite[estimate_index]
+            turned = _nose_first(target.motion, estimate, view)
+            if turned is not estimate:
+                seen = ekf.innovation(target.motion, turned, K, view)
+            _hit(target, turned, seen, K, view)
         used = {estimate_index for _, estimate_index, _ in pairs}
         hit = {target_index for target_index, _, _ in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]
@@ -202,6 +207,15 @@ def _associate(
         if all(i != pair[0] and j != pair[1] for pair in pairs):
             pairs.append((i, j, seen))
     return pairs
+
+
+def _nose_first(motion: Motion, estimate: Estimate, view: View) -> Estimate:
+    """The estimate turned to fly where its track goes; in `ned` alone is the velocity that over ground."""
+    if motion.kind != "ned":
+        return estimate
+    R_cam_ned = view.R_frame_cam.T
+    P_v = R_cam_ned @ motion.P[ekf.VELOCITY, ekf.VELOCITY] @ R_cam_ned.T
+    return flown_nose_first(estimate, R_cam_ned @ motion.v_mps, P_v)
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from edge.tracking.heading import depth_reversed
 from edge.tracking.tracker import COAST_MAX_S, PERSISTENT, Tracker
 from edge.types import Estimate, Mount, OwnShip, Track, TrackState
 from msgs.geometry import rotation_angle
@@ -248,7 +249,18 @@ def test_a_rotation_turned_over_once_is_ignored_and_one_that_stays_is_believed()
             assert rotation_angle(track.R_cam_target, truth if i == 65 else now.R_cam_target) < np.deg2rad(25.0)
 
 
-@pytest.mark.parametrize("kind", ["ned", "cam"])
+def test_the_way_it_flies_settles_which_end_is_the_nose() -> None:
+    """Every single frame tells the depth reversal; once the track's velocity is sure, its rotation is right."""
+    tracker = Tracker(4, FORWARD)
+    for i, now in enumerate(flight(21, frames=150)):
+        along = now.t_cam_target_m / np.linalg.norm(now.t_cam_target_m)
+        (track,) = update(tracker, now, "ned", [depth_reversed(now.estimate, along)])
+        if i == 2:
+            assert rotation_angle(track.R_cam_target, now.R_cam_target) > np.deg2rad(90.0)
+    assert rotation_angle(track.R_cam_target, now.R_cam_target) < np.deg2rad(15.0)
+
+
+@pytest.mark.parametrize("kind", ["ned_relative", "cam"])
 def test_a_rotation_that_turns_over_again_and_again_is_told_as_unsure_about_that_axis(kind: str) -> None:
     tracker = Tracker(4, FORWARD)
     tail_for_nose = Rotation.from_euler("z", 180, degrees=True).as_matrix()
