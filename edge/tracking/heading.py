@@ -15,7 +15,7 @@ from edge.types import Array, Estimate
 
 WIND_MPS = 5.0  # a nose may point against the ground track's sight-line component by this much
 SIGMAS = 2.0  # the component's sign must be this sure
-ACROSS = np.sin(np.deg2rad(10.0))  # a nose this near to across the sight line has no side
+ACROSS = float(np.sin(np.deg2rad(10.0)))  # a nose this near to across the sight line has no side
 MIRRORED_WINGS = np.diag([1.0, -1.0, 1.0])
 
 
@@ -26,7 +26,7 @@ def flown_nose_first(estimate: Estimate, v_cam_mps: Array, v_covariance: Array) 
     """
     along = estimate.t_cam_target_m / np.linalg.norm(estimate.t_cam_target_m)
     opening_mps = float(along @ v_cam_mps)
-    std_mps = float(np.sqrt(max(along @ v_covariance @ along, 0.0)))
+    std_mps = float(np.sqrt(max(float(along @ v_covariance @ along), 0.0)))
     nose = float(along @ estimate.R_cam_target[:, 0])
     sure = abs(opening_mps) > WIND_MPS + SIGMAS * std_mps
     if not sure or abs(nose) < ACROSS or nose * opening_mps > 0.0:
