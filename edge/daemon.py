@@ -58,7 +58,8 @@ def run(file: ConfigFile, stop: threading.Event) -> int:
         capture.start()
         with file.blame(*camera_key(config.camera)):
             pipeline.fly(stop)
-        log.info("stopped: %s", pipeline.snapshot().line())
+    # With the links stopped, their counts are whole.
+    log.info("stopped: %s", pipeline.snapshot().line())
     return 0
 
 

@@ -102,7 +102,7 @@ class MavlinkLink:
         self._woken.close()
 
     def counters(self) -> dict[str, int]:
-        """As of the thread's last tick."""
+        """As of the thread's last tick; exact once it is stopped."""
         with self._mail_lock:
             return {**self._counted, "reports_replaced": self._replaced, "events_lost": self._lost_events}
 
@@ -138,6 +138,7 @@ class MavlinkLink:
                     # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
                     self._station.counters["failed"] += 1
                     log.exception("mavlink: a turn of the link failed")
+        self._counted = self._count()
 
     def _count(self) -> dict[str, int]:
         station = self._station
