@@ -310,16 +310,15 @@ def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
 def test_the_loop_never_waits_for_the_links_thread_to_count() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as flood:
         junk = b"\xfe\0\0\0\0\0\0\0" * 1_000  # what takes a parser longest: 10 ms
-        for _ in range(60):
+        waited_s, began = 0.0, time.monotonic()
+        for _ in range(200):
             flood.socket.sendto(junk, flood.address)
-        waited_s, refused = [], 0
-        deadline = time.monotonic() + DEADLINE_S
-        while refused == 0:
             asked = time.monotonic()
-            refused = link.counters().get("refused_stranger", 0)
-            waited_s.append(time.monotonic() - asked)
-            assert time.monotonic() < deadline
-        assert max(waited_s) < 0.1
+            link.counters()
+            waited_s += time.monotonic() - asked
+        # Waiting for the thread at each count would fill nearly all of this time; sending shares the rest.
+        assert waited_s < 0.5 * (time.monotonic() - began)
+        flood.settle(lambda: link.counters().get("refused_stranger", 0) > 0, "count of what was refused")
 
 
 def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
