@@ -45,6 +45,8 @@ if [ "$use" = dev ]; then
     ldconfig=$(command -v ldconfig || echo /sbin/ldconfig)
     $ldconfig -p | grep -q 'libEGL\.so\.1' && $ldconfig -p | grep -q 'libEGL_\(mesa\|nvidia\)\.so\.0' && $ldconfig -p | grep -q 'libGL\.so\.1' ||
         apt_install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri
+    # Certificates of the TLS tests.
+    command -v openssl >/dev/null || apt_install openssl
 fi
 
 stamp=".venv/.$use-$(cat pyproject.toml deploy/constraints.txt | sha256sum | cut -c1-16)"
