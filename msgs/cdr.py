@@ -35,7 +35,7 @@ class PoseWithCovarianceStamped:
     @classmethod
     def decode(cls, payload: bytes) -> PoseWithCovarianceStamped:
         data = Reader(payload)
-        message = cls(*data.header(), data.f64(3), data.quaternion(), data.covariance())
+        message = cls(*data.header(), *data.pose())
         data.done()
         return message
 
@@ -69,8 +69,7 @@ class Odometry:
         data = Reader(payload)
         stamp_ns, frame_id = data.header()
         child_frame_id = data.string()
-        pose = data.f64(3), data.quaternion(), data.covariance()
-        message = cls(stamp_ns, frame_id, child_frame_id, *pose, data.f64(3), data.f64(3), data.covariance())
+        message = cls(stamp_ns, frame_id, child_frame_id, *data.pose(), data.f64(3), data.f64(3), data.covariance())
         data.done()
         return message
 
@@ -374,9 +373,6 @@ def _put_pose(out: Writer, t_m: ArrayLike, q_xyzw: ArrayLike, covariance: ArrayL
 def _take_detection(data: Reader) -> Detection3D:
     stamp_ns, frame_id = data.header()
     # The smallest hypothesis: empty string 5, score 8, pose 56, covariance 288 bytes.
-    hypotheses = tuple(
-        Hypothesis(data.string(), float(data.f64(1)[0]), data.f64(3), data.quaternion(), data.covariance())
-        for _ in range(data.length(357))
-    )
+    hypotheses = tuple(Hypothesis(data.string(), float(data.f64(1)[0]), *data.pose()) for _ in range(data.length(357)))
     box = data.f64(3), data.quaternion(), data.f64(3)
     return Detection3D(stamp_ns, frame_id, hypotheses, *box, data.string())
