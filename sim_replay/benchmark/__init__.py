@@ -1,0 +1,1 @@
+"""The benchmark: datasets made from a preset and a seed, their statistics, and how fast they are made."""

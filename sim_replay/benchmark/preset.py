@@ -1,0 +1,234 @@
+"""What a dataset is made of: the preset file's schema, the shipped presets, and the airframes kept for testing."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from edge.errors import InputError
+from sim_replay.airframes import AIRFRAMES
+
+Split = Literal["train", "val", "test"]
+Weather = Literal["clear", "haze", "overcast", "low_sun", "dusk", "fog", "glare", "broken_cloud"]
+Quality = Literal["good", "ordinary", "poor"]
+Gust = Literal["calm", "light", "moderate"]
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+SHIPPED = ("fw-uav6d", "unseen", "stress")
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Weight = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _rises(name: str, bounds: tuple[float, float]) -> None:
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"{name} must not fall: {bounds[0]} is above {bounds[1]}")
+
+
+def _some_weight(name: str, weights: Mapping[Any, float]) -> None:
+    if sum(weights.values()) <= 0:
+        raise ValueError(f"{name}: no weight is above 0")
+
+
+class SplitSize(Section):
+    sequences: int = Field(ge=1, description="how many sequences")
+    frames: int = Field(ge=1, description="frames of all of them together")
+
+
+class Airframes(Section):
+    only: list[str] = Field(default_factory=list, description="names of the airframes to use; empty: all")
+    not_those_of: str | None = Field(default=None, description="shipped preset whose `only` is left out here")
+
+    @model_validator(mode="after")
+    def _known(self) -> Airframes:
+        names = [airframe.name for airframe in AIRFRAMES]
+        for name in self.only:
+            if name not in names:
+                raise ValueError(f"only: no airframe is called {name!r}; there are {', '.join(names)}")
+        if self.not_those_of is not None and self.not_those_of not in SHIPPED:
+            raise ValueError(f"not_those_of: no shipped preset is called {self.not_those_of!r}")
+        if self.only and self.not_those_of:
+            raise ValueError("give only or not_those_of, not both")
+        return self
+
+
+class Lens(Section):
+    focal_px: tuple[Positive, Positive] = Field(default=(1200.0, 8000.0), description="shortest and longest there are")
+    box_share: float = Field(
+        default=0.012, gt=0.0, le=0.1, description="mean share of the picture that the target's visible box covers"
+    )
+    spread: float = Field(
+        default=0.5, ge=0.0, le=1.0, description="scatter (sigma) of the logarithm of the lens chosen"
+    )
+    distorted_share: Share = Field(default=0.0, description="share of sequences whose lens distorts")
+
+    @model_validator(mode="after")
+    def _order(self) -> Lens:
+        _rises("focal_px", self.focal_px)
+        return self
+
+
+class Flight(Section):
+    gimbal_share: Share = Field(
+        default=0.6, description="share of sequences filmed from a gimbal; the rest is bolted on"
+    )
+    jitter_mrad: tuple[Weight, Weight] = Field(
+        default=(0.02, 0.3), description="camera shake, rms, drawn between these"
+    )
+    gust: dict[Gust, Weight] = Field(
+        default={"calm": 1.0, "light": 1.0, "moderate": 1.0}, description="weights of the air's states"
+    )
+    leaves_share: Share = Field(default=0.0, description="share of sequences in which the target leaves and returns")
+
+    @model_validator(mode="after")
+    def _order(self) -> Flight:
+        _rises("jitter_mrad", self.jitter_mrad)
+        _some_weight("gust", self.gust)
+        return self
+
+
+class Targets(Section):
+    two_share: Share = Field(default=0.0, description="share of sequences with two targets")
+    three_share: Share = Field(default=0.0, description="share of sequences with three targets")
+    empty_share: Share = Field(default=0.0, description="share of frames that lie in sequences without any target")
+
+    @model_validator(mode="after")
+    def _sum(self) -> Targets:
+        if self.two_share + self.three_share + self.empty_share > 1.0:
+            raise ValueError("two_share, three_share and empty_share together exceed 1")
+        return self
+
+
+class Picture(Section):
+    weather: dict[Weather, Weight] = Field(min_length=1, description="weights of the kinds of weather")
+    quality: dict[Quality, Weight] = Field(min_length=1, description="weights of the kinds of camera")
+    exposure_ms: tuple[Positive, Positive] = Field(default=(0.5, 5.0), description="shutter time, drawn between these")
+    distractors: tuple[int, int] = Field(default=(0, 2), description="birds and specks in a sequence, between these")
+
+    @model_validator(mode="after")
+    def _order(self) -> Picture:
+        _rises("exposure_ms", self.exposure_ms)
+        _rises("distractors", self.distractors)
+        _some_weight("weather", self.weather)
+        _some_weight("quality", self.quality)
+        if self.distractors[0] < 0:
+            raise ValueError("distractors cannot be fewer than 0")
+        return self
+
+
+class Compression(Section):
+    weight: Positive = Field(default=1.0, description="how often it is drawn")
+    jpeg_quality: tuple[int, int] = Field(default=(85, 95), description="of the stored pictures, drawn between these")
+    h264_kbps: tuple[int, int] | None = Field(
+        default=None, description="pass the sequence through H.264 at a bitrate drawn between these before storing it"
+    )
+
+    @model_validator(mode="after")
+    def _range(self) -> Compression:
+        _rises("jpeg_quality", self.jpeg_quality)
+        if not 1 <= self.jpeg_quality[0] <= self.jpeg_quality[1] <= 100:
+            raise ValueError("jpeg_quality lies between 1 and 100")
+        if self.h264_kbps is not None:
+            _rises("h264_kbps", self.h264_kbps)
+            if self.h264_kbps[0] < 50:
+                raise ValueError("h264_kbps must be at least 50")
+        return self
+
+
+class Preset(Section):
+    """A whole dataset. Every key but the first four tables has a default."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", description="lower case, digits and hyphens")
+    description: str = Field(default="", description="one sentence, copied into the dataset")
+    splits: dict[Split, SplitSize] = Field(min_length=1, description="how many sequences and frames each split has")
+    picture: Picture
+    size_wh_px: tuple[int, int] = Field(default=(1920, 1080), description="width and height of the pictures")
+    fps: list[Positive] = Field(
+        default_factory=lambda: [10.0, 15.0, 30.0], min_length=1, description="rates drawn from"
+    )
+    sequence_frames: tuple[int, int] = Field(default=(40, 160), description="shortest and longest sequence")
+    range_m: tuple[Positive, Positive] = Field(
+        default=(100.0, 500.0), description="distances, spread evenly over frames"
+    )
+    airframes: Airframes = Airframes()
+    lens: Lens = Lens()
+    flight: Flight = Flight()
+    targets: Targets = Targets()
+    compression: list[Compression] = Field(default_factory=lambda: [Compression()], min_length=1)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Preset:
+        _rises("range_m", self.range_m)
+        _rises("sequence_frames", self.sequence_frames)
+        shortest, longest = self.sequence_frames
+        if shortest < 2:
+            raise ValueError("sequence_frames must be at least 2")
+        if min(self.size_wh_px) < 64:
+            raise ValueError("size_wh_px must be at least 64 by 64")
+        for name, size in self.splits.items():
+            if not size.sequences * shortest <= size.frames <= size.sequences * longest:
+                raise ValueError(
+                    f"splits.{name}: {size.frames} frames cannot be cut into {size.sequences} sequences of "
+                    f"{shortest} to {longest}"
+                )
+        return self
+
+    def airframe_names(self) -> tuple[str, ...]:
+        """The airframes this dataset shows, in the fleet's order."""
+        if self.airframes.only:
+            chosen = set(self.airframes.only)
+        else:
+            left_out = self.airframes.not_those_of
+            chosen = {airframe.name for airframe in AIRFRAMES}
+            chosen -= set(load_preset(left_out).airframes.only) if left_out else set()
+        return tuple(airframe.name for airframe in AIRFRAMES if airframe.name in chosen)
+
+
+def held_out_airframes() -> tuple[str, ...]:
+    """Airframes of the `unseen` preset: no training picture may show them."""
+    return load_preset("unseen").airframe_names()
+
+
+def preset_text(name_or_path: str) -> tuple[str, str]:
+    """(where it lies, its text) of a shipped preset or a TOML file. Raises InputError."""
+    if name_or_path in SHIPPED:
+        resource = files("sim_replay").joinpath("presets", f"{name_or_path}.toml")
+        return f"{name_or_path}.toml", resource.read_text(encoding="utf-8")
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        raise InputError(f"no preset is called {name_or_path!r}; there are {', '.join(SHIPPED)}, or name a .toml file")
+    try:
+        return str(path), path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from error
+
+
+def load_preset(name_or_path: str) -> Preset:
+    """Read a shipped preset by name, or a file. Raises InputError: a line a fault, each naming file and key."""
+    return parse_preset(*preset_text(name_or_path))
+
+
+def parse_preset(place: str, text: str) -> Preset:
+    """The preset in `text`, which lies at `place`. Raises InputError."""
+    try:
+        return Preset.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{place}: not valid TOML: {error}") from error
+    except ValidationError as error:
+        raise InputError("\n".join(f"{place}: {_fault(item)}" for item in error.errors())) from error
+
+
+def _fault(item: Any) -> str:
+    key = ".".join(str(part) for part in item["loc"] if part != "[key]") or "the file"
+    said = {"extra_forbidden": "unknown key", "missing": "is missing"}
+    return f"{key}: {said.get(item['type'], str(item['msg']).removeprefix('Value error, '))}"
