@@ -69,6 +69,13 @@ class OwnShip:
     t_ned_body_m: Array | None  # [3], None without a position source
     v_ned_body_mps: Array | None  # [3]
     lat_lon_alt: tuple[float, float, float] | None  # degrees, degrees, metres AMSL, of the ned origin
+    R_body_gimbal: Array | None = None  # [3, 3]; None: the camera is fixed to the body
+
+    def camera(self, mount: Mount) -> Mount:
+        """How the camera sits on the body now; on a gimbal, `mount` says how it sits on that."""
+        if self.R_body_gimbal is None:
+            return mount
+        return Mount(self.R_body_gimbal @ mount.R_body_cam, mount.t_body_cam_m)
 
 
 class TrackState(Enum):

@@ -67,7 +67,7 @@ def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
 
 def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
     """The own ship: its camera on its body, that in ned axes at itself, and those in `ned` if its position is known."""
-    q, q_camera = q_xyzw(own_ship.R_ned_body), q_xyzw(mount.R_body_cam)
+    q, q_camera = q_xyzw(own_ship.R_ned_body), q_xyzw(own_ship.camera(mount).R_body_cam)
     chain = [
         cdr.TransformStamped(stamp_ns, FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q),
         cdr.TransformStamped(stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, mount.t_body_cam_m, q_camera),

@@ -73,8 +73,9 @@ class View:
     def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount) -> View:
         if own_ship is None:
             return cls("cam", time_ns, np.eye(3), np.zeros(3), np.zeros(3))
-        R_ned_cam = own_ship.R_ned_body @ mount.R_body_cam
-        lever_ned_m = own_ship.R_ned_body @ mount.t_body_cam_m
+        camera = own_ship.camera(mount)
+        R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
+        lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
         if own_ship.t_ned_body_m is None:
             return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3))
         return cls("ned", time_ns, R_ned_cam, own_ship.t_ned_body_m + lever_ned_m, own_ship.v_ned_body_mps)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, OwnShip
-from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
+from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so3_log
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
 ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the time between
@@ -36,6 +37,20 @@ class _Position:
     v_ned_mps: Array
 
 
+class GimbalFrame(Enum):
+    """What a gimbal's attitude is told against (GIMBAL_DEVICE_ATTITUDE_STATUS, MAVLink 285)."""
+
+    EARTH = "earth"  # ned
+    HEADING = "heading"  # level axes that turn with the vehicle's heading alone
+
+
+@dataclass(frozen=True)
+class _Gimbal:
+    time_ns: int
+    R_frame_gimbal: Array
+    frame: GimbalFrame
+
+
 @dataclass(frozen=True)
 class _Global:
     time_ns: int
@@ -49,8 +64,11 @@ class OwnShipBuffer:
     Each kind must come in rising time: a sample that does not is refused, and the `add_*` method returns False.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gimballed: bool = False) -> None:
+        """`gimballed`: the camera hangs on a gimbal, and without its attitude that of the body is of no use."""
+        self._gimballed = gimballed
         self._lock = threading.Lock()
+        self._gimbals: deque[_Gimbal] = deque(maxlen=KEPT)
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
         self._positions: deque[_Position] = deque(maxlen=KEPT)
         self._global: _Global | None = None
@@ -60,6 +78,11 @@ class OwnShipBuffer:
         sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), np.array(rates_body_radps, dtype=np.float64))
         with self._lock:
             return _append(self._attitudes, sample)
+
+    def add_gimbal(self, time_ns: int, q_frame_gimbal_wxyz: ArrayLike, frame: GimbalFrame) -> bool:
+        """Attitude [4] of the gimbal's axes (FRD when it looks ahead). Raises ValueError on a zero quaternion."""
+        with self._lock:
+            return _append(self._gimbals, _Gimbal(time_ns, R_from_q_wxyz(q_frame_gimbal_wxyz), frame))
 
     def add_position(self, time_ns: int, t_ned_m: ArrayLike, v_ned_mps: ArrayLike) -> bool:
         """Position and velocity [3] of the body origin in the local ned frame."""
@@ -81,22 +104,27 @@ class OwnShipBuffer:
         """Forget all: the autopilot has started again, and its local origin with it."""
         with self._lock:
             self._attitudes.clear()
+            self._gimbals.clear()
             self._positions.clear()
             self._global = None
 
     def at(self, time_ns: int) -> OwnShip | None:
         """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 50 ms.
 
-        None without an attitude for that time. Position and velocity are None where the positions do not reach;
+        None without an attitude for that time, of the gimbal too if there is one. Position and velocity are None where the positions do not reach;
         then the ned origin is the own ship itself.
         """
         with self._lock:
             R_ned_body = _attitude_at(self._attitudes, time_ns)
-            if R_ned_body is None:
+            R_body_gimbal = None
+            if R_ned_body is not None and self._gimballed:
+                R_body_gimbal = _gimbal_at(self._gimbals, time_ns, R_ned_body)
+            if R_ned_body is None or (self._gimballed and R_body_gimbal is None):
                 return None
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
-            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, self._origin(time_ns, t_ned_m is not None))
+            origin = self._origin(time_ns, t_ned_m is not None)
+            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal)
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
         """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
@@ -112,7 +140,7 @@ class OwnShipBuffer:
         return lat_lon_alt_from_ned(place, -then[0])
 
 
-def _append(samples: deque, sample: _Attitude | _Position) -> bool:
+def _append(samples: deque, sample: _Attitude | _Gimbal | _Position) -> bool:
     if samples and sample.time_ns <= samples[-1].time_ns:
         return False
     samples.append(sample)
@@ -142,6 +170,25 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
         return None
     share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
     return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
+
+
+def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
+    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 50 ms."""
+    after = _first_after(samples, time_ns)
+    if after == 0 or (after == len(samples) and time_ns - samples[-1].time_ns > ATTITUDE_AHEAD_MAX_NS):
+        return None
+    a, b = samples[max(min(after, len(samples) - 1) - 1, 0)], samples[min(after, len(samples) - 1)]
+    if a.frame is not b.frame or not 0 < b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
+        if after < len(samples):
+            return None
+        a, share = b, 0.0  # the last sample stands alone
+    else:
+        share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
+    R = a.R_frame_gimbal @ so3_exp(share * so3_log(a.R_frame_gimbal.T @ b.R_frame_gimbal))
+    if b.frame is GimbalFrame.HEADING:
+        _, _, yaw_rad = euler_from_R(R_ned_body)
+        R = R_from_euler(0.0, 0.0, float(yaw_rad)) @ R
+    return R_ned_body.T @ R
 
 
 def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array] | None:

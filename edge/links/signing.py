@@ -1,0 +1,142 @@
+"""MAVLink 2 message signing: what goes out is signed, what comes in is believed only with a signature.
+
+signature = first 6 bytes of sha256(key + frame from its magic to its signature's timestamp) (MAVLink guide, "Message
+signing"). Timestamps count 10 us since 2015-01-01 UTC and rise in every stream of (link id, system, component).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import logging
+import os
+import secrets
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edge.errors import InputError
+from msgs.mavlink import dialect
+
+log = logging.getLogger(__name__)
+
+KEY_BYTES = 32
+SIGNATURE_BYTES = 6
+TIMESTAMP_MAX = 2**48 - 1
+EPOCH_S = 1_420_070_400  # 2015-01-01 UTC
+UNIT_NS = 10_000
+NEW_STREAM_BEHIND_MAX = 60 * 100_000  # one minute
+RESERVED_AHEAD = 60 * 100_000  # so often the state is saved; after a crash these are skipped
+
+
+def timestamp_of(utc_ns: int) -> int:
+    """Signing timestamp of a UTC time; 0 before 2015."""
+    return max((utc_ns - EPOCH_S * 1_000_000_000) // UNIT_NS, 0)
+
+
+class Signing:
+    """One key, the timestamps used with it, and those seen. Used by one thread.
+
+    `saved` is what `save` was last given, or 0: no timestamp up to it is used again. `save` is called before a
+    timestamp beyond it is used, so that a restart without a clock that knows the time repeats none.
+    """
+
+    def __init__(self, key: bytes, saved: int, save: Callable[[int], None], utc_ns: Callable[[], int]) -> None:
+        if len(key) != KEY_BYTES:
+            raise ValueError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
+        self._key = key
+        self._last = self._reserved = saved
+        self._seen = max(saved - RESERVED_AHEAD, 0)  # no later than what was last used
+        self._save = save
+        self._utc_ns = utc_ns
+        self._streams: dict[tuple[int, int, int], int] = {}
+
+    def next_timestamp(self) -> int:
+        """For the next message: the time it is, or one more than the last."""
+        self._last = min(max(self._last + 1, timestamp_of(self._utc_ns())), TIMESTAMP_MAX)
+        if self._last > self._reserved:
+            self._reserved = min(self._last + RESERVED_AHEAD, TIMESTAMP_MAX)
+            self._save(self._reserved)
+        return self._last
+
+    def prepare(self, mav: Any) -> None:
+        """Let a pymavlink packer sign its next message."""
+        mav.signing.secret_key = self._key
+        mav.signing.sign_outgoing = True
+        mav.signing.timestamp = self.next_timestamp()
+
+    def refusal(self, message: Any) -> str | None:
+        """Why a parsed message is not believed: "unsigned", "signature" or "replay"; None if it is.
+
+        The hash comes first: what is not signed with our key leaves no trace in what is remembered of streams.
+        """
+        if not message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED:
+            return "unsigned"
+        frame = bytes(message.get_msgbuf())
+        expected = hashlib.sha256(self._key + frame[:-SIGNATURE_BYTES]).digest()[:SIGNATURE_BYTES]
+        if not hmac.compare_digest(expected, frame[-SIGNATURE_BYTES:]):
+            return "signature"
+        timestamp = int.from_bytes(frame[-12:-6], "little")
+        stream = (frame[-13], message.get_srcSystem(), message.get_srcComponent())
+        last = self._streams.get(stream)
+        now = max(self._seen, timestamp_of(self._utc_ns()))
+        if timestamp <= last if last is not None else timestamp < now - NEW_STREAM_BEHIND_MAX:
+            return "replay"
+        self._streams[stream] = timestamp
+        self._seen = max(self._seen, timestamp)
+        self._last = max(self._last, timestamp)
+        return None
+
+
+def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) -> Signing:
+    """Signing with the key of a file, its timestamps kept in another. Raises InputError for a key file that is none."""
+    return Signing(load_key(key_file), _load_state(state_file), lambda stamp: _save_state(state_file, stamp), utc_ns)
+
+
+def load_key(path: Path) -> bytes:
+    """The 32 bytes of a key file. Raises InputError if it is absent, of another length or readable by others."""
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            key = file.read(KEY_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"signing key {path} cannot be read: {error.strerror}") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise InputError(f"signing key {path} is open to group or others; chmod 600 it")
+    if len(key) != KEY_BYTES:
+        raise InputError(f"signing key {path} does not hold {KEY_BYTES} bytes")
+    return key
+
+
+def write_new_key(path: Path) -> None:
+    """Write 32 random bytes to a new file that only its owner can read. Raises InputError; never overwrites."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise InputError(f"{path} exists; a key is never overwritten") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    with os.fdopen(descriptor, "wb") as file:
+        os.fchmod(file.fileno(), 0o600)
+        file.write(secrets.token_bytes(KEY_BYTES))
+
+
+def _load_state(path: Path) -> int:
+    try:
+        stamp = int(path.read_text(encoding="ascii"))
+    except FileNotFoundError:
+        return 0
+    except (OSError, ValueError) as error:
+        log.warning("mavlink: signing state %s is of no use: %s", path, error)
+        return 0
+    return min(max(stamp, 0), TIMESTAMP_MAX)
+
+
+def _save_state(path: Path, stamp: int) -> None:
+    scratch = path.with_name(path.name + ".new")
+    try:
+        scratch.write_text(str(stamp), encoding="ascii")
+        scratch.replace(path)
+    except OSError as error:
+        log.warning("mavlink: signing state %s cannot be saved: %s", path, error.strerror)

@@ -1,0 +1,45 @@
+"""What a person asks of the running daemon: a link leaves it here, the loop takes it at its next frame."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+WAITING_MAX = 8
+
+
+@dataclass(frozen=True)
+class TrackBox:
+    """Look for a target here."""
+
+    box_xyxy_share: tuple[float, float, float, float]  # of the picture's width and height, 0..1
+
+
+@dataclass(frozen=True)
+class StopTracking:
+    """Drop all targets."""
+
+
+Request = TrackBox | StopTracking
+
+
+class RequestQueue:
+    """Bounded, and safe to use from several threads; neither side ever waits for the other."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: list[Request] = []
+
+    def put(self, request: Request) -> bool:
+        """Leave a request; False, and it is not taken, if too many wait."""
+        with self._lock:
+            if len(self._waiting) >= WAITING_MAX:
+                return False
+            self._waiting.append(request)
+            return True
+
+    def take(self) -> list[Request]:
+        """All that wait, oldest first."""
+        with self._lock:
+            taken, self._waiting = self._waiting, []
+            return taken
