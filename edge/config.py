@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from edge.errors import InputError
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
+from msgs.session import TlsFiles, check_endpoint
 
 SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
@@ -180,12 +181,35 @@ class EstimatorSettings(Section):
     )
 
 
+class ZenohTlsSettings(Section):
+    root_ca: ConfigPath = Field(description="the authority that signed both ends' certificates, PEM")
+    certificate: ConfigPath = Field(description="the vehicle's; its common name is the vehicle's name, PEM")
+    private_key: ConfigPath = Field(description="the vehicle's, PEM, mode 0600")
+
+    def files(self) -> TlsFiles:
+        return TlsFiles(self.root_ca, self.certificate, self.private_key)
+
+    @model_validator(mode="after")
+    def _do(self) -> ZenohTlsSettings:
+        self.files().check()
+        return self
+
+
 class ZenohSettings(Section):
     enabled: bool = Field(default=True, description="publish over zenoh")
     listen: list[str] = Field(
         default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
     )
-    connect: list[str] = Field(default_factory=list, description="endpoints of the ground; retried for ever")
+    connect: list[str] = Field(
+        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447?mixed_rel=1; retried for ever"
+    )
+    tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
+    pose_rate_max_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=240,
+        description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
+    )
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
         default="jazzy", description="whose keys and type hashes"
@@ -193,6 +217,12 @@ class ZenohSettings(Section):
     max_age_ms: float = Field(
         default=500.0, gt=0, allow_inf_nan=False, description="an older measurement is not published as a pose"
     )
+
+    @model_validator(mode="after")
+    def _endpoints_do(self) -> ZenohSettings:
+        for endpoint in (*self.listen, *self.connect):
+            check_endpoint(endpoint, tls=self.tls is not None)
+        return self
 
 
 class MavlinkSettings(Section):

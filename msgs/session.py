@@ -7,15 +7,20 @@ noticed within seconds.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+import ssl
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
 LEASE_MS = 2000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
+SECURE = ("tls", "quic")
+_ENDPOINT = re.compile(r"(tcp|tls|quic)/((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5}))([?#].*)?")
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,38 @@ class TlsFiles:
     root_ca: Path
     certificate: Path
     private_key: Path
+
+    def check(self) -> None:
+        """Raises ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
+        for path in (self.root_ca, self.certificate, self.private_key):
+            try:
+                path.read_bytes()
+            except OSError as error:
+                raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+        if self.private_key.stat().st_mode & 0o077:
+            raise ValueError(f"{self.private_key} is open to other users; chmod 600 it")
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        try:
+            context.load_verify_locations(self.root_ca)
+        except ssl.SSLError as error:
+            raise ValueError(f"{self.root_ca} holds no certificate in PEM") from error
+        try:
+            context.load_cert_chain(self.certificate, self.private_key)
+        except ssl.SSLError as error:
+            raise ValueError(f"{self.private_key} is not the PEM key of {self.certificate}") from error
+
+
+def check_endpoint(endpoint: str, *, tls: bool) -> str:
+    """Return a zenoh endpoint that will do; raises ValueError, a sentence, for one that will not.
+
+    Plain UDP is left out: it loses declarations for good. `quic/` carries datagrams with `?mixed_rel=1`.
+    """
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or int(match[4]) > 65535:
+        raise ValueError(f"'{endpoint}' is not tcp/HOST:PORT, tls/HOST:PORT or quic/HOST:PORT")
+    if match[1] in SECURE and not tls:
+        raise ValueError(f"'{endpoint}' needs tls: root_ca, certificate and private_key")
+    return endpoint
 
 
 def peer_config(
@@ -52,9 +89,14 @@ def peer_config(
     return config
 
 
-def router_config(listen: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
-    """The ground's session, which UAVs and tools connect to."""
-    return _config("router", listen, [], False, tls)
+def router_config(
+    listen: Sequence[str], *, tls: TlsFiles | None = None, access_control: Mapping[str, Any] | None = None
+) -> zenoh.Config:
+    """The ground's session, which UAVs and tools connect to; `access_control` is zenoh's section of that name."""
+    config = _config("router", listen, [], False, tls)
+    if access_control is not None:
+        _insert(config, "access_control", access_control)
+    return config
 
 
 def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:

@@ -63,7 +63,13 @@ class ZenohLink:
         """Open the session and begin. Raises LinkError if an endpoint cannot be listened on."""
         endpoints = ", ".join(self._settings.listen) or "none"
         try:
-            config = peer_config(self._settings.listen, self._settings.connect)
+            tls = self._settings.tls
+            config = peer_config(
+                self._settings.listen,
+                self._settings.connect,
+                tls=tls.files() if tls is not None else None,
+                pose_rate_max_hz=self._settings.pose_rate_max_hz,
+            )
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source

@@ -1,0 +1,87 @@
+"""Who may do what on the router, as zenoh's access control spells it: by the certificate's common name. Pure.
+
+Deny is the default. A vehicle writes below its own name only; a reader reads; an operator also commands. `**` never
+matches a chunk that begins with `@`, so what zenoh and ROS keep there is listed apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_LOOKS = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
+_GIVES = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
+
+
+@dataclass(frozen=True)
+class Access:
+    """Common names by what they may do. `loopback_reads`: plain TCP on this machine reads without a certificate."""
+
+    vehicles: Sequence[str]
+    readers: Sequence[str] = ()
+    operators: Sequence[str] = ()
+    loopback_reads: bool = False
+
+
+def access_control(access: Access, domain: int) -> dict[str, Any]:
+    """The router's `access_control` section."""
+    rules: list[dict[str, Any]] = []
+    subjects: list[dict[str, Any]] = []
+    policies: list[dict[str, Any]] = []
+
+    def allow(subject: dict[str, Any], *allowed: dict[str, Any]) -> None:
+        subjects.append(subject)
+        rules.extend(allowed)
+        policies.append({"subjects": [subject["id"]], "rules": [rule["id"] for rule in allowed]})
+
+    for vehicle in access.vehicles:
+        gives = _rule(f"{vehicle} gives", "ingress", _GIVES, vehicle_keys(vehicle, domain))
+        asked = _rule(f"{vehicle} is asked", "egress", _LOOKS, _all_keys(domain))
+        allow({"id": f"vehicle {vehicle}", "cert_common_names": [vehicle]}, gives, asked)
+    looks = _rule("reader looks", "ingress", _LOOKS, _readable_keys(domain))
+    gets = _rule("reader gets", "egress", _GIVES, _all_keys(domain))
+    commands = _rule("operator commands", "ingress", ["query"], ["uavpose/@v1/*/cmd/**"])
+    readers: list[dict[str, Any]] = []
+    if access.readers:
+        readers.append({"id": "readers", "cert_common_names": list(access.readers)})
+    if access.loopback_reads:
+        readers.append({"id": "this machine", "interfaces": ["lo"], "link_protocols": ["tcp"]})
+    if readers:
+        subjects.extend(readers)
+        rules.extend([looks, gets])
+        policies.append({"subjects": [one["id"] for one in readers], "rules": [looks["id"], gets["id"]]})
+    if access.operators:
+        operator = {"id": "operators", "cert_common_names": list(access.operators)}
+        theirs = [{**rule, "id": f"operator: {rule['id']}"} for rule in (looks, gets)]
+        allow(operator, *theirs, commands)
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def vehicle_keys(vehicle: str, domain: int) -> list[str]:
+    """What a vehicle may give: its topics with their caches, its own part of our keys, its ROS node and publishers."""
+    return [
+        f"{domain}/{vehicle}/**",
+        f"{domain}/{vehicle}/**/@adv/**",
+        f"uavpose/@v1/{vehicle}/**",
+        f"@ros2_lv/{domain}/*/*/*/*/%/%{vehicle}/**",
+    ]
+
+
+def _readable_keys(domain: int) -> list[str]:
+    ours = [f"uavpose/@v1/*/{name}" for name in ("alive", "info", "config")]
+    return [f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**", *ours]
+
+
+def _all_keys(domain: int) -> list[str]:
+    return [f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**", "uavpose/@v1/**"]
+
+
+def _rule(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str, Any]:
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}

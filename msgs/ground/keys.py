@@ -1,0 +1,146 @@
+"""A small certificate authority for zenoh over TLS and QUIC: EC P-256, one certificate an identity.
+
+The common name is the identity that the router's access rules know. One certificate serves both ends of a link
+(extended key usage: server and client), since a zenoh peer both listens and connects.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from msgs.ground.errors import InputError
+from msgs.session import TlsFiles
+
+AUTHORITY = "ca"
+DAYS_MAX = 36500
+_IDENTITY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,62}")
+# Clocks of vehicles without a network may lag.
+_BACKDATED = timedelta(days=1)
+
+
+def init_authority(folder: Path, days: int = 3650) -> tuple[Path, Path]:
+    """Make `ca.pem` and `ca.key` (mode 0600) in `folder`; (certificate, key).
+
+    Raises InputError if one is there already or cannot be written.
+    """
+    certificate_path, key_path = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
+    _require_new(key_path, certificate_path)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "uavpose authority")])
+    usage = x509.KeyUsage(
+        digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
+        key_agreement=False, key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
+    )  # fmt: skip
+    builder = (
+        _builder(name, name, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+    _write_new(key_path, _pem(key), mode=0o600)
+    _write_new(certificate_path, builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    return certificate_path, key_path
+
+
+def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 825) -> TlsFiles:
+    """Make `<identity>.pem` and `.key` (mode 0600) in `folder`, signed by the authority there.
+
+    `hosts` are the DNS names and IP addresses under which others will reach it. Raises InputError if the authority is
+    missing, the identity exists, or a name is none.
+    """
+    if not _IDENTITY.fullmatch(identity) or identity == AUTHORITY:
+        raise InputError(f"'{identity}' is no identity: a letter, then letters, digits, '_', '-' or '.'")
+    files = TlsFiles(folder / f"{AUTHORITY}.pem", folder / f"{identity}.pem", folder / f"{identity}.key")
+    authority, authority_key = _read_authority(folder)
+    _require_new(files.private_key, files.certificate)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity)])
+    names = [_alternative_name(host) for host in dict.fromkeys((identity, *hosts))]
+    both_ends = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
+    builder = (
+        _builder(name, authority.subject, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(both_ends, critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()),
+            critical=False,
+        )
+    )
+    signed = builder.sign(authority_key, hashes.SHA256())
+    _write_new(files.private_key, _pem(key), mode=0o600)
+    _write_new(files.certificate, signed.public_bytes(serialization.Encoding.PEM))
+    return files
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, public_key: ec.EllipticCurvePublicKey, days: int
+) -> x509.CertificateBuilder:
+    if not 1 <= days <= DAYS_MAX:
+        raise InputError(f"a certificate is valid for 1 to {DAYS_MAX} days, not {days}")
+    now = datetime.now(UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public_key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BACKDATED)
+        .not_valid_after(now + timedelta(days=days))
+    )
+
+
+def _alternative_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        pass
+    if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9_.-]*[A-Za-z0-9])?", host):
+        raise InputError(f"'{host}' is neither an IP address nor a host name")
+    return x509.DNSName(host)
+
+
+def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    certificate_path, key_path = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
+    try:
+        certificate = x509.load_pem_x509_certificate(certificate_path.read_bytes())
+        key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); `keys init` makes it") from error
+    except ValueError as error:
+        raise InputError(f"{folder}: {AUTHORITY}.pem or {AUTHORITY}.key is no PEM file: {error}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise InputError(f"{key_path}: is not the key of {certificate_path.name}")
+    return certificate, key
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _require_new(*paths: Path) -> None:
+    for path in paths:
+        if path.exists():
+            raise InputError(f"{path}: is there already; move it away first, so that no key is lost")
+
+
+def _write_new(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """The mode holds from the first byte on: a key must not be readable even for a moment."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error

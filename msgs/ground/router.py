@@ -1,0 +1,127 @@
+"""The ground's router in a Python process: TLS or QUIC with certificates on both sides, and rules for each identity.
+
+listen = ["quic/0.0.0.0:7447?mixed_rel=1", "tcp/127.0.0.1:7447"]
+
+[tls]
+root_ca = "keys/ca.pem"
+certificate = "keys/ground.pem"
+private_key = "keys/ground.key"
+
+[access]
+vehicles = ["uav1", "uav2"]
+operators = ["alice"]
+readers = ["screen"]
+loopback_reads = true
+"""
+
+from __future__ import annotations
+
+import threading
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import zenoh
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from msgs.ground.access import Access, access_control
+from msgs.ground.errors import InputError
+from msgs.session import TlsFiles, check_endpoint, router_config
+
+CommonName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,62}$")]
+VehicleName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TlsSettings(_Section):
+    root_ca: Path = Field(description="the authority that signed every certificate, PEM")
+    certificate: Path = Field(description="the router's, PEM")
+    private_key: Path = Field(description="the router's, PEM, mode 0600")
+
+
+class AccessSettings(_Section):
+    vehicles: list[VehicleName] = Field(default_factory=list, description="write below their own name, nowhere else")
+    operators: list[CommonName] = Field(default_factory=list, description="read everything and command")
+    readers: list[CommonName] = Field(default_factory=list, description="read everything")
+    loopback_reads: bool = Field(default=False, description="tcp from this machine reads without a certificate")
+
+
+class RouterSettings(_Section):
+    listen: list[str] = Field(min_length=1, description="endpoints: quic/HOST:PORT?mixed_rel=1, tls/, tcp/")
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
+    tls: TlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
+    access: AccessSettings | None = Field(default=None, description="who may do what; without it everyone may")
+
+    @model_validator(mode="after")
+    def _endpoints_do(self) -> RouterSettings:
+        for endpoint in self.listen:
+            check_endpoint(endpoint, tls=self.tls is not None)
+        if self.access is not None and self.tls is None:
+            raise ValueError("[access] tells identities by their certificates and needs [tls]")
+        return self
+
+
+def load_settings(path: Path) -> RouterSettings:
+    """Read a router's TOML; its paths are taken from its folder. Raises InputError naming file and key."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    try:
+        return RouterSettings.model_validate(tree)
+    except ValidationError as error:
+        raise InputError("\n".join(f"{path}: {_fault(item)}" for item in error.errors())) from error
+
+
+def _fault(item: object) -> str:
+    assert isinstance(item, dict)
+    key = ".".join(str(part) for part in item["loc"])
+    known = {"extra_forbidden": "unknown key", "missing": "is missing"}
+    reason = known.get(item["type"], str(item["msg"]).removeprefix("Value error, "))
+    return f"{key}: {reason}" if key else reason
+
+
+@contextmanager
+def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Session]:
+    """The router, running until the context ends. Raises InputError for files and endpoints that do not do."""
+    tls = None
+    if settings.tls is not None:
+        tls = TlsFiles(*(folder / path.expanduser() for path in settings.tls.model_dump().values()))
+        try:
+            tls.check()
+        except ValueError as error:
+            raise InputError(f"[tls] {error}") from error
+    rules = None
+    if settings.access is not None:
+        rules = access_control(Access(**settings.access.model_dump()), settings.domain)
+    try:
+        session = zenoh.open(router_config(settings.listen, tls=tls, access_control=rules))
+    except zenoh.ZError as error:
+        reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+        raise InputError(f"the router cannot listen on {', '.join(settings.listen)}: {reason}") from error
+    with session:
+        yield session
+
+
+def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
+    """Run the router of a TOML file until `stop` is set, saying which vehicles come and go; 0."""
+    settings = load_settings(path)
+    with open_router(settings, path.resolve().parent) as session:
+
+        def seen(sample: zenoh.Sample) -> None:
+            vehicle = str(sample.key_expr).split("/")[2]
+            say(f"{vehicle}: {'gone' if sample.kind == zenoh.SampleKind.DELETE else 'here'}")
+
+        handler = zenoh.handlers.Callback(seen, indirect=False)
+        session.liveliness().declare_subscriber("uavpose/@v1/*/alive", handler, history=True)
+        say(f"listening on {', '.join(settings.listen)}" + ("" if settings.access else "; everyone may do everything"))
+        stop.wait()
+    return 0
