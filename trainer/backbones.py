@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from trainer.depthwise import DepthwiseConv2d
+from trainer.image_conv import ImageConv2d
 
 Features = tuple[Tensor, Tensor, Tensor]
 
@@ -223,7 +224,7 @@ class EfficientNetLite0(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self._conv_stem = nn.Conv2d(3, 32, 3, 2, bias=False)
+        self._conv_stem = ImageConv2d(32, 3, 2)
         self._bn0 = nn.BatchNorm2d(32, eps=1e-3)
         blocks, inputs = [], 32
         for repeats, kernel, stride, expand, outputs in self.GROUPS:
