@@ -12,7 +12,8 @@ from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
 from msgs.geometry import Array
-from sim_replay.bop import BopError, read_models_info, read_scene
+from sim_replay.bop import Distortion, Model, read_scene
+from sim_replay.datasets import Dataset
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
 from sim_replay.telemetry import TelemetryError, read_telemetry
@@ -27,6 +28,7 @@ class SceneTruth:
     K: list[Array]  # [3, 3] for each frame
     truths: list[Truth]
     extents: dict[int, Extents]  # by object id
+    distortions: list[Distortion | None]  # of each picture on disk; None: a pinhole camera
 
     @property
     def name(self) -> str:
@@ -45,22 +47,33 @@ class PlayedSequence:
 
 
 def read_scene_truth(folder: Path) -> SceneTruth:
-    """Read a BOP scene folder and its dataset's models_info.json. Raises InputError, naming file and key."""
-    try:
-        scene = read_scene(folder)
-        models = read_models_info(_models_folder(folder))
-        images = [scene.image_path(frame) for frame in scene.frames]
-    except BopError as error:
-        raise InputError(str(error)) from error
+    """Read a BOP scene folder and its dataset's models. Raises InputError, naming file and key."""
+    scene = read_scene(folder)
+    models = Dataset(folder.name, scene.root or folder, scene.split, (scene,)).models
+    frames = scene.pictured
     truths = []
-    for index, frame in enumerate(scene.frames):
+    for index, frame in enumerate(frames):
         for target in frame.targets:
             if target.object_id not in models:
-                raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not in models_info.json")
+                raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
             diameter_m = models[target.object_id].diameter_m
             truths.append(Truth(index, target.R_cam_target, target.t_cam_target_m, target.object_id, diameter_m))
-    extents = {object_id: Extents(model.low_m, model.size_m) for object_id, model in models.items()}
-    return SceneTruth(folder, images, [frame.K for frame in scene.frames], truths, extents)
+    return SceneTruth(
+        folder,
+        [scene.image_path(frame) for frame in frames],
+        [frame.K for frame in frames],
+        truths,
+        {object_id: _extents(model) for object_id, model in models.items()},
+        [frame.distortion for frame in frames],
+    )
+
+
+def _extents(model: Model) -> Extents:
+    """The model's box; of one whose box nobody knows, a cube as long as its diameter."""
+    if model.low_m is not None and model.size_m is not None:
+        return Extents(model.low_m, model.size_m)
+    half = 0.5 * model.diameter_m
+    return Extents((-half, -half, -half), (2 * half, 2 * half, 2 * half))
 
 
 def read_sequence(folder: Path) -> PlayedSequence:
@@ -76,14 +89,6 @@ def read_sequence(folder: Path) -> PlayedSequence:
     except TelemetryError as error:
         raise InputError(str(error)) from error
     return PlayedSequence(scene, fps, mount, folder / "telemetry.csv", frame0_ns)
-
-
-def _models_folder(folder: Path) -> Path:
-    """The dataset's models/: BOP has scenes at <dataset>/<split>/<scene>; a scene by itself may hold its own."""
-    for parent in (folder, *folder.resolve().parents[:2]):
-        if (parent / "models" / "models_info.json").is_file():
-            return parent / "models"
-    raise InputError(f"{folder}: no models/models_info.json in the scene or up to two folders above it")
 
 
 @contextmanager

@@ -1,0 +1,80 @@
+"""Values out of JSON files, checked; whatever is wrong is told in a sentence that names the file and the key."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim_replay.bop.records import MM_PER_M, Array, BopError
+
+ROTATION_TOLERANCE = 0.02  # of R R^T from the unit matrix: single precision and rounded files pass, a shear does not
+
+
+def load_json(path: Path) -> Any:
+    """What the file holds. Raises BopError."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise BopError(f"{path} is missing") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise BopError(f"{path} cannot be read: {getattr(error, 'strerror', 'not UTF-8 text')}") from error
+    except json.JSONDecodeError as error:
+        raise BopError(f"{path} line {error.lineno} is not JSON: {error.msg}") from error
+
+
+def load_object(path: Path, optional: bool = False) -> dict[str, Any]:
+    """The file's object by key; an empty one where an optional file is absent. Raises BopError."""
+    if optional and not path.is_file():
+        return {}
+    value = load_json(path)
+    if not isinstance(value, dict):
+        raise BopError(f"{path} does not hold an object of pictures or models")
+    return value
+
+
+def number_key(path: Path, key: str) -> int:
+    """The number that a picture or model goes by. Raises BopError."""
+    if not key.isdecimal():
+        raise BopError(f"{path}: {key!r} is not the number of a picture or model")
+    return int(key)
+
+
+def matrix(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) -> Array:
+    """Finite numbers of the given shape from entry[name]. Raises BopError."""
+    if not isinstance(entry, dict) or name not in entry:
+        raise BopError(f"{path}: {key!r} has no {name!r}")
+    try:
+        values = np.asarray(entry[name], dtype=np.float64).reshape(shape)
+    except (ValueError, TypeError) as error:
+        raise BopError(f"{path}: {name!r} of {key!r} is not {int(np.prod(shape))} numbers") from error
+    if not np.isfinite(values).all():
+        raise BopError(f"{path}: {name!r} of {key!r} is not finite")
+    return values
+
+
+def is_rotation(R: Array) -> bool:
+    """Whether R [3, 3] turns without shear, scale or mirror image."""
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0)
+
+
+def rotation(path: Path, key: str, entry: Any, name: str) -> Array:
+    """A rotation matrix [3, 3]. Raises BopError, for a mirror image (a left-handed frame) too."""
+    R = matrix(path, key, entry, name, (3, 3))
+    if not is_rotation(R):
+        raise BopError(f"{path}: {name!r} of {key!r} is not a rotation (nine numbers, row by row, right-handed)")
+    return R
+
+
+def length_m(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) -> Array:
+    """Lengths that the file gives in millimetres, in metres. Raises BopError."""
+    return matrix(path, key, entry, name, shape) / MM_PER_M
+
+
+def integer(path: Path, key: str, entry: Any, name: str) -> int:
+    """A whole number. Raises BopError."""
+    if not isinstance(entry, dict) or not isinstance(entry.get(name), int):
+        raise BopError(f"{path}: {key!r} has no integer {name!r}")
+    return int(entry[name])

@@ -1,0 +1,79 @@
+"""Entries of BOP's scene files to `BopFrame`: the same in scenewise and imagewise datasets. Lengths to metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sim_replay.bop.fields import integer, length_m, matrix, rotation
+from sim_replay.bop.model_frame import ModelFrames
+from sim_replay.bop.records import DISTORTION_KEY, Array, BopError, BopFrame, BopTarget, Distortion
+
+
+class Source(NamedTuple):
+    """The files that a picture's entries come from, to name them in errors."""
+
+    camera: Path
+    gt: Path
+    gt_info: Path
+
+
+def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, models: ModelFrames) -> BopFrame:
+    """One picture's record; `poses` and `info` may be None. Targets' poses are of their body axes. Raises BopError."""
+    key = str(image_id)
+    K = matrix(source.camera, key, camera, "cam_K", (3, 3))
+    has_world = "cam_R_w2c" in camera and "cam_t_w2c" in camera
+    return BopFrame(
+        image_id=image_id,
+        K=K,
+        targets=tuple(models.in_body(target) for target in _targets(source, key, poses or [], info)),
+        R_cam_world=rotation(source.camera, key, camera, "cam_R_w2c") if has_world else None,
+        t_cam_world_m=length_m(source.camera, key, camera, "cam_t_w2c", (3,)) if has_world else None,
+        distortion=distortion_of(source.camera, key, camera),
+    )
+
+
+def distortion_of(path: Path, key: str, entry: dict[str, Any]) -> Distortion | None:
+    """The lens of a camera's entry; None if it has none. Raises BopError."""
+    if DISTORTION_KEY not in entry:
+        return None
+    k1, k2, p1, p2, k3 = (float(value) for value in matrix(path, key, entry, DISTORTION_KEY, (5,)))
+    return (k1, k2, p1, p2, k3) if any((k1, k2, p1, p2, k3)) else None
+
+
+def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]:
+    if not isinstance(poses, list):
+        raise BopError(f"{source.gt}: {key!r} is not a list of objects")
+    if info is not None and (not isinstance(info, list) or len(info) != len(poses)):
+        raise BopError(f"{source.gt_info}: {key!r} does not list the {len(poses)} objects of {source.gt.name}")
+    return [
+        BopTarget(
+            integer(source.gt, key, entry, "obj_id"),
+            rotation(source.gt, key, entry, "cam_R_m2c"),
+            length_m(source.gt, key, entry, "cam_t_m2c", (3,)),
+            **({} if info is None else _seen(source.gt_info, key, info[index])),
+        )
+        for index, entry in enumerate(poses)
+    ]
+
+
+def _seen(path: Path, key: str, entry: Any) -> dict[str, Any]:
+    """What scene_gt_info says of a target; its visible box is what others build on, the rest may be absent."""
+    seen: dict[str, Any] = {"box_visible_xyxy_px": _box(path, key, entry, "bbox_visib")}
+    if "bbox_obj" in entry:
+        seen["box_whole_xyxy_px"] = _box(path, key, entry, "bbox_obj")
+    for field, name in (("visible_px", "px_count_visib"), ("whole_px", "px_count_all")):
+        if name in entry:
+            seen[field] = integer(path, key, entry, name)
+    if seen["box_visible_xyxy_px"] is None:
+        seen["visible_px"] = 0
+    return seen
+
+
+def _box(path: Path, key: str, entry: Any, name: str) -> Array | None:
+    x, y, width, height = matrix(path, key, entry, name, (4,))
+    if width <= 0 or height <= 0:
+        return None
+    return np.array([x, y, x + width, y + height]) - 0.5

@@ -1,0 +1,107 @@
+"""Where the scenes of a BOP dataset lie, and where its models and lists do, whatever folder of it is named."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from sim_replay.bop.model_frame import MODEL_FRAME_FILE, read_model_frames
+from sim_replay.bop.models import models_folder
+from sim_replay.bop.records import BopError
+from sim_replay.bop.scene import BopScene, ImagewiseScene, imagewise_keys
+
+_SCENE_FILES = ("scene_camera.json", "scene_gt.json")
+_DEEPEST = 4  # folders between the one that is named and a scene
+_LEVELS_UP = 3  # from a scene to its dataset: ROOT/SPLIT/SCENE, and one for those who pack it deeper
+TARGETS_FILE = "test_targets_bop19.json"
+
+
+def find_scenes(path: Path) -> tuple[BopScene, ...]:
+    """The scenes in `path`, a scene, split or dataset folder, by split and number; their files are not read yet.
+
+    Raises BopError if there is none.
+    """
+    if not path.is_dir():
+        raise BopError(f"{path} is not a folder")
+    scenes = [scene for folder in _walk(path, _DEEPEST) for scene in _scenes_of(folder)]
+    if not scenes:
+        raise BopError(f"{path}: no BOP scene (scene_camera.json or KEY.camera.json) in it or below")
+    return _numbered(scenes)
+
+
+def read_scene(folder: Path) -> BopScene:
+    """One scene folder, its files read and checked; all but the camera and pictures may be absent. Raises BopError."""
+    (scene,) = _numbered([_scene(folder)])
+    _ = scene.frames
+    return scene
+
+
+def find_root(folder: Path) -> Path | None:
+    """The dataset that a folder belongs to: the nearest one up with models, model_frame.toml or a list of targets."""
+    here = _absolute(folder)
+    for candidate in (here, *here.parents[:_LEVELS_UP]):
+        named = (candidate / name for name in (MODEL_FRAME_FILE, TARGETS_FILE))
+        if models_folder(candidate) is not None or any(path.is_file() for path in named):
+            return candidate
+    return next((c for c in (here, *here.parents[:2]) if (c / "camera.json").is_file()), None)
+
+
+def _absolute(folder: Path) -> Path:
+    return Path(os.path.abspath(folder))  # a split may be a link to another disk: its dataset is where the link is
+
+
+def _walk(folder: Path, deepest: int) -> Iterator[Path]:
+    """`folder` and those below it, sorted, that may be or hold scenes; nothing inside a scene."""
+    yield folder
+    if deepest == 0 or _is_scene(folder):
+        return
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and not child.name.startswith((".", "models")):
+            yield from _walk(child, deepest - 1)
+
+
+def _is_scene(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in _SCENE_FILES)
+
+
+def _scenes_of(folder: Path) -> Iterator[BopScene]:
+    if _is_scene(folder):
+        yield _scene(folder)
+        return
+    keys = imagewise_keys(folder)
+    if keys:
+        root, split = _root_and_split(folder, _absolute(folder))
+        frames = read_model_frames(root)
+        for scene_id, pictures in sorted(keys.items()):
+            yield ImagewiseScene(folder, scene_id, split, root, frames, pictures)
+
+
+def _scene(folder: Path) -> BopScene:
+    here = _absolute(folder)
+    root, split = _root_and_split(folder, here.parent)
+    scene_id = int(here.name) if here.name.isdecimal() else -1
+    return BopScene(folder, scene_id, split, root, read_model_frames(root))
+
+
+def _root_and_split(folder: Path, holder: Path) -> tuple[Path | None, str | None]:
+    """The dataset of `folder` and the split's name, if `holder`, which holds the pictures' scenes, is a split."""
+    root = find_root(folder)
+    if root is not None:
+        return root, holder.name if root in holder.parents else None
+    named = re.match(r"train|val|test", holder.name)
+    return (holder.parent, holder.name) if named else (None, None)
+
+
+def _numbered(scenes: list[BopScene]) -> tuple[BopScene, ...]:
+    """Sorted; where folder names are no numbers, or one number comes twice, scenes count from 0 in each split."""
+    ordered = sorted(scenes, key=lambda scene: (scene.split or "", scene.scene_id, str(scene.folder)))
+    out = []
+    for split in dict.fromkeys(scene.split for scene in ordered):
+        group = [scene for scene in ordered if scene.split == split]
+        ids = [scene.scene_id for scene in group]
+        clear = min(ids) >= 0 and len(set(ids)) == len(ids)
+        out += [scene if clear else replace(scene, scene_id=index) for index, scene in enumerate(group)]
+    return tuple(out)

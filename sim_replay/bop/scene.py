@@ -1,0 +1,178 @@
+"""A BOP scene on disk: its frames are read when first asked for, its pictures and masks one at a time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay.bop.fields import load_json, load_object, matrix, number_key
+from sim_replay.bop.frames import Source, frame_of
+from sim_replay.bop.model_frame import ModelFrames
+from sim_replay.bop.records import DISTORTION_KEY, BopError, BopFrame
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+PICTURE_FOLDERS = ("gray", "rgb")  # the later wins where a frame has both
+IMAGEWISE_CAMERA = ".camera.json"
+
+
+@dataclass(frozen=True, eq=False)
+class BopScene:
+    """A scene folder: scene_camera.json, scene_gt.json, scene_gt_info.json, rgb/ or gray/, mask/, mask_visib/.
+
+    Only the camera and the pictures must be there. A scene without scene_camera.json takes the dataset's camera.json.
+    """
+
+    folder: Path
+    scene_id: int = 0
+    split: str | None = None  # the folder that holds the scene, if the dataset has splits
+    root: Path | None = None  # of the dataset: models, camera.json
+    models: ModelFrames = field(default_factory=ModelFrames)
+
+    @cached_property
+    def frames(self) -> tuple[BopFrame, ...]:
+        """By growing image id. Raises BopError, naming file and key."""
+        poses = load_object(self.folder / "scene_gt.json", optional=True)
+        info = load_object(self.folder / "scene_gt_info.json", optional=True)
+        camera_file, cameras = self._cameras(poses)
+        source = Source(camera_file, self.folder / "scene_gt.json", self.folder / "scene_gt_info.json")
+        numbered = sorted((number_key(source.camera, key), key) for key in cameras)
+        return tuple(
+            frame_of(source, image_id, cameras[key], poses.get(key), info.get(key), self.models)
+            for image_id, key in numbered
+        )
+
+    @property
+    def pictured(self) -> tuple[BopFrame, ...]:
+        """The frames that have a picture: an index may list more than was kept. Raises BopError if none has."""
+        frames = tuple(frame for frame in self.frames if frame.image_id in self._pictures)
+        if self.frames and not frames:
+            raise BopError(f"{self.folder} holds no picture of those that it lists in rgb/ or gray/")
+        return frames
+
+    def image_path(self, frame: BopFrame) -> Path:
+        """The frame's picture. Raises BopError if there is none."""
+        path = self._pictures.get(frame.image_id)
+        if path is None:
+            raise BopError(f"{self.folder / 'rgb'} holds no picture {frame.image_id:06d}")
+        return path
+
+    def image_bgr(self, frame: BopFrame) -> Image:
+        """The frame's picture [H, W, 3]; a gray one has three equal channels. Raises BopError."""
+        return _pixels(self.image_path(frame), cv2.IMREAD_COLOR)
+
+    def mask(self, frame: BopFrame, target_index: int) -> Mask | None:
+        """The visible mask [H, W] of a target, or None where the data set has no masks. Raises BopError."""
+        return self._mask("mask_visib", frame, target_index)
+
+    def whole_mask(self, frame: BopFrame, target_index: int) -> Mask | None:
+        """The mask [H, W] of a target's whole silhouette inside the picture, or None. Raises BopError."""
+        return self._mask("mask", frame, target_index)
+
+    def _cameras(self, poses: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+        path = self.folder / "scene_camera.json"
+        shared = None if self.root is None else self.root / "camera.json"
+        if path.is_file() or shared is None or not shared.is_file() or not poses:
+            return path, load_object(path)
+        entry = load_object(shared)
+        fx, fy, cx, cy = (float(matrix(shared, "camera", entry, name, ())) for name in ("fx", "fy", "cx", "cy"))
+        camera = {"cam_K": [fx, 0, cx, 0, fy, cy, 0, 0, 1]} | {k: entry[k] for k in (DISTORTION_KEY,) if k in entry}
+        return shared, dict.fromkeys(poses, camera)
+
+    @cached_property
+    def _pictures(self) -> dict[int, Path]:
+        found = {}
+        for name in PICTURE_FOLDERS:
+            for path in sorted((self.folder / name).glob("*"), reverse=True):  # of 7.jpg and 7.png the first wins
+                if path.stem.isdecimal() and path.suffix.lower() in PICTURE_SUFFIXES:
+                    found[int(path.stem)] = path
+        return found
+
+    @cached_property
+    def _masks(self) -> dict[tuple[str, int, int], Path]:
+        """By kind, image and target: IMAGE_TARGET.png; IMAGE.png where a picture shows but one target."""
+        found = {}
+        for kind in ("mask", "mask_visib"):
+            for path in (self.folder / kind).glob("*"):
+                name = re.fullmatch(r"(\d+)(?:_(\d+))?", path.stem)
+                if name and path.suffix.lower() in PICTURE_SUFFIXES:
+                    found[kind, int(name[1]), int(name[2] or 0)] = path
+        return found
+
+    def _mask(self, kind: str, frame: BopFrame, target_index: int) -> Mask | None:
+        path = self._masks.get((kind, frame.image_id, target_index))
+        if path is None:
+            return None
+        values = _pixels(path, cv2.IMREAD_GRAYSCALE)
+        return values > values.max() // 2  # the format says 255 for yes; some datasets write 1
+
+
+@dataclass(frozen=True, eq=False)
+class ImagewiseScene(BopScene):
+    """The pictures of one scene in a BOP-imagewise folder: KEY.rgb.jpg, KEY.camera.json, KEY.gt.json, ..."""
+
+    keys: tuple[tuple[int, str], ...] = ()  # image id and KEY, as 000001_000023
+
+    @cached_property
+    def frames(self) -> tuple[BopFrame, ...]:
+        """By growing image id. Raises BopError, naming file and key."""
+        return tuple(self._frame(image_id, key) for image_id, key in sorted(self.keys))
+
+    def _frame(self, image_id: int, key: str) -> BopFrame:
+        source = Source(*(self.folder / f"{key}.{kind}.json" for kind in ("camera", "gt", "gt_info")))
+        poses, info = (load_json(path) if path.is_file() else None for path in source[1:])
+        return frame_of(source, image_id, load_json(source.camera), poses, info, self.models)
+
+    @cached_property
+    def _pictures(self) -> dict[int, Path]:
+        ids = {key: image_id for image_id, key in self.keys}
+        found = {}
+        for kind in PICTURE_FOLDERS:
+            for path in sorted(self.folder.glob(f"*.{kind}.*"), reverse=True):
+                key = path.name.split(".")[0]
+                if key in ids and path.suffix.lower() in PICTURE_SUFFIXES:
+                    found[ids[key]] = path
+        return found
+
+    def _mask(self, kind: str, frame: BopFrame, target_index: int) -> Mask | None:
+        path = self.folder / f"{dict(self.keys)[frame.image_id]}.{kind}.json"
+        if not path.is_file():
+            return None
+        entry = load_object(path).get(str(target_index))
+        return None if entry is None else _mask_of_runs(path, target_index, entry)
+
+
+def imagewise_keys(folder: Path) -> dict[int, tuple[tuple[int, str], ...]]:
+    """Image ids and keys of a BOP-imagewise folder by scene id; empty if it is none."""
+    scenes: dict[int, list[tuple[int, str]]] = {}
+    for path in sorted(folder.glob("*" + IMAGEWISE_CAMERA)):
+        name = re.fullmatch(r"(?:(\d+)_)?(\d+)", path.name.removesuffix(IMAGEWISE_CAMERA))
+        if name:
+            scenes.setdefault(int(name[1] or 0), []).append((int(name[2]), name[0]))
+    return {scene_id: tuple(keys) for scene_id, keys in scenes.items()}
+
+
+def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
+    """COCO's uncompressed run lengths: of no and yes in turn, beginning with no, column by column."""
+    try:
+        height, width = entry["size"]
+        counts = np.asarray(entry["counts"], dtype=np.int64)
+        flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+        return flat.reshape(width, height).T
+    except (KeyError, TypeError, ValueError) as error:
+        raise BopError(f"{path}: '{target_index}' does not hold 'size' and 'counts' of one mask") from error
+
+
+def _pixels(path: Path, flags: int) -> Image:
+    pixels = cv2.imread(str(path), flags)
+    if pixels is None:
+        raise BopError(f"{path} is not a readable picture")
+    return np.asarray(pixels, dtype=np.uint8)

@@ -1,0 +1,253 @@
+"""A BOP dataset as evaluation and training see it: its frames, cameras, targets in body axes (FRD) and models.
+
+    dataset = open_dataset(Path("FW-UAV6DPose"), "test")
+    for frame in dataset.frames():
+        picture = frame.undistorted_bgr()   # of the pinhole camera frame.K
+
+What a dataset leaves out is derived: visible boxes from masks, else from the projected model; diameters from the
+meshes, else from how large the targets look at their known depth.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
+from sim_replay.bop.fields import integer, load_json
+from sim_replay.bop.layout import TARGETS_FILE
+from sim_replay.bop.scene import Image, Mask
+
+Array = NDArray[np.float64]
+Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
+_MASKS_LOOKED_AT = 200  # to guess an object's diameter where there are neither models nor boxes
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetFrame:
+    """One picture with its truth."""
+
+    scene_id: int
+    image_id: int
+    K: Array  # [3, 3], pixel centres at integers
+    distortion: Distortion | None  # k1, k2, p1, p2, k3 of the picture on disk; None: a pinhole camera
+    image_path: Path
+    targets: tuple[BopTarget, ...]  # poses of body axes (FRD); boxes in the picture on disk
+    scene: BopScene
+    target_indices: tuple[int, ...]  # of each target among all that the scene lists for this picture
+
+    def image_bgr(self) -> Image:
+        """The picture as it is on disk [H, W, 3]. Raises BopError."""
+        return _picture(self.image_path)
+
+    def undistorted_bgr(self) -> Image:
+        """The picture [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
+        image_bgr = self.image_bgr()
+        if self.distortion is None:
+            return image_bgr
+        return np.asarray(cv2.undistort(image_bgr, self.K, np.array(self.distortion)), dtype=np.uint8)
+
+    def mask(self, k: int) -> Mask | None:
+        """The visible mask [H, W] of targets[k] in the picture on disk; None if the dataset has none."""
+        return self.scene.mask(BopFrame(self.image_id, self.K), self.target_indices[k])
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Scenes of one dataset; indices are read scene by scene, pictures never before they are asked for."""
+
+    name: str
+    root: Path
+    split: str | None  # None: it has no splits, or several of them were opened together
+    scenes: tuple[BopScene, ...]
+
+    @cached_property
+    def models(self) -> dict[int, Model]:
+        """By object id; sizes in body axes, metres. Raises BopError.
+
+        A dataset without any model gets diameters from its boxes (or masks): the largest side at the target's depth
+        over all its pictures. That is never above the true diameter by more than a pixel's worth.
+        """
+        return read_models(self.root, self.scenes[0].models) or _diameters_from_boxes(self.scenes)
+
+    def frames(self) -> Iterator[DatasetFrame]:
+        """Every frame that has a picture, by scene and image id; of a test split those in test_targets_bop19.json.
+
+        Raises BopError, naming file and key.
+        """
+        wanted = self._wanted
+        for scene in self.scenes:
+            sizes: dict[str, tuple[int, int]] = {}
+            frames = scene.pictured
+            if len(frames) < len(scene.frames):
+                _log.warning("%s: %d listed pictures are missing", scene.folder, len(scene.frames) - len(frames))
+            for frame in frames:
+                indices: Sequence[int] = range(len(frame.targets))
+                if wanted is not None and _is_test(scene):
+                    if (scene.scene_id, frame.image_id) not in wanted:
+                        continue
+                    indices = _chosen(frame.targets, wanted[scene.scene_id, frame.image_id])
+                yield self._frame(scene, frame, indices, sizes)
+
+    @cached_property
+    def _wanted(self) -> Wanted | None:
+        return _read_targets(self.root / TARGETS_FILE)
+
+    def _frame(
+        self, scene: BopScene, frame: BopFrame, indices: Sequence[int], sizes: dict[str, tuple[int, int]]
+    ) -> DatasetFrame:
+        path = scene.image_path(frame)
+        targets = [_with_box(scene, frame, index) for index in indices]
+        if any(_unseen(target) for target in targets) and "wh" not in sizes:
+            height, width = _picture(path).shape[:2]  # of the scene's first; they are alike
+            sizes["wh"] = (width, height)
+        placed = tuple(
+            _with_projected_box(t, self.models.get(t.object_id), frame, sizes["wh"]) if _unseen(t) else t
+            for t in targets
+        )
+        return DatasetFrame(
+            scene.scene_id, frame.image_id, frame.K, frame.distortion, path, placed, scene, tuple(indices)
+        )
+
+
+def open_dataset(path: Path, split: str | None = None) -> Dataset:
+    """Open a BOP dataset, a split of it or one scene, scenewise or imagewise.
+
+    Args:
+        path: Any folder of the dataset that holds scenes or is one.
+        split: Name of a split below `path`; `test` finds `test_primesense` too where it is the only one of its kind.
+            None takes all that is in `path`.
+
+    Raises:
+        BopError: There is no scene, no such split, or a file is not as it should be.
+    """
+    scenes = find_scenes(path)
+    splits = list(dict.fromkeys(scene.split for scene in scenes if scene.split))
+    if split is not None:
+        chosen = [split] if split in splits else [name for name in splits if name.startswith(f"{split}_")]
+        if len(chosen) != 1:
+            has = f"it has {', '.join(splits)}" if splits else "it has no splits"
+            raise BopError(f"{path}: no split {split!r}; {has}")
+        splits = chosen
+        scenes = tuple(scene for scene in scenes if scene.split == chosen[0])
+    root = scenes[0].root or path
+    return Dataset(root.absolute().name, root, splits[0] if len(splits) == 1 else None, scenes)
+
+
+def _is_test(scene: BopScene) -> bool:
+    return scene.split is not None and scene.split.startswith("test")
+
+
+def _read_targets(path: Path) -> Wanted | None:
+    """test_targets_bop19.json; None if the dataset has none. Raises BopError."""
+    if not path.is_file():
+        return None
+    entries = load_json(path)
+    if not isinstance(entries, list):
+        raise BopError(f"{path} does not hold a list of targets")
+    wanted: Wanted = {}
+    for number, entry in enumerate(entries):
+        scene_id, image_id, object_id = (
+            integer(path, f"entry {number}", entry, name) for name in ("scene_id", "im_id", "obj_id")
+        )
+        count = integer(path, f"entry {number}", entry, "inst_count") if "inst_count" in entry else 1
+        wanted.setdefault((scene_id, image_id), Counter())[object_id] += count
+    return wanted
+
+
+def _chosen(targets: Sequence[BopTarget], wanted: Counter[int]) -> list[int]:
+    """Indices of the wanted instances of each object; of too many, those of which most is visible."""
+    by_visible = sorted(range(len(targets)), key=lambda index: -(targets[index].visible_px or 0))
+    left, chosen = wanted.copy(), []
+    for index in by_visible:
+        if left[targets[index].object_id] > 0:
+            left[targets[index].object_id] -= 1
+            chosen.append(index)
+    return sorted(chosen)
+
+
+def _unseen(target: BopTarget) -> bool:
+    """Whether nothing is said of what is visible of it (a target that is said to be hidden has visible_px 0)."""
+    return target.box_visible_xyxy_px is None and target.visible_px is None
+
+
+def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
+    """The target with a visible box from its mask, where the scene says nothing of it but has one."""
+    target = frame.targets[index]
+    if not _unseen(target):
+        return target
+    mask = scene.mask(frame, index)
+    if mask is None:
+        mask = scene.whole_mask(frame, index)
+    if mask is None:
+        return target
+    return replace(target, box_visible_xyxy_px=box_of_mask(mask), visible_px=int(mask.sum()))
+
+
+def box_of_mask(mask: Mask) -> Array | None:
+    """Box (x, y, x, y) around the set pixels of a mask [H, W], edges half a pixel outside their centres; or None."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return None
+    return np.array([columns[0] - 0.5, rows[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5])
+
+
+def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
+    """The target with boxes from its model's vertices, or the corners of its box; as it is where neither is known."""
+    points = None if model is None else model.points_m
+    if points is None:
+        return target
+    points_cam = points @ target.R_cam_target.T + target.t_cam_target_m
+    if points_cam[:, 2].min() <= 0:
+        return target
+    lens = np.zeros(5) if frame.distortion is None else np.array(frame.distortion)
+    pixels, _ = cv2.projectPoints(points_cam[:, None], np.zeros(3), np.zeros(3), frame.K, lens)
+    low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
+    edge_low, edge_high = np.full(2, -0.5), np.array(size_wh) - 0.5
+    inside = np.concatenate([np.maximum(low, edge_low), np.minimum(high, edge_high)])
+    hidden = bool((inside[:2] >= inside[2:]).any())
+    return replace(
+        target,
+        box_whole_xyxy_px=np.concatenate([low, high]),
+        box_visible_xyxy_px=None if hidden else inside,
+        visible_px=0 if hidden else None,
+    )
+
+
+def _diameters_from_boxes(scenes: Sequence[BopScene]) -> dict[int, Model]:
+    largest: dict[int, float] = {}
+    bare: list[tuple[BopScene, BopFrame, int]] = []
+    for scene in scenes:
+        for frame in scene.frames:
+            for index, target in enumerate(frame.targets):
+                largest.setdefault(target.object_id, 0.0)
+                box = target.box_whole_xyxy_px if target.box_whole_xyxy_px is not None else target.box_visible_xyxy_px
+                _widen(largest, target, box, frame.K)
+                if _unseen(target):
+                    bare.append((scene, frame, index))
+    for scene, frame, index in bare[:: max(1, len(bare) // _MASKS_LOOKED_AT)]:
+        target = _with_box(scene, frame, index)
+        _widen(largest, target, target.box_visible_xyxy_px, frame.K)
+    return {object_id: Model(size_m) for object_id, size_m in largest.items() if size_m > 0}
+
+
+def _widen(largest: dict[int, float], target: BopTarget, box_xyxy_px: Array | None, K: Array) -> None:
+    if box_xyxy_px is not None:
+        sides_m = (box_xyxy_px[2:] - box_xyxy_px[:2]) / np.array([K[0, 0], K[1, 1]]) * target.t_cam_target_m[2]
+        largest[target.object_id] = max(largest[target.object_id], float(sides_m.max()))
+
+
+def _picture(path: Path) -> Image:
+    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image_bgr is None:
+        raise BopError(f"{path} is not a readable picture")
+    return np.asarray(image_bgr, dtype=np.uint8)
