@@ -1,0 +1,154 @@
+"""One flight in JSBSim: load, trim, settle, fly a manoeuvre in turbulence, and record the integrated state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import jsbsim
+import numpy as np
+
+from msgs.geometry import Array
+from sim_replay.flight.aircraft import Dynamics
+from sim_replay.flight.manoeuvre import Manoeuvre
+from sim_replay.flight.pilot import Controls, Pilot, Seen
+from sim_replay.flight.track import Track
+
+Gust = Literal["calm", "light", "moderate"]
+FOOT_M = 0.3048
+STEP_S = 0.01
+STEPS_PER_SAMPLE = 2  # the track's 50 Hz, at which the pilot acts too
+SAMPLE_S = STEP_S * STEPS_PER_SAMPLE
+SETTLE_S = 4.0
+# MIL-F-8785C: wind at 20 ft above the ground, ft/s, and severity index (probability of exceedance).
+TURBULENCE: dict[Gust, tuple[float, int]] = {"light": (15.0, 2), "moderate": (25.0, 3)}
+_SEEN = (
+    *("attitude/phi-rad", "attitude/theta-rad", "velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
+    *("aero/beta-rad", "velocities/vt-fps", "velocities/h-dot-fps", "velocities/ned-velocity-mag-fps"),
+)
+_RECORDED = (
+    *("position/ecef-x-ft", "position/ecef-y-ft", "position/ecef-z-ft"),
+    *("velocities/ecef-x-fps", "velocities/ecef-y-fps", "velocities/ecef-z-fps"),
+    *("velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
+)
+
+
+@dataclass(frozen=True)
+class Sortie:
+    """What is to be flown; the same sortie gives the same track, bit for bit."""
+
+    dynamics: Dynamics
+    speed_mps: float
+    height_m: float  # where it starts, above the ground
+    manoeuvre: Manoeuvre
+    roll_rate_limit_radps: float
+    gust: Gust
+    gust_seed: int
+
+
+class FlightError(RuntimeError):
+    """A flight that cannot be; the text says of what."""
+
+
+class _Aircraft:
+    """A JSBSim aircraft in the air, trimmed."""
+
+    def __init__(self, sortie: Sortie) -> None:
+        self._fdm = _trimmed(sortie)
+        self._propagate = self._fdm.get_propagate()
+        self._seen = [self._node(name) for name in _SEEN]
+        self._recorded = [self._node(name) for name in _RECORDED]
+        self._stick = [self._node(f"fcs/{name}-cmd-norm") for name in ("aileron", "elevator", "rudder")]
+        engines = self._fdm.get_propulsion().get_num_engines()
+        self._throttles = [self._node(f"fcs/throttle-cmd-norm[{k}]") for k in range(engines)]
+
+    def _node(self, name: str) -> jsbsim.FGPropertyNode:
+        node = self._fdm.get_property_manager().get_node(name)
+        if node is None:
+            raise FlightError(f"{self._fdm.get_model_name()} has no property {name}")
+        return node
+
+    def controls(self) -> Controls:
+        aileron, elevator, rudder, throttle = (n.get_double_value() for n in (*self._stick, self._throttles[0]))
+        return Controls(aileron, elevator, rudder, throttle)
+
+    def step(self, controls: Controls) -> None:
+        for node, value in zip(self._stick, (controls.aileron, controls.elevator, controls.rudder), strict=True):
+            node.set_double_value(value)
+        for node in self._throttles:
+            node.set_double_value(controls.throttle)
+        for _ in range(STEPS_PER_SAMPLE):
+            self._fdm.run()
+
+    def seen(self) -> Seen:
+        v = [n.get_double_value() for n in self._seen]
+        path_rad = math.asin(max(-1.0, min(1.0, v[7] / max(v[8], 1.0))))
+        return Seen(v[0], v[1], v[2], v[3], v[4], v[5], v[6] * FOOT_M, path_rad)
+
+    def state(self) -> list[float]:
+        return [n.get_double_value() for n in self._recorded]
+
+    def R_body_ecef(self) -> Array:
+        return np.asarray(self._propagate.get_Tec2b(), dtype=np.float64)
+
+    def R_ned_body(self) -> Array:
+        return np.asarray(self._propagate.get_Tl2b(), dtype=np.float64).T
+
+    def height_m(self) -> float:
+        return self._node("position/h-agl-ft").get_double_value() * FOOT_M
+
+
+def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
+    """The flight from `start_s` to `end_s` at 50 Hz, in the flat NED axes at its first sample; the ground is z = 0.
+
+    The aircraft is trimmed heading north SETTLE_S before. Raises FlightError where it cannot be trimmed or departs.
+    """
+    aircraft = _Aircraft(sortie)
+    pilot = Pilot(
+        sortie.dynamics,
+        sortie.manoeuvre,
+        sortie.speed_mps,
+        sortie.roll_rate_limit_radps,
+        aircraft.controls(),
+        SAMPLE_S,
+    )
+    settling, samples = round(SETTLE_S / SAMPLE_S), round((end_s - start_s) / SAMPLE_S) + 1
+    for k in range(-settling, 0):
+        aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
+    R_ned_ecef, height_m = aircraft.R_ned_body() @ aircraft.R_body_ecef(), aircraft.height_m()
+    values, R_body_ecef = np.empty((samples, len(_RECORDED))), np.empty((samples, 3, 3))
+    for k in range(samples):
+        values[k], R_body_ecef[k] = aircraft.state(), aircraft.R_body_ecef()
+        aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
+    position = (values[:, :3] - values[0, :3]) @ R_ned_ecef.T * FOOT_M - np.array([0.0, 0.0, height_m])
+    velocity = values[:, 3:6] @ R_ned_ecef.T * FOOT_M
+    R_ned_body = R_ned_ecef @ np.swapaxes(R_body_ecef, -1, -2)
+    if not np.isfinite(values).all() or R_ned_body[:, 2, 2].min() < 0.2:
+        raise FlightError(f"{sortie.dynamics.jsbsim_name} departed from controlled flight")
+    return Track(start_s + np.arange(samples) * SAMPLE_S, R_ned_body, position, velocity, values[:, 6:9])
+
+
+def _trimmed(sortie: Sortie) -> jsbsim.FGFDMExec:
+    jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
+    fdm = jsbsim.FGFDMExec(jsbsim.get_default_root_dir())
+    fdm.set_debug_level(0)
+    if not fdm.load_model(sortie.dynamics.jsbsim_name):
+        raise FlightError(f"JSBSim has no aircraft named {sortie.dynamics.jsbsim_name}")
+    fdm.set_dt(STEP_S)
+    fdm["simulation/randomseed"] = sortie.gust_seed
+    fdm["ic/h-sl-ft"] = sortie.height_m / FOOT_M
+    fdm["ic/vt-fps"] = sortie.speed_mps / FOOT_M
+    fdm["ic/lat-geod-deg"], fdm["ic/long-gc-deg"] = 47.0, 8.0
+    if fdm.get_property_manager().hasNode("gear/gear-cmd-norm"):
+        fdm["gear/gear-cmd-norm"] = 0.0
+    fdm.run_ic()
+    fdm.get_propulsion().init_running(-1)
+    if not jsbsim.FGTrim(fdm, jsbsim.TrimMode.FULL).do_trim():
+        raise FlightError(f"{sortie.dynamics.jsbsim_name} cannot be trimmed at {sortie.speed_mps:.0f} m/s")
+    if sortie.gust != "calm":
+        wind_fps, severity = TURBULENCE[sortie.gust]
+        fdm["atmosphere/turb-type"] = 3  # MIL-F-8785C
+        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = wind_fps
+        fdm["atmosphere/turbulence/milspec/severity"] = severity
+    return fdm

@@ -1,0 +1,102 @@
+"""The pilot: follows a manoeuvre with the aircraft's own stick, pedals and throttle, in coordinated turns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from sim_replay.flight.aircraft import Dynamics
+from sim_replay.flight.manoeuvre import Manoeuvre
+
+GRAVITY_MPS2 = 9.80665
+PATH_BANDWIDTH = 0.7  # rad/s, flight path angle
+ROLL_BANDWIDTH = 1.6  # rad/s, bank angle
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the pilot's instruments show."""
+
+    bank_rad: float
+    pitch_rad: float
+    p_radps: float
+    q_radps: float
+    r_radps: float
+    slip_rad: float  # sideslip; positive with the wind from the right
+    speed_mps: float  # through the air
+    path_rad: float  # flight path above the horizon
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Commands, -1 to 1, throttle 0 to 1; JSBSim's signs: right roll, nose down, nose left are positive."""
+
+    aileron: float
+    elevator: float
+    rudder: float
+    throttle: float
+
+
+@dataclass
+class Pilot:
+    """Holds bank, flight path and speed; gains follow from the aircraft's derivatives, scaled by dynamic pressure."""
+
+    dynamics: Dynamics
+    manoeuvre: Manoeuvre
+    speed_mps: float
+    roll_rate_limit_radps: float
+    trim: Controls
+    step_s: float
+    _sums: dict[str, float] = field(default_factory=lambda: {"bank": 0.0, "pitch": 0.0, "slip": 0.0, "speed": 0.0})
+
+    def fly(self, t_s: float, seen: Seen) -> Controls:
+        """The controls for the next step."""
+        bank_rad, path_rad = self.manoeuvre.bank_rad(t_s), self.manoeuvre.path_rad(t_s)
+        pressure = (seen.speed_mps / self.dynamics.speed_mps) ** 2
+        return Controls(
+            self._aileron(bank_rad, seen, pressure),
+            self._elevator(path_rad, seen, pressure),
+            self._rudder(seen, pressure),
+            self._throttle(path_rad, seen),
+        )
+
+    def _aileron(self, bank_rad: float, seen: Seen, pressure: float) -> float:
+        error = bank_rad - seen.bank_rad
+        limit = self.roll_rate_limit_radps
+        wanted = min(max(ROLL_BANDWIDTH * error, -limit), limit)
+        self._sum("bank", error, 0.15)
+        damping = self.dynamics.roll_damping * seen.speed_mps / self.dynamics.speed_mps
+        moment = damping * wanted + 2.0 * (wanted - seen.p_radps) + 1.5 * self._sums["bank"]
+        return _clip(self.trim.aileron + moment / (self.dynamics.roll_control * pressure))
+
+    def _elevator(self, path_rad: float, seen: Seen, pressure: float) -> float:
+        turn = GRAVITY_MPS2 / seen.speed_mps * math.sin(seen.bank_rad) * math.tan(seen.bank_rad)
+        wanted = turn + PATH_BANDWIDTH * (path_rad - seen.path_rad)
+        error = wanted - seen.q_radps
+        self._sum("pitch", error, 0.6)
+        d, faster = self.dynamics, seen.speed_mps / self.dynamics.speed_mps
+        # The angle of attack that a turn needs beyond level flight's is held against the aircraft's stiffness.
+        incidence_rad = (1.0 / math.cos(seen.bank_rad) - 1.0) * GRAVITY_MPS2 / (seen.speed_mps * d.lift_slope)
+        held = d.pitch_stiffness * incidence_rad * pressure / faster + d.pitch_damping * wanted * faster
+        moment = held + 2.5 * error + 6.0 * self._sums["pitch"]
+        return _clip(self.trim.elevator - moment / (self.dynamics.pitch_control * pressure))
+
+    def _rudder(self, seen: Seen, pressure: float) -> float:
+        turn = GRAVITY_MPS2 / seen.speed_mps * math.sin(seen.bank_rad) * math.cos(seen.pitch_rad)
+        self._sum("slip", seen.slip_rad, 0.3)
+        moment = 1.0 * (turn - seen.r_radps) + 2.0 * seen.slip_rad + 1.5 * self._sums["slip"]
+        return _clip(self.trim.rudder - moment / (self.dynamics.yaw_control * pressure))
+
+    def _throttle(self, path_rad: float, seen: Seen) -> float:
+        error = self.speed_mps - seen.speed_mps
+        self._sum("speed", error, 8.0)
+        pull = GRAVITY_MPS2 * math.sin(path_rad) + 0.5 * error + 0.1 * self._sums["speed"]
+        return min(max(self.trim.throttle + pull / self.dynamics.thrust, 0.0), 1.0)
+
+    def _sum(self, name: str, error: float, limit: float) -> None:
+        total = self._sums[name] + error * self.step_s
+        self._sums[name] = min(max(total, -limit), limit)
+
+
+def _clip(value: float) -> float:
+    return min(max(value, -1.0), 1.0)
