@@ -7,19 +7,31 @@ import threading
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.cameras.intrinsics import Undistorter, load_intrinsics
+from edge.cameras.intrinsics import Intrinsics, Undistorter, load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
 from edge.config import SequenceCamera
 from edge.errors import InputError
 from edge.types import Array, CameraInfo, Frame, FrameMeta
 
 DECODED_AHEAD = 2
+DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself knows pinhole cameras alone
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePicture:
+    """A picture of a BOP scene and the camera that took it."""
+
+    path: Path
+    K: Array  # [3, 3], pixel centres at integers
+    distortion: tuple[float, ...]  # k1 k2 p1 p2 k3; empty: none
 
 
 class SequenceSource:
@@ -27,9 +39,9 @@ class SequenceSource:
 
     def __init__(self, settings: SequenceCamera) -> None:
         self._settings = settings
-        self._paths: list[Path] = []
-        self._K: list[Array] = []
+        self._pictures: list[ScenePicture] = []
         self._undistort: Undistorter | None = None
+        self._undistorted: ScenePicture | None = None  # the one whose lens `_undistort` is for
         self._image_size_wh = (0, 0)
         self._start_ns: int | None = None
         self._next = 0
@@ -39,18 +51,17 @@ class SequenceSource:
     def open(self) -> CameraInfo:
         """Read the scene's index and first picture. Raises InputError."""
         folder = self._settings.path
-        self._paths, self._K = read_scene(folder)
-        first = _decode(self._paths[0])
+        self._pictures = read_scene(folder)
+        first = _decode(self._pictures[0].path)
         self._image_size_wh = (first.shape[1], first.shape[0])
         if self._settings.intrinsics is not None:
-            intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(self._image_size_wh)
-            self._K = [intrinsics.K] * len(self._paths)
-            self._undistort = Undistorter(intrinsics)
+            given = load_intrinsics(self._settings.intrinsics).scaled_to(self._image_size_wh)
+            self._pictures = [ScenePicture(p.path, given.K, given.distortion) for p in self._pictures]
         self._decoder = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
         self._start_ns, self._next = self._settings.start_at_ns, 0
         self._ahead.clear()
         self._decode_ahead(self._next)
-        return CameraInfo(folder.name, self._image_size_wh, self._K[0], self._settings.fps)
+        return CameraInfo(folder.name, self._image_size_wh, self._pictures[0].K, self._settings.fps)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next exposed frame. Raises EndOfStream after the last, InputError on an unreadable picture."""
@@ -68,11 +79,11 @@ class SequenceSource:
         wait_until(capture_ns, stop)
         image_bgr = self._ahead.popleft()[1].result()
         if (image_bgr.shape[1], image_bgr.shape[0]) != self._image_size_wh:
-            raise InputError(f"{self._path(index)} differs in size from the first picture of the scene")
+            raise InputError(f"{self._at(index).path} differs in size from the first picture of the scene")
         self._next = index + 1
         self._decode_ahead(self._next)
         meta = FrameMeta(index, capture_ns, time.monotonic_ns())
-        return Frame(meta, image_bgr, self._K[index % len(self._K)])
+        return Frame(meta, image_bgr, self._at(index).K)
 
     def close(self) -> None:
         if self._decoder is not None:
@@ -80,10 +91,10 @@ class SequenceSource:
             self._decoder = None
 
     def _exists(self, index: int) -> bool:
-        return self._settings.loop or index < len(self._paths)
+        return self._settings.loop or index < len(self._pictures)
 
-    def _path(self, index: int) -> Path:
-        return self._paths[index % len(self._paths)]
+    def _at(self, index: int) -> ScenePicture:
+        return self._pictures[index % len(self._pictures)]
 
     def _exposure_ns(self, index: int) -> int:
         assert self._start_ns is not None
@@ -93,35 +104,65 @@ class SequenceSource:
         assert self._decoder is not None
         wanted = self._ahead[-1][0] + 1 if self._ahead else index
         while len(self._ahead) < DECODED_AHEAD and self._exists(wanted):
-            self._ahead.append((wanted, self._decoder.submit(self._picture, self._path(wanted))))
+            self._ahead.append((wanted, self._decoder.submit(self._pixels, self._at(wanted))))
             wanted += 1
 
-    def _picture(self, path: Path) -> NDArray[np.uint8]:
-        image_bgr = _decode(path)
-        return self._undistort(image_bgr) if self._undistort is not None else image_bgr
+    def _pixels(self, picture: ScenePicture) -> NDArray[np.uint8]:
+        """The picture as a pinhole camera sees it; on the decoder's one thread, which keeps the last lens's maps."""
+        image_bgr = _decode(picture.path)
+        if not any(picture.distortion):
+            return image_bgr
+        if self._undistort is None or not _same_lens(picture, self._undistorted):
+            lens = Intrinsics(picture.K, (image_bgr.shape[1], image_bgr.shape[0]), picture.distortion)
+            self._undistort, self._undistorted = Undistorter(lens), picture
+        return self._undistort(image_bgr)
 
 
-def read_scene(folder: Path) -> tuple[list[Path], list[Array]]:
-    """Pictures of a BOP scene in order and K [3, 3] of each (bop_datasets_format: scene_camera.json).
+def _same_lens(picture: ScenePicture, other: ScenePicture | None) -> bool:
+    return other is not None and picture.distortion == other.distortion and np.array_equal(picture.K, other.K)
 
-    Raises InputError when the folder is no such scene.
+
+def read_scene(folder: Path) -> list[ScenePicture]:
+    """Pictures of a BOP scene (bop_datasets_format: scene_camera.json, rgb/ or gray/) by growing number.
+
+    Raises InputError when the folder is no such scene, naming file and key.
     """
     index = folder / "scene_camera.json"
     try:
         cameras = json.loads(index.read_text(encoding="utf-8"))
-        K = {int(key): np.array(value["cam_K"], dtype=np.float64).reshape(3, 3) for key, value in cameras.items()}
+        lenses = {int(key): _camera(index, key, entry) for key, entry in cameras.items()}
     except OSError as error:
         raise InputError(f"{folder} is no BOP scene: scene_camera.json cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, AttributeError) as error:
         raise InputError(f"{index} is not as BOP writes it: {error!r}") from error
-    pictures = {int(path.stem): path for path in (folder / "rgb").glob("*") if path.stem.isdigit()}
-    if not pictures:
-        raise InputError(f"{folder} has no pictures in rgb/")
-    missing = sorted(set(pictures) - set(K))
+    paths = {
+        int(path.stem): path
+        for name in ("gray", "rgb")  # the later wins where a frame has both
+        for path in sorted((folder / name).glob("*"), reverse=True)
+        if path.stem.isdecimal() and path.suffix.lower() in _SUFFIXES
+    }
+    if not paths:
+        raise InputError(f"{folder} has no pictures in rgb/ or gray/")
+    missing = sorted(set(paths) - set(lenses))
     if missing:
         raise InputError(f"{index} has no camera for picture {missing[0]}")
-    order = sorted(pictures)
-    return [pictures[i] for i in order], [K[i] for i in order]
+    return [ScenePicture(paths[number], *lenses[number]) for number in sorted(paths)]
+
+
+def _camera(index: Path, key: str, entry: object) -> tuple[Array, tuple[float, ...]]:
+    """K [3, 3] and distortion of one picture's entry. Raises InputError."""
+    if not isinstance(entry, dict) or "cam_K" not in entry:
+        raise InputError(f"{index}: {key!r} has no 'cam_K'")
+    values = []
+    for name, size in (("cam_K", 9), (DISTORTION_KEY, 5)):
+        try:
+            numbers = np.array(entry.get(name, ()), dtype=np.float64).reshape(-1)
+        except (ValueError, TypeError):
+            numbers = np.full(1, np.nan)
+        if (name in entry and numbers.size != size) or not np.isfinite(numbers).all():
+            raise InputError(f"{index}: {name!r} of {key!r} is not {size} finite numbers")
+        values.append(numbers)
+    return values[0].reshape(3, 3), tuple(float(value) for value in values[1])
 
 
 def _decode(path: Path) -> NDArray[np.uint8]:
