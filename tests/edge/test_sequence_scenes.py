@@ -1,0 +1,109 @@
+"""BOP scenes of others as a camera: gray pictures, gaps in the numbers, lenses with distortion, broken indices."""
+
+from __future__ import annotations
+
+import json
+import threading
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.cameras.sequence import DISTORTION_KEY, SequenceSource
+from edge.cameras.source import EndOfStream
+from edge.config import IntrinsicsSettings, SequenceCamera
+from edge.errors import InputError
+from edge.types import Frame
+
+SIZE_WH = (320, 180)
+LENS = (-0.25, 0.08, 0.002, -0.001, -0.01)
+# Points on a plane 10 m ahead, well apart in the picture.
+POINTS_CAM_M = np.array([[x, y, 10.0] for x in (-4.0, -1.5, 1.5, 4.0) for y in (-2.0, 0.5, 2.0)])
+
+
+def camera(focal_px: float) -> np.ndarray:
+    return np.array([[focal_px, 0.0, 159.5], [0.0, focal_px, 89.5], [0.0, 0.0, 1.0]])
+
+
+def dots(K: np.ndarray, lens: tuple[float, ...]) -> np.ndarray:
+    """A gray picture [H, W] with a soft dot where the lens puts each point."""
+    pixels, _ = cv2.projectPoints(POINTS_CAM_M, np.zeros(3), np.zeros(3), K, np.array(lens))
+    x, y = np.meshgrid(np.arange(SIZE_WH[0]), np.arange(SIZE_WH[1]))
+    apart2 = ((np.stack([x, y], axis=-1)[:, :, None] - pixels.reshape(-1, 2)) ** 2).sum(axis=-1)
+    return (255 * np.exp(-apart2 / 8.0)).sum(axis=-1).clip(0, 255).astype(np.uint8)
+
+
+def centroid(image_bgr: np.ndarray, near_px: np.ndarray) -> np.ndarray:
+    left, top = np.round(near_px).astype(int) - 5
+    weight = image_bgr[top : top + 11, left : left + 11, 0].astype(float)
+    y, x = np.mgrid[0:11, 0:11]
+    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum() + (left, top)
+
+
+def play(folder: Path, intrinsics: IntrinsicsSettings | None = None) -> list[Frame]:
+    frames = []
+    settings = SequenceCamera(type="sequence", path=folder, fps=4, intrinsics=intrinsics)
+    with closing(SequenceSource(settings)) as source:
+        source.open()
+        try:
+            while True:
+                frames.append(source.read(threading.Event()))
+        except EndOfStream:
+            return frames
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Pictures 7, 20 and 21, gray, by another lens each; a camera for picture 3 too, that is not there."""
+    folder = tmp_path / "000012"
+    (folder / "gray").mkdir(parents=True)
+    cameras = {}
+    for image_id, focal_px, lens in ((7, 300.0, LENS), (20, 300.0, None), (21, 320.0, LENS), (3, 300.0, None)):
+        K = camera(focal_px)
+        cameras[str(image_id)] = {"cam_K": K.ravel().tolist()} | ({} if lens is None else {DISTORTION_KEY: lens})
+        if image_id != 3:
+            cv2.imwrite(str(folder / "gray" / f"{image_id:04d}.tif"), dots(K, lens or (0.0,) * 5))
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    return folder
+
+
+def test_every_frame_is_as_its_pinhole_camera_would_see_it(scene: Path) -> None:
+    frames = play(scene)
+    assert [frame.K[0, 0] for frame in frames] == [300.0, 300.0, 320.0]
+    for frame in frames:
+        seen = POINTS_CAM_M @ frame.K.T
+        for expected in seen[:, :2] / seen[:, 2:]:
+            np.testing.assert_allclose(centroid(frame.image_bgr, expected), expected, atol=0.25)
+
+
+def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) -> None:
+    plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
+    frames = play(scene, plain)
+    assert [frame.K[0, 0] for frame in frames] == [310.0] * 3
+    # Its lens has no distortion, so the pixels stay what they are on disk.
+    np.testing.assert_array_equal(frames[0].image_bgr[:, :, 0], dots(camera(300.0), LENS))
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({}, r"scene_camera\.json: '7' has no 'cam_K'"),
+        ({"cam_K": [1, 0, 0]}, r"'cam_K' of '7' is not 9 finite numbers"),
+        ({"cam_K": [float("nan")] * 9}, r"'cam_K' of '7' is not 9 finite numbers"),
+        ({"cam_K": np.eye(3).ravel().tolist(), DISTORTION_KEY: [0.1, "a"]}, rf"'{DISTORTION_KEY}' of '7' is not 5"),
+    ],
+)
+def test_a_broken_index_is_told_with_file_and_key(scene: Path, entry: dict[str, object], said: str) -> None:
+    (scene / "scene_camera.json").write_text(json.dumps({"7": entry}))
+    with pytest.raises(InputError, match=said):
+        SequenceSource(SequenceCamera(type="sequence", path=scene)).open()
+
+
+def test_a_picture_without_a_camera_is_told(scene: Path) -> None:
+    cameras = json.loads((scene / "scene_camera.json").read_text())
+    del cameras["20"]
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    with pytest.raises(InputError, match="no camera for picture 20"):
+        SequenceSource(SequenceCamera(type="sequence", path=scene)).open()
