@@ -1,0 +1,158 @@
+"""One MCAP file that is readable up to its last flush, however the program ends."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import os
+import struct
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Chunk, DataEnd, Footer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from msgs.definitions import DEFINITIONS
+
+_RECORD_HEAD = struct.Struct("<BQ")
+_PROFILE = "ros2"
+
+
+class McapFile:
+    """A file being written; every method may raise OSError. Nothing is compressed: CDR floats hardly shrink."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._stream = _Stream(path)
+        self._writer = Writer(self._stream, compression=CompressionType.NONE)  # type: ignore[arg-type]
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        try:
+            self._writer.start(profile=_PROFILE, library="uavpose")
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file, without the chunk that is gathered."""
+        return self._stream.tell()
+
+    def write(self, name: str, ros_type: str, payload: bytes, log_ns: int, publish_ns: int) -> None:
+        """Add a CDR payload of the topic `/name`; times are UTC."""
+        channel = self._channels.get(name)
+        if channel is None:
+            channel = self._channels[name] = self._register(name, ros_type)
+        self._writer.add_message(channel, log_ns, payload, publish_ns)
+
+    def flush(self) -> None:
+        """Put all that was written on the disk as a chunk."""
+        self._writer.flush()
+        self._stream.sync()
+
+    def close(self) -> None:
+        """Write the index and close."""
+        try:
+            self._writer.finish()
+            self._stream.sync()
+        finally:
+            self._stream.close()
+
+    def abandon(self) -> None:
+        """Close with what is whole: for when writing has failed. Raises nothing."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+        with contextlib.suppress(OSError):
+            finish_unfinished(self.path)
+
+    def _register(self, name: str, ros_type: str) -> int:
+        if ros_type not in self._schemas:
+            definition = DEFINITIONS[ros_type].encode()
+            self._schemas[ros_type] = self._writer.register_schema(ros_type, "ros2msg", definition)
+        return self._writer.register_channel(f"/{name}", "cdr", self._schemas[ros_type])
+
+
+class _Stream:
+    """What mcap's writer writes to. Unlike Python's files it holds nothing back, so a full disk is told where it is
+    met, and closing it does not try again."""
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        # While it is held, no other recorder takes the file for one that a crash left.
+        fcntl.flock(self._fd, fcntl.LOCK_EX)
+        self._at = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            written = os.write(self._fd, rest)
+            self._at += written
+            rest = rest[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def sync(self) -> None:
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+def finish_unfinished(path: Path) -> bool:
+    """Make a file that a crash left unfinished whole: cut the torn record off and write the end; whether it was one.
+
+    Readers without an index read all. A file that somebody writes to is left alone; one without any record is
+    removed. Raises OSError.
+    """
+    with open(path, "r+b") as file:
+        try:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        size = os.fstat(file.fileno()).st_size
+        if size > 2 * len(MCAP0_MAGIC):
+            file.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+            if file.read() == MCAP0_MAGIC:
+                return False
+        whole = _whole_bytes(file, size)
+        if whole > 0:
+            ending = RecordBuilder()
+            DataEnd(0).write(ending)
+            Footer(0, 0, 0).write(ending)
+            file.truncate(whole)
+            file.seek(whole)
+            file.write(ending.end() + MCAP0_MAGIC)
+            return True
+    path.unlink()
+    return True
+
+
+def _whole_bytes(file: BinaryIO, size: int) -> int:
+    """Where the last whole chunk, or else the header, ends; 0 without one. A file system may have left zeros in the
+    place of what was never written."""
+    file.seek(0)
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        return 0
+    whole, end = 0, len(MCAP0_MAGIC)
+    while len(head := file.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
+        opcode, length = _RECORD_HEAD.unpack(head)
+        end += _RECORD_HEAD.size + length
+        if opcode not in (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX) or end > size:
+            break
+        if opcode == Opcode.CHUNK:
+            chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
+            if zlib.crc32(chunk.data) != chunk.uncompressed_crc:
+                break
+        if opcode != Opcode.MESSAGE_INDEX:
+            whole = end
+        file.seek(end)
+    return whole

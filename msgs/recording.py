@@ -1,0 +1,225 @@
+"""Recording samples as MCAP with the ROS 2 profile: the same CDR bytes as on the wire, under the same topic names.
+
+A thread of its own writes; `record` never waits. Each second what came is a chunk on disk, so a crash loses at most
+that; files left unfinished are closed at the next start. A full disk ends the recording, never the program.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from msgs import topics
+from msgs.mcap_file import McapFile, finish_unfinished
+from msgs.topics import Topic
+
+log = logging.getLogger(__name__)
+
+WAITING_MAX = 4096  # samples, for a disk that stalls
+FLUSH_S = 1.0
+RETRY_S = 10.0
+STOP_TIMEOUT_S = 10.0
+
+WhenFull = Literal["oldest", "stop"]
+Tell = Callable[[int, str], None]
+
+
+@dataclass(frozen=True)
+class RecordingLimits:
+    """When a file ends and the next begins, and how much of the disk all of them may take."""
+
+    file_bytes_max: int = 256 * 1024**2
+    file_seconds_max: float = 600.0
+    total_bytes_max: int | None = None  # of all files of this recorder; None: only the disk's end counts
+    free_bytes_min: int = 1024**3  # left on the disk for others
+    when_full: WhenFull = "oldest"  # remove the oldest recordings, or stop
+
+
+@dataclass(frozen=True)
+class Sample:
+    topic: Topic
+    name: str  # with vehicle and target
+    payload: bytes
+    log_ns: int  # UTC, when it was recorded
+    publish_ns: int  # UTC, when it was put
+
+
+class Recorder:
+    """Writes `<stem>_<number>_<UTC>.mcap` files into a folder; used from any thread.
+
+    `tell(level, text)` hears what an operator should know (levels as in rcl_interfaces/Log), on the recorder's thread.
+    """
+
+    def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell) -> None:
+        self._store = Store(folder, stem, limits)
+        self._limits = limits
+        self._tell = tell
+        self._changed = threading.Condition()
+        self._waiting: deque[Sample] = deque()
+        self._counters: Counter[str] = Counter()
+        self._wanted = True
+        self._stopping = False
+        self._woken = False
+        self._file: McapFile | None = None
+        self._opened_s = 0.0
+        self._retry_s = 0.0
+        self._failure: str | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def recording(self) -> bool:
+        """Whether what comes is written: wanted, and the disk lets it."""
+        with self._changed:
+            return self._wanted and self._failure is None and not self._stopping
+
+    def start(self) -> None:
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def record(self, topic: Topic, uav: str, target: str | None, payload: bytes, publish_ns: int) -> None:
+        """Take a sample to be written; never waits. Lost, and counted, when the disk is far behind."""
+        sample = Sample(topic, topics.topic_name(topic, uav, target), payload, time.time_ns(), publish_ns)
+        with self._changed:
+            if not self._wanted or self._stopping or self._failure is not None:
+                self._counters["not_recorded"] += 1
+            elif len(self._waiting) >= WAITING_MAX:
+                self._counters["lost"] += 1
+            else:
+                # Nobody is woken: the writer comes by each second.
+                self._waiting.append(sample)
+
+    def switch(self, on: bool) -> None:
+        """Go on with a new file, or end the present one; returns at once."""
+        with self._changed:
+            self._wanted = on
+            self._woken = True
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """Write what waits and close the file. May be called twice, or without start."""
+        with self._changed:
+            self._stopping = self._woken = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(STOP_TIMEOUT_S)
+            self._thread = None
+
+    def counters(self) -> dict[str, int]:
+        with self._changed:
+            return {"recorded": 0, **self._counters}
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._woken, FLUSH_S)
+                self._woken = False
+                samples, self._waiting = self._waiting, deque()
+                go_on, stopping = self._wanted and not self._stopping, self._stopping
+            try:
+                self._turn(samples, go_on)
+                with self._changed:
+                    self._counters["recorded"] += len(samples)
+            except OSError as error:
+                self._fail(error, len(samples))
+            if stopping:
+                return
+
+    def _turn(self, samples: deque[Sample], go_on: bool) -> None:
+        """One second's work: write, put it on the disk, and begin another file where the limits say."""
+        if samples or (self._failure is not None and go_on):
+            self._open()
+        if self._file is None:
+            return
+        for sample in samples:
+            self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
+        self._file.flush()
+        aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
+        if not go_on or aged or self._file.size >= self._limits.file_bytes_max:
+            file, self._file = self._file, None
+            file.close()
+        elif samples:
+            self._store.make_room(self._file)
+
+    def _open(self) -> None:
+        now_s = time.monotonic()
+        if self._file is not None or (self._failure is not None and now_s < self._retry_s):
+            return
+        self._store.finish_unfinished()
+        self._store.make_room(None)
+        self._file = self._store.new_file()
+        self._opened_s = now_s
+        if self._failure is not None:
+            self._set_failure(None)
+            self._tell(logging.INFO, "recording again")
+
+    def _fail(self, error: OSError, lost: int) -> None:
+        """Leave what is whole on the disk, say so once, and try again later."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            file.abandon()
+        self._retry_s = time.monotonic() + RETRY_S
+        first = self._failure is None
+        self._set_failure(error.strerror or str(error), lost)
+        if first:
+            log.warning("recording stopped: %s", error)
+            self._tell(logging.ERROR, f"recording stopped: {self._failure}")
+
+    def _set_failure(self, failure: str | None, lost: int = 0) -> None:
+        with self._changed:
+            self._failure = failure
+            if failure is not None:
+                self._counters["failures"] += 1
+                self._counters["lost"] += lost + len(self._waiting)
+                self._waiting.clear()
+
+
+class Store:
+    """The folder: numbered files, the oldest first to go. Numbers, since a clock may be wrong or be set back."""
+
+    def __init__(self, folder: Path, stem: str, limits: RecordingLimits) -> None:
+        self._folder = folder
+        self._stem = stem
+        self._limits = limits
+        self._name = re.compile(rf"{re.escape(stem)}_(\d{{6,}})_.*\.mcap")
+
+    def files(self) -> list[Path]:
+        """This recorder's files, oldest first."""
+        numbered = [
+            (int(match[1]), path) for path in self._folder.iterdir() if (match := self._name.fullmatch(path.name))
+        ]
+        return [path for _, path in sorted(numbered)]
+
+    def finish_unfinished(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for path in self.files():
+            finish_unfinished(path)
+
+    def new_file(self) -> McapFile:
+        files = self.files()
+        last = self._name.fullmatch(files[-1].name) if files else None
+        number = int(last[1]) + 1 if last is not None else 0
+        began = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        return McapFile(self._folder / f"{self._stem}_{number:06d}_{began}.mcap")
+
+    def make_room(self, current: McapFile | None) -> None:
+        """Keep to the limits, by removing the oldest if they may go. Raises OSError when there is no room."""
+        files = [path for path in self.files() if current is None or path != current.path]
+        while self._is_full():
+            if self._limits.when_full == "stop" or not files:
+                raise OSError("no room left for recordings")
+            files.pop(0).unlink()
+
+    def _is_full(self) -> bool:
+        if shutil.disk_usage(self._folder).free < self._limits.free_bytes_min:
+            return True
+        total_max = self._limits.total_bytes_max
+        return total_max is not None and sum(path.stat().st_size for path in self.files()) > total_max

@@ -1,0 +1,225 @@
+"""Recordings as mcap's own reader and rosbags read them, after kills and on full disks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
+
+from msgs import recording, topics
+from msgs.definitions import DEFINITIONS
+from msgs.mcap_file import McapFile, finish_unfinished
+from msgs.recording import Recorder, RecordingLimits
+
+from . import make_definitions
+from .conftest import pose_now, until
+from .ros_oracle import STORE, deserialize, serialize
+
+ROOM = RecordingLimits(free_bytes_min=0)
+
+
+def read(path: Path) -> list[tuple[str, str, bytes, int]]:
+    """(topic, schema's name, payload, log time) of each message."""
+    with open(path, "rb") as file:
+        return [(c.topic, s.name if s else "", m.data, m.log_time) for s, c, m in make_reader(file).iter_messages()]
+
+
+def test_definitions_are_those_of_the_interfaces() -> None:
+    assert make_definitions.PATH.read_text() == make_definitions.definitions()
+    assert {topic.ros_type for topic in topics.TOPICS} == set(DEFINITIONS)
+
+
+def record_some(recorder: Recorder, payloads: list[bytes]) -> None:
+    for payload in payloads:
+        recorder.record(topics.POSE, "uav1", "t0", payload, time.time_ns())
+
+
+def test_a_recording_holds_the_bytes_that_were_sent_and_ros_reads_them(tmp_path: Path) -> None:
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path / "new", "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    payloads = [pose_now(z).encode() for z in (250.0, 251.0, 252.0)]
+    record_some(recorder, payloads)
+    recorder.record(topics.EVENTS, "uav1", None, b"an event", time.time_ns())
+    recorder.stop()
+    (path,) = (tmp_path / "new").iterdir()
+    came = read(path)
+    assert [data for topic, _, data, _ in came if topic == "/uav1/target/t0/pose"] == payloads
+    assert Counter(topic for topic, *_ in came) == {"/uav1/target/t0/pose": 3, "/uav1/events": 1}
+    assert recorder.counters() == {"recorded": 4}
+    assert told == []
+    with open(path, "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+    assert summary is not None
+    for schema in summary.schemas.values():
+        assert (schema.encoding, schema.data.decode()) == (
+            "ros2msg",
+            STORE.generate_msgdef(schema.name, ros_version=2)[0],
+        )
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+    message = deserialize(came[0][2], came[0][1])
+    assert serialize(message) == payloads[0]
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from msgs import topics
+from msgs.recording import Recorder, RecordingLimits
+recorder = Recorder(Path(sys.argv[1]), "uav1", RecordingLimits(free_bytes_min=0), print)
+recorder.start()
+n = 0
+while True:
+    recorder.record(topics.EVENTS, "uav1", None, n.to_bytes(4, "little"), time.time_ns())
+    n += 1
+    print(n, recorder.counters()["recorded"], flush=True)
+    time.sleep(0.005)
+"""
+
+
+def test_a_killed_recorder_loses_at_most_a_second_and_the_next_start_makes_the_file_whole(tmp_path: Path) -> None:
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    on_disk = 0
+    try:
+        for line in writer.stdout:
+            on_disk = int(line.split()[1])
+            if on_disk >= 100:
+                break
+    finally:
+        writer.kill()
+        writer.wait()
+    (path,) = tmp_path.iterdir()
+    torn = path.read_bytes()
+    # As a kill in the middle of a write leaves it.
+    path.write_bytes(torn + b"\x06" + (1000).to_bytes(8, "little") + b"half of a chunk")
+    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder.start()
+    recorder.record(topics.EVENTS, "uav1", None, b"next", time.time_ns())
+    recorder.stop()
+    numbers = [int.from_bytes(data, "little") for *_, data, _ in read(path)]
+    assert len(numbers) >= on_disk
+    assert numbers == list(range(len(numbers)))
+    first, second = sorted(tmp_path.iterdir())
+    assert (first, [data for *_, data, _ in read(second)]) == (path, [b"next"])
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> bytes:
+    file = McapFile(tmp_path / "whole.mcap")
+    for n in range(3):
+        file.write("uav1/events", "rcl_interfaces/msg/Log", bytes([n]), n, n)
+        file.flush()
+    file.close()
+    return (tmp_path / "whole.mcap").read_bytes()
+
+
+def test_a_file_cut_anywhere_is_readable_once_finished(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "cut.mcap"
+    lengths = []
+    for size in range(0, len(whole), 7):
+        path.write_bytes(whole[:size] + bytes(size % 3 * 50))
+        assert finish_unfinished(path)
+        lengths.append(len(read(path)) if path.exists() else 0)
+        if path.exists():
+            assert not finish_unfinished(path)
+    assert lengths == sorted(lengths)
+    assert set(lengths) == {0, 1, 2, 3}
+
+
+def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    file = McapFile(tmp_path / "live.mcap")
+    file.write("uav1/events", "rcl_interfaces/msg/Log", b"a", 1, 1)
+    assert not finish_unfinished(file.path)
+    file.close()
+    assert len(read(file.path)) == 1
+
+
+def test_files_rotate_by_size_and_the_oldest_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    limits = RecordingLimits(file_bytes_max=20_000, total_bytes_max=60_000, free_bytes_min=0)
+    (tmp_path / "of_somebody_else.mcap").write_bytes(bytes(50_000))
+    recorder = Recorder(tmp_path, "uav1", limits, print)
+    recorder.start()
+    sent: list[int] = []
+
+    def step() -> None:
+        sent.append(len(sent))
+        recorder.record(topics.EVENTS, "uav1", None, sent[-1].to_bytes(4, "little") + bytes(2000), time.time_ns())
+
+    until(lambda: "000008" in "".join(path.name for path in tmp_path.iterdir()), step)
+    recorder.stop()
+    ours = sorted(path for path in tmp_path.iterdir() if path.name.startswith("uav1_"))
+    assert ours[0].name[:11] > "uav1_000000"
+    assert sum(path.stat().st_size for path in ours) <= 60_000 + 2 * 20_000
+    numbers = [int.from_bytes(data[:4], "little") for path in ours for *_, data, _ in read(path)]
+    assert numbers == sent[-len(numbers) :]
+    assert (tmp_path / "of_somebody_else.mcap").exists()
+
+
+def test_switching_off_ends_the_file_and_on_begins_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder.start()
+    record_some(recorder, [b"first"])
+    until(lambda: recorder.counters()["recorded"] == 1)
+    recorder.switch(False)
+    (path,) = tmp_path.iterdir()
+    until(lambda: path.stat().st_size > 500 and path.read_bytes().endswith(MCAP0_MAGIC))
+    record_some(recorder, [b"unheard"])
+    recorder.switch(True)
+    record_some(recorder, [b"second"])
+    recorder.stop()
+    assert [data for path in sorted(tmp_path.iterdir()) for *_, data, _ in read(path)] == [b"first", b"second"]
+    assert recorder.counters() == {"recorded": 2, "not_recorded": 1}
+
+
+def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.05)
+    told: list[tuple[int, str]] = []
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    recorder = Recorder(folder, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    record_some(recorder, [b"before"])
+    until(lambda: recorder.counters()["recorded"] == 1)
+    full = os.open("/dev/full", os.O_WRONLY)
+    real_write = os.write
+    monkeypatch.setattr(os, "write", lambda _, data: real_write(full, data))
+    until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
+    assert not recorder.recording
+    until(lambda: recorder.counters().get("failures", 0) >= 3)
+    assert told == [(40, "recording stopped: No space left on device")]
+    monkeypatch.setattr(os, "write", real_write)
+    os.close(full)
+    until(lambda: len(told) == 2)
+    assert told[1] == (20, "recording again")
+    record_some(recorder, [b"after"])
+    recorder.stop()
+    kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
+    assert (kept[0], kept[-1]) == (b"before", b"after")
+    assert b"lost" not in kept
+
+
+def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    told: list[tuple[int, str]] = []
+    limits = RecordingLimits(free_bytes_min=2**62, when_full="stop")
+    recorder = Recorder(tmp_path, "uav1", limits, lambda *event: told.append(event))
+    recorder.start()
+    record_some(recorder, [b"one"])
+    until(lambda: told == [(40, "recording stopped: no room left for recordings")])
+    recorder.stop()
+    assert recorder.counters()["lost"] == 1
