@@ -16,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES
-from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window, outline_px, visible_share
-from sim_replay.render.renderer import Rendered, Renderer, extents_px
-from sim_replay.render.scene import Camera, Scene
-from sim_replay.render.sensor import Sensor, add_distractors, exposed, sensor_from
+from sim_replay.render.distractors import add_distractors
+from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
+from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
+from sim_replay.render.projection import extents_px
+from sim_replay.render.renderer import Rendered, Renderer
+from sim_replay.render.scene import Camera, Target
+from sim_replay.render.sensor import exposed, sensor_from
 from sim_replay.sample import SampleBatch
 
-MASK_COVERAGE_MIN = 64  # of 255: a quarter of the pixel, so that thin wings stay in the mask
+__all__ = ["WindowSampler", "render_frame"]
+
 TILES = (4, 4)
 
 
@@ -41,29 +45,27 @@ def _labels_blank(count: int, height_px: int, width_px: int) -> dict[str, NDArra
     }
 
 
-def visible_box(scene: Scene, camera: Camera, mask: NDArray[np.bool_]) -> NDArray[np.float32] | None:
-    """[4] box of the first target; None if nothing of it is seen.
-
-    A target wholly inside the image has the box of its outline, exact to a fraction of a pixel; one that the image
-    cuts has the box of its mask.
-    """
-    if not mask.any():
-        return None
-    height, width = mask.shape
-    outline = extents_px(outline_px(scene.targets[0], camera))
-    if outline and min(outline[:2]) >= -0.5 and outline[2] <= width - 0.5 and outline[3] <= height - 0.5:
-        return np.asarray(outline, np.float32)
-    x, y = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return np.array([x[0] - 0.5, y[0] - 0.5, x[-1] + 0.5, y[-1] + 0.5], np.float32)
+def _box(target: Target, camera: Camera, mask: NDArray[np.bool_], hidden: bool) -> Box | None:
+    """That of the outline, exact to a fraction of a pixel, where nothing cuts or hides it; else that of the mask."""
+    outline = extents_px(outline_px(target, camera))
+    box = mask_extents_px(mask)
+    whole = box is not None and not hidden and is_inside(outline, camera.width_px, camera.height_px)
+    return outline if whole else box
 
 
 def _write_target(
-    out: dict[str, NDArray], k: int, scene: Scene, camera: Camera, mask: NDArray[np.bool_], noc: NDArray
+    out: dict[str, NDArray],
+    k: int,
+    window: Window,
+    camera: Camera,
+    mask: NDArray[np.bool_],
+    noc: NDArray,
+    hidden: bool,
 ) -> None:
-    box = visible_box(scene, camera, mask)
+    target = window.scene.targets[0]
+    box = _box(target, camera, mask, hidden)
     if box is None:
         return
-    target = scene.targets[0]
     out["present"][k] = True
     out["box_xyxy_px"][k] = box
     out["R_cam_target"][k], out["t_cam_target_m"][k] = target.pose_in(camera)
@@ -127,44 +129,20 @@ class WindowSampler:
         rng = np.random.default_rng([window.scene.sensor_seed, self.seed])
         image, coverage = rendered.image_bgr[tile, :side, :side], rendered.coverage[tile, :side, :side]
         noc = rendered.coordinate[tile, :side, :side]
+        # The target's number stays where cloud hides it, its coverage does not.
+        whole_px = int(np.count_nonzero(rendered.target[tile, :side, :side]))
+        clear = int(np.count_nonzero(coverage)) / max(whole_px, 1)
         if window.distractors:
             image = add_distractors(image, coverage, rng)
-        image = exposed(image, sensor_from(rng), window.native_scale, rng)
+        image = exposed(image, sensor_from(rng, window.quality), window.native_scale, rng)
         camera = window.scene.camera
         if side < size:
             image = np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.uint8)
             coverage, noc = _enlarged(coverage, noc, size)
             camera = Camera(crop_K(camera.K, 0.0, 0.0, size / side), size, size, camera.R_ned_cam, camera.t_ned_cam_m)
         out["image_bgr"][k], out["K"][k] = image, camera.K
-        if window.visible_share >= VISIBLE_SHARE_MIN:
-            _write_target(out, k, window.scene, camera, coverage >= MASK_COVERAGE_MIN, noc)
-
-
-_frame_renderers: dict[tuple[int, int], Renderer] = {}
-
-
-def render_frame(scene: Scene, sensor: Sensor | None = None) -> SampleBatch:
-    """A whole frame, batch of one, labelled with the scene's first target.
-
-    The sky, the ground and the camera (unless given) depend on the scene's values alone, so the frames of a sequence
-    that share an environment and a sensor seed show one world; only the noise follows `frame_index`.
-    """
-    camera = scene.camera
-    size = (camera.width_px, camera.height_px)
-    if size not in _frame_renderers:
-        _frame_renderers[size] = Renderer(*size, 1, 1)
-    rendered = _frame_renderers[size].draw([scene])
-    out = _labels_blank(1, camera.height_px, camera.width_px)
-    chosen = sensor or sensor_from(np.random.default_rng([scene.sensor_seed, 1]))
-    out["image_bgr"][0] = exposed(
-        rendered.image_bgr[0], chosen, 1.0, np.random.default_rng([scene.sensor_seed, 2, scene.frame_index])
-    )
-    out["K"][0] = camera.K
-    if scene.targets:
-        mask = (rendered.coverage[0] >= MASK_COVERAGE_MIN) & (rendered.target[0] == 1)
-        if visible_share(outline_px(scene.targets[0], camera), *size) >= VISIBLE_SHARE_MIN:
-            _write_target(out, 0, scene, camera, mask, rendered.coordinate[0])
-    return SampleBatch(**out)
+        if window.visible_share * clear >= VISIBLE_SHARE_MIN:
+            _write_target(out, k, window, camera, coverage >= MASK_COVERAGE_MIN, noc, hidden=clear < 1.0)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

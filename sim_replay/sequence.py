@@ -21,12 +21,9 @@ from edge.tracking.geodesy import lat_lon_alt_from_ned
 from msgs.geometry import R_from_euler, q_wxyz_from_R, so3_log
 from sim_replay.airframes import AIRFRAMES, airframe_id
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter, write_camera, write_models
-from sim_replay.render.placing import outline_px
-from sim_replay.render.renderer import extents_px
+from sim_replay.render.frame import RenderedFrame, render_frame
 from sim_replay.render.scene import Camera, Environment, Scene, Target, environment_from_seed
 from sim_replay.render.sensor import Sensor
-from sim_replay.sample import SampleBatch
-from sim_replay.sampler import render_frame
 from sim_replay.telemetry import Telemetry, write_telemetry
 
 Array = NDArray[np.float64]
@@ -171,22 +168,21 @@ def telemetry(seed: int) -> Telemetry:
     return Telemetry(t_ns, values)
 
 
-def bop_frame(scene: Scene, batch: SampleBatch, object_id: int) -> BopFrame:
-    """The BOP record of a rendered frame whose only target nothing hides."""
-    camera, target = scene.camera, scene.targets[0]
+def bop_frame(scene: Scene, rendered: RenderedFrame, object_id: int) -> BopFrame:
+    """The BOP record of a rendered frame whose only target is an object of that id."""
+    camera, seen = scene.camera, rendered.targets[0]
     R_cam_ned = camera.R_ned_cam.T
-    R_cam_target, t_cam_target_m = target.pose_in(camera)
-    outline = extents_px(outline_px(target, camera))
-    visible = bool(batch.present[0])
-    seen = BopTarget(
+    R_cam_target, t_cam_target_m = scene.targets[0].pose_in(camera)
+    target = BopTarget(
         object_id,
         R_cam_target,
         t_cam_target_m,
-        box_visible_xyxy_px=batch.box_xyxy_px[0].astype(np.float64) if visible else None,
-        box_whole_xyxy_px=None if outline is None else np.asarray(outline),
-        visible_px=int(batch.mask[0].sum()),
+        box_visible_xyxy_px=None if seen.box_visible_xyxy_px is None else np.asarray(seen.box_visible_xyxy_px),
+        box_whole_xyxy_px=None if seen.box_whole_xyxy_px is None else np.asarray(seen.box_whole_xyxy_px),
+        visible_px=seen.visible_px,
+        whole_px=seen.whole_px,
     )
-    return BopFrame(scene.frame_index, camera.K, (seen,), R_cam_ned, -R_cam_ned @ camera.t_ned_cam_m)
+    return BopFrame(scene.frame_index, camera.K, (target,), R_cam_ned, -R_cam_ned @ camera.t_ned_cam_m)
 
 
 def _sequence_toml(seed: int, command: str) -> str:
@@ -216,9 +212,11 @@ def generate(folder: Path, seed: int, jpeg_quality: int, command: str) -> None:
     object_id = airframe_id(AIRFRAME) + 1
     with SceneWriter(folder, jpeg_quality) as writer:
         for scene in shown:
-            batch = render_frame(scene, SENSOR)
-            writer.add(bop_frame(scene, batch, object_id), batch.image_bgr[0], [batch.mask[0]])
-    write_models(folder / "models", {object_id: AIRFRAMES[object_id - 1].mesh()})
+            rendered = render_frame(scene, SENSOR)
+            writer.add(
+                bop_frame(scene, rendered, object_id), rendered.image_bgr, [t.mask_visib for t in rendered.targets]
+            )
+    write_models(folder / "models", {object_id: AIRFRAMES[object_id - 1].mesh()}, {object_id: AIRFRAME})
     write_camera(folder / "camera.json", shown[0].camera.K, WIDTH_PX, HEIGHT_PX)
     write_telemetry(folder / "telemetry.csv", telemetry(seed))
     (folder / "sequence.toml").write_text(_sequence_toml(seed, command), encoding="utf-8")

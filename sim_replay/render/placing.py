@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from msgs.geometry import R_from_euler, so3_exp
-from sim_replay.render.renderer import extents_px, project_px, solid_vertices_m
+from sim_replay.render.frame import outline_px
+from sim_replay.render.projection import extents_px, solid_vertices_m
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
+from sim_replay.render.sensor import Quality
 
 Array = NDArray[np.float64]
 Kind = Literal["track", "acquire"]
@@ -23,6 +25,8 @@ BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame; its mean 
 WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = 3.0
 VISIBLE_SHARE_MIN = 0.35
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Window:
     native_scale: float  # rendered pixels per native pixel, at most 1
     visible_share: float  # share of the target's outline inside the window; 0 without a target
     distractors: bool
+    quality: Quality
 
 
 def crop_K(K: Array, x0_px: float, y0_px: float, scale: float) -> Array:
@@ -99,12 +104,7 @@ def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int]) -> Scene:
     t_ned_cam_m = np.array([rng.uniform(-4000, 4000), rng.uniform(-4000, 4000), -height_m])
     target = Target(airframe_id, int(rng.integers(2**31)), R_ned_body, t_ned_cam_m + range_m * los)
     camera = Camera(K, FRAME_WIDTH_PX, FRAME_HEIGHT_PX, R_ned_cam, t_ned_cam_m)
-    return Scene(camera, (target,), environment_from_seed(int(rng.integers(2**31))))
-
-
-def outline_px(target: Target, camera: Camera) -> Array:
-    """Projected vertices [V, 2] of the target without its propeller disc."""
-    return project_px(solid_vertices_m(target.airframe_id), *target.pose_in(camera), camera.K)
+    return Scene(camera, (target,), environment_from_seed(int(rng.integers(2**31)), sight_ned=los))
 
 
 def visible_share(pixels: Array, width_px: int, height_px: int) -> float:
@@ -161,4 +161,5 @@ def draw_window(
     if share == 0.0:
         targets = ()
     scene = Scene(camera, targets, frame.environment, int(rng.integers(2**31)), index)
-    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors)
+    quality = QUALITIES[int(rng.choice(len(QUALITIES), p=QUALITY_SHARES))]
+    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors, quality)

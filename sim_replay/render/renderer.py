@@ -1,6 +1,8 @@
-"""Draws scenes as tiles of one framebuffer: aircraft supersampled, surroundings at pixel resolution, one readback.
+"""Draws scenes with OpenGL: aircraft supersampled, surroundings at pixel resolution.
 
-Runs on whatever EGL offers: a GPU, or Mesa's llvmpipe. The context belongs to the process and thread that made it.
+Windows are drawn many at a time as tiles of one framebuffer. A whole frame is drawn in layers, each target alone, so
+that what hides what is known. Runs on whatever EGL offers: a GPU, or Mesa's llvmpipe. The context belongs to the
+process and thread that made it.
 """
 
 from __future__ import annotations
@@ -14,12 +16,24 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.airframes import AIRFRAMES, Part
-from sim_replay.airframes.livery import livery_from_seed
-from sim_replay.render.scene import Camera, Environment, Scene, Target
+from sim_replay.airframes import AIRFRAMES, Mesh, Part
+from sim_replay.render.backdrop import Backdrop, load_backdrop
+from sim_replay.render.packing import (
+    columns,
+    noise_texture,
+    packed_environment,
+    packed_livery,
+    sun_basis,
+    write_lens,
+    write_rows,
+)
+from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, fine_mesh, project_px
+from sim_replay.render.scene import Camera, Scene, Target
 
 Array = NDArray[np.float64]
-NEAREST_VERTEX_M = 1.0
+Crop = tuple[int, int, int, int]  # x0, y0, x1, y1, pixels
+SUN_THAT_CASTS_SHADOW = 0.2
+_NOISE_UNIT, _COLOUR_UNIT, _COORDINATE_UNIT, _SHADOW_UNIT, _SKY_UNIT, _BACKDROP_UNIT = range(6)
 
 
 @dataclass(frozen=True)
@@ -32,88 +46,23 @@ class Rendered:
     target: NDArray[np.uint8]  # [N, H, W], 0: none, k: the scene's k-th target
 
 
-def solid_vertices_m(airframe_id: int) -> Array:
-    """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds."""
-    mesh = AIRFRAMES[airframe_id].mesh()
-    return mesh.vertices_m[mesh.part != Part.PROPELLER_DISC].astype(np.float64)
+@dataclass(frozen=True)
+class Layer:
+    """One aircraft alone, as if nothing hid it, in a crop of the frame."""
+
+    x0_px: int
+    y0_px: int
+    colour_bgr: NDArray[np.uint8]  # [h, w, 3], gamma 2, premultiplied by the cover
+    cover: NDArray[np.float32]  # [h, w], share of the pixel's light that it takes, propeller disc included
+    solid: NDArray[np.uint8]  # [h, w], share of the pixel that is aircraft, 255: all; without the propeller disc
 
 
-def project_px(points_m: Array, R_cam_body: Array, t_cam_body_m: Array, K: Array) -> Array:
-    """Body points [V, 3] to pixels [V, 2]; NaN for points less than a metre ahead of the camera."""
-    cam = points_m @ R_cam_body.T + t_cam_body_m
-    depth = np.where(cam[:, 2:] < NEAREST_VERTEX_M, np.nan, cam[:, 2:])
-    return (cam / depth) @ K.T[:, :2]
-
-
-def extents_px(pixels: Array) -> tuple[float, float, float, float] | None:
-    """(x0, y0, x1, y1) of projected points [V, 2], or None if any lies behind the camera."""
-    if not np.all(np.isfinite(pixels)):
-        return None
-    (x0, y0), (x1, y1) = pixels.min(axis=0), pixels.max(axis=0)
-    return float(x0), float(y0), float(x1), float(y1)
-
-
-def noise_texture(side: int = 512, seed: int = 20) -> NDArray[np.float16]:
-    """Periodic noise [side, side, 4] in 0..1 by spectral synthesis: two cloud-like, one rough, one white channel."""
-    rng = np.random.default_rng(seed)
-    fy, fx = np.fft.fftfreq(side)[:, None] * side, np.fft.rfftfreq(side)[None, :] * side
-    radius = np.maximum(np.hypot(fx, fy), 1.0)
-    channels = []
-    for exponent in (1.75, 1.75, 0.9, 0.0):
-        spectrum = np.fft.rfft2(rng.standard_normal((side, side))) / radius**exponent
-        spectrum[0, 0] = 0.0
-        field = np.fft.irfft2(spectrum, s=(side, side))
-        channels.append(np.clip(0.5 + 0.18 * field / field.std(), 0.0, 1.0))
-    return np.stack(channels, axis=-1).astype(np.float16)
-
-
-def clip_from_cam(K: Array, x0: int, y0: int, width: int, height: int, near_m: float, far_m: float) -> Array:
-    """[4, 4] projection of a crop at (x0, y0): pixel centres at integers, row 0 first in the framebuffer."""
-    fx, fy, skew, cx, cy = K[0, 0], K[1, 1], K[0, 1], K[0, 2] - x0, K[1, 2] - y0
-    depth = far_m - near_m
-    return np.array(
-        [
-            [2 * fx / width, 2 * skew / width, 2 * (cx + 0.5) / width - 1, 0],
-            [0, 2 * fy / height, 2 * (cy + 0.5) / height - 1, 0],
-            [0, 0, (far_m + near_m) / depth, -2 * far_m * near_m / depth],
-            [0, 0, 1, 0],
-        ]
-    )
-
-
-def _packed_environment(e: Environment) -> NDArray[np.float32]:
-    rows = [
-        [*e.sun_ned, e.cloud_threshold],
-        [*e.sun_colour, e.cloud_softness],
-        [*e.zenith, e.cloud_base_m],
-        [*e.horizon, e.haze_per_m],
-        [*e.cloud, e.cirrus],
-        [*e.ground[0], float(e.ground_kind)],
-        [*e.ground[1], e.field_m],
-        [*e.ground[2], e.ground_turn_rad],
-        [*e.noise_offset, e.cloud_scale_m, e.glow],
-    ]
-    return np.asarray(rows, dtype=np.float32)
-
-
-def _packed_livery(seed: int) -> NDArray[np.float32]:
-    paint = livery_from_seed(seed)
-    rows = [[*rgb, paint.gloss] for rgb in paint.palette]
-    rows += [
-        [*paint.camouflage, paint.camouflage_share],
-        [*paint.marking, paint.tip_from],
-        [paint.band_x, paint.band_width, *paint.noise_offset],
-    ]
-    return np.asarray(rows, dtype=np.float32)
-
-
-def _columns(matrix: Array) -> bytes:
-    return np.ascontiguousarray(matrix.T, dtype=np.float32).tobytes()
-
-
-def _write_rows(uniform: Any, rows: NDArray[np.float32]) -> None:
-    # A driver drops the trailing rows that a shader never reads.
-    uniform.write(rows[: uniform.array_length].tobytes())
+@dataclass(frozen=True)
+class _GpuMesh:
+    aircraft: Any  # vertex array with normals and parts
+    shadow: Any  # vertex array with positions alone
+    solid_indices: int  # indices of faces that cast shadow; the propeller disc comes after them
+    radius_m: float  # of the sphere about the origin that holds it
 
 
 class Renderer:
@@ -123,33 +72,60 @@ class Renderer:
         self.width_px, self.height_px, self.columns, self.rows = width_px, height_px, columns, rows
         # Twice the window: a target that fills it is sampled 2 x 2, a small one up to 4 x 4.
         self._fine_px = max(min(2 * max(width_px, height_px), 2048), width_px, height_px)
+        self._shadow_px = min(self._fine_px, 1024)
         self._context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
-        self._aircraft = self._program("aircraft")
-        self._surroundings = self._program("surroundings")
+        self._aircraft = self._program("aircraft.vert", "aircraft.frag")
+        self._shadow = self._program("shadow.vert", "shadow.frag")
         self._fine = self._framebuffer(self._fine_px * columns, self._fine_px * rows, depth=True)
         self._image = self._framebuffer(width_px * columns, height_px * rows, depth=False)
+        shadow_size = (self._shadow_px * columns, self._shadow_px * rows * (2 if self.capacity > 1 else 1))
+        self._shadow_map = self._context.depth_texture(shadow_size)
+        self._shadow_map.compare_func = "<="
+        self._shadow_map.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._shadow_buffer = self._context.framebuffer(depth_attachment=self._shadow_map)
         noise = noise_texture()
         texture = self._context.texture(noise.shape[1::-1], 4, noise.tobytes(), dtype="f2")
         texture.build_mipmaps()
-        texture.use(0)
-        for unit, attachment in enumerate(self._fine.color_attachments, start=1):
+        texture.use(_NOISE_UNIT)
+        for unit, attachment in zip((_COLOUR_UNIT, _COORDINATE_UNIT), self._fine.color_attachments, strict=True):
             attachment.use(unit)
-        self._aircraft["noise"].value = 0
-        for unit, name in enumerate(("noise", "aircraft_colour", "aircraft_coordinate")):
-            self._surroundings[name].value = unit
-        corners = self._context.buffer(np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32).tobytes())
-        self._screen = self._context.vertex_array(self._surroundings, [(corners, "2f", "in_corner")])
-        self._meshes: dict[int, Any] = {}
+        self._shadow_map.use(_SHADOW_UNIT)
+        self._aircraft["noise"].value, self._aircraft["shadows"].value = _NOISE_UNIT, _SHADOW_UNIT
+        self._corners = self._context.buffer(np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32).tobytes())
+        self._screens: dict[str, tuple[Any, Any]] = {}
+        self._meshes: dict[tuple[int, bool], _GpuMesh] = {}
+        self._sky: Any = None
+        self._backdrop: tuple[Backdrop, Any] | None = None
 
     @property
     def capacity(self) -> int:
         """Scenes that one call of `draw` takes."""
         return self.columns * self.rows
 
-    def _program(self, name: str) -> Any:
+    # --- programs, buffers, meshes ------------------------------------------------------------------------------------
+
+    def _program(self, vertex: str, fragment: str, prelude: str = "") -> Any:
         folder = files("sim_replay").joinpath("shaders")
-        vertex, fragment = (folder.joinpath(f"{name}.{kind}").read_text(encoding="utf-8") for kind in ("vert", "frag"))
-        return self._context.program(vertex, fragment)
+        texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in (vertex, fragment)]
+        return self._context.program(texts[0], prelude + texts[1])
+
+    def _screen(self, name: str, world: bool = True) -> tuple[Any, Any]:
+        """(program, vertex array) of a fragment shader that covers its viewport."""
+        if name not in self._screens:
+            text = files("sim_replay").joinpath("shaders", "world.glsl").read_text(encoding="utf-8")
+            prelude = "#version 330 core\n" + text if world else ""
+            program = self._program("surroundings.vert", f"{name}.frag", prelude)
+            units = {
+                "noise": _NOISE_UNIT,
+                "aircraft_colour": _COLOUR_UNIT,
+                "aircraft_coordinate": _COORDINATE_UNIT,
+                "far_sky": _SKY_UNIT,
+                "backdrop": _BACKDROP_UNIT,
+            }
+            for uniform in set(units) & set(program):
+                program[uniform].value = units[uniform]
+            self._screens[name] = program, self._context.vertex_array(program, [(self._corners, "2f", "in_corner")])
+        return self._screens[name]
 
     def _framebuffer(self, width: int, height: int, depth: bool) -> Any:
         textures = [self._context.texture((width, height), 4, dtype=dtype) for dtype in ("f1", "f2")]
@@ -157,26 +133,26 @@ class Renderer:
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return self._context.framebuffer(textures, self._context.depth_renderbuffer((width, height)) if depth else None)
 
-    def _mesh(self, airframe_id: int) -> Any:
-        if airframe_id not in self._meshes:
-            mesh = AIRFRAMES[airframe_id].mesh()
+    def _mesh(self, airframe_id: int, fine: bool) -> _GpuMesh:
+        key = (airframe_id, fine)
+        if key not in self._meshes:
+            mesh: Mesh = fine_mesh(airframe_id) if fine else AIRFRAMES[airframe_id].mesh()
             vertex = np.hstack([mesh.vertices_m, mesh.normals, mesh.part[:, None].astype(np.float32)])
             # The nearly transparent disc goes last, so that it hides nothing it does not cover.
-            order = np.argsort(mesh.part[mesh.faces[:, 0]] == Part.PROPELLER_DISC, kind="stable")
-            self._meshes[airframe_id] = self._context.vertex_array(
-                self._aircraft,
-                [
-                    (
-                        self._context.buffer(vertex.astype(np.float32).tobytes()),
-                        "3f 3f 1f",
-                        "in_position",
-                        "in_normal",
-                        "in_part",
-                    )
-                ],
-                self._context.buffer(mesh.faces[order].astype(np.int32).tobytes()),
+            disc = mesh.part[mesh.faces[:, 0]] == Part.PROPELLER_DISC
+            faces = mesh.faces[np.argsort(disc, kind="stable")].astype(np.int32)
+            vertices = self._context.buffer(vertex.astype(np.float32).tobytes())
+            indices = self._context.buffer(faces.tobytes())
+            layout = (vertices, "3f 3f 1f", "in_position", "in_normal", "in_part")
+            self._meshes[key] = _GpuMesh(
+                self._context.vertex_array(self._aircraft, [layout], indices),
+                self._context.vertex_array(self._shadow, [(vertices, "3f 16x", "in_position")], indices),
+                3 * int((~disc).sum()),
+                float(np.linalg.norm(mesh.vertices_m, axis=1).max()),
             )
-        return self._meshes[airframe_id]
+        return self._meshes[key]
+
+    # --- windows ------------------------------------------------------------------------------------------------------
 
     def draw(self, scenes: Sequence[Scene], first_tile: int = 0) -> Rendered:
         """Scenes in the tiles from `first_tile` on; pixels beyond a scene's own width and height are undefined.
@@ -188,10 +164,11 @@ class Renderer:
             raise ValueError(f"{len(scenes)} scenes from tile {first_tile} do not fit {self.capacity} tiles")
         # A process may hold several renderers, each with a context of its own.
         with self._context:
+            slots = self._draw_shadows(scenes)
             self._fine.use()
             self._fine.clear()
             self._context.enable_only(moderngl.DEPTH_TEST)
-            crops = [self._draw_targets(k, scene) for k, scene in enumerate(scenes, first_tile)]
+            crops = [self._draw_targets(first_tile + k, scene, slots, k) for k, scene in enumerate(scenes)]
             self._image.use()
             self._context.enable_only(moderngl.NOTHING)
             for k, (scene, (crop, samples)) in enumerate(zip(scenes, crops, strict=True), first_tile):
@@ -205,64 +182,211 @@ class Renderer:
         grid = np.frombuffer(raw, dtype=dtype).reshape(self.rows, self.height_px, self.columns, self.width_px, 4)
         return grid.swapaxes(1, 2).reshape(self.capacity, self.height_px, self.width_px, 4)
 
-    def _crop(self, scene: Scene) -> tuple[int, int, int, int]:
-        """Pixels that the targets may touch, clipped to the image; empty if there are none."""
-        x0, y0, x1, y1 = scene.camera.width_px, scene.camera.height_px, 0, 0
-        for target in scene.targets:
-            vertices = AIRFRAMES[target.airframe_id].mesh().vertices_m.astype(np.float64)
-            box = extents_px(project_px(vertices, *target.pose_in(scene.camera), scene.camera.K))
-            if box is not None:
-                low, high = np.floor(box[:2]).astype(int) - 1, np.ceil(box[2:]).astype(int) + 2
-                x0, y0, x1, y1 = min(x0, low[0]), min(y0, low[1]), max(x1, high[0]), max(y1, high[1])
-        x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, scene.camera.width_px), min(y1, scene.camera.height_px)
-        return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else (0, 0, 0, 0)
-
-    def _draw_targets(self, tile: int, scene: Scene) -> tuple[tuple[int, int, int, int], int]:
-        crop = self._crop(scene)
+    def _draw_targets(self, tile: int, scene: Scene, slots: dict[tuple[int, int], int], order: int) -> tuple[Crop, int]:
+        crop = crop_of(scene.targets, scene.camera)
         width, height = crop[2] - crop[0], crop[3] - crop[1]
-        if width == 0:
+        drawn = [t for t in scene.targets if is_ahead(t, scene.camera)]
+        if width == 0 or not drawn:
             return crop, 1
         samples = int(np.clip(self._fine_px // max(width, height), 1, 4))
         corner = (tile % self.columns * self._fine_px, tile // self.columns * self._fine_px)
         self._fine.viewport = (*corner, width * samples, height * samples)
-        _write_rows(self._aircraft["environment"], _packed_environment(scene.environment))
-        self._aircraft["corner"].value = corner
         # One depth range for all targets, so that the nearer hides the farther.
-        reach = [(t.pose_in(scene.camera)[1][2], AIRFRAMES[t.airframe_id].diameter_m()) for t in scene.targets]
-        ahead = [z - size >= NEAREST_VERTEX_M for z, size in reach]
-        if not any(ahead):
-            return crop, samples
-        near_m = min(z - size for (z, size), drawn in zip(reach, ahead, strict=True) if drawn)
-        far_m = max(z + size for z, size in reach)
-        projection = clip_from_cam(scene.camera.K, crop[0], crop[1], width, height, near_m, far_m)
-        for number, (target, drawn) in enumerate(zip(scene.targets, ahead, strict=True), start=1):
-            if drawn:
-                self._draw_target(target, scene.camera, projection, number)
+        projection = _projection(drawn, scene.camera, crop)
+        for number, target in enumerate(scene.targets, start=1):
+            if is_ahead(target, scene.camera):
+                self._draw_target(target, scene, projection, number, slots.get((order, number)), corner)
         return crop, samples
 
-    def _draw_target(self, target: Target, camera: Camera, projection: Array, number: int) -> None:
-        airframe = AIRFRAMES[target.airframe_id]
-        R_cam_body, t_cam_body_m = target.pose_in(camera)
-        diameter_m = airframe.diameter_m()
-        cam_from_body = np.eye(4)
-        cam_from_body[:3, :3], cam_from_body[:3, 3] = R_cam_body, t_cam_body_m
-        program = self._aircraft
-        program["clip_from_body"].write(_columns(projection @ cam_from_body))
-        program["ned_from_body"].write(_columns(target.R_ned_body))
-        program["camera_body_m"].value = tuple(-R_cam_body.T @ t_cam_body_m)
-        program["livery"].write(_packed_livery(target.livery_seed).tobytes())
-        program["extent"].value = (1.0 / diameter_m, 0.5 * airframe.span_m, airframe.length_m, float(number))
-        self._mesh(target.airframe_id).render()
-
-    def _draw_surroundings(self, tile: int, scene: Scene, crop: tuple[int, int, int, int], samples: int) -> None:
-        camera, program = scene.camera, self._surroundings
+    def _draw_surroundings(self, tile: int, scene: Scene, crop: Crop, samples: int) -> None:
+        program, screen = self._screen("surroundings")
         column, row = tile % self.columns, tile // self.columns
-        self._image.viewport = (column * self.width_px, row * self.height_px, camera.width_px, camera.height_px)
-        _write_rows(program["environment"], _packed_environment(scene.environment))
-        program["K"].value = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])
-        program["ned_from_cam"].write(_columns(camera.R_ned_cam))
-        program["camera_ned_m"].value = tuple(camera.t_ned_cam_m)
+        self._image.viewport = (
+            column * self.width_px,
+            row * self.height_px,
+            scene.camera.width_px,
+            scene.camera.height_px,
+        )
+        _write_world(program, scene)
         program["tile"].value = (column * self.width_px, row * self.height_px, samples, 0)
         program["crop"].value = crop
         program["crop_at"].value = (column * self._fine_px, row * self._fine_px)
-        self._screen.render()
+        screen.render()
+
+    # --- whole frames -------------------------------------------------------------------------------------------------
+
+    def surroundings(self, scene: Scene) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """(BGR [H, W, 3] with gamma 2, without any aircraft; what near cloud hides [H, W], 255: all).
+
+        The scene's camera must be as large as a tile. Raises BackdropError if its backdrop cannot be read.
+        """
+        backdrop = load_backdrop(scene.backdrop) if scene.backdrop else None
+        with self._context:
+            self._context.enable_only(moderngl.NOTHING)
+            if backdrop is None:
+                self._draw_far_sky(scene)
+            program, screen = self._screen("frame")
+            program["backdrop_map"].value = self._use_backdrop(backdrop, scene)
+            self._image.use()
+            self._image.viewport = (0, 0, self.width_px, self.height_px)
+            _write_world(program, scene)
+            screen.render()
+            raw = self._image.read((0, 0, self.width_px, self.height_px), components=4, dtype="f1")
+        pixels = np.frombuffer(raw, np.uint8).reshape(self.height_px, self.width_px, 4)
+        return pixels[..., :3], pixels[..., 3]
+
+    def _draw_far_sky(self, scene: Scene) -> None:
+        if self._sky is None:
+            texture = self._context.texture(((self.width_px + 1) // 2, (self.height_px + 1) // 2), 4, dtype="f2")
+            texture.repeat_x = texture.repeat_y = False
+            texture.use(_SKY_UNIT)
+            self._sky = self._context.framebuffer([texture])
+        program, screen = self._screen("far_sky")
+        self._sky.use()
+        _write_world(program, scene)
+        screen.render()
+
+    def _use_backdrop(self, backdrop: Backdrop | None, scene: Scene) -> tuple[float, float, float, float]:
+        if backdrop is None:
+            return (0.0, 1.0, 1.0, 0.0)
+        if self._backdrop is None or self._backdrop[0] is not backdrop:
+            if self._backdrop is not None:
+                self._backdrop[1].release()
+            height, width = backdrop.image_rgb.shape[:2]
+            texture = self._context.texture((width, height), 3, backdrop.image_rgb.tobytes(), alignment=1)
+            texture.build_mipmaps()
+            texture.use(_BACKDROP_UNIT)
+            self._backdrop = backdrop, texture
+        return backdrop.map_for(scene.camera, scene.sensor_seed)
+
+    def layer(self, scene: Scene, index: int) -> Layer | None:
+        """The scene's target of that index alone; None where no pixel of the picture can show it."""
+        target, camera = scene.targets[index], scene.camera
+        crop = crop_of((target,), camera)
+        width, height = crop[2] - crop[0], crop[3] - crop[1]
+        if width == 0 or not is_ahead(target, camera):
+            return None
+        samples = int(np.clip(self._fine_px // max(width, height), 1, 4))
+        with self._context:
+            slots = self._draw_shadows([Scene(camera, (target,), scene.environment)])
+            self._fine.use()
+            self._fine.viewport = (0, 0, width * samples, height * samples)
+            self._fine.clear(viewport=self._fine.viewport)
+            self._context.enable_only(moderngl.DEPTH_TEST)
+            projection = _projection([target], camera, crop)
+            self._draw_target(target, scene, projection, 1, slots.get((0, 1)), (0, 0))
+            self._context.enable_only(moderngl.NOTHING)
+            program, screen = self._screen("layer", world=False)
+            program["samples"].value = (samples, 0)
+            self._image.use()
+            self._image.viewport = (0, 0, width, height)
+            screen.render()
+            colour = self._image.read((0, 0, width, height), components=4, dtype="f1")
+            cover = self._image.read((0, 0, width, height), components=1, attachment=1, dtype="f2")
+        pixels = np.frombuffer(colour, np.uint8).reshape(height, width, 4)
+        share = np.frombuffer(cover, np.float16).reshape(height, width).astype(np.float32)
+        return Layer(crop[0], crop[1], pixels[..., :3], share, pixels[..., 3])
+
+    # --- aircraft -----------------------------------------------------------------------------------------------------
+
+    def _draw_shadows(self, scenes: Sequence[Scene]) -> dict[tuple[int, int], int]:
+        """Each target as the sun sees it, in a slot of the atlas; gives slots by (scene, target number)."""
+        casting = [
+            ((order, number), target, scene.environment.sun_ned)
+            for order, scene in enumerate(scenes)
+            if scene.environment.sun_colour.max() > SUN_THAT_CASTS_SHADOW
+            for number, target in enumerate(scene.targets, start=1)
+        ]
+        if not casting:
+            return {}
+        self._shadow_buffer.use()
+        self._shadow_buffer.viewport = (0, 0, *self._shadow_map.size)
+        self._shadow_buffer.clear()
+        self._context.enable_only(moderngl.DEPTH_TEST)
+        slots = {}
+        across = self._shadow_map.width // self._shadow_px
+        room = across * (self._shadow_map.height // self._shadow_px)
+        for slot, (key, target, sun_ned) in enumerate(casting[:room]):
+            at = (slot % across * self._shadow_px, slot // across * self._shadow_px)
+            self._shadow_buffer.viewport = (*at, self._shadow_px, self._shadow_px)
+            mesh = self._mesh(target.airframe_id, fine=False)
+            clip = np.eye(4)
+            clip[:3, :3] = sun_basis(target.R_ned_body.T @ sun_ned) / mesh.radius_m * np.array([[1.0], [1.0], [-1.0]])
+            self._shadow["clip_from_body"].write(columns(clip))
+            mesh.shadow.render(vertices=mesh.solid_indices)
+            slots[key] = slot
+        return slots
+
+    def _write_shadow(self, target: Target, sun_ned: Array, slot: int | None, radius_m: float) -> None:
+        program = self._aircraft
+        program["shadowed"].value = float(slot is not None)
+        if slot is None:
+            return
+        basis = sun_basis(target.R_ned_body.T @ sun_ned)
+        size = np.array(self._shadow_map.size, dtype=np.float64)
+        across = self._shadow_map.width // self._shadow_px
+        atlas = np.eye(4)
+        for axis, place in enumerate((slot % across, slot // across)):
+            atlas[axis, :3] = 0.5 * basis[axis] / radius_m * self._shadow_px / size[axis]
+            atlas[axis, 3] = (place + 0.5) * self._shadow_px / size[axis]
+        atlas[2, :3], atlas[2, 3] = -0.5 * basis[2] / radius_m, 0.5 - 1e-4
+        program["shadow_from_body"].write(columns(atlas))
+        # Lifted by two texels, a lit surface does not shadow itself.
+        program["sun_body"].value = (*basis[2], 4.0 * radius_m / self._shadow_px)
+
+    def _draw_target(
+        self, target: Target, scene: Scene, projection: Array, number: int, slot: int | None, corner: tuple[int, int]
+    ) -> None:
+        airframe, camera, program = AIRFRAMES[target.airframe_id], scene.camera, self._aircraft
+        mesh = self._mesh(target.airframe_id, fine=camera.distortion is not None)
+        R_cam_body, t_cam_body_m = target.pose_in(camera)
+        cam_from_body = np.eye(4)
+        cam_from_body[:3, :3], cam_from_body[:3, 3] = R_cam_body, t_cam_body_m
+        program["cam_from_body"].write(columns(cam_from_body))
+        program["clip_from_cam"].write(columns(projection))
+        program["ned_from_body"].write(columns(target.R_ned_body))
+        program["camera_body_m"].value = tuple(-R_cam_body.T @ t_cam_body_m)
+        program["corner"].value = corner
+        program["extent"].value = (1.0 / airframe.diameter_m(), 0.5 * airframe.span_m, airframe.length_m, float(number))
+        write_rows(program["environment"], packed_environment(scene.environment))
+        write_rows(program["livery"], packed_livery(target.livery_seed))
+        write_lens(program, camera)
+        self._write_shadow(target, scene.environment.sun_ned, slot, mesh.radius_m)
+        mesh.aircraft.render()
+
+
+def _write_world(program: Any, scene: Scene) -> None:
+    camera = scene.camera
+    write_rows(program["environment"], packed_environment(scene.environment))
+    program["K"].value = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])
+    write_lens(program, camera)
+    program["ned_from_cam"].write(columns(camera.R_ned_cam))
+    program["camera_ned_m"].value = tuple(camera.t_ned_cam_m)
+
+
+def is_ahead(target: Target, camera: Camera) -> bool:
+    """Whether the whole aircraft lies in front of the camera."""
+    depth_m = target.pose_in(camera)[1][2]
+    return bool(depth_m - AIRFRAMES[target.airframe_id].diameter_m() >= NEAREST_VERTEX_M)
+
+
+def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
+    """Pixels that the targets may touch, clipped to the image; zeros if there are none."""
+    x0, y0, x1, y1 = camera.width_px, camera.height_px, 0, 0
+    for target in targets:
+        mesh = AIRFRAMES[target.airframe_id].mesh()
+        points = mesh.vertices_m.astype(np.float64)
+        box = extents_px(project_px(points, *target.pose_in(camera), camera.K, camera.distortion))
+        if box is not None:
+            # Under distortion an edge may bow out beyond its ends.
+            margin = 1 if camera.distortion is None else 6
+            low, high = np.floor(box[:2]).astype(int) - margin, np.ceil(box[2:]).astype(int) + 1 + margin
+            x0, y0, x1, y1 = min(x0, low[0]), min(y0, low[1]), max(x1, high[0]), max(y1, high[1])
+    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, camera.width_px), min(y1, camera.height_px)
+    return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else (0, 0, 0, 0)
+
+
+def _projection(targets: Sequence[Target], camera: Camera, crop: Crop) -> Array:
+    reach = [(t.pose_in(camera)[1][2], AIRFRAMES[t.airframe_id].diameter_m()) for t in targets]
+    near_m, far_m = min(z - size for z, size in reach), max(z + size for z, size in reach)
+    return clip_from_cam(camera.K, crop[0], crop[1], crop[2] - crop[0], crop[3] - crop[1], near_m, far_m)

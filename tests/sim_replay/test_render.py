@@ -11,7 +11,8 @@ import pytest
 from msgs.geometry import R_from_euler, so3_exp, so3_log
 from sim_replay.airframes import AIRFRAMES
 from sim_replay.render.placing import crop_K, looking_along
-from sim_replay.render.renderer import Rendered, Renderer, project_px, solid_vertices_m
+from sim_replay.render.projection import project_px, solid_vertices_m
+from sim_replay.render.renderer import Rendered, Renderer
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
 
 SIDE = 160
@@ -76,7 +77,7 @@ def test_each_pixel_names_the_body_point_that_projects_into_it(drawn: list[tuple
     for scene, rendered, k in drawn:
         inside = cv2.erode((rendered.coverage[k] == 255).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         rows, columns = np.nonzero(inside)
-        assert len(rows) > 10
+        assert len(rows) > 2
         diameter = AIRFRAMES[scene.targets[0].airframe_id].diameter_m()
         points = rendered.coordinate[k][rows, columns].astype(np.float64) * diameter
         error = np.linalg.norm(_opencv_px(points, scene) - np.stack([columns, rows], axis=-1), axis=1)

@@ -11,7 +11,7 @@ import pytest
 import sim_replay
 from msgs.geometry import R_from_q_wxyz, euler_from_R, rotation_angle, so3_log
 from sim_replay.bop import BopScene, read_models_info, read_scene
-from sim_replay.sampler import render_frame
+from sim_replay.render.frame import render_frame
 from sim_replay.sequence import FPS, SENSOR, scenes
 from sim_replay.telemetry import Telemetry, read_telemetry
 
@@ -105,10 +105,10 @@ def test_the_target_flies_coordinated_turns(scene: BopScene) -> None:
 
 
 def test_the_seed_makes_the_same_pictures(scene: BopScene) -> None:
-    batch = render_frame(scenes(SETTINGS["seed"])[77], SENSOR)
+    rendered = render_frame(scenes(SETTINGS["seed"])[77], SENSOR)
     stored = scene.image_bgr(scene.frames[77])
-    assert np.abs(batch.image_bgr[0].astype(np.int16) - stored).mean() < 2.0
+    assert np.abs(rendered.image_bgr.astype(np.int16) - stored).mean() < 2.0
     mask = scene.mask(scene.frames[77], 0)
     assert mask is not None
-    assert np.mean(mask[batch.mask[0]]) > 0.98
-    assert mask.sum() == pytest.approx(batch.mask[0].sum(), rel=0.02)
+    assert np.mean(mask[rendered.targets[0].mask_visib]) > 0.98
+    assert mask.sum() == pytest.approx(rendered.targets[0].mask_visib.sum(), rel=0.02)

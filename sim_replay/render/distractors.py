@@ -1,0 +1,113 @@
+"""Things in the air that are no aircraft: birds, specks, shreds of cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay.render.scene import Scene
+
+_SPAN_PX = (5.0, 60.0)
+_MARGIN_PX = 80
+
+
+def bird_outline(span_px: float, flap: float, chord: float, bend: float, turn_rad: float) -> NDArray[np.float64]:
+    """Outline [9, 2] of a bird about its own centre, pixels; `flap` -0.5..0.5 lifts the wing tips."""
+    elbow = bend * flap
+    outline = np.array(
+        [
+            [-0.5, flap - 0.02],
+            [-0.2, elbow - chord / 2],
+            [0, -0.35 * chord],
+            [0.2, elbow - chord / 2],
+            [0.5, flap - 0.02],
+            [0.22, elbow + chord / 2],
+            [0.03, chord],
+            [-0.03, chord],
+            [-0.22, elbow + chord / 2],
+        ]
+    )
+    rotation = np.array([[np.cos(turn_rad), -np.sin(turn_rad)], [np.sin(turn_rad), np.cos(turn_rad)]])
+    return span_px * outline @ rotation.T
+
+
+def _filled(points: NDArray[np.float64], width: int, height: int) -> NDArray[np.float32]:
+    alpha = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(alpha, [np.round(points * 16).astype(np.int32)], 255, cv2.LINE_AA, shift=4)
+    return alpha.astype(np.float32) / np.float32(255)
+
+
+def _bird(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
+    span = rng.uniform(3.0, 0.22 * side)
+    flap, turn = rng.uniform(-0.5, 0.5), rng.uniform(0, 2 * np.pi)
+    outline = bird_outline(span, flap, rng.uniform(0.08, 0.2), rng.uniform(0.0, 0.25), turn)
+    return _filled(outline + rng.uniform(0, side, 2), side, side)
+
+
+def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) -> NDArray[np.float32]:
+    """A soft ellipse [side, side] in 0..1 anywhere in the picture."""
+    y, x = np.mgrid[:side, :side].astype(np.float32)
+    centre, turn = rng.uniform(0, side, 2), rng.uniform(0, np.pi)
+    a, b = rng.uniform(*radius_px, 2)
+    u = (np.cos(turn) * (x - centre[0]) + np.sin(turn) * (y - centre[1])) / a
+    v = (-np.sin(turn) * (x - centre[0]) + np.cos(turn) * (y - centre[1])) / b
+    return np.exp(-0.5 * (u * u + v * v)).astype(np.float32)
+
+
+def add_distractors(
+    image_bgr: NDArray[np.uint8], coverage: NDArray[np.uint8], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Birds, specks and shreds of cloud on a square picture [S, S, 3], behind the aircraft."""
+    side = image_bgr.shape[0]
+    image, behind = image_bgr.astype(np.float32), 1.0 - coverage.astype(np.float32) / 255
+    for _ in range(int(rng.integers(1, 5))):
+        kind = rng.random()
+        if kind < 0.6:
+            alpha, level = _bird(rng, side), rng.uniform(10, 110) * np.ones(3)
+        elif kind < 0.8:
+            alpha, level = blob(rng, side, (0.6, 2.5)), rng.uniform(0, 255) * np.ones(3)
+        else:
+            alpha, level = 0.7 * blob(rng, side, (0.03 * side, 0.2 * side)), rng.uniform(140, 235) * np.ones(3)
+        seen = (alpha * behind)[..., None]
+        image += seen * (level.astype(np.float32) - image)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Sprite:
+    """One distractor in a whole frame."""
+
+    x0_px: int
+    y0_px: int
+    alpha: NDArray[np.float32]  # [h, w], inside the picture
+    level: float  # 0..255, gamma 2
+    before: bool  # nearer than the targets
+
+
+def sprites(scene: Scene) -> list[Sprite]:
+    """The scene's distractors where they are in this frame, some of them perhaps outside the picture and left out.
+
+    Their paths depend on the sensor seed alone, so from frame to frame they fly on and beat their wings.
+    """
+    out = []
+    width, height = scene.camera.width_px, scene.camera.height_px
+    for number in range(scene.distractors):
+        rng = np.random.default_rng([scene.sensor_seed, 0xB12D, number])
+        span = float(np.exp(rng.uniform(*np.log(_SPAN_PX))))
+        speed, heading = rng.uniform(0.3, 4.0) * span / 20.0, rng.uniform(0, 2 * np.pi)
+        room = np.array([width, height]) + 2.0 * _MARGIN_PX
+        start = rng.uniform(0.0, room)
+        at = (start + scene.frame_index * speed * np.array([np.cos(heading), np.sin(heading)])) % room - _MARGIN_PX
+        phase, beat = rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 0.9)
+        flap = 0.1 + 0.3 * np.sin(phase + beat * scene.frame_index)
+        level, before = float(rng.uniform(12, 120)), bool(rng.random() < 0.5)
+        outline = bird_outline(span, flap, rng.uniform(0.1, 0.2), rng.uniform(0.0, 0.25), rng.normal(0.0, 0.5)) + at
+        low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
+        high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
+        if np.all(high > low):
+            alpha = _filled(outline - low, int(high[0] - low[0]), int(high[1] - low[1]))
+            out.append(Sprite(int(low[0]), int(low[1]), alpha, level, before))
+    return out
