@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -42,7 +42,7 @@ class DatasetFrame:
     distortion: Distortion | None  # k1, k2, p1, p2, k3 of the picture on disk; None: a pinhole camera
     image_path: Path
     targets: tuple[BopTarget, ...]  # poses of body axes (FRD); boxes in the picture on disk
-    scene: BopScene
+    scene: BopScene = field(repr=False)
     target_indices: tuple[int, ...]  # of each target among all that the scene lists for this picture
 
     def image_bgr(self) -> Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
 from msgs.geometry import so3_exp
-from sim_replay.airframes import AIRFRAMES
+from sim_replay.airframes.mesh import Mesh
 from sim_replay.bop import (
     BopError,
     BopFrame,
@@ -23,6 +25,7 @@ from sim_replay.bop import (
     read_scene,
     write_models,
 )  # fmt: skip
+from sim_replay.bop.models import largest_distance
 
 K = np.array([[1500.25, 0, 31.5], [0, 1501.75, 23.5], [0, 0, 1]])
 numbers = st.floats(-500, 500, allow_nan=False)
@@ -130,14 +133,24 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 
 def test_models_come_back_in_metres(tmp_path: Path) -> None:
-    mesh = AIRFRAMES[1].mesh()
+    points = np.random.default_rng(3).normal(size=(300, 3)) * [4.0, 6.0, 1.0]
+    mesh = Mesh(
+        *(points.astype(np.float32) for _ in range(2)), np.zeros(300, np.uint8), np.array([[0, 1, 2]], np.int32)
+    )
     write_models(tmp_path, {2: mesh})
-    np.testing.assert_allclose(read_ply_vertices_m(tmp_path / "obj_000002.ply"), mesh.vertices_m, atol=1e-5)
+    np.testing.assert_allclose(read_ply_vertices_m(tmp_path / "obj_000002.ply"), points, atol=1e-5)
     info = read_models_info(tmp_path)[2]
-    assert info.diameter_m == pytest.approx(AIRFRAMES[1].diameter_m(), abs=1e-6)
-    np.testing.assert_allclose(info.size_m, np.ptp(mesh.vertices_m, axis=0), atol=1e-5)
+    assert info.diameter_m == pytest.approx(pdist(mesh.vertices_m.astype(float)).max(), abs=1e-6)
+    np.testing.assert_allclose(info.size_m, np.ptp(points, axis=0), atol=1e-5)
     raw = json.loads((tmp_path / "models_info.json").read_text())["2"]
-    assert raw["size_y"] == pytest.approx(12000.0)
+    assert raw["size_y"] == pytest.approx(1000.0 * np.ptp(points[:, 1]), abs=1e-2)
+
+
+@given(st.integers(2, 200), st.sampled_from([(1, 1, 1), (10, 0.1, 0.1), (5, 8, 0), (0, 0, 0)]), st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_the_diameter_is_exact_for_any_cloud_of_points(count: int, size: tuple[float, ...], seed: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * size + [100.0, -3.0, 0.5]
+    assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-9, abs=1e-12)
 
 
 def test_ascii_models_of_others_can_be_read(tmp_path: Path) -> None:
@@ -149,6 +162,56 @@ def test_ascii_models_of_others_can_be_read(tmp_path: Path) -> None:
         "1000 2000 -3000 255\n0.5 0 0 1\n"
     )
     np.testing.assert_allclose(read_ply_vertices_m(path), [[1, 2, -3], [0.0005, 0, 0]])
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    np.testing.assert_allclose(read_ply_vertices_m(path), [[1, 2, -3], [0.0005, 0, 0]])
     path.write_text("solid stl")
     with pytest.raises(BopError, match="not a PLY file"):
         read_ply_vertices_m(path)
+
+
+def test_binary_models_of_either_byte_order_and_any_number_type_can_be_read(tmp_path: Path) -> None:
+    for name, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        rows = np.array([(7, 1000.0, -2000.0, 3000.0), (9, 0.0, 0.5, 0.0)], f"{order}u2,{order}f8,{order}f8,{order}f8")
+        head = f"ply\nformat {name} 1.0\nelement vertex 2\nproperty ushort tag\n"
+        head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        path = tmp_path / "obj_000001.ply"
+        path.write_bytes(head.encode() + rows.tobytes())
+        np.testing.assert_allclose(read_ply_vertices_m(path), [[1, -2, 3], [0, 0.0005, 0]])
+        path.write_bytes(head.encode() + rows.tobytes()[:-4])
+        with pytest.raises(BopError, match="vertices cannot be read"):
+            read_ply_vertices_m(path)
+
+
+def test_a_lens_comes_back_and_a_pinhole_camera_has_none(tmp_path: Path) -> None:
+    lens = (-0.21, 0.043, 0.0012, -0.0007, 0.0)
+    plain = _frame(1)
+    bent = dataclasses.replace(_frame(2), distortion=lens)
+    assert [frame.distortion for frame in read_scene(_write(tmp_path, plain, bent)).frames] == [None, lens]
+
+
+def test_a_silhouette_of_which_more_exists_is_not_made_up_from_what_is_visible(tmp_path: Path) -> None:
+    half_hidden = _frame(3)  # 80 of 100 pixels
+    free = BopFrame(4, K, (dataclasses.replace(half_hidden.targets[0], visible_px=200, whole_px=200),))
+    scene = read_scene(_write(tmp_path, half_hidden, free))
+    assert scene.whole_mask(scene.frames[0], 0) is None
+    whole, visible = scene.whole_mask(scene.frames[1], 0), scene.mask(scene.frames[1], 0)
+    assert whole is not None
+    assert visible is not None
+    np.testing.assert_array_equal(whole, visible)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("cam_R_m2c", [-1, 0, 0, 0, 1, 0, 0, 0, 1], r"scene_gt\.json: 'cam_R_m2c' of '3' is not a rotation"),
+        ("cam_R_m2c", [2, 0, 0, 0, 2, 0, 0, 0, 2], "is not a rotation"),
+        ("cam_t_m2c", ["far"], "'cam_t_m2c' of '3' is not 3 numbers"),
+    ],
+)
+def test_a_mirrored_or_scaled_pose_is_refused(tmp_path: Path, name: str, value: list[object], said: str) -> None:
+    folder = _write(tmp_path, _frame())
+    poses = json.loads((folder / "scene_gt.json").read_text())
+    poses["3"][0][name] = value
+    (folder / "scene_gt.json").write_text(json.dumps(poses))
+    with pytest.raises(BopError, match=said):
+        read_scene(folder)
