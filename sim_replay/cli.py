@@ -14,9 +14,12 @@ from rich.progress import Progress
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.estimator.model import load_model
-from sim_replay.demo import BUNDLED_SEQUENCE, show, summary_table
-from sim_replay.ground_truth import read_scene_truth, read_sequence
-from sim_replay.offline import DEFAULT_THREADS, dataset_score, scene_folders, score_scenes
+from sim_replay.datasets import open_dataset
+from sim_replay.demo import BUNDLED_SEQUENCE, show
+from sim_replay.evaluation.judge import judge_frames, score_of
+from sim_replay.evaluation.table import score_table
+from sim_replay.ground_truth import read_sequence
+from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.play import PlayError
 
 
@@ -49,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     score.add_argument("--dataset", type=Path, required=True, metavar="DIR", help="BOP scene, split or dataset folder")
     score.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
+    score.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
     score.add_argument("--json", action="store_true", help="print the score as JSON")
     return parser
 
@@ -66,15 +70,16 @@ def _run(args: argparse.Namespace) -> int:
 
 def _score(args: argparse.Namespace, console: Console) -> int:
     model = load_model(args.model, DEFAULT_THREADS)
-    scenes = [read_scene_truth(folder) for folder in scene_folders(args.dataset)]
+    dataset = open_dataset(args.dataset, args.split)
+    pictures = list(dataset.frames())
     with Progress(console=console, disable=args.json or not console.is_terminal) as progress:
-        task = progress.add_task("scoring", total=sum(len(scene.images) for scene in scenes))
-        results = score_scenes(scenes, model, lambda _: progress.advance(task))
-    score = dataset_score(args.dataset.name, results, model)
+        task = progress.add_task("scoring", total=len(pictures))
+        judged = judge_frames(pictures, dataset.models, estimator_answers(model), lambda _: progress.advance(task))
+    score = score_of(dataset, method_of(model), judged)
     if args.json:
         print(json.dumps(score, indent=2))
     else:
-        console.print(summary_table(score))
+        console.print(score_table(score))
     return 0
 
 

@@ -182,20 +182,18 @@ def _read(path: Path) -> Image:
 
 def summary_table(score: dict[str, Any]) -> Table:
     """The figures of a score, as a person reads them."""
+    overall = score["overall"]
     table = Table("figure", "value", title=f"score of {score['sequence']}", title_justify="left")
     rows = {
-        "frames / poses received": f"{score['frames']} / {score['poses']}",
-        "targets found": _text(score["detection_rate"], "{:.1%}"),
-        "rotation error, mean / median": _pair(score["rotation_error_deg"], "{:.2f}°"),
-        "translation error, mean / median": _pair(score["translation_error_m"], "{:.2f} m"),
-        "depth error, mean": _text(score["depth_error_rel"]["mean"], "{:.2%}"),
-        "pose within 10° and 5 %": _text(score["pose_10deg_5pct"], "{:.1%}"),
+        "frames / poses received": f"{overall['frames']} / {score['poses']}",
+        "targets found": _text(overall["recall"], "{:.1%}"),
+        "rotation error, mean / median": _pair(overall["rotation_error_deg"], "{:.2f}°"),
+        "translation error, mean / median": _pair(overall["translation_error_m"], "{:.2f} m"),
+        "depth error, mean": _text(overall["depth_error_rel"]["mean"], "{:.2%}"),
+        "pose within 10° and 5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
+        "capture to MAVLink, p50 / p95 / p99": _percentiles(score["latency_ms"]),
+        "frames dropped": _text(score["dropped_frames"], "{:d}"),
     }
-    if "latency_ms" in score:
-        rows["capture to MAVLink, p50 / p95 / p99"] = _percentiles(score["latency_ms"])
-        rows["frames dropped"] = _text(score["dropped_frames"], "{:d}")
-    if "estimate_ms" in score:
-        rows["acquire and track, p50 / p95 / p99"] = _percentiles(score["estimate_ms"])
     rows["model"] = f"{score['model']['file']} ({score['model']['precision']})"
     for row in rows.items():
         table.add_row(*row)

@@ -56,19 +56,19 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         for target in frame.targets:
             if target.object_id not in models:
                 raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
-            diameter_m = models[target.object_id].diameter_m
-            truths.append(Truth(index, target.R_cam_target, target.t_cam_target_m, target.object_id, diameter_m))
+            model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
+            truths.append(Truth(index, R, t_m, target.object_id, model.diameter_m, model.name, model.points_m))
     return SceneTruth(
         folder,
         [scene.image_path(frame) for frame in frames],
         [frame.K for frame in frames],
         truths,
-        {object_id: _extents(model) for object_id, model in models.items()},
+        {object_id: extents_of(model) for object_id, model in models.items()},
         [frame.distortion for frame in frames],
     )
 
 
-def _extents(model: Model) -> Extents:
+def extents_of(model: Model) -> Extents:
     """The model's box; of one whose box nobody knows, a cube as long as its diameter."""
     if model.low_m is not None and model.size_m is not None:
         return Extents(model.low_m, model.size_m)

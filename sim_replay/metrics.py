@@ -1,7 +1,9 @@
-"""Pose errors of the paper's "Evaluation Metrics", one function a metric, broadcasting over leading axes.
+"""Pose metrics of the paper's section "Evaluation Metrics", one function each, broadcasting over leading axes.
 
 Arguments stand in the order R_est, t_est, R_gt, t_gt; rotations [..., 3, 3] turn target body axes into `cam`,
-translations [..., 3] are the target's origin in `cam`, metres.
+translations [..., 3] are the target's origin in `cam`, metres. Covariances [..., 6, 6] are of (x, y, z m, rotation
+x, y, z rad) in `cam`, rotation as R = exp(w) R_est. Functions named after a threshold give booleans; a rate is their
+mean.
 """
 
 from __future__ import annotations
@@ -9,10 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from msgs.geometry import Array, rotation_angle
+from msgs.geometry import Array, rotation_angle, so3_log
 
-POSE_ROTATION_DEG = 10.0
-POSE_TRANSLATION_REL = 0.05
+ROTATION_LIMIT_DEG = 10.0
+DEPTH_LIMIT_REL = 0.05
+TRANSLATION_LIMIT_REL = 0.05
+
+Booleans = NDArray[np.bool_]
 
 
 def rotation_error_deg(R_est: ArrayLike, R_gt: ArrayLike) -> Array:
@@ -31,7 +36,7 @@ def depth_error_m(t_est: ArrayLike, t_gt: ArrayLike) -> Array:
 
 
 def depth_error_rel(t_est: ArrayLike, t_gt: ArrayLike) -> Array:
-    """[...]: E_z over the true depth; "Depth < 5 %" is this below 0.05."""
+    """[...]: E_z over the true depth."""
     return depth_error_m(t_est, t_gt) / np.abs(np.asarray(t_gt, dtype=np.float64)[..., 2])
 
 
@@ -40,14 +45,29 @@ def translation_error_rel(t_est: ArrayLike, t_gt: ArrayLike) -> Array:
     return translation_error_m(t_est, t_gt) / np.linalg.norm(np.asarray(t_gt, dtype=np.float64), axis=-1)
 
 
-def pose_10deg_5pct(R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike) -> NDArray[np.bool_]:
+def bearing_error_deg(t_est: ArrayLike, t_gt: ArrayLike) -> Array:
+    """[...]: angle between the rays to the estimated and the true origin, degrees."""
+    a, b = np.asarray(t_est, dtype=np.float64), np.asarray(t_gt, dtype=np.float64)
+    return np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+
+
+def rot_10deg(R_est: ArrayLike, R_gt: ArrayLike) -> Booleans:
+    """Rot<10° [...]: E_r below 10°."""
+    return rotation_error_deg(R_est, R_gt) < ROTATION_LIMIT_DEG
+
+
+def depth_5pct(t_est: ArrayLike, t_gt: ArrayLike) -> Booleans:
+    """Depth<5 % [...]: E_z below 5 % of the true depth."""
+    return depth_error_rel(t_est, t_gt) < DEPTH_LIMIT_REL
+
+
+def pose_10deg_5pct(R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike) -> Booleans:
     """Pose@10°/5 % [...]: rotation error below 10° and translation error below 5 % of the true range."""
-    rotation_ok = rotation_error_deg(R_est, R_gt) < POSE_ROTATION_DEG
-    return rotation_ok & (translation_error_rel(t_est, t_gt) < POSE_TRANSLATION_REL)
+    return rot_10deg(R_est, R_gt) & (translation_error_rel(t_est, t_gt) < TRANSLATION_LIMIT_REL)
 
 
 def add_m(R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike, points_body_m: ArrayLike) -> Array:
-    """ADD [...], metres: mean distance of model points [P, 3] under both poses. ADD-0.5d: below half the diameter."""
+    """ADD [...], metres: mean over model points x [P, 3] of ||(R_est x + t_est) - (R_gt x + t_gt)||."""
     points = np.asarray(points_body_m, dtype=np.float64)
     delta_R = np.asarray(R_est, dtype=np.float64) - np.asarray(R_gt, dtype=np.float64)
     delta_t = np.asarray(t_est, dtype=np.float64) - np.asarray(t_gt, dtype=np.float64)
@@ -55,7 +75,30 @@ def add_m(R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike, 
     return np.linalg.norm(moved, axis=-1).mean(axis=-1)
 
 
-def bearing_error_deg(t_est: ArrayLike, t_gt: ArrayLike) -> Array:
-    """[...]: angle between the rays to the estimated and the true origin, degrees."""
-    a, b = np.asarray(t_est, dtype=np.float64), np.asarray(t_gt, dtype=np.float64)
-    return np.rad2deg(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+def add_within(add: ArrayLike, diameter_m: ArrayLike, fraction: float) -> Booleans:
+    """ADD-0.5d, ADD-0.1d [...]: ADD `add`, metres, below `fraction` of the model's diameter."""
+    return np.asarray(add, dtype=np.float64) < fraction * np.asarray(diameter_m, dtype=np.float64)
+
+
+def depth_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
+    """[...]: whether the true depth lies within `sigmas` standard deviations of the estimated one."""
+    variance = np.asarray(covariance, dtype=np.float64)[..., 2, 2]
+    return depth_error_m(t_est, t_gt) <= sigmas * np.sqrt(variance)
+
+
+def bearing_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
+    """[..., 2]: the same of the ray's two slopes, x/z and y/z; their variance by the Jacobian at the estimate."""
+    est, gt = np.asarray(t_est, dtype=np.float64), np.asarray(t_gt, dtype=np.float64)
+    slopes = est[..., :2] / est[..., 2:]
+    J = np.concatenate([np.broadcast_to(np.eye(2), (*slopes.shape, 2)), -slopes[..., None]], axis=-1)
+    J = J / est[..., 2, None, None]
+    variance = np.einsum("...ij,...jk,...ik->...i", J, np.asarray(covariance, dtype=np.float64)[..., :3, :3], J)
+    return np.abs(gt[..., :2] / gt[..., 2:] - slopes) <= sigmas * np.sqrt(np.maximum(variance, 0.0))
+
+
+def rotation_inside(R_est: ArrayLike, R_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
+    """[..., 3]: the same of the rotation vector that turns the estimate into the truth, each axis of `cam`."""
+    est, gt = np.asarray(R_est, dtype=np.float64), np.asarray(R_gt, dtype=np.float64)
+    error_rad = so3_log(gt @ np.swapaxes(est, -1, -2))
+    variance = np.diagonal(np.asarray(covariance, dtype=np.float64)[..., 3:, 3:], axis1=-2, axis2=-1)
+    return np.abs(error_rad) <= sigmas * np.sqrt(variance)

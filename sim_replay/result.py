@@ -18,8 +18,7 @@ from sim_replay.score import (
     frame_of,
     latency_statistics,
     match_poses,
-    pose_statistics,
-    statistics_by_range,
+    statistics,
 )
 
 
@@ -28,7 +27,8 @@ class Result:
     """One replay, judged."""
 
     matches: tuple[Match, ...]
-    false_poses: int
+    false_poses: tuple[TargetPose, ...]  # those of a frame that belong to no target
+    strays: int  # poses of no frame of the sequence
     latencies_ms: dict[int, float]  # by frame: capture to the first TARGET_RELATIVE of that frame
     recording: Recording
 
@@ -64,26 +64,26 @@ def judge(sequence: PlayedSequence, recording: Recording) -> Result:
         frame = frame_of_record(record, recording, sequence)
         if frame is not None:
             latencies_ms.setdefault(frame, latency_ms(record, recording))
-    return Result(tuple(matches), false_poses + strays, latencies_ms, recording)
+    return Result(tuple(matches), tuple(false_poses), strays, latencies_ms, recording)
 
 
 def score_json(sequence: PlayedSequence, result: Result, model: Model) -> dict[str, Any]:
-    """score.json: shares 0..1, degrees, metres, milliseconds; null where there is nothing to tell."""
+    """score.json: shares 0..1, degrees, metres, milliseconds; null where there is nothing to tell.
+
+    The figures of the poses are those of `sim_replay.score.statistics`.
+    """
     recording = result.recording
     return {
         "sequence": sequence.scene.name,
-        "frames": len(sequence.scene.images),
-        "targets": len(result.matches),
         "poses": len(recording.poses),
-        "false_poses": result.false_poses,
-        **pose_statistics(result.matches),
+        "stray_poses": result.strays,
+        **statistics(len(sequence.scene.images), result.matches, result.false_poses),
         "latency_ms": latency_statistics([latency_ms(record, recording) for record in recording.targets]),
         "dropped_frames": recording.daemon_counters.get("dropped", 0),
         "mavlink_received": recording.mavlink.get("received", {}),
         "mavlink_refused": recording.mavlink.get("refused", {}),
         "zenoh_received": recording.zenoh.get("received", {}),
         "zenoh_refused": recording.zenoh.get("refused", {}),
-        "by_range": statistics_by_range(result.matches),
         "model": {"file": model.path.name, "sha256": model.sha256, "precision": model.contract.precision},
     }
 

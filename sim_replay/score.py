@@ -5,8 +5,8 @@ A target that no pose was found for counts as a failure in every rate; means and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,20 @@ from numpy.typing import ArrayLike
 from msgs.geometry import Array
 from sim_replay import metrics
 
-RANGE_BANDS_M = ((0.0, 200.0), (200.0, 300.0), (300.0, 400.0), (400.0, np.inf))
+RANGE_BANDS_M = ((100.0, 200.0), (200.0, 300.0), (300.0, 400.0), (400.0, 500.0))  # the paper's
+ADD_FRACTIONS = {"add_0_5d": 0.5, "add_0_1d": 0.1}
+FALSE_POSITIVES_PER = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class TargetPose:
-    """A target's pose in one frame, true or estimated, in `cam`."""
+    """A target's pose in one frame, true or estimated, in `cam`; an estimate may say how sure it is."""
 
     frame: int  # index into the sequence
     R_cam_target: Array  # [3, 3]
     t_cam_target_m: Array  # [3]
+    score: float | None = field(default=None, kw_only=True)
+    covariance: Array | None = field(default=None, kw_only=True)  # [6, 6], as edge.types.Estimate has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,13 @@ class Truth(TargetPose):
 
     object_id: int  # BOP's obj_id: which airframe
     diameter_m: float  # largest distance between two points of the target
+    airframe: str = ""  # its name; empty: the dataset gives none
+    points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
+
+    @property
+    def airframe_label(self) -> str:
+        """The airframe's name, else one made of its number as BOP's files have it."""
+        return self.airframe or f"obj_{self.object_id:06d}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +65,15 @@ class Match:
             return None
         return float(metrics.translation_error_m(self.estimate.t_cam_target_m, self.truth.t_cam_target_m))
 
+    @property
+    def add_m(self) -> float | None:
+        """ADD; None where nothing was found or the target's model is not known."""
+        if self.estimate is None or self.truth.points_body_m is None:
+            return None
+        est, gt = self.estimate, self.truth
+        points = self.truth.points_body_m
+        return float(metrics.add_m(est.R_cam_target, est.t_cam_target_m, gt.R_cam_target, gt.t_cam_target_m, points))
+
 
 def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | None:
     """Index of the frame exposed at start_ns + k / fps nearest to `capture_ns`; None beyond half a frame."""
@@ -62,13 +82,13 @@ def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | N
     return index if 0 <= index < frames and abs(position - index) < 0.5 else None
 
 
-def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], int]:
+def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], list[TargetPose]]:
     """Give each truth at most one pose of its frame: pairs by growing bearing error, at most one diameter apart.
 
     Association looks along the ray alone, so that a wrong depth or rotation is an error and not a miss.
 
     Returns:
-        One match for each truth, in their order, and the number of poses that belong to no target.
+        One match for each truth, in their order, and the poses that belong to no target.
     """
     by_frame: dict[int, list[TargetPose]] = {}
     for estimate in estimates:
@@ -86,41 +106,77 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
         if i not in found and id(estimate) not in taken:
             found[i] = estimate
             taken.add(id(estimate))
-    false_poses = sum(len(group) for group in by_frame.values()) - len(taken)
+    false_poses = [pose for group in by_frame.values() for pose in group if id(pose) not in taken]
     return [Match(truth, found.get(i)) for i, truth in enumerate(truths)], false_poses
 
 
-def pose_statistics(matches: Sequence[Match]) -> dict[str, Any]:
-    """The pose figures of a score: degrees, metres and shares 0..1; None where nothing was found or asked."""
+def statistics(frames: int, matches: Sequence[Match], false_poses: Sequence[TargetPose] = ()) -> dict[str, Any]:
+    """All figures of a score: {"overall", "by_range", "by_airframe"}, each of `pose_statistics`'s form.
+
+    `frames` is how many there are; matches and poses name theirs by index 0..frames-1. A range band counts the frames
+    that hold a target in it, and the false positives whose own range lies in it; an airframe has no false positives.
+    """
+    with_target = {match.truth.frame for match in matches}
+    in_empty = [pose for pose in false_poses if pose.frame not in with_target]
+    empty = frames - len(with_target)
+    false_rate = lambda poses: _share(FALSE_POSITIVES_PER * len(poses), empty)  # noqa: E731
+    overall = pose_statistics(frames, matches, false_rate(in_empty))
+    overall["false_poses"] = len(false_poses)
+    by_range = {}
+    for band, inside in _bands(matches, lambda match: match.truth).items():
+        strays = _bands(in_empty, lambda pose: pose).get(band, [])
+        by_range[band] = pose_statistics(_frames_of(inside), inside, false_rate(strays))
+    by_airframe = {}
+    for name in sorted({match.truth.airframe_label for match in matches}):
+        inside = [match for match in matches if match.truth.airframe_label == name]
+        by_airframe[name] = pose_statistics(_frames_of(inside), inside, None)
+    return {"overall": overall, "by_range": by_range, "by_airframe": by_airframe}
+
+
+def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1000: float | None) -> dict[str, Any]:
+    """The figures of one group of targets: degrees, metres and shares 0..1; None where there is nothing to tell."""
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
     R_gt, t_gt = _stack([truth for truth, _ in found])
     R_est, t_est = _stack([estimate for _, estimate in found])
-    rotation_deg = metrics.rotation_error_deg(R_est, R_gt)
-    depth_rel = metrics.depth_error_rel(t_est, t_gt)
-    good = metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt)
+    rate = lambda good: _share(int(np.sum(good)), len(matches))  # noqa: E731
     return {
-        "detection_rate": _share(len(found), len(matches)),
-        "rotation_error_deg": _mean_median(rotation_deg),
-        "rotation_below_10deg": _share(int((rotation_deg < metrics.POSE_ROTATION_DEG).sum()), len(matches)),
+        "frames": frames,
+        "targets": len(matches),
+        "recall": _share(len(found), len(matches)),
+        "false_positives_per_1000": false_positives_per_1000,
+        "rotation_error_deg": _mean_median(metrics.rotation_error_deg(R_est, R_gt)),
         "translation_error_m": _mean_median(metrics.translation_error_m(t_est, t_gt)),
         "depth_error_m": _mean_median(metrics.depth_error_m(t_est, t_gt)),
-        "depth_error_rel": _mean_median(depth_rel),
-        "depth_below_5pct": _share(int((depth_rel < metrics.POSE_TRANSLATION_REL).sum()), len(matches)),
+        "depth_error_rel": _mean_median(metrics.depth_error_rel(t_est, t_gt)),
         "bearing_error_deg": _mean_median(metrics.bearing_error_deg(t_est, t_gt)),
-        "pose_10deg_5pct": _share(int(good.sum()), len(matches)),
+        "rot_10deg": rate(metrics.rot_10deg(R_est, R_gt)),
+        "depth_5pct": rate(metrics.depth_5pct(t_est, t_gt)),
+        "pose_10deg_5pct": rate(metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt)),
+        **_add_rates(matches),
+        "calibration": calibration(matches),
     }
 
 
-def statistics_by_range(matches: Sequence[Match]) -> list[dict[str, Any]]:
-    """`pose_statistics` for each band of true range that holds a target."""
-    ranges_m = np.array([np.linalg.norm(m.truth.t_cam_target_m) for m in matches])
-    bands = []
-    for low_m, high_m in RANGE_BANDS_M:
-        inside = [m for m, range_m in zip(matches, ranges_m, strict=True) if low_m <= range_m < high_m]
-        if inside:
-            limits = [low_m, None if np.isinf(high_m) else high_m]
-            bands.append({"range_m": limits, "targets": len(inside)} | pose_statistics(inside))
-    return bands
+def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
+    """Share of the truth inside one and two predicted standard deviations, axis by axis; None without covariances.
+
+    Of an honest Gaussian 0.683 and 0.954. Depth is one axis, bearing two, rotation three; each axis counts by itself.
+    """
+    sure = [(m.truth, m.estimate) for m in matches if m.estimate is not None and m.estimate.covariance is not None]
+    if not sure:
+        return None
+    R_gt, t_gt = _stack([truth for truth, _ in sure])
+    R_est, t_est = _stack([estimate for _, estimate in sure])
+    covariance = np.array([estimate.covariance for _, estimate in sure])
+    inside: dict[str, Callable[[float], metrics.Booleans]] = {
+        "depth": lambda sigmas: metrics.depth_inside(t_est, t_gt, covariance, sigmas),
+        "bearing": lambda sigmas: metrics.bearing_inside(t_est, t_gt, covariance, sigmas),
+        "rotation": lambda sigmas: metrics.rotation_inside(R_est, R_gt, covariance, sigmas),
+    }
+    return {
+        name: {f"inside_{sigmas}sigma": _rounded(np.mean(within(sigmas))) for sigmas in (1, 2)}
+        for name, within in inside.items()
+    }
 
 
 def latency_statistics(latencies_ms: ArrayLike) -> dict[str, float | None]:
@@ -130,6 +186,38 @@ def latency_statistics(latencies_ms: ArrayLike) -> dict[str, float | None]:
     if samples.size == 0:
         return dict.fromkeys(names)
     return {name: _rounded(value) for name, value in zip(names, np.percentile(samples, [50, 95, 99]), strict=True)}
+
+
+def range_band(range_m: float) -> str:
+    """The band of a true range, metres; 500 m belongs to the last of the paper's."""
+    for low_m, high_m in RANGE_BANDS_M:
+        if low_m <= range_m < high_m or range_m == high_m == RANGE_BANDS_M[-1][1]:
+            return f"{low_m:.0f}-{high_m:.0f}"
+    return f"below-{RANGE_BANDS_M[0][0]:.0f}" if range_m < RANGE_BANDS_M[0][0] else f"above-{RANGE_BANDS_M[-1][1]:.0f}"
+
+
+def _bands(items: Sequence[Any], pose: Callable[[Any], TargetPose]) -> dict[str, list[Any]]:
+    """Items by the range of their pose, near to far: the paper's bands always, those beyond where they hold one."""
+    order = ["below-100", *(f"{low:.0f}-{high:.0f}" for low, high in RANGE_BANDS_M), "above-500"]
+    groups: dict[str, list[Any]] = {name: [] for name in order}
+    for item in items:
+        groups[range_band(float(np.linalg.norm(pose(item).t_cam_target_m)))].append(item)
+    return {name: group for name, group in groups.items() if group or name[0].isdigit()}
+
+
+def _frames_of(matches: Sequence[Match]) -> int:
+    return len({match.truth.frame for match in matches})
+
+
+def _add_rates(matches: Sequence[Match]) -> dict[str, float | None]:
+    """ADD rates over the targets whose model is known, found or not."""
+    modelled = [m for m in matches if m.truth.points_body_m is not None]
+    add = np.array([np.inf if m.estimate is None else m.add_m for m in modelled])
+    diameter_m = np.array([m.truth.diameter_m for m in modelled])
+    return {
+        name: _share(int(np.sum(metrics.add_within(add, diameter_m, fraction))), len(modelled))
+        for name, fraction in ADD_FRACTIONS.items()
+    }
 
 
 def _stack(poses: Sequence[TargetPose]) -> tuple[Array, Array]:

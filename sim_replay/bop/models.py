@@ -47,6 +47,7 @@ class Model:
     size_m: tuple[float, float, float] | None = None
     ply: Path | None = None
     frame: ModelFrame | None = None
+    name: str = ""  # models_info.json's optional "name"; empty: it has none
 
     @cached_property
     def vertices_m(self) -> Array | None:
@@ -97,6 +98,7 @@ def _files_of(folder: Path, frames: ModelFrames) -> Iterator[tuple[int, Model]]:
 def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame) -> Model:
     """One object; what models_info.json leaves out comes from the mesh."""
     known = entry if isinstance(entry, dict) else {}
+    name = str(known.get("name", ""))
     diameter_m = _metres(path, key, entry, "diameter") if "diameter" in known or ply is None else None
     corners = None
     if all(f"{kind}_{axis}" in known for kind in ("min", "size") for axis in "xyz"):
@@ -111,8 +113,8 @@ def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame
     if diameter_m <= 0:
         raise BopError(f"{path}: 'diameter' of {key!r} is not above zero")
     if corners is None:
-        return Model(diameter_m, ply=ply, frame=frame)
-    return Model(diameter_m, _triple(corners.min(axis=0)), _triple(np.ptp(corners, axis=0)), ply, frame)
+        return Model(diameter_m, ply=ply, frame=frame, name=name)
+    return Model(diameter_m, _triple(corners.min(axis=0)), _triple(np.ptp(corners, axis=0)), ply, frame, name)
 
 
 def largest_distance(points: Array) -> float:

@@ -145,8 +145,11 @@ def write_camera(path: Path, K: Array, width_px: int, height_px: int, distortion
     path.write_text(json.dumps(entry, indent=2) + "\n", encoding="utf-8")
 
 
-def write_models(folder: Path, meshes: Mapping[int, Mesh]) -> None:
-    """Write obj_NNNNNN.ply (millimetres, binary) of each object id and models_info.json into `folder`."""
+def write_models(folder: Path, meshes: Mapping[int, Mesh], names: Mapping[int, str] | None = None) -> None:
+    """Write obj_NNNNNN.ply (millimetres, binary) of each object id and models_info.json into `folder`.
+
+    `names` of objects go into models_info.json as "name", a key of ours that scores are told by.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     info = {}
     for object_id, mesh in meshes.items():
@@ -154,6 +157,7 @@ def write_models(folder: Path, meshes: Mapping[int, Mesh]) -> None:
         points = mesh.vertices_m.astype(np.float64) * MM_PER_M
         low, size = points.min(axis=0), np.ptp(points, axis=0)
         info[object_id] = {
+            **({"name": names[object_id]} if names and object_id in names else {}),
             "diameter": round(largest_distance(points), 4),
             **{f"min_{axis}": round(float(v), 4) for axis, v in zip("xyz", low, strict=True)},
             **{f"size_{axis}": round(float(v), 4) for axis, v in zip("xyz", size, strict=True)},

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from sim_replay.offline import score_dataset
+from sim_replay.datasets import open_dataset
+from sim_replay.evaluation.judge import judge_frames
+from sim_replay.offline import estimator_answers, load_model
 
 
 def score_command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -18,25 +20,40 @@ def score_command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_every_frame_is_judged_by_itself(dark_spot_scene: Path, dark_spot_model: Path) -> None:
-    results = score_dataset([dark_spot_scene], dark_spot_model, threads=1)
+    dataset = open_dataset(dark_spot_scene)
+    answers = estimator_answers(load_model(dark_spot_model, threads=1))
+    results = judge_frames(list(dataset.frames()), dataset.models, answers)
     assert [len(result.matches) for result in results] == [1, 1, 1, 1, 0]
-    assert [result.false_poses for result in results] == [0] * 5
+    assert [result.false_poses for result in results] == [()] * 5
     for result in results[:4]:
         match = result.matches[0]
         assert match.rotation_error_deg == pytest.approx(0.0, abs=1e-4)
         # The spot's darkest pixel lies within its radius of six pixels, 0.5 m at 200 m.
         assert match.translation_error_m is not None
         assert match.translation_error_m < 0.75
+        assert match.estimate is not None
+        assert match.estimate.score == pytest.approx(250 / 255, abs=0.05)
+        assert match.estimate.covariance is not None
+        assert match.estimate.covariance[3, 3] == pytest.approx(0.01)
 
 
 def test_the_command_scores_a_dataset_folder_as_json(dark_spot_scene: Path, dark_spot_model: Path) -> None:
     done = score_command("--dataset", dark_spot_scene.parents[1], "--model", dark_spot_model, "--json")
     assert done.returncode == 0, done.stderr
     score = json.loads(done.stdout)
-    assert (score["frames"], score["targets"], score["poses"], score["false_poses"]) == (5, 4, 4, 0)
-    assert score["detection_rate"] == score["pose_10deg_5pct"] == 1.0
-    assert [band["range_m"] for band in score["by_range"]] == [[200.0, 300.0]]
-    assert score["model"]["file"] == "dark-spot.onnx"
+    overall = score["overall"]
+    assert (overall["frames"], overall["targets"], overall["false_poses"]) == (5, 4, 0)
+    assert overall["recall"] == overall["pose_10deg_5pct"] == 1.0
+    assert overall["false_positives_per_1000"] == 0.0
+    assert {band for band, group in score["by_range"].items() if group["targets"]} == {"200-300"}
+    assert score["method"]["file"] == "dark-spot.onnx"
+
+
+def test_the_command_shows_the_score_as_a_table(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    done = score_command("--dataset", dark_spot_scene.parents[1], "--split", "test", "--model", dark_spot_model)
+    assert done.returncode == 0, done.stderr
+    for words in ("dark-spot.onnx on dataset, 5 frames", "200-300 m", "Pose@10°/5 %", "obj_000001"):
+        assert words in done.stdout
 
 
 def test_bad_input_is_told_in_a_sentence_with_exit_code_2(dark_spot_scene: Path, dark_spot_model: Path) -> None:
@@ -46,6 +63,7 @@ def test_bad_input_is_told_in_a_sentence_with_exit_code_2(dark_spot_scene: Path,
     cases = (
         (["--dataset", dark_spot_scene, "--model", dark_spot_model], ("scene_gt.json", "cam_t_m2c")),
         (["--dataset", dark_spot_scene / "rgb", "--model", dark_spot_model], ("no BOP scene",)),
+        (["--dataset", dark_spot_scene.parents[1], "--split", "val", "--model", dark_spot_model], ("'val'",)),
         (["--dataset", dark_spot_scene, "--model", dark_spot_scene / "none.onnx"], ("none.onnx",)),
     )
     for arguments, words in cases:

@@ -65,8 +65,11 @@ def test_records_become_the_score(sequence: PlayedSequence, recording: Recording
     result = judge(sequence, recording)
     score = score_json(sequence, result, load_model(dark_spot_model, threads=1))
     assert json.loads(json.dumps(score, allow_nan=False)) == score
-    assert (score["frames"], score["targets"], score["poses"], score["false_poses"]) == (5, 4, 4, 2)
-    assert score["detection_rate"] == score["pose_10deg_5pct"] == 0.5
+    overall = score["overall"]
+    assert (score["poses"], score["stray_poses"], overall["false_poses"]) == (4, 1, 1)
+    assert (overall["frames"], overall["targets"]) == (5, 4)
+    assert overall["recall"] == overall["pose_10deg_5pct"] == overall["add_0_1d"] == 0.5
+    assert overall["false_positives_per_1000"] == 1000.0
     assert score["latency_ms"]["p50"] == pytest.approx(15.0, abs=0.002)
     assert score["mavlink_received"] == {"TARGET_RELATIVE": 2}
     assert score["zenoh_received"] == {"uav1/target/t0/pose": 4}

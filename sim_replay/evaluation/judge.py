@@ -1,0 +1,86 @@
+"""A method's poses against the truth of a dataset's pictures, one by one. What answers may be a model or a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from edge.errors import InputError
+from sim_replay.bop import Model
+from sim_replay.datasets import Dataset, DatasetFrame
+from sim_replay.score import Match, TargetPose, Truth, latency_statistics, match_poses, statistics
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a method says of one picture."""
+
+    poses: tuple[TargetPose, ...]
+    time_ms: float | None  # it took; None: not known
+
+
+Answerer = Callable[[int, DatasetFrame], Answer]  # the index is what the poses name as their frame
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedFrame:
+    """One picture, judged by itself."""
+
+    picture: DatasetFrame
+    matches: tuple[Match, ...]  # in the order of picture.targets
+    false_poses: tuple[TargetPose, ...]  # those that belong to no target
+    time_ms: float | None
+
+
+def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
+    """The picture's targets with size, name and model points. Raises InputError for an object without a model."""
+    truths = []
+    for target in picture.targets:
+        model = models.get(target.object_id)
+        if model is None:
+            raise InputError(f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models")
+        truths.append(
+            Truth(
+                index,
+                target.R_cam_target,
+                target.t_cam_target_m,
+                target.object_id,
+                model.diameter_m,
+                model.name,
+                model.points_m,
+            )
+        )
+    return truths
+
+
+def judge_frames(
+    pictures: Sequence[DatasetFrame],
+    models: Mapping[int, Model],
+    answer: Answerer,
+    on_frame: Callable[[JudgedFrame], None] = lambda _: None,
+) -> list[JudgedFrame]:
+    """Ask for every picture's poses and match them; `on_frame` sees each as it comes. Raises InputError."""
+    judged = []
+    for index, picture in enumerate(pictures):
+        answered = answer(index, picture)
+        matches, false_poses = match_poses(truths_of(index, picture, models), answered.poses)
+        judged.append(JudgedFrame(picture, tuple(matches), tuple(false_poses), answered.time_ms))
+        on_frame(judged[-1])
+    return judged
+
+
+def score_of(dataset: Dataset, method: dict[str, Any], judged: Sequence[JudgedFrame]) -> dict[str, Any]:
+    """The score of many frames: shares 0..1, degrees, metres, milliseconds; None where there is nothing to tell.
+
+    `method` says what was judged. The figures are those of `sim_replay.score.statistics`.
+    """
+    matches = [match for frame in judged for match in frame.matches]
+    false_poses = [pose for frame in judged for pose in frame.false_poses]
+    return {
+        "dataset": dataset.name,
+        "split": dataset.split,
+        "method": method,
+        "time_ms": latency_statistics([frame.time_ms for frame in judged if frame.time_ms is not None]),
+        **statistics(len(judged), matches, false_poses),
+    }

@@ -1,0 +1,59 @@
+"""A score as a person reads it: a column for each distance band, then a line for each airframe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import Group
+from rich.table import Table
+
+_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "targets": lambda group: str(group["targets"]),
+    "found": lambda group: _text(group["recall"], "{:.1%}"),
+    "E_r mean": lambda group: _text(group["rotation_error_deg"]["mean"], "{:.2f}°"),
+    "E_r median": lambda group: _text(group["rotation_error_deg"]["median"], "{:.2f}°"),
+    "E_t mean": lambda group: _text(group["translation_error_m"]["mean"], "{:.2f} m"),
+    "E_t median": lambda group: _text(group["translation_error_m"]["median"], "{:.2f} m"),
+    "E_z mean": lambda group: _text(group["depth_error_m"]["mean"], "{:.2f} m"),
+    "bearing mean": lambda group: _text(group["bearing_error_deg"]["mean"], "{:.3f}°"),
+    "Rot<10°": lambda group: _text(group["rot_10deg"], "{:.1%}"),
+    "Depth<5 %": lambda group: _text(group["depth_5pct"], "{:.1%}"),
+    "Pose@10°/5 %": lambda group: _text(group["pose_10deg_5pct"], "{:.1%}"),
+    "ADD-0.5d": lambda group: _text(group["add_0_5d"], "{:.1%}"),
+    "ADD-0.1d": lambda group: _text(group["add_0_1d"], "{:.1%}"),
+}
+_AIRFRAME_COLUMNS = ("targets", "found", "E_r mean", "E_t mean", "Pose@10°/5 %", "ADD-0.1d")
+
+
+def score_table(score: dict[str, Any]) -> Group:
+    """The figures of a score (sim_replay.evaluation.judge.score_of)."""
+    overall = score["overall"]
+    title = f"{score['method']['file']} on {score['dataset']}, {overall['frames']} frames"
+    false_rate = _text(overall["false_positives_per_1000"], "{:.1f}")
+    caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
+    table = Table("", title=title, caption=caption, title_justify="left", caption_justify="left")
+    groups = {"all": overall}
+    groups |= {f"{band} m": group for band, group in score["by_range"].items() if group["targets"]}
+    for name in groups:
+        table.add_column(name, justify="right")
+    for name, cell in _ROWS.items():
+        table.add_row(name, *(cell(group) for group in groups.values()))
+    airframes = Table()
+    airframes.add_column("airframe", no_wrap=True)
+    for name in _AIRFRAME_COLUMNS:
+        airframes.add_column(name, justify="right")
+    for name, group in score["by_airframe"].items():
+        airframes.add_row(name, *(_ROWS[column](group) for column in _AIRFRAME_COLUMNS))
+    return Group(table, airframes)
+
+
+def _calibration(group: dict[str, Any]) -> str:
+    if group["calibration"] is None:
+        return "no covariances to check"
+    shares = (f"{name} {value['inside_1sigma']:.0%}" for name, value in group["calibration"].items())
+    return "truth inside one sigma (an honest one: 68 %): " + ", ".join(shares)
+
+
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
