@@ -14,22 +14,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from edge.config_ground import RecorderSettings, ZenohSettings
+from edge.config_section import ConfigPath, Section
 from edge.errors import InputError
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
-from msgs.session import TlsFiles, check_endpoint
 
 SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
 # Optical axis along the nose, image right along the right wing: the mount when all three angles are zero.
 R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-
-def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
-    folder = (info.context or {}).get("folder", Path())
-    return (folder / path.expanduser()).resolve()
 
 
 def _endpoint(text: str) -> str:
@@ -39,14 +35,9 @@ def _endpoint(text: str) -> str:
     return text
 
 
-ConfigPath = Annotated[Path, AfterValidator(_from_config_folder)]
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class VehicleSettings(Section):
@@ -181,50 +172,6 @@ class EstimatorSettings(Section):
     )
 
 
-class ZenohTlsSettings(Section):
-    root_ca: ConfigPath = Field(description="the authority that signed both ends' certificates, PEM")
-    certificate: ConfigPath = Field(description="the vehicle's; its common name is the vehicle's name, PEM")
-    private_key: ConfigPath = Field(description="the vehicle's, PEM, mode 0600")
-
-    def files(self) -> TlsFiles:
-        return TlsFiles(self.root_ca, self.certificate, self.private_key)
-
-    @model_validator(mode="after")
-    def _do(self) -> ZenohTlsSettings:
-        self.files().check()
-        return self
-
-
-class ZenohSettings(Section):
-    enabled: bool = Field(default=True, description="publish over zenoh")
-    listen: list[str] = Field(
-        default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
-    )
-    connect: list[str] = Field(
-        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447?mixed_rel=1; retried for ever"
-    )
-    tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
-    pose_rate_max_hz: float | None = Field(
-        default=None,
-        gt=0,
-        le=240,
-        description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
-    )
-    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
-    ros_distribution: Literal["jazzy", "humble", "off"] = Field(
-        default="jazzy", description="whose keys and type hashes"
-    )
-    max_age_ms: float = Field(
-        default=500.0, gt=0, allow_inf_nan=False, description="an older measurement is not published as a pose"
-    )
-
-    @model_validator(mode="after")
-    def _endpoints_do(self) -> ZenohSettings:
-        for endpoint in (*self.listen, *self.connect):
-            check_endpoint(endpoint, tls=self.tls is not None)
-        return self
-
-
 class MavlinkSettings(Section):
     enabled: bool = Field(default=True, description="speak MAVLink to the autopilot")
     endpoints: list[Endpoint] = Field(
@@ -269,6 +216,8 @@ class Config(Section):
     model: ModelSettings = ModelSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     zenoh: ZenohSettings = ZenohSettings()
+    # Checked though it is the default, so that its folder is taken from the file's.
+    recorder: RecorderSettings = Field(default_factory=dict, validate_default=True)
     mavlink: MavlinkSettings = MavlinkSettings()
 
 

@@ -14,6 +14,7 @@ from edge.types import CameraInfo, Report
 if TYPE_CHECKING:
     from edge.links.mavlink_link import MavlinkLink
     from edge.links.zenoh_link import ZenohLink
+    from msgs.recording import Recorder
 
 # Python's logging levels are those of rcl_interfaces/Log; MAVLink counts the other way (MAV_SEVERITY).
 LEVELS = {HealthState.DEGRADED: logging.WARNING, HealthState.FAULT: logging.ERROR}
@@ -23,9 +24,10 @@ MAV_SEVERITY = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3}
 class Outlets:
     """The enabled links, running. Peers may come and go; only our own endpoints must be free."""
 
-    def __init__(self, zenoh: ZenohLink | None, mavlink: MavlinkLink | None) -> None:
+    def __init__(self, zenoh: ZenohLink | None, mavlink: MavlinkLink | None, recorder: Recorder | None = None) -> None:
         self._zenoh = zenoh
         self._mavlink = mavlink
+        self._recorder = recorder
 
     def publish(self, report: Report) -> None:
         if self._mavlink is not None:
@@ -40,7 +42,10 @@ class Outlets:
 
     def tell(self, state: HealthState, text: str) -> None:
         """A change of state, as an event."""
-        level = LEVELS.get(state, logging.INFO)
+        self.event(LEVELS.get(state, logging.INFO), text)
+
+    def event(self, level: int, text: str) -> None:
+        """Something an operator should know; from any thread."""
         if self._mavlink is not None:
             self._mavlink.event(MAV_SEVERITY[level], text)
         if self._zenoh is not None:
@@ -51,7 +56,7 @@ class Outlets:
             self._zenoh.publish_diagnostics(snapshot)
 
     def counters(self) -> dict[str, int]:
-        links = {"zenoh": self._zenoh, "mavlink": self._mavlink}
+        links = {"zenoh": self._zenoh, "mavlink": self._mavlink, "recorder": self._recorder}
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
 
 
@@ -63,11 +68,21 @@ def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo,
     config = file.config
     zenoh: ZenohLink | None = None
     mavlink: MavlinkLink | None = None
-    if config.zenoh.enabled:
+    recorder: Recorder | None = None
+    if config.zenoh.enabled or config.recorder.enabled:
         from edge.links.zenoh_link import ZenohLink
+        from msgs.recording import Recorder
 
+        recorder = Recorder(
+            config.recorder.folder,
+            config.vehicle.name,
+            config.recorder.limits(),
+            lambda level, text: outlets.event(level, text),
+            on=config.recorder.enabled,
+        )
+        cleanup.callback(recorder.stop)
         with file.blame("zenoh", "listen"):
-            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount())
+            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder)
             cleanup.callback(zenoh.stop)
             zenoh.start()
     if config.mavlink.enabled:
@@ -77,4 +92,7 @@ def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo,
             mavlink = MavlinkLink(config.mavlink, own_ship, camera)
             cleanup.callback(mavlink.stop)
             mavlink.start()
-    return Outlets(zenoh, mavlink)
+    outlets = Outlets(zenoh, mavlink, recorder)
+    if recorder is not None:
+        recorder.start()
+    return outlets

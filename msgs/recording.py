@@ -59,14 +59,14 @@ class Recorder:
     `tell(level, text)` hears what an operator should know (levels as in rcl_interfaces/Log), on the recorder's thread.
     """
 
-    def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell) -> None:
+    def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell, *, on: bool = True) -> None:
         self._store = Store(folder, stem, limits)
         self._limits = limits
         self._tell = tell
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
         self._counters: Counter[str] = Counter()
-        self._wanted = True
+        self._wanted = on
         self._stopping = False
         self._woken = False
         self._file: McapFile | None = None
@@ -86,12 +86,12 @@ class Recorder:
         self._thread.start()
 
     def record(self, topic: Topic, uav: str, target: str | None, payload: bytes, publish_ns: int) -> None:
-        """Take a sample to be written; never waits. Lost, and counted, when the disk is far behind."""
+        """Take a sample to be written, if it is switched on; never waits. Lost, and counted, when the disk fails."""
         sample = Sample(topic, topics.topic_name(topic, uav, target), payload, time.time_ns(), publish_ns)
         with self._changed:
-            if not self._wanted or self._stopping or self._failure is not None:
-                self._counters["not_recorded"] += 1
-            elif len(self._waiting) >= WAITING_MAX:
+            if not self._wanted or self._stopping:
+                return
+            if self._failure is not None or len(self._waiting) >= WAITING_MAX:
                 self._counters["lost"] += 1
             else:
                 # Nobody is woken: the writer comes by each second.

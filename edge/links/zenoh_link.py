@@ -1,7 +1,8 @@
 """The link to the ground: what each report says, put on the topic table's keys by a thread of its own.
 
 The loop only leaves the newest report in a mailbox. The session is a peer: it opens whether or not the ground is
-there, and zenoh goes on connecting.
+there, and zenoh goes on connecting. What goes out is recorded too, byte for byte, if there is a recorder; with zenoh
+off it is only recorded.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ import logging
 import threading
 import time
 from collections import Counter, deque
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
 import zenoh
 
-from edge.config import ZenohSettings
+from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
@@ -24,6 +26,7 @@ from edge.types import Mount, Report
 from msgs import topics
 from msgs.cdr import Log, Payload
 from msgs.publish import Node, TopicPublisher
+from msgs.recording import Recorder
 from msgs.session import peer_config
 from msgs.topics import Topic
 
@@ -49,8 +52,11 @@ class Mailbox:
 class ZenohLink:
     """Publishes reports, diagnostics and events of one vehicle. The publish methods never block."""
 
-    def __init__(self, settings: ZenohSettings, vehicle_name: str, mount: Mount) -> None:
+    def __init__(
+        self, settings: ZenohSettings, vehicle_name: str, mount: Mount, recorder: Recorder | None = None
+    ) -> None:
         self._settings = settings
+        self._recorder = recorder
         self._vehicle_name = vehicle_name
         self._mount = mount
         self._waiting = threading.Condition()
@@ -61,21 +67,25 @@ class ZenohLink:
 
     def start(self) -> None:
         """Open the session and begin. Raises LinkError if an endpoint cannot be listened on."""
-        endpoints = ", ".join(self._settings.listen) or "none"
-        try:
-            tls = self._settings.tls
-            config = peer_config(
-                self._settings.listen,
-                self._settings.connect,
-                tls=tls.files() if tls is not None else None,
-                pose_rate_max_hz=self._settings.pose_rate_max_hz,
-            )
-            self._session = zenoh.open(config)
-        except zenoh.ZError as error:
-            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
-            raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
+        if self._settings.enabled:
+            self._session = self._open()
         self._worker = threading.Thread(target=self._work, args=(self._session,), name="zenoh", daemon=True)
         self._worker.start()
+
+    def _open(self) -> zenoh.Session:
+        settings = self._settings
+        try:
+            config = peer_config(
+                settings.listen,
+                settings.connect,
+                tls=settings.tls.files() if settings.tls is not None else None,
+                pose_rate_max_hz=settings.pose_rate_max_hz,
+            )
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            endpoints = ", ".join(settings.listen) or "none"
+            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+            raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
 
     def publish(self, report: Report) -> None:
         """Leave a report for the worker; one it has not taken yet is replaced and counted."""
@@ -119,15 +129,15 @@ class ZenohLink:
             taken, self._mailbox = self._mailbox, Mailbox(stopping=self._mailbox.stopping)
             return taken
 
-    def _work(self, session: zenoh.Session) -> None:
-        node = Node(
-            session,
-            self._vehicle_name,
-            domain=self._settings.domain,
-            distribution=self._settings.ros_distribution,
-        )
-        desk = Desk(node, self._vehicle_name, self._mount, self._settings.max_age_ms)
-        with node, session.liveliness().declare_token(topics.alive_token(self._vehicle_name)):
+    def _work(self, session: zenoh.Session | None) -> None:
+        with ExitStack() as stack:
+            node: Node | None = None
+            if session is not None:
+                names = {"domain": self._settings.domain, "distribution": self._settings.ros_distribution}
+                node = stack.enter_context(Node(session, self._vehicle_name, **names))  # type: ignore[arg-type]
+                token = session.liveliness().declare_token(topics.alive_token(self._vehicle_name))
+                stack.enter_context(token)
+            desk = Desk(node, self._recorder, self._vehicle_name, self._mount, self._settings.max_age_ms)
             while True:
                 mail = self._take()
                 counted = self._deliver(desk, mail)
@@ -153,11 +163,14 @@ class ZenohLink:
 
 
 class Desk:
-    """The publishers, used by the worker alone."""
+    """Turns what is told into messages, and gives each to the publishers and the recorder; used by the worker alone."""
 
-    def __init__(self, node: Node, vehicle_name: str, mount: Mount, max_age_ms: float) -> None:
+    def __init__(
+        self, node: Node | None, recorder: Recorder | None, vehicle_name: str, mount: Mount, max_age_ms: float
+    ) -> None:
         self.counted: Counter[str] = Counter()
         self._node = node
+        self._recorder = recorder
         self._vehicle_name = vehicle_name
         self._mount = mount
         self._max_age_ms = max_age_ms
@@ -165,8 +178,9 @@ class Desk:
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
         self._intrinsics: tuple[bytes, tuple[int, int]] | None = None
         shared = (topics.DETECTIONS, topics.TF, topics.CAMERA_INFO, topics.DIAGNOSTICS, topics.EVENTS)
-        for topic in shared:
-            self._publisher(topic, None)
+        if node is not None:
+            for topic in shared:
+                self._publisher(node, topic, None)
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
@@ -195,11 +209,15 @@ class Desk:
         self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))
 
     def _put(self, topic: Topic, message: Payload, target: str | None = None) -> None:
-        self._publisher(topic, target).put(message.encode())
-        self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
+        payload = message.encode()
+        if self._recorder is not None and topic.recorded:
+            self._recorder.record(topic, self._vehicle_name, target, payload, time.time_ns())
+        if self._node is not None:
+            self._publisher(self._node, topic, target).put(payload)
+            self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
 
-    def _publisher(self, topic: Topic, target: str | None) -> TopicPublisher:
+    def _publisher(self, node: Node, topic: Topic, target: str | None) -> TopicPublisher:
         key = (topic.name, target)
         if key not in self._publishers:
-            self._publishers[key] = self._node.publisher(topic, target)
+            self._publishers[key] = node.publisher(topic, target)
         return self._publishers[key]

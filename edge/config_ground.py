@@ -1,0 +1,87 @@
+"""The sections of what goes to the ground and to disk: [zenoh] and [recorder]."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from edge.config_section import ConfigPath, Section
+from msgs.recording import RecordingLimits
+from msgs.session import TlsFiles, check_endpoint
+
+_MB = 1_000_000
+
+
+class ZenohTlsSettings(Section):
+    root_ca: ConfigPath = Field(description="the authority that signed both ends' certificates, PEM")
+    certificate: ConfigPath = Field(description="the vehicle's; its common name is the vehicle's name, PEM")
+    private_key: ConfigPath = Field(description="the vehicle's, PEM, mode 0600")
+
+    def files(self) -> TlsFiles:
+        return TlsFiles(self.root_ca, self.certificate, self.private_key)
+
+    @model_validator(mode="after")
+    def _do(self) -> ZenohTlsSettings:
+        self.files().check()
+        return self
+
+
+class ZenohSettings(Section):
+    enabled: bool = Field(default=True, description="publish over zenoh")
+    listen: list[str] = Field(
+        default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
+    )
+    connect: list[str] = Field(
+        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447?mixed_rel=1; retried for ever"
+    )
+    tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
+    pose_rate_max_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=240,
+        description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
+    )
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
+    ros_distribution: Literal["jazzy", "humble", "off"] = Field(
+        default="jazzy", description="whose keys and type hashes"
+    )
+    max_age_ms: float = Field(
+        default=500.0, gt=0, allow_inf_nan=False, description="an older measurement is not published as a pose"
+    )
+
+    @model_validator(mode="after")
+    def _endpoints_do(self) -> ZenohSettings:
+        for endpoint in (*self.listen, *self.connect):
+            check_endpoint(endpoint, tls=self.tls is not None)
+        return self
+
+
+class RecorderSettings(Section):
+    """What goes to the ground, as MCAP on disk; zenoh may be off."""
+
+    enabled: bool = Field(default=False, description="record from the start on")
+    folder: ConfigPath = Field(default=Path("recordings"), validate_default=True, description="made if it is not there")
+    file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="then the next file begins")
+    file_max_minutes: float = Field(default=10.0, gt=0, le=1440, description="then the next file begins")
+    total_max_mb: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="of all of this vehicle's files; default: the disk's end"
+    )
+    free_min_mb: float = Field(default=1000.0, ge=0, allow_inf_nan=False, description="left on the disk for others")
+    when_full: Literal["oldest", "stop"] = Field(default="oldest", description="remove the oldest files, or stop")
+
+    @model_validator(mode="after")
+    def _room_for_two(self) -> RecorderSettings:
+        if self.total_max_mb is not None and self.total_max_mb < 2 * self.file_max_mb:
+            raise ValueError("total_max_mb must hold two files of file_max_mb, or nothing is left when one begins")
+        return self
+
+    def limits(self) -> RecordingLimits:
+        return RecordingLimits(
+            file_bytes_max=round(self.file_max_mb * _MB),
+            file_seconds_max=60.0 * self.file_max_minutes,
+            total_bytes_max=None if self.total_max_mb is None else round(self.total_max_mb * _MB),
+            free_bytes_min=round(self.free_min_mb * _MB),
+            when_full=self.when_full,
+        )
