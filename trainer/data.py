@@ -132,15 +132,18 @@ class Feed:
         first_index: int,
         workers: int = 1,
         prefetch: int = 4,
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
+        """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ...: each trains in one process."""
         context = mp.get_context("spawn")
         self._turn = 0
         self._queues: list[mp.Queue] = []
         self._processes = []
         for worker in range(workers):
             out: mp.Queue = context.Queue(maxsize=prefetch)
-            first = first_index + worker * batch_size
-            arguments = (open_sampler, batch_size, first, workers * batch_size, out)
+            first = first_index + (worker * ranks + rank) * batch_size
+            arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, out)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
             process.start()
             self._queues.append(out)

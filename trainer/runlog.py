@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
 from trainer.config import TrainerConfig
@@ -94,6 +95,10 @@ class RunLog:
         self._record("validation", samples, {"step": step, "samples": samples, "size_px": size_px, **metrics})
         self._since_s = time.monotonic()
         self._sums, self._count = {}, 0
+
+    def picture(self, name: str, samples: int, image_bgr: NDArray[np.uint8]) -> None:
+        """An image [H, W, 3] on TensorBoard."""
+        self._board.add_image(name, image_bgr[..., ::-1].copy(), samples, dataformats="HWC")
 
     def note(self, text: str) -> None:
         print(text, flush=True)

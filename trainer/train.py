@@ -18,9 +18,11 @@ from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
 from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors, window_sampler
+from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
 from trainer.model import Decoded, Perception, PoseNet
+from trainer.pictures import example_sheet
 from trainer.runlog import RunLog, provenance
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
@@ -85,9 +87,9 @@ class StepResult(NamedTuple):
 class Trainer:
     """Network, moving average, optimiser and counters of one run."""
 
-    def __init__(self, config: TrainerConfig, device: torch.device) -> None:
+    def __init__(self, config: TrainerConfig, device: torch.device, group: Group | None = None) -> None:
         torch.manual_seed(config.data.seed)
-        self.config, self.device = config, device
+        self.config, self.device, self.group = config, device, group or Group()
         self.model = PoseNet(config.model).to(device)
         for part in (self.model.backbone, self.model.neck, self.model.head_hm):
             part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -108,10 +110,14 @@ class Trainer:
         return [{"params": p, "lr_scale": scale, "weight_decay": decay} for (scale, decay), p in groups.items()]
 
     def step(self, batch: TrainingBatch, progress: float) -> StepResult:
-        """One optimiser step. Its only randomness is drawn from (seed, step), so a resumed run repeats it."""
+        """One optimiser step over the group's batches. Its only randomness is drawn from (seed, step, rank).
+
+        So a resumed run repeats it. Gradients and norm statistics are means over the group.
+        """
         schedule = self.config.schedule
         image, labels = to_tensors(batch, self.device)
-        generator = torch.Generator().manual_seed(self.config.data.seed * 1_000_003 + self.steps)
+        draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
+        generator = torch.Generator().manual_seed(draw_of)
         self.model.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
             seen = self.model.perceive(image)
@@ -127,10 +133,12 @@ class Trainer:
             group["lr"] = rate * group["lr_scale"]
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        self.group.average(p.grad for p in self.model.parameters() if p.grad is not None)
         nn.utils.clip_grad_norm_(self.model.parameters(), schedule.gradient_clip)
         self.optimizer.step()
+        self.group.average(b for b in self.model.buffers() if b.dtype.is_floating_point)
         self.steps += 1
-        self.samples += len(batch.present)
+        self.samples += len(batch.present) * self.group.size
         self._update_average()
         rotation_deg, depth_rel = _batch_errors(out, labels)
         return StepResult(loss.item(), {k: v.item() for k, v in terms.items()}, rotation_deg, depth_rel)
@@ -228,18 +236,18 @@ def run_training(
     Progress, which drives the schedule, is the larger of samples done over planned and time used over budget.
     """
     torch.set_num_threads(config.run.threads)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
-    trainer = Trainer(config, device)
-    if not resume and (out / RESUME_NAME).exists():
-        raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
-    if start_from is not None:
-        trainer.start_from(start_from)
-    used_before_s = resume_run(out, trainer) if resume else 0.0
-    budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
-    loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
-    with stop_on_signals() as stopped:
-        loop.run(stopped, max_steps)
+    with joined_group() as group:
+        trainer = Trainer(config, group.device, group)
+        if not resume and (out / RESUME_NAME).exists():
+            raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+        if start_from is not None:
+            trainer.start_from(start_from)
+        used_before_s = resume_run(out, trainer) if resume else 0.0
+        budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
+        loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
+        with stop_on_signals() as stopped:
+            loop.run(stopped, max_steps)
     return trainer
 
 
@@ -253,8 +261,10 @@ class _Loop:
         self.out, self.budget, self.planned, self.opener = out, budget, planned, opener
         self.started_s = time.monotonic()
         self.saved_s = self.started_s
-        self.provenance = provenance(trainer.config)
-        self.log = RunLog(out, config_text, self.provenance)
+        self.group = trainer.group
+        self.provenance = {**provenance(trainer.config), "processes": self.group.size}
+        self.log = RunLog(out, config_text, self.provenance) if self.group.first else None
+        self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}
 
     def used_s(self) -> float:
@@ -263,7 +273,11 @@ class _Loop:
     def progress(self) -> float:
         by_samples = self.trainer.samples / self.planned
         by_time = self.used_s() / self.budget.total_s if self.budget.total_s else 0.0
-        return max(by_samples, by_time)
+        return self.group.agreed(max(by_samples, by_time))[0]  # a message: all processes must ask together
+
+    def note(self, text: str) -> None:
+        if self.log is not None:
+            self.log.note(text)
 
     def run(self, stopped: list[int], max_steps: int | None) -> None:
         last_step = None if max_steps is None else self.trainer.steps + max_steps
@@ -278,41 +292,56 @@ class _Loop:
                 reason = "the time budget is used up"
         finally:
             self.save()
-        self.validate(size_at(self.config.schedule, min(self.progress(), 1.0)))
-        self.log.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
-        self.log.close()
+        self.validate(self.size_px)
+        self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
+        if self.log is not None:
+            self.log.close()
 
     def _train_at(self, size_px: int, stopped: list[int], last_step: int | None) -> bool:
         """Train with windows of one size until the schedule changes it or ends. True: told to stop."""
         trainer, data, run = self.trainer, self.config.data, self.config.run
-        self.log.note(f"windows of {size_px} px from sample {trainer.samples} on")
+        self.size_px = size_px
+        self.note(f"windows of {size_px} px from sample {trainer.samples} on")
         opener = self.opener(data.seed, size_px)
-        with Feed(opener, data.batch_size, trainer.samples, data.workers, data.prefetch) as feed:
+        rank, ranks = self.group.rank, self.group.size
+        with Feed(opener, data.batch_size, trainer.samples, data.workers, data.prefetch, rank, ranks) as feed:
             while (progress := self.progress()) < 1.0 and size_at(self.config.schedule, progress) == size_px:
-                if stopped or (last_step is not None and trainer.steps >= last_step):
+                told_to_stop = self.group.largest(float(bool(stopped))) > 0
+                if told_to_stop or (last_step is not None and trainer.steps >= last_step):
                     return True
                 result = trainer.step(feed.next(), progress)
-                self.log.add(result.loss, result.terms, result.rotation_deg, result.depth_rel)
-                if trainer.steps % run.log_every_steps == 0:
-                    rate = trainer.optimizer.param_groups[-1]["lr"]
-                    self.log.report(trainer.steps, trainer.samples, progress, rate)
-                if trainer.samples % run.validate_every_samples < data.batch_size:
+                self._record(result, progress)
+                if trainer.samples % run.validate_every_samples < data.batch_size * ranks:
                     self.validate(size_px)
                 if time.monotonic() - self.saved_s > run.checkpoint_every_s:
                     self.save()
         return False
 
+    def _record(self, result: StepResult, progress: float) -> None:
+        if self.log is None:
+            return
+        trainer = self.trainer
+        self.log.add(result.loss, result.terms, result.rotation_deg, result.depth_rel)
+        if trainer.steps % self.config.run.log_every_steps == 0:
+            self.log.report(trainer.steps, trainer.samples, progress, trainer.optimizer.param_groups[-1]["lr"])
+
     def validate(self, size_px: int) -> None:
-        """Measure the averaged network on held-out windows of this size, rendered once."""
+        """Measure the averaged network on held-out windows of this size, rendered once, and show some."""
+        if self.log is None:
+            return
         if size_px not in self.held_out:
             data = self.config.data
             self.held_out[size_px] = render_once(self.opener(data.validation_seed, size_px), data.validation_samples)
         batches = self.held_out[size_px]
-        metrics = measure(predict_all(torch_predictor(self.trainer.average), batches), batches)
-        self.log.validation(self.trainer.steps, self.trainer.samples, size_px, metrics)
+        predicted = predict_all(torch_predictor(self.trainer.average), batches)
+        self.log.validation(self.trainer.steps, self.trainer.samples, size_px, measure(predicted, batches))
+        self.log.picture("held out", self.trainer.samples, example_sheet(batches[0], predicted))
 
     def save(self) -> None:
         """Both files; the weights first, so that resume.pt never knows more than weights.pt."""
+        self.saved_s = time.monotonic()
+        if self.log is None:
+            return
         state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
         training = {
             **self.provenance,
@@ -320,7 +349,6 @@ class _Loop:
             "samples": self.trainer.samples,
             "steps": self.trainer.steps,
         }
-        training["resolution_px"] = size_at(self.config.schedule, min(self.progress(), 1.0))
+        training["resolution_px"] = self.size_px
         save_weights(self.out / WEIGHTS_NAME, self.trainer.average, self.config_text, training)
         write_atomic(self.out / RESUME_NAME, state)
-        self.saved_s = time.monotonic()
