@@ -9,7 +9,9 @@ from sim_replay.airframes import AIRFRAMES, airframe_id
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A JSBSim aircraft with its derivatives at a reference speed, 1,000 m up (jsbsim.FGLinearization at its trim).
+    """A JSBSim aircraft with its derivatives at a reference speed, 1,000 m up.
+
+    They come from jsbsim.FGLinearization at its trim; the sailplane's, which it cannot trim, from differences.
 
     Moments are divided by inertia: rad/s² for full control, 1/s for a rate, 1/s² for an angle of attack.
     """
@@ -25,14 +27,16 @@ class Dynamics:
     pitch_control: float
     lift_slope: float  # 1/s: rate of the flight path for an angle of attack
     yaw_control: float
-    thrust: float  # m/s² for full throttle
+    thrust: float  # m/s² for full throttle; 0 for a sailplane
+    autopilot: bool = False  # JSBSim ships one with it that holds heading and height
 
 
 DYNAMICS = {
     d.jsbsim_name: d
     for d in (
         Dynamics("J3Cub", 30.0, 24.0, 35.0, 11.17, 12.95, 11.83, 7.54, 4.61, 3.03, 2.66, 2.31),
-        Dynamics("c172x", 52.0, 38.0, 60.0, 4.67, 6.51, 4.41, 22.05, 8.81, 4.11, 0.74, 4.23),
+        Dynamics("SGS", 25.0, 26.0, 28.0, 6.13, 3.01, 1.42, 2.52, 1.98, 2.25, 0.58, 0.0),
+        Dynamics("c172x", 52.0, 38.0, 60.0, 4.67, 6.51, 4.41, 22.05, 8.81, 4.11, 0.74, 4.23, autopilot=True),
         Dynamics("c182", 60.0, 45.0, 68.0, 5.54, 4.90, 6.08, 15.74, 6.01, 2.86, 1.54, 3.25),
         Dynamics("DHC6", 70.0, 58.0, 74.0, 5.75, 3.71, 3.65, 5.68, 2.38, 1.16, 1.51, 3.74),
         Dynamics("t6texan2", 95.0, 75.0, 125.0, 3.52, 11.32, 2.26, 22.37, 7.75, 1.70, 1.45, 3.22),
@@ -64,7 +68,7 @@ _CLASSES = {
     "tactical_inverted_v": FlightClass("J3Cub", 34.0, 0.7, 0.7),
     "light_aircraft": FlightClass("c172x", 55.0, 0.6, 0.5),
     "loitering_delta": FlightClass("c172x", 52.0, 0.7, 0.8),
-    "glider": FlightClass("J3Cub", 27.0, 0.7, 0.5),
+    "glider": FlightClass("SGS", 27.0, 0.45, 0.3),
     "tailless_swept": FlightClass("J3Cub", 28.0, 0.7, 0.8),
     "twin_boom_h_tail": FlightClass("c182", 52.0, 0.5, 0.35),
     "male_inverted_v": FlightClass("DHC6", 66.0, 0.5, 0.3),

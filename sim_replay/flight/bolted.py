@@ -6,7 +6,7 @@ import numpy as np
 
 from msgs.geometry import R_from_euler
 from sim_replay.flight.pointing import R_BODY_FORWARD_CAM, bearing_rad
-from sim_replay.flight.track import Array, Track
+from sim_replay.flight.track import Array, Mask, Track
 
 STEEPEST_MOUNT_RAD = np.radians(55.0)
 
@@ -30,10 +30,11 @@ def reach_rad(relative_m: Array, half_fov_rad: tuple[float, float], radius_m: fl
     return 0.97 * np.asarray(half_fov_rad) - radius[..., None] - 6.0 * jitter_rad
 
 
-def keeps(aim_rad: Array, body: Array, reach: Array) -> Array:
+def keeps(aim_rad: Array, body: Array, reach: Array) -> Mask:
     """Which cameras [M] bolted on at yaw and pitch [M, 2] keep sights [M, N, 3] (body) within reach [M, N, 2]."""
     angles = bearing_rad(np.einsum("mij,mni->mnj", bolted(aim_rad[:, 0], aim_rad[:, 1]), body))
-    return np.all(np.abs(angles) <= reach, axis=(1, 2)) & (np.abs(aim_rad[:, 1]) <= STEEPEST_MOUNT_RAD)
+    inside: Mask = np.all(np.abs(angles) <= reach, axis=(1, 2))
+    return inside & (np.abs(aim_rad[:, 1]) <= STEEPEST_MOUNT_RAD)
 
 
 def aim(

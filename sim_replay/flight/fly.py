@@ -11,17 +11,18 @@ from sim_replay.flight import bolted
 from sim_replay.flight.aircraft import flight_class
 from sim_replay.flight.encounter import Encounter, EncounterPlan, camera_pose
 from sim_replay.flight.jsbsim_flight import FlightError, Sortie, fly
-from sim_replay.flight.meeting import draw_aspect, draw_layouts, flyable, seen_from
+from sim_replay.flight.meeting import Layouts, draw_aspect, draw_layouts, flyable, seen_from
 from sim_replay.flight.others import View, fly_beside
 from sim_replay.flight.pointing import Pointing, bearing_rad, draw_excursion, draw_jitter, gimbal
 from sim_replay.flight.sorties import Clock, draw_own_class, draw_sortie
-from sim_replay.flight.track import Array, Track
+from sim_replay.flight.track import Array, Mask, Track
 
 LOWEST_M, HIGHEST_M = 60.0, 3300.0
 NEAREST_M, FARTHEST_M = 90.0, 520.0
 SPANS_APART = 1.5
 LAYOUTS = 600
 ENOUGH = 12  # layouts to choose an aspect among
+CONFIRMED = 10  # layouts looked at closely before others are drawn
 ATTEMPTS = 8
 
 
@@ -30,14 +31,12 @@ def fly_encounter(plan: EncounterPlan) -> Encounter:
     _check(plan)
     clock = Clock(np.arange(plan.frames) / plan.fps)
     rng = np.random.default_rng([plan.seed, 0xF1])
-    if plan.mount == "fixed" and not plan.leaves:
-        met = _meet(plan, clock, rng, bolted_on=True) or _meet(plan, clock, rng, bolted_on=False)
-    else:
-        met = _meet(plan, clock, rng, bolted_on=False)
+    lever = np.array([rng.uniform(0.2, 0.8), rng.uniform(-0.2, 0.2), rng.uniform(0.05, 0.25)])
+    met = _meet(plan, clock, rng, lever, bolted_on=True) if plan.mount == "fixed" and not plan.leaves else None
+    met = met or _meet(plan, clock, rng, lever, bolted_on=False)
     if met is None:
         raise FlightError(f"seed {plan.seed}: no flight keeps {plan.range_m:.0f} m over {plan.frames} frames")
     met = _into_the_world(rng, met)
-    lever = np.array([rng.uniform(0.2, 0.8), rng.uniform(-0.2, 0.2), rng.uniform(0.05, 0.25)])
     pointing = _point(plan, clock, rng, met, lever)
     targets = _with_others(plan, clock, rng, met, lever, pointing)
     R_ned_cam, t_ned_cam_m = camera_pose(met.own, pointing, lever, clock.frame_t_s)
@@ -73,10 +72,11 @@ class _Meeting:
     R_body_cam: Array | None  # [3, 3] of a bolted camera
 
 
-def _meet(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, bolted_on: bool) -> _Meeting | None:
+def _meet(
+    plan: EncounterPlan, clock: Clock, rng: np.random.Generator, lever: Array, bolted_on: bool
+) -> _Meeting | None:
     """The first drawn pair of flights that can be laid against each other as planned, the aspect as drawn."""
     aspect = draw_aspect(rng)
-    middle = len(clock.checked_s) // 2
     for attempt in range(ATTEMPTS):
         own_sortie, target_sortie = _draw_pair(plan, clock, rng, attempt)
         try:
@@ -84,20 +84,41 @@ def _meet(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, bolted_on
         except FlightError:
             continue
         layouts = draw_layouts(rng, LAYOUTS, plan.range_m)
-        own_checked, target_checked = own.at(clock.checked_s), target.at(clock.checked_s)
-        relative = layouts.relative_m(own_checked, target_checked, middle)
-        good = flyable(relative, NEAREST_M + 3.0, FARTHEST_M - 3.0)
-        mean_rad, body = bolted.mean_aim(own_checked, relative)
-        reach = bolted.reach_rad(relative, plan.half_fov_rad, _radius_m(plan.airframes[0]), plan.jitter_rad)
-        if bolted_on:
-            good = good & bolted.keeps(mean_rad, body, reach)
+        coarse = _Fit(plan, own, target, lever, clock.checked_s, layouts)
+        good = coarse.flyable() & (coarse.kept_in_picture() if bolted_on else True)
         if good.sum() < (ENOUGH if attempt < ATTEMPTS // 2 else 1):
             continue
-        match = seen_from(layouts, target_checked, middle) @ aspect
-        k = int(np.argmax(np.where(good, match, -2.0)))
-        mount = bolted.aim(rng, mean_rad[k], body[k], reach[k], plan.half_fov_rad) if bolted_on else None
-        return _Meeting(own, layouts.laid(k, own, target, clock.middle_s), target_sortie, mount)
+        match = seen_from(layouts, target.at(clock.checked_s), len(clock.checked_s) // 2) @ aspect
+        for k in np.argsort(np.where(good, -match, np.inf), kind="stable")[: min(int(good.sum()), CONFIRMED)]:
+            fine = _Fit(plan, own, target, lever, clock.all_s, layouts.only(int(k)))
+            if not fine.flyable()[0] or (bolted_on and not fine.kept_in_picture()[0]):
+                continue
+            mount = fine.aimed(rng) if bolted_on else None
+            return _Meeting(own, layouts.laid(int(k), own, target, clock.middle_s), target_sortie, mount)
     return None
+
+
+class _Fit:
+    """Layouts of a pair of flights, looked at at some times; the middle one is mid sequence."""
+
+    def __init__(
+        self, plan: EncounterPlan, own: Track, target: Track, lever: Array, times_s: Array, layouts: Layouts
+    ) -> None:
+        ship = own.at(times_s)
+        self.relative_m = layouts.relative_m(ship, target.at(times_s), len(times_s) // 2)
+        sight = self.relative_m - ship.R_ned_body @ lever
+        self.half_fov_rad = plan.half_fov_rad
+        self.mean_rad, self.body = bolted.mean_aim(ship, sight)
+        self.reach = bolted.reach_rad(sight, plan.half_fov_rad, _radius_m(plan.airframes[0]), plan.jitter_rad)
+
+    def flyable(self) -> Mask:
+        return flyable(self.relative_m, NEAREST_M + 2.0, FARTHEST_M - 2.0)
+
+    def kept_in_picture(self) -> Mask:
+        return bolted.keeps(self.mean_rad, self.body, self.reach)
+
+    def aimed(self, rng: np.random.Generator) -> Array:
+        return bolted.aim(rng, self.mean_rad[0], self.body[0], self.reach[0], self.half_fov_rad)
 
 
 def _draw_pair(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, attempt: int) -> tuple[Sortie, Sortie]:
@@ -109,7 +130,7 @@ def _draw_pair(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, atte
     if attempt >= 3:
         own = replace(own, speed_mps=target.speed_mps)
     if attempt >= 4:
-        own = replace(own, manoeuvre=target.manoeuvre, height_m=target.height_m)
+        own = replace(own, manoeuvre=target.manoeuvre, height_m=target.height_m, autopilot=target.autopilot)
     return own, target
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from msgs.geometry import Array
 from sim_replay.flight.aircraft import Dynamics
 from sim_replay.flight.manoeuvre import Manoeuvre
-from sim_replay.flight.pilot import Controls, Pilot, Seen
+from sim_replay.flight.pilot import GLIDE_RAD, AutopilotOperator, Controls, Pilot, Seen
 from sim_replay.flight.track import Track
 
 Gust = Literal["calm", "light", "moderate"]
@@ -20,12 +20,14 @@ FOOT_M = 0.3048
 STEP_S = 0.01
 STEPS_PER_SAMPLE = 2  # the track's 50 Hz, at which the pilot acts too
 SAMPLE_S = STEP_S * STEPS_PER_SAMPLE
-SETTLE_S = 4.0
+SETTLE_S = 6.0
+SAILPLANE_INCIDENCE_DEG = 2.0
 # MIL-F-8785C: wind at 20 ft above the ground, ft/s, and severity index (probability of exceedance).
 TURBULENCE: dict[Gust, tuple[float, int]] = {"light": (15.0, 2), "moderate": (25.0, 3)}
 _SEEN = (
     *("attitude/phi-rad", "attitude/theta-rad", "velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
     *("aero/beta-rad", "velocities/vt-fps", "velocities/h-dot-fps", "velocities/ned-velocity-mag-fps"),
+    *("attitude/psi-rad", "position/h-sl-ft"),
 )
 _RECORDED = (
     *("position/ecef-x-ft", "position/ecef-y-ft", "position/ecef-z-ft"),
@@ -45,6 +47,7 @@ class Sortie:
     roll_rate_limit_radps: float
     gust: Gust
     gust_seed: int
+    autopilot: bool = False  # flown by the autopilot that JSBSim ships with the aircraft
 
 
 class FlightError(RuntimeError):
@@ -70,21 +73,25 @@ class _Aircraft:
         return node
 
     def controls(self) -> Controls:
-        aileron, elevator, rudder, throttle = (n.get_double_value() for n in (*self._stick, self._throttles[0]))
-        return Controls(aileron, elevator, rudder, throttle)
+        aileron, elevator, rudder = (n.get_double_value() for n in self._stick)
+        return Controls(aileron, elevator, rudder, self._throttles[0].get_double_value() if self._throttles else 0.0)
 
     def step(self, controls: Controls) -> None:
         for node, value in zip(self._stick, (controls.aileron, controls.elevator, controls.rudder), strict=True):
             node.set_double_value(value)
         for node in self._throttles:
             node.set_double_value(controls.throttle)
+        if controls.autopilot is not None:
+            self._fdm["ap/heading_setpoint"] = math.degrees(controls.autopilot.heading_rad) % 360.0
+            self._fdm["ap/altitude_setpoint"] = controls.autopilot.height_m / FOOT_M
+            self._fdm["ap/heading_hold"] = self._fdm["ap/altitude_hold"] = 1.0
         for _ in range(STEPS_PER_SAMPLE):
             self._fdm.run()
 
     def seen(self) -> Seen:
         v = [n.get_double_value() for n in self._seen]
         path_rad = math.asin(max(-1.0, min(1.0, v[7] / max(v[8], 1.0))))
-        return Seen(v[0], v[1], v[2], v[3], v[4], v[5], v[6] * FOOT_M, path_rad)
+        return Seen(v[0], v[1], v[2], v[3], v[4], v[5], v[6] * FOOT_M, path_rad, v[9], v[10] * FOOT_M)
 
     def state(self) -> list[float]:
         return [n.get_double_value() for n in self._recorded]
@@ -105,7 +112,7 @@ def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
     The aircraft is trimmed heading north SETTLE_S before. Raises FlightError where it cannot be trimmed or departs.
     """
     aircraft = _Aircraft(sortie)
-    pilot = Pilot(
+    by_hand = Pilot(
         sortie.dynamics,
         sortie.manoeuvre,
         sortie.speed_mps,
@@ -113,6 +120,7 @@ def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
         aircraft.controls(),
         SAMPLE_S,
     )
+    pilot = AutopilotOperator(by_hand) if sortie.autopilot else by_hand
     settling, samples = round(SETTLE_S / SAMPLE_S), round((end_s - start_s) / SAMPLE_S) + 1
     for k in range(-settling, 0):
         aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
@@ -123,10 +131,11 @@ def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
         aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
     position = (values[:, :3] - values[0, :3]) @ R_ned_ecef.T * FOOT_M - np.array([0.0, 0.0, height_m])
     velocity = values[:, 3:6] @ R_ned_ecef.T * FOOT_M
-    R_ned_body = R_ned_ecef @ np.swapaxes(R_body_ecef, -1, -2)
+    R_ned_body: Array = R_ned_ecef @ np.swapaxes(R_body_ecef, -1, -2)
     if not np.isfinite(values).all() or R_ned_body[:, 2, 2].min() < 0.2:
         raise FlightError(f"{sortie.dynamics.jsbsim_name} departed from controlled flight")
-    return Track(start_s + np.arange(samples) * SAMPLE_S, R_ned_body, position, velocity, values[:, 6:9])
+    t_s: Array = start_s + np.arange(samples, dtype=np.float64) * SAMPLE_S
+    return Track(t_s, R_ned_body, position, velocity, values[:, 6:9])
 
 
 def _trimmed(sortie: Sortie) -> jsbsim.FGFDMExec:
@@ -142,10 +151,14 @@ def _trimmed(sortie: Sortie) -> jsbsim.FGFDMExec:
     fdm["ic/lat-geod-deg"], fdm["ic/long-gc-deg"] = 47.0, 8.0
     if fdm.get_property_manager().hasNode("gear/gear-cmd-norm"):
         fdm["gear/gear-cmd-norm"] = 0.0
+    if sortie.dynamics.thrust == 0.0:
+        fdm["ic/gamma-deg"] = math.degrees(GLIDE_RAD)
+        fdm["ic/alpha-deg"] = SAILPLANE_INCIDENCE_DEG
     fdm.run_ic()
-    fdm.get_propulsion().init_running(-1)
-    if not jsbsim.FGTrim(fdm, jsbsim.TrimMode.FULL).do_trim():
-        raise FlightError(f"{sortie.dynamics.jsbsim_name} cannot be trimmed at {sortie.speed_mps:.0f} m/s")
+    if sortie.dynamics.thrust > 0.0:
+        fdm.get_propulsion().init_running(-1)
+        if not jsbsim.FGTrim(fdm, jsbsim.TrimMode.FULL).do_trim():
+            raise FlightError(f"{sortie.dynamics.jsbsim_name} cannot be trimmed at {sortie.speed_mps:.0f} m/s")
     if sortie.gust != "calm":
         wind_fps, severity = TURBULENCE[sortie.gust]
         fdm["atmosphere/turb-type"] = 3  # MIL-F-8785C

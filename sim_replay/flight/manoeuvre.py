@@ -9,6 +9,7 @@ import numpy as np
 
 Kind = Literal["straight", "turn", "climbing_turn", "s_turn", "roll_in", "roll_out", "orbit", "climb"]
 KINDS: tuple[Kind, ...] = ("straight", "turn", "climbing_turn", "s_turn", "roll_in", "roll_out", "orbit", "climb")
+OFTEN = (1, 1, 1, 2, 2, 2, 1, 1)  # how often each is drawn against the others: those that change bank show the most
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def draw_manoeuvre(
     rng: np.random.Generator, duration_s: float, bank_limit_rad: float, path_limit_rad: float
 ) -> Manoeuvre:
     """A manoeuvre that shows itself within 0 to `duration_s`."""
-    kind = KINDS[int(rng.integers(len(KINDS)))]
+    kind = KINDS[int(rng.choice(len(KINDS), p=np.array(OFTEN) / sum(OFTEN)))]
     side = float(rng.choice([-1.0, 1.0]))
     bank = side * float(rng.uniform(0.3, 1.0)) * bank_limit_rad
     path = float(rng.uniform(-1.0, 1.0)) * path_limit_rad

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msgs.geometry import so3_exp
-from sim_replay.flight.track import Array, Track
+from sim_replay.flight.track import Array, Mask, Track
 
 ELEVATION_LIMIT_RAD = np.radians(38.0)
 
@@ -25,6 +25,10 @@ class Layouts:
         R = so3_exp(np.stack([0 * self.yaw_rad, 0 * self.yaw_rad, self.yaw_rad], axis=-1))
         passed = first.t_ned_body_m - first.t_ned_body_m[middle]
         return self.offset_ned_m[:, None] + np.einsum("mij,nj->mni", R, along) - passed
+
+    def only(self, k: int) -> Layouts:
+        """Layout `k` alone, M = 1."""
+        return Layouts(self.yaw_rad[k : k + 1], self.offset_ned_m[k : k + 1])
 
     def laid(self, k: int, first: Track, second: Track, middle_s: float) -> Track:
         """The second flight in the first one's axes, in layout `k`."""
@@ -45,11 +49,12 @@ def draw_layouts(rng: np.random.Generator, count: int, range_m: float) -> Layout
     return Layouts(yaw, range_m * direction)
 
 
-def flyable(relative_m: Array, near_m: float, far_m: float) -> Array:
+def flyable(relative_m: Array, near_m: float, far_m: float) -> Mask:
     """Which layouts [M] keep range and elevation at every time of `relative_m` [M, N, 3]."""
     range_m = np.linalg.norm(relative_m, axis=-1)
     steepest = np.abs(relative_m[..., 2]) <= np.sin(ELEVATION_LIMIT_RAD) * range_m
-    return np.all((range_m >= near_m) & (range_m <= far_m) & steepest, axis=1)
+    kept: Mask = np.all((range_m >= near_m) & (range_m <= far_m) & steepest, axis=1)
+    return kept
 
 
 def seen_from(layouts: Layouts, second: Track, middle: int) -> Array:

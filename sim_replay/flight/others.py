@@ -12,7 +12,7 @@ from sim_replay.flight.jsbsim_flight import FlightError, Sortie, fly
 from sim_replay.flight.meeting import Layouts, flyable
 from sim_replay.flight.pointing import bearing_rad
 from sim_replay.flight.sorties import Clock, draw_sortie
-from sim_replay.flight.track import Array, Track
+from sim_replay.flight.track import Array, Mask, Track
 
 NEAREST_M, FARTHEST_M = 90.0, 550.0
 LAYOUTS = 400
@@ -26,7 +26,7 @@ class View:
     R_ned_cam: Array  # [N, 3, 3]
     t_ned_cam_m: Array  # [N, 3]
     half_fov_rad: tuple[float, float]
-    counted: Array  # [N] bool: times at which the main target is in the picture
+    counted: Mask  # [N], times at which the main target is in the picture
 
 
 def fly_beside(

@@ -1,15 +1,18 @@
-"""The pilot: follows a manoeuvre with the aircraft's own stick, pedals and throttle, in coordinated turns."""
+"""Who flies a manoeuvre: a pilot on stick, pedals and throttle, or the autopilot that JSBSim ships with an aircraft."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sim_replay.flight.aircraft import Dynamics
 from sim_replay.flight.manoeuvre import Manoeuvre
 
 GRAVITY_MPS2 = 9.80665
+GLIDE_RAD = -0.05  # a sailplane's path at its cruise
+GLIDE_PER_MPS = 0.02  # rad of path for each m/s too fast: a sailplane trades height for speed
 PATH_BANDWIDTH = 0.7  # rad/s, flight path angle
+QUARTER_RAD = math.pi / 2.0
 ROLL_BANDWIDTH = 1.6  # rad/s, bank angle
 
 
@@ -25,6 +28,8 @@ class Seen:
     slip_rad: float  # sideslip; positive with the wind from the right
     speed_mps: float  # through the air
     path_rad: float  # flight path above the horizon
+    heading_rad: float
+    height_m: float
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,15 @@ class Controls:
     elevator: float
     rudder: float
     throttle: float
+    autopilot: Setpoints | None = None  # what JSBSim's own autopilot is to hold beside the stick
+
+
+@dataclass(frozen=True)
+class Setpoints:
+    """What an autopilot with heading and height hold is set to."""
+
+    heading_rad: float
+    height_m: float
 
 
 @dataclass
@@ -70,6 +84,8 @@ class Pilot:
         return _clip(self.trim.aileron + moment / (self.dynamics.roll_control * pressure))
 
     def _elevator(self, path_rad: float, seen: Seen, pressure: float) -> float:
+        if self.dynamics.thrust == 0.0:
+            path_rad = GLIDE_RAD + GLIDE_PER_MPS * (seen.speed_mps - self.speed_mps)
         turn = GRAVITY_MPS2 / seen.speed_mps * math.sin(seen.bank_rad) * math.tan(seen.bank_rad)
         wanted = turn + PATH_BANDWIDTH * (path_rad - seen.path_rad)
         error = wanted - seen.q_radps
@@ -88,6 +104,8 @@ class Pilot:
         return _clip(self.trim.rudder - moment / (self.dynamics.yaw_control * pressure))
 
     def _throttle(self, path_rad: float, seen: Seen) -> float:
+        if self.dynamics.thrust == 0.0:
+            return 0.0
         error = self.speed_mps - seen.speed_mps
         self._sum("speed", error, 8.0)
         pull = GRAVITY_MPS2 * math.sin(path_rad) + 0.5 * error + 0.1 * self._sums["speed"]
@@ -96,6 +114,29 @@ class Pilot:
     def _sum(self, name: str, error: float, limit: float) -> None:
         total = self._sums[name] + error * self.step_s
         self._sums[name] = min(max(total, -limit), limit)
+
+
+@dataclass
+class AutopilotOperator:
+    """Sets the shipped autopilot, which banks as it sees fit; the pilot keeps rudder and throttle."""
+
+    pilot: Pilot
+    _heading_rad: float | None = None
+    _height_m: float | None = None
+    _bank_rad: float | None = None
+
+    def fly(self, t_s: float, seen: Seen) -> Controls:
+        """The controls for the next step: a turn is a new heading a quarter circle on, a climb a height that rises."""
+        bank_rad, path_rad = self.pilot.manoeuvre.bank_rad(t_s), self.pilot.manoeuvre.path_rad(t_s)
+        if self._heading_rad is None or bank_rad != self._bank_rad:
+            self._heading_rad = seen.heading_rad + math.copysign(QUARTER_RAD, bank_rad) * (bank_rad != 0.0)
+            self._bank_rad = bank_rad
+        height_m = seen.height_m if self._height_m is None else self._height_m
+        self._height_m = height_m + self.pilot.speed_mps * math.sin(path_rad) * self.pilot.step_s
+        trim = self.pilot.trim
+        by_hand = self.pilot.fly(t_s, seen)
+        setpoints = Setpoints(self._heading_rad, self._height_m)
+        return replace(by_hand, aileron=trim.aileron, elevator=trim.elevator, autopilot=setpoints)
 
 
 def _clip(value: float) -> float:

@@ -120,9 +120,9 @@ class Excursion:
 
 
 def draw_excursion(rng: np.random.Generator, last_frame_s: float) -> Excursion:
-    """An absence of 13 to 27 % of the time, away from both ends."""
-    length = float(rng.uniform(0.13, 0.27)) * last_frame_s
-    ramp = float(rng.uniform(0.04, 0.1)) * last_frame_s
+    """An absence of 12 to 22 % of the time, away from both ends."""
+    length = float(rng.uniform(0.12, 0.22)) * last_frame_s
+    ramp = float(rng.uniform(0.03, 0.06)) * last_frame_s
     start = float(rng.uniform(0.15 * last_frame_s, 0.85 * last_frame_s - length))
     side = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)][int(rng.integers(4))]
     return Excursion((start, start + length), ramp, side)

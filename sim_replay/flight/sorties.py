@@ -51,6 +51,11 @@ class Clock:
         """Times [N] at which an encounter is checked, a little more than the frames; N is odd, the middle in it."""
         return np.linspace(-0.1, 2.0 * self.middle_s + 0.1, 29)
 
+    @property
+    def all_s(self) -> Array:
+        """As `checked_s`, at least 25 times a second."""
+        return np.linspace(-0.1, 2.0 * self.middle_s + 0.1, 2 * int(np.ceil((self.middle_s + 0.1) * 25.0)) + 1)
+
 
 def draw_sortie(rng: np.random.Generator, clock: Clock, how: FlightClass, gust: Gust) -> Sortie:
     """A flight of that class near its cruise, with a manoeuvre that shows within the frames."""
@@ -64,6 +69,7 @@ def draw_sortie(rng: np.random.Generator, clock: Clock, how: FlightClass, gust: 
         how.roll_rate_limit_radps,
         gust,
         int(rng.integers(1, 2**30)),
+        autopilot=bool(rng.random() < 0.5) and how.dynamics.autopilot,
     )
 
 

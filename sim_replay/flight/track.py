@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from msgs.geometry import so3_exp, so3_log
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
