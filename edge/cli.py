@@ -49,6 +49,10 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
     bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     bench.set_defaults(act=_bench)
+
+    keygen = commands.add_parser("keygen", help="write a new key that signs MAVLink, for [mavlink] signing_key")
+    keygen.add_argument("--out", type=Path, required=True, help="file to write; one that exists is left alone")
+    keygen.set_defaults(act=_keygen)
     return parser
 
 
@@ -77,6 +81,14 @@ def _bench(options: argparse.Namespace) -> int:
         raise InputError("--runs and --threads take whole numbers from 1 on")
     timings = bench(options.models, options.threads, options.spinning, options.runs)
     print(to_json(timings) if options.json else table(timings))
+    return 0
+
+
+def _keygen(options: argparse.Namespace) -> int:
+    from edge.links.signing import write_new_key
+
+    write_new_key(options.out)
+    print(f"{options.out}: 32 random bytes, readable by its owner alone; the autopilot needs the same key")
     return 0
 
 

@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from edge.config_ground import RecorderSettings, ZenohSettings
 from edge.config_section import ConfigPath, Section
 from edge.errors import InputError
+from edge.links.mavlink_endpoints import parse_endpoint
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
 
@@ -29,9 +30,7 @@ R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 
 
 def _endpoint(text: str) -> str:
-    match = re.fullmatch(r"(udpin|udpout):(\[[^\]]+\]|[^:\s]+):(\d{1,5})", text)
-    if not match or not 0 <= int(match[3]) <= 65535:
-        raise ValueError(f"'{text}' is not udpin:HOST:PORT or udpout:HOST:PORT")
+    parse_endpoint(text)
     return text
 
 
@@ -72,7 +71,13 @@ class IntrinsicsSettings(Section):
         return self
 
 
-class SequenceCamera(Section):
+class Camera(Section):
+    mount: Literal["fixed", "gimbal"] = Field(
+        default="fixed", description="gimbal: [mount] says how the camera sits on it, MAVLink how it is turned"
+    )
+
+
+class SequenceCamera(Camera):
     type: Literal["sequence"]
     path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
     fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
@@ -83,13 +88,13 @@ class SequenceCamera(Section):
     intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
 
 
-class FileCamera(Section):
+class FileCamera(Camera):
     type: Literal["file"]
     path: ConfigPath = Field(description="video file, played at its own rate")
     intrinsics: IntrinsicsSettings
 
 
-class DeviceCamera(Section):
+class DeviceCamera(Camera):
     type: Literal["device"]
     device: str = Field(default="/dev/video0", description="V4L2 device")
     width: int = Field(default=1920, gt=0, description="pixels asked of the device")
@@ -102,7 +107,7 @@ class DeviceCamera(Section):
     intrinsics: IntrinsicsSettings
 
 
-class StreamCamera(Section):
+class StreamCamera(Camera):
     type: Literal["stream"]
     url: str = Field(min_length=1, description="RTSP, HTTP or UDP address, as ffmpeg takes it")
     latency_ms: float = Field(
@@ -177,7 +182,7 @@ class MavlinkSettings(Section):
     endpoints: list[Endpoint] = Field(
         default_factory=lambda: ["udpin:127.0.0.1:14550"],
         min_length=1,
-        description="udpin:HOST:PORT or udpout:HOST:PORT",
+        description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD; spoken on at once",
     )
     system_id: int | None = Field(
         default=None, ge=1, le=255, description="the vehicle's; default: taken from its heartbeat"
@@ -188,7 +193,16 @@ class MavlinkSettings(Section):
     camera_component_id: int = Field(default=100, ge=2, le=255, description="the camera's; 100 is the first")
     allowed_hosts: list[str] = Field(
         default_factory=list,
-        description="addresses heard on udpin; empty: the first that sends a valid autopilot heartbeat",
+        description="addresses heard on udpin and tcpin; empty: the first that sends a valid autopilot heartbeat",
+    )
+    commanders: list[Annotated[int, Field(ge=1, le=255)]] = Field(
+        default_factory=list, description="system ids whose commands are obeyed; empty: all heard on an endpoint"
+    )
+    signing_key: ConfigPath | None = Field(
+        default=None, description="file of 32 bytes by `uavpose-edge keygen`; all is signed, nothing unsigned is heard"
+    )
+    signing_state: ConfigPath | None = Field(
+        default=None, description="where the last signing timestamp is kept; default: beside the key, .timestamp"
     )
     target_relative: bool = Field(default=True, description="send TARGET_RELATIVE (511) to autopilots other than PX4")
     target_relative_to_px4: bool = Field(
@@ -196,6 +210,23 @@ class MavlinkSettings(Section):
     )
     target_relative_rate_hz: float = Field(default=50.0, gt=0, le=50, description="upper bound of its rate")
     tracking_rate_hz: float = Field(default=10.0, ge=5, le=20, description="rate of CAMERA_TRACKING_* messages")
+    follow_target: bool = Field(default=False, description="send FOLLOW_TARGET from virtual_system_id")
+    adsb_icao_address: int | None = Field(
+        default=None,
+        ge=1,
+        le=0xFFFFFF - 3,
+        description="send ADSB_VEHICLE with this ICAO address plus the target's number; may make the autopilot avoid",
+    )
+    virtual_system_id: int = Field(
+        default=200, ge=1, le=255, description="the target's own system, for FOLLOW_TARGET and ADSB_VEHICLE"
+    )
+    onboard_computer_status: bool = Field(default=False, description="send ONBOARD_COMPUTER_STATUS once a second")
+    sensor_width_mm: float | None = Field(
+        default=None, gt=0, le=100, description="of the part that makes the picture; CAMERA_INFORMATION's lens needs it"
+    )
+    gimbal_component_id: int | None = Field(
+        default=None, ge=1, le=255, description="whose gimbal attitude is the camera's; default: the first heard"
+    )
     attitude_rate_hz: float = Field(default=50.0, gt=0, le=400, description="asked of the autopilot")
     position_rate_hz: float = Field(default=20.0, gt=0, le=100, description="asked of the autopilot")
     max_age_ms: float = Field(
@@ -206,6 +237,10 @@ class MavlinkSettings(Section):
     def _two_components(self) -> MavlinkSettings:
         if self.component_id == self.camera_component_id:
             raise ValueError("component_id and camera_component_id must differ")
+        if self.system_id == self.virtual_system_id:
+            raise ValueError("virtual_system_id must not be the vehicle's system_id")
+        if self.signing_state is not None and self.signing_key is None:
+            raise ValueError("signing_state needs signing_key")
         return self
 
 
@@ -219,6 +254,12 @@ class Config(Section):
     # Checked though it is the default, so that its folder is taken from the file's.
     recorder: RecorderSettings = Field(default_factory=dict, validate_default=True)
     mavlink: MavlinkSettings = MavlinkSettings()
+
+    @model_validator(mode="after")
+    def _gimbal_is_heard(self) -> Config:
+        if self.camera.mount == "gimbal" and not self.mavlink.enabled:
+            raise ValueError('[camera] mount = "gimbal" needs [mavlink]: the gimbal\'s attitude comes by it')
+        return self
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,11 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model, load_model
 from edge.health import Announcer, Health, HealthSnapshot
 from edge.outlets import Outlets, start_outlets
+from edge.requests import RequestQueue, StopTracking
+from edge.tracking.by_hand import ByHand
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.tracking.tracker import Tracker
-from edge.types import CameraInfo, Estimate, Frame, FrameMeta, OwnShip, Report, Track, TrackState
+from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, OwnShip, Report, Track, TrackState
 
 log = logging.getLogger(__name__)
 
@@ -47,9 +49,10 @@ def run(file: ConfigFile, stop: threading.Event) -> int:
             source, camera_info, opened = open_source(config.camera)
         capture = Capture(source, opened)
         cleanup.callback(capture.stop)
-        own_ship = OwnShipBuffer()
-        outlets = start_outlets(file, own_ship, camera_info, cleanup)
-        pipeline = Pipeline(config, model, own_ship, outlets, capture)
+        own_ship = OwnShipBuffer(gimballed=config.camera.mount == "gimbal")
+        requests = RequestQueue()
+        outlets = start_outlets(file, own_ship, camera_info, requests, cleanup)
+        pipeline = Pipeline(config, model, own_ship, outlets, capture, requests)
         pipeline.warm_up(camera_info)
         # What lives by now lives to the end: the collector need not walk it between frames.
         gc.collect()
@@ -67,12 +70,20 @@ class Pipeline:
     """One frame at a time through the stages, and once a second word of how it goes."""
 
     def __init__(
-        self, config: Config, model: Model, own_ship: OwnShipBuffer, outlets: Outlets, capture: Capture
+        self,
+        config: Config,
+        model: Model,
+        own_ship: OwnShipBuffer,
+        outlets: Outlets,
+        capture: Capture,
+        requests: RequestQueue,
     ) -> None:
         self._model = model
         self._own_ship = own_ship
         self._outlets = outlets
         self._capture = capture
+        self._requests = requests
+        self._by_hand = ByHand()
         self._acquire_every_n = config.estimator.acquire_every_n
         self._max_targets = config.estimator.max_targets
         self._estimator = Estimator(model, config.estimator.max_targets)
@@ -119,9 +130,12 @@ class Pipeline:
         clock.lap("wait")
         capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         own_ship = self._own_ship.at(capture_ns)
+        self._take_requests(capture_ns)
         expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh)
-        estimates = self._estimate(frame, expected, clock.lap)
+        pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
+        estimates = self._estimate(frame, expected, pointed_at, clock.lap)
         tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh)
+        self._by_hand.settle(tracks)
         clock.lap("filter")
         self._publish(frame, size_wh, tracks, own_ship)
         clock.lap("publish")
@@ -129,16 +143,29 @@ class Pipeline:
             frame.meta.sequence, clock.stages_ns(), tracks, own_ship is not None, time.monotonic_ns()
         )
 
-    def _estimate(self, frame: Frame, expected: list[Track], lap: Callable[[str], None]) -> list[Estimate]:
+    def _take_requests(self, capture_ns: int) -> None:
+        for request in self._requests.take():
+            self._by_hand.take(request, capture_ns)
+            if isinstance(request, StopTracking):
+                self._tracker.drop_all()
+
+    def _estimate(
+        self, frame: Frame, expected: list[Track], pointed_at: Array | None, lap: Callable[[str], None]
+    ) -> list[Estimate]:
         found: list[Estimate] = []
-        if self._estimator.has_track_stage and expected:
-            boxes = [track.box_xyxy_px for track in expected]
-            found = [estimate for estimate in self._estimator.track(frame, boxes) if estimate is not None]
+        boxes = [track.box_xyxy_px for track in expected]
+        if self._estimator.has_track_stage and (expected or pointed_at is not None):
+            seen = self._estimator.track(frame, boxes if pointed_at is None else [*boxes, pointed_at])
+            if pointed_at is not None and (there := seen[-1]) is not None:
+                self._by_hand.found(there)
+                self._tracker.make_room()
+            found = [estimate for estimate in seen if estimate is not None]
             lap("track")
         self._since_acquire += 1
         nothing_tracked = all(track.state is TrackState.COASTING for track in expected)
         another_due = self._since_acquire >= self._acquire_every_n and len(expected) < self._max_targets
-        if nothing_tracked or another_due or not self._estimator.has_track_stage:
+        wanted = nothing_tracked or another_due or not self._estimator.has_track_stage
+        if wanted and self._by_hand.searches(frame.meta.capture_ns):
             found += self._estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found])
             self._since_acquire = 0
             lap("acquire")
@@ -147,7 +174,10 @@ class Pipeline:
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
     ) -> None:
-        self._outlets.publish(Report(frame.meta, frame.K, size_wh, tracks, own_ship, self._model.sha256))
+        report = Report(
+            frame.meta, frame.K, size_wh, tracks, own_ship, self._model.sha256, chosen_id=self._by_hand.chosen_id
+        )
+        self._outlets.publish(report)
 
     def _supervise(self) -> None:
         """Tell the links how the daemon is: its state at every turn, changes as events, counters once a second."""

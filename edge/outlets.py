@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from edge.config import ConfigFile
 from edge.health import HealthSnapshot, HealthState
+from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report
 
@@ -60,7 +61,9 @@ class Outlets:
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
 
 
-def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo, cleanup: ExitStack) -> Outlets:
+def start_outlets(
+    file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo, requests: RequestQueue, cleanup: ExitStack
+) -> Outlets:
     """Start the enabled links, to be stopped by `cleanup`. A link that is off is not even imported.
 
     Raises InputError (LinkError) when an endpoint of our own cannot be opened.
@@ -86,10 +89,12 @@ def start_outlets(file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo,
             cleanup.callback(zenoh.stop)
             zenoh.start()
     if config.mavlink.enabled:
-        from edge.links.mavlink_link import MavlinkLink
+        from edge.links.mavlink_link import MavlinkLink, signing_of
 
+        with file.blame("mavlink", "signing_key"):
+            signing = signing_of(config.mavlink)
         with file.blame("mavlink", "endpoints"):
-            mavlink = MavlinkLink(config.mavlink, own_ship, camera)
+            mavlink = MavlinkLink(config.mavlink, own_ship, camera, requests, signing)
             cleanup.callback(mavlink.stop)
             mavlink.start()
     outlets = Outlets(zenoh, mavlink, recorder)

@@ -28,6 +28,7 @@ MAVLinkMessage = dialect.MAVLink_message
 MAVError = dialect.MAVError
 
 TARGET_OBS_FRAME_OTHER = 3
+CANDIDATES_MAX = 256  # places in one piece of bytes that look like a frame and are none: more is a flood, not a link
 _Q_UNKNOWN = (0.0, 0.0, 0.0, 0.0)
 _TYPES = {
     "uint64_t": ("Q", 8), "int64_t": ("q", 8), "double": ("d", 8),
@@ -162,3 +163,77 @@ def _unit_quaternion(field: str, q_wxyz: Sequence[float]) -> tuple[float, ...]:
     if not abs(math.hypot(*q) - 1.0) <= 1e-3:
         raise ValueError(f"TARGET_RELATIVE.{field} is not of unit length: {q}")
     return q
+
+
+class FrameReader:
+    """Messages out of bytes, whatever lies between them.
+
+    A candidate that is no frame costs one byte, not the length it claims: a truncated header swallows nothing that
+    follows. Media of datagrams use `datagram=True`, where no frame goes on in the next; byte streams one reader for
+    each connection.
+    """
+
+    def __init__(self, datagram: bool) -> None:
+        self.bad_runs = 0  # stretches of bytes that are no frame
+        self.unknown_ids = 0  # frames whose id no dialect of ours has: neither checksum nor signature can be judged
+        self.datagram = datagram
+        self._buffer = bytearray()
+        self._decoder = dialect.MAVLink(None)
+        self._in_bad_run = False
+
+    def feed(self, data: bytes) -> list[Any]:
+        """All messages with a valid checksum that these bytes complete, as pymavlink's classes."""
+        self._buffer += data
+        self._in_bad_run = self._in_bad_run and not self.datagram
+        messages = []
+        at, spoilt = 0, 0
+        while spoilt <= CANDIDATES_MAX and (at := self._next_magic(at)) < len(self._buffer):
+            end = self._frame_end(at)
+            message = None if end is None or end > len(self._buffer) else self._decoded(at, end)
+            if message is not None and end is not None:
+                messages.append(message)
+                self._in_bad_run = False
+                at = end
+            elif not self.datagram and (end is None or end > len(self._buffer)):
+                break  # the rest of it may be on its way
+            else:
+                spoilt += 1
+                self._skip(at + 1, at)
+                at += 1
+        keep_from = len(self._buffer) if self.datagram or spoilt > CANDIDATES_MAX else at
+        del self._buffer[:keep_from]
+        return messages
+
+    def _next_magic(self, start: int) -> int:
+        found = [i for i in (self._buffer.find(magic, start) for magic in (b"\xfd", b"\xfe")) if i >= 0]
+        nearest = min(found, default=len(self._buffer))
+        self._skip(nearest, start)
+        return nearest
+
+    def _frame_end(self, at: int) -> int | None:
+        """Where the frame that would begin here ends; None if its header is not all there, 0 if it is no frame."""
+        header = self._buffer[at : at + 3]
+        if header[0] == 0xFE:
+            return at + 8 + header[1] if len(header) > 1 else None
+        if len(header) < 3:
+            return None
+        if header[2] & ~dialect.MAVLINK_IFLAG_SIGNED:
+            return 0
+        return at + 12 + header[1] + (13 if header[2] else 0)
+
+    def _decoded(self, at: int, end: int) -> Any | None:
+        if end <= at:
+            return None
+        try:
+            message = self._decoder.decode(self._buffer[at:end])
+        except MAVError:
+            return None
+        if message.get_msgId() >= 0 and not message.get_type().startswith("UNKNOWN"):
+            return message
+        self.unknown_ids += 1
+        return None
+
+    def _skip(self, end: int, start: int) -> None:
+        if end > start and not self._in_bad_run:
+            self._in_bad_run = True
+            self.bad_runs += 1

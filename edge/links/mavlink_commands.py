@@ -1,23 +1,29 @@
-"""COMMAND_LONG and COMMAND_INT addressed to us. Pure: what is asked, and the MAV_RESULT it gets.
+"""COMMAND_LONG and COMMAND_INT addressed to us. Pure: what is asked, the MAV_RESULT it gets, and what follows.
 
-Carried out: REQUEST_MESSAGE (512) for CAMERA_INFORMATION, SET_MESSAGE_INTERVAL (511) for what we send at a rate.
-All else, tracking by hand too, is answered UNSUPPORTED.
+| command | |
+|---|---|
+| 2004 CAMERA_TRACK_POINT, 2005 CAMERA_TRACK_RECTANGLE | look for a target there |
+| 2010 CAMERA_STOP_TRACKING | drop all targets |
+| 511 SET_MESSAGE_INTERVAL | of what is sent at a rate |
+| 512 REQUEST_MESSAGE | of what is sent |
+
+All else is UNSUPPORTED.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
-from msgs.mavlink import MAVLink_target_relative_message, dialect
+from edge.links.mavlink_table import CAMERA_INFORMATION, HEARTBEAT, RATE_LIMITS_HZ
+from edge.requests import Request, StopTracking, TrackBox
+from msgs.mavlink import dialect
 
-TARGET_RELATIVE = MAVLink_target_relative_message.id
-IMAGE_STATUS = dialect.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS
-GEO_STATUS = dialect.MAVLINK_MSG_ID_CAMERA_TRACKING_GEO_STATUS
-CAMERA_INFORMATION = dialect.MAVLINK_MSG_ID_CAMERA_INFORMATION
-
-RATE_LIMITS_HZ = {TARGET_RELATIVE: (0.1, 50.0), IMAGE_STATUS: (5.0, 20.0), GEO_STATUS: (5.0, 20.0)}
+POINT_HALF_SHARE = 0.02  # of the picture's width: the box looked into where a point comes without a radius
+RECTANGLE_MIN_SHARE = 1e-3
+REQUESTABLE = frozenset((HEARTBEAT, CAMERA_INFORMATION, *RATE_LIMITS_HZ))
 
 
 @dataclass(frozen=True)
@@ -25,26 +31,77 @@ class Answer:
     """A MAV_RESULT, and what follows from it."""
 
     result: int
-    send_camera_information: bool = False
+    request: Request | None = None  # to be handed to the loop
+    send_once: int | None = None  # message id
     interval: tuple[int, float | None] | None = None  # message id, Hz: 0 off, None the default
 
 
-def answer(command: Any) -> Answer:
-    """Answer a COMMAND_LONG or COMMAND_INT; no parameter of it is trusted."""
+def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
+    """Answer a COMMAND_LONG or COMMAND_INT; no parameter of it is trusted.
+
+    `enabled` holds the ids that the configuration lets out, `aspect` is the picture's width by its height.
+    """
     if command.command == dialect.MAV_CMD_REQUEST_MESSAGE:
-        if command.param1 == CAMERA_INFORMATION:
-            return Answer(dialect.MAV_RESULT_ACCEPTED, send_camera_information=True)
-        return Answer(dialect.MAV_RESULT_UNSUPPORTED)
-    if command.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-        return Answer(dialect.MAV_RESULT_UNSUPPORTED)
-    if not math.isfinite(command.param1) or not math.isfinite(command.param2):
+        return _request_message(command.param1, enabled)
+    if command.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+        return _set_interval(command.param1, command.param2, enabled)
+    if command.command == dialect.MAV_CMD_CAMERA_TRACK_POINT:
+        return _track_point(command.param1, command.param2, command.param3, aspect)
+    if command.command == dialect.MAV_CMD_CAMERA_TRACK_RECTANGLE:
+        return _track_rectangle((command.param1, command.param2, command.param3, command.param4))
+    if command.command == dialect.MAV_CMD_CAMERA_STOP_TRACKING:
+        return Answer(dialect.MAV_RESULT_ACCEPTED, request=StopTracking())
+    return Answer(dialect.MAV_RESULT_UNSUPPORTED)
+
+
+def _request_message(number: float, enabled: Container[int]) -> Answer:
+    if not math.isfinite(number):
         return Answer(dialect.MAV_RESULT_DENIED)
-    message_id, interval_us = int(command.param1), float(command.param2)
+    message_id = int(number)
+    if message_id not in REQUESTABLE:
+        return Answer(dialect.MAV_RESULT_UNSUPPORTED)
+    if message_id in RATE_LIMITS_HZ and message_id not in enabled:
+        return Answer(dialect.MAV_RESULT_DENIED)
+    return Answer(dialect.MAV_RESULT_ACCEPTED, send_once=message_id)
+
+
+def _set_interval(number: float, interval_us: float, enabled: Container[int]) -> Answer:
+    if not math.isfinite(number) or not math.isfinite(interval_us):
+        return Answer(dialect.MAV_RESULT_DENIED)
+    message_id = int(number)
     if message_id not in RATE_LIMITS_HZ:
         return Answer(dialect.MAV_RESULT_UNSUPPORTED)
+    if message_id not in enabled:
+        return Answer(dialect.MAV_RESULT_DENIED)
     if interval_us in (0.0, -1.0):
         return Answer(dialect.MAV_RESULT_ACCEPTED, interval=(message_id, None if interval_us == 0.0 else 0.0))
     low_hz, high_hz = RATE_LIMITS_HZ[message_id]
     if interval_us < 0.0 or not low_hz <= 1e6 / interval_us <= high_hz * 1.001:
         return Answer(dialect.MAV_RESULT_DENIED)
     return Answer(dialect.MAV_RESULT_ACCEPTED, interval=(message_id, 1e6 / interval_us))
+
+
+def _track_point(x: float, y: float, radius: float, aspect: float) -> Answer:
+    if not (_is_share(x) and _is_share(y)):
+        return Answer(dialect.MAV_RESULT_DENIED)
+    # The radius may be left out, as NaN or 0, which would be one pixel.
+    half = radius if _is_share(radius) and radius > RECTANGLE_MIN_SHARE else POINT_HALF_SHARE
+    return _look_into((x - half, y - half * aspect, x + half, y + half * aspect))
+
+
+def _track_rectangle(corners: tuple[float, float, float, float]) -> Answer:
+    left, top, right, bottom = corners
+    if not all(_is_share(value) for value in corners):
+        return Answer(dialect.MAV_RESULT_DENIED)
+    if right - left < RECTANGLE_MIN_SHARE or bottom - top < RECTANGLE_MIN_SHARE:
+        return Answer(dialect.MAV_RESULT_DENIED)
+    return _look_into(corners)
+
+
+def _look_into(box: tuple[float, float, float, float]) -> Answer:
+    left, top, right, bottom = (min(max(value, 0.0), 1.0) for value in box)
+    return Answer(dialect.MAV_RESULT_ACCEPTED, request=TrackBox((left, top, right, bottom)))
+
+
+def _is_share(value: float) -> bool:
+    return 0.0 <= value <= 1.0  # False for NaN

@@ -1,53 +1,57 @@
-"""The link to the autopilot: one thread that owns the sockets and drives the station.
-
-A `udpin` endpoint belongs to the first address that shows an autopilot's heartbeat, until that falls silent; whatever
-comes from elsewhere is counted and dropped, and nothing is ever sent there.
-"""
+"""The link to the autopilot: one thread that owns the sockets and ports and drives the station."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import selectors
+import select
 import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from edge.config import MavlinkSettings
 from edge.health import HealthState
+from edge.links.mavlink_peer import Endpoint
 from edge.links.mavlink_station import Station
-from edge.links.mavlink_vehicle import LOST_NS, Contact
-from edge.links.transport import Address, Udp
+from edge.links.mavlink_vehicle import Contact
+from edge.links.signing import Signing, open_signing
+from edge.links.transports import open_transport
+from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
-DATAGRAMS_A_TURN = 256  # so that a flood cannot keep reports from going out
+RECEIVED_A_TURN = 256  # so that a flood cannot keep reports from going out
 EVENTS_WAITING = 64
 STOP_TIMEOUT_S = 5.0
 
 
-@dataclass
-class Endpoint:
-    """A socket and whom it talks with."""
-
-    transport: Udp
-    peer: Address | None
-    fixed: bool  # the peer was given, not found
-    heard_ns: int = 0
+def signing_of(settings: MavlinkSettings) -> Signing | None:
+    """As the settings ask. Raises InputError for a key file that does not do."""
+    if settings.signing_key is None:
+        return None
+    state = settings.signing_state or Path(f"{settings.signing_key}.timestamp")
+    return open_signing(settings.signing_key, state, time.time_ns)
 
 
 class MavlinkLink:
     """Speaks MAVLink on the endpoints of `settings`. None of the methods but start and stop ever blocks."""
 
-    def __init__(self, settings: MavlinkSettings, own_ship: OwnShipBuffer, camera_info: CameraInfo) -> None:
+    def __init__(
+        self,
+        settings: MavlinkSettings,
+        own_ship: OwnShipBuffer,
+        camera_info: CameraInfo,
+        requests: RequestQueue,
+        signing: Signing | None = None,
+    ) -> None:
         self._settings = settings
-        self._station = Station(settings, own_ship, camera_info)
+        self._station = Station(settings, own_ship, camera_info, requests, signing)
         self._endpoints: list[Endpoint] = []
         self._counted = self._count()  # replaced whole by the thread, so that nobody waits for it
         self._mail_lock = threading.Lock()
@@ -61,9 +65,11 @@ class MavlinkLink:
 
     def start(self) -> None:
         """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
-        for name in self._settings.endpoints:
-            transport = Udp(name)
-            self._endpoints.append(Endpoint(transport, transport.peer, transport.peer is not None))
+        station = self._station
+        for text in self._settings.endpoints:
+            transport = open_transport(text)
+            hosts = self._settings.allowed_hosts
+            self._endpoints.append(Endpoint(transport, hosts, station.refused, station.authentic, station.introduces))
         for end in (self._wake, self._woken):
             end.setblocking(False)
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
@@ -108,8 +114,8 @@ class MavlinkLink:
 
     @property
     def ports(self) -> list[int]:
-        """Local UDP port of each endpoint, in the settings' order."""
-        return [endpoint.transport.port for endpoint in self._endpoints]
+        """Local port of each endpoint that has one, in the settings' order."""
+        return [port for endpoint in self._endpoints if (port := endpoint.transport.port) is not None]
 
     def _poke(self) -> None:
         # Full: the thread has been told often enough. Closed: it is gone.
@@ -117,28 +123,33 @@ class MavlinkLink:
             self._wake.send(b"\0")
 
     def _run(self) -> None:
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._woken, selectors.EVENT_READ)
-            for endpoint in self._endpoints:
-                selector.register(endpoint.transport, selectors.EVENT_READ, endpoint)
-            next_tick_ns = 0
-            while not self._stopping.is_set():
-                wait_s = max(0.0, (next_tick_ns - time.monotonic_ns()) / 1e9)
-                ready = [key.data for key, _ in selector.select(wait_s)]
-                try:
-                    self._deliver()
-                    for endpoint in ready:
-                        self._hear(endpoint)
-                    now_ns = time.monotonic_ns()
-                    if now_ns >= next_tick_ns:
-                        next_tick_ns = now_ns + round(TICK_S * 1e9)
-                        self._tick(now_ns)
-                        self._counted = self._count()
-                except Exception:
-                    # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
-                    self._station.counters["failed"] += 1
-                    log.exception("mavlink: a turn of the link failed")
+        next_tick_ns = 0
+        while not self._stopping.is_set():
+            self._wait(max(0.0, (next_tick_ns - time.monotonic_ns()) / 1e9))
+            try:
+                self._deliver()
+                for number, endpoint in enumerate(self._endpoints):
+                    self._hear(number, endpoint)
+                now_ns = time.monotonic_ns()
+                if now_ns >= next_tick_ns:
+                    next_tick_ns = now_ns + round(TICK_S * 1e9)
+                    self._tick(now_ns)
+                    self._counted = self._count()
+            except Exception:
+                # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
+                self._station.counters["failed"] += 1
+                log.exception("mavlink: a turn of the link failed")
+                next_tick_ns = time.monotonic_ns() + round(TICK_S * 1e9)
         self._counted = self._count()
+
+    def _wait(self, timeout_s: float) -> None:
+        """Until something is to be read or told, or the time is over."""
+        poll = select.poll()  # a new one each time, as connections come and go; it holds nothing in the kernel
+        poll.register(self._woken, select.POLLIN)
+        for endpoint in self._endpoints:
+            for fileno in endpoint.transport.filenos():
+                poll.register(fileno, select.POLLIN)
+        poll.poll(timeout_s * 1000.0)
 
     def _count(self) -> dict[str, int]:
         station = self._station
@@ -175,50 +186,29 @@ class MavlinkLink:
             self._station.counters["unpackable"] += 1
             log.warning("mavlink: not sent: %s", error)
 
-    def _hear(self, endpoint: Endpoint | None) -> None:
-        if endpoint is None:
-            return
-        for _ in range(DATAGRAMS_A_TURN):
+    def _hear(self, number: int, endpoint: Endpoint) -> None:
+        for _ in range(RECEIVED_A_TURN):
             received = endpoint.transport.receive()
             if received is None:
                 return
-            datagram, sender = received
             now_ns = time.monotonic_ns()
-            if not self._trusted(endpoint, datagram, sender, now_ns):
-                continue
-            endpoint.heard_ns = now_ns
-            for reply in self._station.take(datagram, now_ns):
-                endpoint.transport.send(reply, sender)
-
-    def _trusted(self, endpoint: Endpoint, datagram: bytes, sender: Address, now_ns: int) -> bool:
-        refused = self._station.refused
-        if endpoint.peer is not None:
-            refused["address"] += sender != endpoint.peer
-            return sender == endpoint.peer
-        if self._settings.allowed_hosts and sender[0] not in self._settings.allowed_hosts:
-            refused["host"] += 1
-            return False
-        if not self._station.introduces(datagram, now_ns):
-            refused["stranger"] += 1
-            return False
-        endpoint.peer = sender
-        log.info("mavlink: %s: autopilot at %s", endpoint.transport.endpoint, sender)
-        return True
+            messages = endpoint.believed(received, now_ns)
+            for reply in self._station.take(messages, number, now_ns):
+                self._station.counters["send_failed"] += not endpoint.send(reply)
 
     def _tick(self, now_ns: int) -> None:
         for endpoint in self._endpoints:
-            silent = endpoint.peer is not None and now_ns - endpoint.heard_ns > LOST_NS
-            if silent and not endpoint.fixed:
-                log.warning("mavlink: %s: nothing heard from %s", endpoint.transport.endpoint, endpoint.peer)
-                endpoint.peer = None
+            endpoint.tick(now_ns)
         was = self._station.vehicle.contact
         out = self._station.tick(now_ns)
         if was is Contact.HEARD and self._station.vehicle.contact is Contact.LOST:
             log.warning("mavlink: the autopilot's heartbeat has stopped")
-        self._send(out)
+        self._send(out.everywhere)
+        home = self._station.home
+        if home is not None:
+            self._send(out.home, self._endpoints[home : home + 1])
 
-    def _send(self, datagrams: Iterable[bytes]) -> None:
-        for datagram in datagrams:
-            for endpoint in self._endpoints:
-                if endpoint.peer is not None and not endpoint.transport.send(datagram, endpoint.peer):
-                    self._station.counters["send_failed"] += 1
+    def _send(self, frames: Iterable[bytes], endpoints: Sequence[Endpoint] | None = None) -> None:
+        for data in frames:
+            for endpoint in self._endpoints if endpoints is None else endpoints:
+                self._station.counters["send_failed"] += not endpoint.send(data)

@@ -21,6 +21,11 @@ GEO_STATUS_UNKNOWN = ("h_acc", "v_acc", "vel_n", "vel_e", "vel_d", "vel_acc", "h
 CAMERA_INFORMATION_UNKNOWN = ("focal_length", "sensor_size_h", "sensor_size_v")
 STATUSTEXT_BYTES = 50
 VENDOR = b"MF-UAVPose6D"
+CAMERA_ABILITIES = (
+    dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT
+    | dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_RECTANGLE
+    | dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
+)
 
 SYSTEM_STATUS = {
     HealthState.INIT: dialect.MAV_STATE_BOOT,
@@ -39,9 +44,13 @@ def heartbeat(kind: int, state: HealthState) -> Any:
     return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, status, 3)
 
 
-def primary(tracks: Sequence[Track]) -> Track | None:
-    """The one target that the camera protocol has room for: seen before coasting, then the lowest number."""
-    return min(tracks, key=lambda t: (t.state is not TrackState.CONFIRMED, t.track_id), default=None)
+def primary(tracks: Sequence[Track], chosen_id: int | None) -> Track | None:
+    """The one target that the camera protocol has room for: the chosen, else seen before coasting, lowest number."""
+    return min(
+        tracks,
+        key=lambda t: (t.track_id != chosen_id, t.state is not TrackState.CONFIRMED, t.track_id),
+        default=None,
+    )
 
 
 def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
@@ -109,22 +118,23 @@ def geo_status(report: Report, track: Track) -> Any | None:
     )
 
 
-def camera_information(camera: CameraInfo, boot_ms: int) -> Any:
-    """CAMERA_INFORMATION (259). Millimetres of lens and sensor are not known from pixels, and not made up."""
+def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_ms: int) -> Any:
+    """CAMERA_INFORMATION (259). The focal length in mm follows from the sensor's width, and is else not known (NaN)."""
     width_px, height_px = camera.image_size_wh
+    mm_per_px = NAN if sensor_width_mm is None else sensor_width_mm / width_px
     name = camera.name.encode()[:32]
     return dialect.MAVLink_camera_information_message(
         boot_ms,
         list(VENDOR.ljust(32, b"\0")),
         list(name.ljust(32, b"\0")),
         0,
-        NAN,
-        NAN,
-        NAN,
+        float(camera.K[0, 0]) * mm_per_px,
+        width_px * mm_per_px,
+        height_px * mm_per_px,
         width_px,
         height_px,
         0,
-        dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS,
+        CAMERA_ABILITIES,
         0,
         b"",
     )

@@ -1,4 +1,4 @@
-"""What is believed of a datagram. Pure but for its counters; everything refused is counted by reason."""
+"""What is believed of received bytes. Pure but for its counters; everything refused is counted by reason."""
 
 from __future__ import annotations
 
@@ -7,13 +7,39 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from msgs.mavlink import MAVError, MAVLink, dialect
+from edge.links.mavlink_table import (
+    ATTITUDE,
+    ATTITUDE_QUATERNION,
+    COMMAND_ACK,
+    COMMAND_INT,
+    COMMAND_LONG,
+    GIMBAL_ATTITUDE,
+    GLOBAL_POSITION_INT,
+    HEARTBEAT,
+    LOCAL_POSITION_NED,
+    READ_IDS,
+)
+from msgs.mavlink import FrameReader, dialect
 
-DATAGRAM_MAX = 8192  # bytes; longer ones carry no telemetry, and parsing is slow
+DATAGRAM_MAX = 8192  # bytes; longer ones carry no telemetry
 RATE_MAX_HZ = 2000
 MAGIC = (0xFD, 0xFE)  # MAVLink 2 and 1
 QUATERNION_TOLERANCE = 1e-2
+# No aircraft turns, lies or flies beyond these; finite nonsense would pass through the filter into what we tell.
+TURN_RATE_MAX_RADPS = 50.0
+ANGLE_MAX_RAD = 2.0 * math.pi
+LOCAL_MAX_M = 1e6
+SPEED_MAX_MPS = 1e3
+ALTITUDE_RANGE_MM = (-10_000_000, 100_000_000)
 AUTOPILOT_COMPONENT = 1
+GIMBAL_COMPONENTS = (
+    dialect.MAV_COMP_ID_GIMBAL,
+    dialect.MAV_COMP_ID_GIMBAL2,
+    dialect.MAV_COMP_ID_GIMBAL3,
+    dialect.MAV_COMP_ID_GIMBAL4,
+    dialect.MAV_COMP_ID_GIMBAL5,
+    dialect.MAV_COMP_ID_GIMBAL6,
+)
 # Types that fly with nobody's camera; an antenna tracker runs an autopilot's firmware as component 1.
 NOT_VEHICLES = (
     dialect.MAV_TYPE_GCS,
@@ -23,37 +49,22 @@ NOT_VEHICLES = (
     dialect.MAV_TYPE_ADSB,
     dialect.MAV_TYPE_CAMERA,
 )
-
-TELEMETRY = (
-    dialect.MAVLINK_MSG_ID_HEARTBEAT,
-    dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
-    dialect.MAVLINK_MSG_ID_ATTITUDE,
-    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    dialect.MAVLINK_MSG_ID_TIMESYNC,
-    dialect.MAVLINK_MSG_ID_COMMAND_ACK,
+COMMANDS = (COMMAND_LONG, COMMAND_INT)
+# Fields that may be NaN: not known, and not used.
+OPTIONAL_FIELDS = (
+    "repr_offset_q",
+    "angular_velocity_x",
+    "angular_velocity_y",
+    "angular_velocity_z",
+    "delta_yaw",
+    "delta_yaw_velocity",
 )
-COMMANDS = (dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT)
-
-
-def parse(datagram: bytes) -> list[Any]:
-    """All of a datagram's messages, bad ones as pymavlink gives them.
-
-    A parser for each datagram: a truncated header in one must not swallow the next.
-    """
-    parser = MAVLink(None)
-    parser.robust_parsing = True
-    try:
-        return list(parser.parse_buffer(bytearray(datagram)) or [])
-    except MAVError:
-        return []
 
 
 def is_autopilot_heartbeat(message: Any) -> bool:
     """Whether a message is the heartbeat of a vehicle's autopilot, not of a ground station or another companion."""
     return (
-        message.get_msgId() == dialect.MAVLINK_MSG_ID_HEARTBEAT
+        message.get_msgId() == HEARTBEAT
         and message.get_srcSystem() != 0
         and message.get_srcComponent() == AUTOPILOT_COMPONENT
         and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
@@ -62,21 +73,25 @@ def is_autopilot_heartbeat(message: Any) -> bool:
 
 
 class Receiver:
-    """Checks for one endpoint, whose sender's address was checked before."""
+    """Checks for one source, whose address was looked at before."""
 
     def __init__(self, refused: Counter[str]) -> None:
         self._refused = refused
         self._second = 0
         self._in_second = 0
 
-    def take(self, datagram: bytes, now_ns: int) -> list[Any]:
-        """Messages that are well-formed, of a kind we read and finite; who sent them is the next check."""
-        if not datagram or datagram[0] not in MAGIC:
+    def take(self, data: bytes, reader: FrameReader, now_ns: int) -> list[Any]:
+        """Messages that are well-formed, of a kind we read and plausible; who sent them is the next check."""
+        if reader.datagram and data[:1] not in (b"\xfd", b"\xfe"):
             return self._refuse("not_mavlink")
-        if len(datagram) > DATAGRAM_MAX:
+        if reader.datagram and len(data) > DATAGRAM_MAX:
             return self._refuse("too_long")
+        bad, unknown = reader.bad_runs, reader.unknown_ids
+        messages = reader.feed(data)
+        self._refused["bad_data"] += reader.bad_runs - bad
+        self._refused["message_id"] += reader.unknown_ids - unknown
         accepted = []
-        for message in parse(datagram):
+        for message in messages:
             reason = malformed(message) or self._too_many(now_ns)
             if reason is None:
                 accepted.append(message)
@@ -97,28 +112,48 @@ class Receiver:
 
 def malformed(message: Any) -> str | None:
     """Why a parsed message is no use, whoever sent it; None if it is sound."""
-    kind = message.get_type()
-    if kind == "BAD_DATA":
-        return "bad_data"
-    # Unknown ids skip CRC and signature in pymavlink.
-    if kind.startswith("UNKNOWN") or message.get_msgId() not in TELEMETRY + COMMANDS:
+    message_id = message.get_msgId()
+    if message_id not in READ_IDS:
         return "message_id"
+    if message_id in COMMANDS:
+        return None  # NaN stands for "not given" there; each command looks at what it reads
     if not _finite(message):
         return "not_finite"
-    if message.get_msgId() == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
-        norm = math.hypot(message.q1, message.q2, message.q3, message.q4)
-        if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-            return "quaternion_norm"
-    return None
+    if message_id in (ATTITUDE_QUATERNION, GIMBAL_ATTITUDE) and not _is_rotation(message):
+        return "quaternion_norm"
+    return None if _plausible(message) else "implausible"
+
+
+def _is_rotation(message: Any) -> bool:
+    gimbal = message.get_msgId() == GIMBAL_ATTITUDE
+    q = message.q if gimbal else (message.q1, message.q2, message.q3, message.q4)
+    return abs(math.hypot(*q) - 1.0) <= QUATERNION_TOLERANCE
+
+
+def _plausible(message: Any) -> bool:
+    message_id = message.get_msgId()
+    if message_id in (ATTITUDE, ATTITUDE_QUATERNION):
+        rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
+        angles = (message.roll, message.pitch, message.yaw) if message_id == ATTITUDE else ()
+        return _within(TURN_RATE_MAX_RADPS, *rates) and _within(ANGLE_MAX_RAD, *angles)
+    if message_id == LOCAL_POSITION_NED:
+        in_place = _within(LOCAL_MAX_M, message.x, message.y, message.z)
+        return in_place and _within(SPEED_MAX_MPS, message.vx, message.vy, message.vz)
+    if message_id == GLOBAL_POSITION_INT:
+        low_mm, high_mm = ALTITUDE_RANGE_MM
+        return abs(message.lat) <= 90e7 and abs(message.lon) <= 180e7 and low_mm <= message.alt <= high_mm
+    return True
+
+
+def _within(limit: float, *values: float) -> bool:
+    return all(abs(value) <= limit for value in values)
 
 
 def _finite(message: Any) -> bool:
-    if message.get_msgId() in COMMANDS:
-        return True  # NaN stands for "not given" there; each command looks at what it reads
     for field in message.get_fieldnames():
         value = getattr(message, field)
         numbers = value if isinstance(value, (list, tuple)) else (value,)
-        if field != "repr_offset_q" and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
+        if field not in OPTIONAL_FIELDS and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
             return False
     return True
 
@@ -128,8 +163,12 @@ def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], 
     if message.get_msgId() in COMMANDS:
         ours = message.target_system == vehicle_id and our_components(message.target_component)
         return None if ours else "not_for_us"
-    if message.get_srcSystem() != vehicle_id or message.get_srcComponent() != AUTOPILOT_COMPONENT:
+    if message.get_srcSystem() != vehicle_id:
         return "not_our_autopilot"
-    if message.get_msgId() == dialect.MAVLINK_MSG_ID_COMMAND_ACK and message.target_system not in (0, vehicle_id):
+    component = message.get_srcComponent()
+    by_gimbal = message.get_msgId() == GIMBAL_ATTITUDE and component in GIMBAL_COMPONENTS
+    if component != AUTOPILOT_COMPONENT and not by_gimbal:
+        return "not_our_autopilot"
+    if message.get_msgId() == COMMAND_ACK and message.target_system not in (0, vehicle_id):
         return "not_for_us"
     return None

@@ -1,96 +1,130 @@
-"""Both components we are on MAVLink, onboard computer and camera: datagrams in, datagrams out, no socket.
+"""Both components we are on MAVLink, onboard computer and camera: messages in, frames out, no socket.
 
-Every time comes in as an argument (monotonic ns). Used by one thread.
+Every time comes in as an argument (monotonic ns). Used by one thread. Links are known by number; telemetry is taken
+from one of them alone, the home link, where the autopilot was heard first, until it falls silent there.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from edge.config import MavlinkSettings
 from edge.health import HealthState
 from edge.links import mavlink_messages as words
-from edge.links.mavlink_commands import GEO_STATUS, IMAGE_STATUS, TARGET_RELATIVE, answer
-from edge.links.mavlink_receive import COMMANDS, Receiver, is_autopilot_heartbeat, misaddressed
+from edge.links.computer_status import ComputerReader, onboard_computer_status
+from edge.links.mavlink_announce import TargetAnnouncer
+from edge.links.mavlink_commands import answer
+from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
+from edge.links.mavlink_schedule import Schedule
+from edge.links.mavlink_table import (
+    ADSB_VEHICLE,
+    ATTITUDE_QUATERNION,
+    CAMERA_INFORMATION,
+    COMMAND_ACK,
+    COMPUTER_STATUS,
+    FOLLOW_TARGET,
+    GEO_STATUS,
+    GIMBAL_ATTITUDE,
+    GLOBAL_POSITION_INT,
+    HEARTBEAT,
+    IMAGE_STATUS,
+    LOCAL_POSITION_NED,
+    SYSTEM_TIME,
+    TARGET_RELATIVE,
+    TIMESYNC,
+)
+from edge.links.mavlink_telemetry import Telemetry
+from edge.links.mavlink_traffic import adsb_vehicle, follow_target
 from edge.links.mavlink_vehicle import Contact, Vehicle
 from edge.links.outgoing import UtcClock, sendable
-from edge.tracking.clock import BootClock, TimesyncEstimator
+from edge.links.signing import Signing
+from edge.requests import RequestQueue
+from edge.tracking.clock import TimesyncEstimator
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report, Track
-from msgs.geometry import R_from_euler, q_wxyz_from_R
 from msgs.mavlink import MAVLink, dialect, pack
 
-AUTOPILOT_COMPONENT = 1
 SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, to make ourselves known to a peer that waits for us
 HEARTBEAT_NS = 1_000_000_000
 HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stuck, and no heartbeat may hide that
+HOME_SILENT_NS = 3_000_000_000
 TIMESYNC_NS = 200_000_000
 GLOBAL_POSITION_HZ = 5.0
 SYSTEM_TIME_HZ = 1.0
-ATTITUDE_FALLBACK_NS = 1_000_000_000
-EARLY_SHARE = 0.1  # a message may come this share of its interval early: frames jitter
+GIMBAL_HZ = 50.0
+FOLLOW_TARGET_HZ = 10.0
+ADSB_VEHICLE_HZ = 2.0
+COMPUTER_STATUS_HZ = 1.0
+
+
+@dataclass
+class Outgoing:
+    """Frames for every peer, and for the home link alone."""
+
+    everywhere: list[bytes] = field(default_factory=list)
+    home: list[bytes] = field(default_factory=list)
 
 
 class Station:
-    """`own_ship` is filled from the autopilot's telemetry."""
+    """`own_ship` is filled from the autopilot's telemetry, `requests` from commands; `signing` None: unsigned."""
 
-    def __init__(self, settings: MavlinkSettings, own_ship: OwnShipBuffer, camera: CameraInfo) -> None:
+    def __init__(
+        self,
+        settings: MavlinkSettings,
+        own_ship: OwnShipBuffer,
+        camera: CameraInfo,
+        requests: RequestQueue,
+        signing: Signing | None = None,
+    ) -> None:
         self.counters: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.timesync = TimesyncEstimator()
-        rates_hz = {
-            dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: settings.attitude_rate_hz,
-            dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: settings.position_rate_hz,
-            dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: GLOBAL_POSITION_HZ,
-            dialect.MAVLINK_MSG_ID_SYSTEM_TIME: SYSTEM_TIME_HZ,
-        }
-        self.vehicle = Vehicle(settings.system_id, rates_hz)
+        self.vehicle = Vehicle(settings.system_id, _wanted_rates_hz(settings, own_ship))
+        self.home: int | None = None
         self._settings = settings
-        self._own_ship = own_ship
         self._camera = camera
-        self._receiver = Receiver(self.refused)
-        # Strangers have a rate limit of their own: their flood must not use up the autopilot's.
-        self._stranger_receiver = Receiver(self.refused)
-        self._boot_clock = BootClock(self.timesync)
+        self._requests = requests
+        self._signing = signing
+        self._telemetry = Telemetry(own_ship, self.timesync, settings.gimbal_component_id)
         self._utc = UtcClock()
-        components = (settings.component_id, settings.camera_component_id)
-        self._packers = {component: MAVLink(None, srcComponent=component) for component in components}
-        self._default_hz = {
-            TARGET_RELATIVE: settings.target_relative_rate_hz,
-            IMAGE_STATUS: settings.tracking_rate_hz,
-            GEO_STATUS: settings.tracking_rate_hz,
-        }
-        self._hz = dict(self._default_hz)
-        self._due_ns: dict[tuple[int, int], int] = {}
-        self._heartbeat_due_ns = self._timesync_due_ns = 0
+        self._components = (settings.component_id, settings.camera_component_id)
+        self._packers = {component: MAVLink(None, srcComponent=component) for component in self._components}
+        self._virtual = MAVLink(None, settings.virtual_system_id, settings.component_id)
+        self._schedule = Schedule(_rates_hz(settings))
+        self._announcer = TargetAnnouncer()
+        self._computer = ComputerReader()
+        self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
         self._health: tuple[HealthState, int] | None = None
-        self._quaternion_ns: int | None = None
         self._text_id = 0
 
-    def introduces(self, datagram: bytes, now_ns: int) -> bool:
-        """Whether a stranger's datagram holds the heartbeat of an autopilot that we would listen to."""
-        fixed = self._settings.system_id
-        return any(
-            is_autopilot_heartbeat(message) and fixed in (None, message.get_srcSystem())
-            for message in self._stranger_receiver.take(datagram, now_ns)
-        )
+    def authentic(self, messages: Iterable[Any]) -> list[Any]:
+        """Those that carry a valid signature; all of them where nothing is signed."""
+        if self._signing is None:
+            return list(messages)
+        believed = []
+        for message in messages:
+            reason = self._signing.refusal(message)
+            if reason is None:
+                believed.append(message)
+            else:
+                self.refused[reason] += 1
+        return believed
 
-    def take(self, datagram: bytes, now_ns: int) -> list[bytes]:
-        """Take a datagram from a trusted address; returns replies."""
+    def introduces(self, message: Any) -> bool:
+        """Whether a stranger's message is the heartbeat of an autopilot that we would listen to."""
+        return is_autopilot_heartbeat(message) and self._settings.system_id in (None, message.get_srcSystem())
+
+    def take(self, messages: Iterable[Any], link: int, now_ns: int) -> list[bytes]:
+        """Take authentic messages from a trusted address of a link; returns replies to it."""
         replies: list[bytes] = []
-        for message in self._receiver.take(datagram, now_ns):
+        for message in messages:
             if is_autopilot_heartbeat(message):
-                before = self.vehicle.system_id
-                known = self.vehicle.heartbeat(message.get_srcSystem(), message.autopilot, now_ns)
-                if before not in (None, self.vehicle.system_id):
-                    self._forget()  # another vehicle's clock, attitude and origin
-                self._count(message, None if known else "not_our_autopilot")
+                self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
                 continue
-            vehicle_id = self.vehicle.system_id
-            reason: str | None = "before_heartbeat"
-            if vehicle_id is not None:
-                reason = misaddressed(message, vehicle_id, self._packers.__contains__)
+            reason = self._misdirected(message, link)
             self._count(message, reason)
             if reason is None:
                 replies += self._believe(message, now_ns)
@@ -100,23 +134,25 @@ class Station:
         """A word from the loop; HEARTBEAT follows it and stops without it."""
         self._health = (state, now_ns)
 
-    def tick(self, now_ns: int) -> list[bytes]:
-        """Let time pass: heartbeats, time synchronisation, requests for rates."""
+    def tick(self, now_ns: int) -> Outgoing:
+        """Let time pass: heartbeats, own computer, time synchronisation, requests for rates."""
         self.vehicle.tick(now_ns)
-        out: list[bytes] = []
+        out = Outgoing()
         if now_ns >= self._heartbeat_due_ns and self._health and now_ns - self._health[1] <= HEALTH_AGE_MAX_NS:
             self._heartbeat_due_ns = now_ns + HEARTBEAT_NS
             state = self._health[0]
-            out.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, state)))
-            out.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, state), camera=True))
+            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, state)))
+            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, state), camera=True))
         if self.vehicle.contact is not Contact.HEARD:
             return out
+        if self._schedule.due(COMPUTER_STATUS, 0, now_ns):
+            out.everywhere += self._computer_status(now_ns)
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns = now_ns + TIMESYNC_NS
-            out.append(self._packed(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
+            out.home.append(self._packed(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
         wanted = self.vehicle.request(now_ns)
         if wanted is not None:
-            out.append(self._packed(self._interval_request(*wanted)))
+            out.home.append(self._packed(self._interval_request(*wanted)))
         return out
 
     def report(self, report: Report, now_ns: int) -> list[bytes]:
@@ -126,14 +162,16 @@ class Station:
         tracks = sendable(report, now_ns, self._settings.max_age_ms)
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
         out = [self._target_relative(report, track) for track in tracks if self._wants_target_relative(track, now_ns)]
-        first = words.primary(tracks)
-        if self._due(IMAGE_STATUS, 0, now_ns):
+        first = words.primary(tracks, report.chosen_id)
+        if self._schedule.due(IMAGE_STATUS, 0, now_ns):
             status = words.image_status(report, first)
             out.append(self._packed(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN))
-        if first is not None:
-            place = words.geo_status(report, first)
-            if place is not None and self._due(GEO_STATUS, 0, now_ns):
-                out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
+        place = None if first is None else words.geo_status(report, first)
+        if place is not None and self._schedule.due(GEO_STATUS, 0, now_ns):
+            out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
+        out += self._traffic(report, tracks, first, now_ns)
+        for severity, text in self._announcer.words(report.tracks):
+            out += self.event(severity, text)
         return out
 
     def event(self, severity: int, text: str) -> list[bytes]:
@@ -141,66 +179,74 @@ class Station:
         self._text_id = self._text_id % 65535 + 1
         return [self._packed(message) for message in words.statustexts(severity, text, self._text_id)]
 
+    def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
+        before = self.vehicle.system_id
+        if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), heartbeat.autopilot, now_ns):
+            return False
+        if before not in (None, self.vehicle.system_id):
+            self._telemetry.forget()  # another vehicle's clock, attitude and origin
+            self.timesync.clear()
+        if link != self.home and (self.home is None or now_ns - self._home_heard_ns > HOME_SILENT_NS):
+            self.home = link
+            self.vehicle.ask_anew()
+        if link == self.home:
+            self._home_heard_ns = now_ns
+        return True
+
+    def _misdirected(self, message: Any, link: int) -> str | None:
+        vehicle_id = self.vehicle.system_id
+        if vehicle_id is None:
+            return "before_heartbeat"
+        reason = misaddressed(message, vehicle_id, self._components.__contains__)
+        if reason is not None:
+            return reason
+        if message.get_msgId() in COMMANDS:
+            allowed = self._settings.commanders
+            return None if not allowed or message.get_srcSystem() in allowed else "not_a_commander"
+        return None if link == self.home else "other_link"
+
     def _believe(self, message: Any, now_ns: int) -> list[bytes]:
         message_id = message.get_msgId()
         self.vehicle.arrived(message_id, now_ns)
-        if message_id == dialect.MAVLINK_MSG_ID_TIMESYNC:
+        if message_id == TIMESYNC:
             if message.tc1 == 0:
                 return [self._packed(dialect.MAVLink_timesync_message(now_ns, message.ts1))]
             self.counters["timesync_refused"] += not self.timesync.reply(message.tc1, message.ts1, now_ns)
-        elif message_id == dialect.MAVLINK_MSG_ID_COMMAND_ACK:
+        elif message_id == COMMAND_ACK:
             if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
                 self.vehicle.acknowledged(message.result == dialect.MAV_RESULT_ACCEPTED)
         elif message_id in COMMANDS:
             return self._obey(message, now_ns)
-        elif message_id != dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            self._telemetry(message, now_ns)
+        elif message_id != HEARTBEAT:
+            by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
+            if by_autopilot and self.vehicle.boot_time(message.time_boot_ms):
+                self._telemetry.forget()
+                self.timesync.clear()
+            reason = self._telemetry.take(message, now_ns)
+            if reason is not None:
+                self.refused[reason] += 1
         return []
 
-    def _telemetry(self, message: Any, now_ns: int) -> None:
-        if self.vehicle.boot_time(message.time_boot_ms):
-            self._forget()
-        time_ns = self._boot_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
-        message_id = message.get_msgId()
-        taken = True
-        if message_id == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
-            self._quaternion_ns = now_ns
-            q = (message.q1, message.q2, message.q3, message.q4)
-            taken = self._own_ship.add_attitude(time_ns, q, _rates(message))
-        elif message_id == dialect.MAVLINK_MSG_ID_ATTITUDE:
-            if self._quaternion_ns is None or now_ns - self._quaternion_ns > ATTITUDE_FALLBACK_NS:
-                q_wxyz = q_wxyz_from_R(R_from_euler(message.roll, message.pitch, message.yaw))
-                taken = self._own_ship.add_attitude(time_ns, q_wxyz, _rates(message))
-        elif message_id == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
-            t_ned_m, v_ned_mps = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-            taken = self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
-        # 0, 0 is how an autopilot without a fix says so.
-        elif message_id == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
-            place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
-            v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
-            taken = self._own_ship.add_global(time_ns, place, v_ned_mps)
-        self.refused["late"] += not taken
-
-    def _forget(self) -> None:
-        """What was heard holds no more: the autopilot has started again, or it is another."""
-        self._own_ship.clear()
-        self._boot_clock.clear()
-        self.timesync.clear()
-        self._quaternion_ns = None
-
     def _obey(self, command: Any, now_ns: int) -> list[bytes]:
-        reply = answer(command)
+        width_px, height_px = self._camera.image_size_wh
+        reply = answer(command, self._enabled(), width_px / height_px)
+        result = reply.result
+        if reply.request is not None and not self._requests.put(reply.request):
+            result = dialect.MAV_RESULT_TEMPORARILY_REJECTED
         camera = command.target_component == self._settings.camera_component_id
         asker = (command.get_srcSystem(), command.get_srcComponent())
-        ack = dialect.MAVLink_command_ack_message(command.command, reply.result, 0, 0, *asker)
+        ack = dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *asker)
         out = [self._packed(ack, camera=camera)]
         if reply.interval is not None:
-            message_id, hz = reply.interval
-            self._hz[message_id] = self._default_hz[message_id] if hz is None else hz
-        if reply.send_camera_information:
+            self._schedule.set_rate(*reply.interval)
+        if reply.send_once == CAMERA_INFORMATION:
             boot_ms = now_ns // 1_000_000 % 2**32
-            information = words.camera_information(self._camera, boot_ms)
+            information = words.camera_information(self._camera, self._settings.sensor_width_mm, boot_ms)
             out.append(self._packed(information, camera=True, unknown=words.CAMERA_INFORMATION_UNKNOWN))
+        elif reply.send_once == HEARTBEAT:
+            self._heartbeat_due_ns = 0
+        elif reply.send_once is not None:
+            self._schedule.ask_once(reply.send_once)
         return out
 
     def _interval_request(self, message_id: int, rate_hz: float) -> Any:
@@ -210,28 +256,40 @@ class Station:
             message_id, 1e6 / rate_hz, 0, 0, 0, 0, 0,
         )  # fmt: skip
 
+    def _enabled(self) -> set[int]:
+        """Ids that may go out to this autopilot."""
+        to_px4 = self.vehicle.autopilot == dialect.MAV_AUTOPILOT_PX4
+        withheld = {TARGET_RELATIVE} if to_px4 and not self._settings.target_relative_to_px4 else set()
+        return self._schedule.message_ids - withheld
+
     def _wants_target_relative(self, track: Track, now_ns: int) -> bool:
-        if not self._settings.target_relative:
-            return False
-        if self.vehicle.autopilot == dialect.MAV_AUTOPILOT_PX4 and not self._settings.target_relative_to_px4:
-            return False
-        return self._due(TARGET_RELATIVE, track.track_id, now_ns)
+        return TARGET_RELATIVE in self._enabled() and self._schedule.due(TARGET_RELATIVE, track.track_id, now_ns)
 
     def _target_relative(self, report: Report, track: Track) -> bytes:
         self.counters["sent_TARGET_RELATIVE"] += 1
         utc_us = self._utc.utc_ns(report.meta.capture_ns) // 1000
         return words.target_relative(self._packer(camera=False), track, utc_us)
 
-    def _due(self, message_id: int, instance: int, now_ns: int) -> bool:
-        hz = self._hz[message_id]
-        if hz == 0.0:
-            return False
-        interval_ns = round(1e9 / hz)
-        due_ns = self._due_ns.get((message_id, instance), now_ns)
-        if now_ns < due_ns - EARLY_SHARE * interval_ns:
-            return False
-        self._due_ns[message_id, instance] = max(due_ns, now_ns - interval_ns) + interval_ns
-        return True
+    def _traffic(self, report: Report, tracks: list[Track], first: Track | None, now_ns: int) -> list[bytes]:
+        if self._virtual.srcSystem == self.vehicle.system_id:
+            self.counters["virtual_system_id_taken"] += 1
+            return []
+        messages = []
+        if first is not None and self._schedule.due(FOLLOW_TARGET, 0, now_ns):
+            messages.append(follow_target(report, first))
+        address = self._settings.adsb_icao_address
+        if address is not None:
+            due = [track for track in tracks if self._schedule.due(ADSB_VEHICLE, track.track_id, now_ns)]
+            messages += [adsb_vehicle(report, track, address, now_ns) for track in due]
+        return [self._signed(self._virtual, message) for message in messages if message is not None]
+
+    def _computer_status(self, now_ns: int) -> list[bytes]:
+        try:
+            status = self._computer.read()
+        except (OSError, ValueError, LookupError):
+            self.counters["computer_unread"] += 1
+            return []
+        return [self._packed(onboard_computer_status(status, self._utc.utc_ns(now_ns) // 1000))]
 
     @property
     def _system_id(self) -> int:
@@ -241,11 +299,19 @@ class Station:
         settings = self._settings
         packer = self._packers[settings.camera_component_id if camera else settings.component_id]
         packer.srcSystem = self._system_id
+        if self._signing is not None:
+            self._signing.prepare(packer)
         return packer
 
     def _packed(self, message: Any, *, camera: bool = False, unknown: tuple[str, ...] = ()) -> bytes:
         self.counters[f"sent_{message.get_type()}"] += 1
         return pack(self._packer(camera), message, unknown=unknown)
+
+    def _signed(self, packer: Any, message: Any) -> bytes:
+        if self._signing is not None:
+            self._signing.prepare(packer)
+        self.counters[f"sent_{message.get_type()}"] += 1
+        return pack(packer, message)
 
     def _count(self, message: Any, refusal: str | None) -> None:
         if refusal is None:
@@ -254,5 +320,25 @@ class Station:
             self.refused[refusal] += 1
 
 
-def _rates(message: Any) -> tuple[float, float, float]:
-    return message.rollspeed, message.pitchspeed, message.yawspeed
+def _wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict[int, float]:
+    """What is asked of the autopilot."""
+    gimbal = {GIMBAL_ATTITUDE: GIMBAL_HZ} if own_ship.gimballed else {}
+    return {
+        ATTITUDE_QUATERNION: settings.attitude_rate_hz,
+        LOCAL_POSITION_NED: settings.position_rate_hz,
+        GLOBAL_POSITION_INT: GLOBAL_POSITION_HZ,
+        SYSTEM_TIME: SYSTEM_TIME_HZ,
+        **gimbal,
+    }
+
+
+def _rates_hz(settings: MavlinkSettings) -> dict[int, float]:
+    """What may go out, and how often."""
+    optional = {
+        TARGET_RELATIVE: (settings.target_relative, settings.target_relative_rate_hz),
+        FOLLOW_TARGET: (settings.follow_target, FOLLOW_TARGET_HZ),
+        ADSB_VEHICLE: (settings.adsb_icao_address is not None, ADSB_VEHICLE_HZ),
+        COMPUTER_STATUS: (settings.onboard_computer_status, COMPUTER_STATUS_HZ),
+    }
+    always = {IMAGE_STATUS: settings.tracking_rate_hz, GEO_STATUS: settings.tracking_rate_hz}
+    return always | {message_id: hz for message_id, (enabled, hz) in optional.items() if enabled}

@@ -94,8 +94,7 @@ class Vehicle:
         if not self._boot.rebooted(boot_ms):
             return False
         self.reboots += 1
-        self._streams = self._new_streams()
-        self._in_flight = None
+        self.ask_anew()
         return True
 
     def arrived(self, message_id: int, now_ns: int) -> None:
@@ -112,13 +111,16 @@ class Vehicle:
             self.refusals += not accepted
             self._in_flight = None
 
+    def ask_anew(self) -> None:
+        """Forget what was asked: the autopilot may have forgotten it too, or is heard by another link now."""
+        self._streams = self._new_streams()
+        self._in_flight = None
+
     def tick(self, now_ns: int) -> None:
         """Let time pass."""
         if self.contact is Contact.HEARD and self._heartbeat_ns is not None and now_ns - self._heartbeat_ns > LOST_NS:
             self.contact = Contact.LOST
-            # Whoever comes back may have forgotten what we asked.
-            self._streams = self._new_streams()
-            self._in_flight = None
+            self.ask_anew()
 
     def request(self, now_ns: int) -> tuple[int, float] | None:
         """(message id, Hz) to ask for now, or None."""
@@ -137,8 +139,7 @@ class Vehicle:
 
     def _forget(self) -> None:
         self._boot = RebootDetector()
-        self._streams = self._new_streams()
-        self._in_flight = None
+        self.ask_anew()
 
     def _new_streams(self) -> dict[int, Stream]:
         return {message_id: Stream(message_id, rate_hz) for message_id, rate_hz in self._rates_hz.items()}

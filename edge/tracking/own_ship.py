@@ -66,7 +66,7 @@ class OwnShipBuffer:
 
     def __init__(self, gimballed: bool = False) -> None:
         """`gimballed`: the camera hangs on a gimbal, and without its attitude that of the body is of no use."""
-        self._gimballed = gimballed
+        self.gimballed = gimballed
         self._lock = threading.Lock()
         self._gimbals: deque[_Gimbal] = deque(maxlen=KEPT)
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
@@ -111,15 +111,15 @@ class OwnShipBuffer:
     def at(self, time_ns: int) -> OwnShip | None:
         """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 50 ms.
 
-        None without an attitude for that time, of the gimbal too if there is one. Position and velocity are None where the positions do not reach;
-        then the ned origin is the own ship itself.
+        None without an attitude for that time, of the gimbal too if there is one. Position and velocity are None where
+        the positions do not reach; then the ned origin is the own ship itself.
         """
         with self._lock:
             R_ned_body = _attitude_at(self._attitudes, time_ns)
             R_body_gimbal = None
-            if R_ned_body is not None and self._gimballed:
+            if R_ned_body is not None and self.gimballed:
                 R_body_gimbal = _gimbal_at(self._gimbals, time_ns, R_ned_body)
-            if R_ned_body is None or (self._gimballed and R_body_gimbal is None):
+            if R_ned_body is None or (self.gimballed and R_body_gimbal is None):
                 return None
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)

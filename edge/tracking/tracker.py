@@ -121,6 +121,15 @@ class Tracker:
                 expected.append(track)
         return expected
 
+    def drop_all(self) -> None:
+        """Forget all targets."""
+        self._targets.clear()
+
+    def make_room(self) -> None:
+        """Forget the target that was measured longest ago, if there is no room for another."""
+        if len(self._targets) >= self.max_targets:
+            self._targets.remove(min(self._targets, key=lambda t: t.measured_ns))
+
     def is_late(self, capture_ns: int) -> bool:
         """Whether a frame is not later than the last: nothing of it can be used."""
         return self._view is not None and capture_ns <= self._view.time_ns

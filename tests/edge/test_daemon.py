@@ -22,6 +22,7 @@ from edge.daemon import Pipeline
 from edge.estimator.model import load_model
 from edge.health import Announcer, Health, HealthSnapshot, HealthState, Percentiles, judge, percentiles_ms
 from edge.outlets import Outlets
+from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Frame, Report, Track, TrackState
 from msgs.client import connect, subscribe
@@ -232,7 +233,7 @@ def test_a_frame_that_is_not_later_than_the_last_is_counted_and_its_pose_not_sen
         "camera": {"type": "sequence", "path": scene}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
     })  # fmt: skip
     capture, outlets = Capture(FrozenStamp(scene), False), Recorder()
-    pipeline = Pipeline(config, load_model(toy_model, 1), OwnShipBuffer(), outlets, capture)
+    pipeline = Pipeline(config, load_model(toy_model, 1), OwnShipBuffer(), outlets, capture, RequestQueue())
     capture.start()
     pipeline.fly(threading.Event())
     capture.stop()

@@ -19,9 +19,10 @@ from edge.health import HealthState
 from edge.links.errors import LinkError
 from edge.links.mavlink_link import MavlinkLink
 from edge.links.mavlink_station import Station
+from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, TrackState
-from msgs.mavlink import MAVLink, dialect
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .reports import BOX_XYXY_PX, ORIGIN, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, V_NED_MPS, K
 from .reports import make_report as report
@@ -120,7 +121,7 @@ class Peer:
 @contextlib.contextmanager
 def linked(**settings: Any) -> Iterator[tuple[MavlinkLink, OwnShipBuffer]]:
     own_ship = OwnShipBuffer()
-    link = MavlinkLink(MavlinkSettings(endpoints=["udpin:127.0.0.1:0"], **settings), own_ship, CAMERA)
+    link = MavlinkLink(MavlinkSettings(endpoints=["udpin:127.0.0.1:0"], **settings), own_ship, CAMERA, RequestQueue())
     link.start()
     try:
         yield link, own_ship
@@ -286,7 +287,7 @@ def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
 
 def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
     own_ship = OwnShipBuffer()
-    station = Station(MavlinkSettings(), own_ship, CAMERA)
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
 
     def tell(system_id: int, now_s: float, boot_s: float, rotation: Rotation) -> None:
         mav = MAVLink(None, srcSystem=system_id, srcComponent=1)
@@ -295,7 +296,7 @@ def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
             dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3),
             dialect.MAVLink_attitude_quaternion_message(round(boot_s * 1000), *q, 0.0, 0.0, 0.0),
         ):
-            station.take(message.pack(mav), round(now_s * 1e9))
+            station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, round(now_s * 1e9))
 
     turned = Rotation.from_euler("x", 1.0)
     tell(1, now_s=1_000.0, boot_s=500.0, rotation=Rotation.identity())
@@ -348,7 +349,7 @@ def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
         (511, (275.0, 100_000.0), dialect.MAV_RESULT_ACCEPTED),
         (511, (275.0, 1_000.0), dialect.MAV_RESULT_DENIED),
         (511, (math.nan, 1_000.0), dialect.MAV_RESULT_DENIED),
-        (2004, (0.5, 0.5), dialect.MAV_RESULT_UNSUPPORTED),
+        (2004, (0.5, 0.5), dialect.MAV_RESULT_ACCEPTED),
         (400, (1.0,), dialect.MAV_RESULT_UNSUPPORTED),
     ],
 )
@@ -362,7 +363,7 @@ def test_commands_are_answered(command: int, params: tuple[float, ...], result: 
             information = peer.named("CAMERA_INFORMATION")
             assert (information.resolution_h, information.resolution_v) == SIZE_WH
             assert math.isnan(information.focal_length), "millimetres are not known from pixels"
-            assert information.flags == dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_GEO_STATUS
+            assert information.flags == 512 + 1024 + 2048
 
 
 def test_commands_to_others_are_not_answered() -> None:
@@ -463,7 +464,7 @@ def test_a_port_that_is_taken_is_a_sentence() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         endpoint = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
-        link = MavlinkLink(MavlinkSettings(endpoints=[endpoint]), OwnShipBuffer(), CAMERA)
+        link = MavlinkLink(MavlinkSettings(endpoints=[endpoint]), OwnShipBuffer(), CAMERA, RequestQueue())
         with pytest.raises(LinkError, match=f"MAVLink endpoint {endpoint} cannot be opened: {os.strerror(98)}"):
             link.start()
         link.stop()
@@ -473,7 +474,7 @@ def test_udpout_makes_itself_known_first() -> None:
     with Peer(0) as peer:
         endpoint = f"udpout:127.0.0.1:{peer.socket.getsockname()[1]}"
         own_ship = OwnShipBuffer()
-        link = MavlinkLink(MavlinkSettings(endpoints=[endpoint]), own_ship, CAMERA)
+        link = MavlinkLink(MavlinkSettings(endpoints=[endpoint]), own_ship, CAMERA, RequestQueue())
         link.start()
         try:
             peer.address = ("127.0.0.1", link.ports[0])

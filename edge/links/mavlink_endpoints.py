@@ -1,0 +1,44 @@
+"""What an endpoint's text says. Pure.
+
+udpin:HOST:PORT     wait on this port for the autopilot
+udpout:HOST:PORT    talk to this address
+tcpin:HOST:PORT     be a TCP server
+tcpout:HOST:PORT    be a TCP client; connected again for ever
+serial:DEVICE:BAUD  a serial port; opened again for ever
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+BAUD_MAX = 12_000_000
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcpin:HOST:PORT, tcpout:HOST:PORT or serial:DEVICE:BAUD"
+
+
+@dataclass(frozen=True)
+class NetworkEndpoint:
+    kind: Literal["udpin", "udpout", "tcpin", "tcpout"]
+    host: str  # an IPv6 address without its brackets
+    port: int
+    text: str
+
+
+@dataclass(frozen=True)
+class SerialEndpoint:
+    device: str
+    baud: int
+    text: str
+
+
+def parse_endpoint(text: str) -> NetworkEndpoint | SerialEndpoint:
+    """Raises ValueError with a sentence that names the text and the forms there are."""
+    serial = re.fullmatch(r"serial:(/\S+):(\d{1,8})", text)
+    if serial and 0 < int(serial[2]) <= BAUD_MAX:
+        return SerialEndpoint(serial[1], int(serial[2]), text)
+    network = re.fullmatch(r"(udpin|udpout|tcpin|tcpout):(?:\[([^\]]+)\]|([^:\s]+)):(\d{1,5})", text)
+    if network and int(network[4]) <= 65_535:
+        kind: Literal["udpin", "udpout", "tcpin", "tcpout"] = network[1]  # type: ignore[assignment]
+        return NetworkEndpoint(kind, network[2] or network[3], int(network[4]), text)
+    raise ValueError(f"'{text}' is not {FORMS}")

@@ -1,0 +1,116 @@
+"""The autopilot's and the gimbal's telemetry into the own ship, on the monotonic clock. Pure but for that buffer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
+from edge.links.mavlink_table import (
+    ATTITUDE,
+    ATTITUDE_QUATERNION,
+    GIMBAL_ATTITUDE,
+    GLOBAL_POSITION_INT,
+    LOCAL_POSITION_NED,
+)
+from edge.tracking.clock import BootClock, RebootDetector, TimesyncEstimator
+from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
+from msgs.geometry import R_from_euler, q_wxyz_from_R
+from msgs.mavlink import dialect
+
+FALLBACK_NS = 1_000_000_000  # the better source silent for so long: the other one is taken
+# What leaves a gimbal's own attitude in doubt; standing at an end stop does not.
+GIMBAL_FAILURES = (
+    dialect.GIMBAL_DEVICE_ERROR_FLAGS_ENCODER_ERROR
+    | dialect.GIMBAL_DEVICE_ERROR_FLAGS_POWER_ERROR
+    | dialect.GIMBAL_DEVICE_ERROR_FLAGS_SOFTWARE_ERROR
+    | dialect.GIMBAL_DEVICE_ERROR_FLAGS_COMMS_ERROR
+    | dialect.GIMBAL_DEVICE_ERROR_FLAGS_CALIBRATION_RUNNING
+)
+
+
+def gimbal_frame(flags: int) -> GimbalFrame | None:
+    """What the quaternion of GIMBAL_DEVICE_ATTITUDE_STATUS is told against; None if its flags contradict themselves.
+
+    64 says earth, 32 the vehicle's heading; where a gimbal sets neither, 16 (yaw lock) says earth.
+    """
+    earth = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+    heading = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+    if earth and heading:
+        return None
+    if not earth and not heading:
+        earth = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+    return GimbalFrame.EARTH if earth else GimbalFrame.HEADING
+
+
+class Telemetry:
+    """`gimbal_component` None: the first that tells, until it falls silent."""
+
+    def __init__(self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, gimbal_component: int | None) -> None:
+        self._own_ship = own_ship
+        self._timesync = timesync
+        self._gimbal_component = gimbal_component
+        self.forget()
+
+    def forget(self) -> None:
+        """What was heard holds no more: the autopilot has started again, or it is another."""
+        self._own_ship.clear()
+        self._boot_clock = BootClock(self._timesync)
+        self._forget_gimbal_clock()
+        self._quaternion_ns: int | None = None
+        self._gimbal: tuple[int, int] | None = None  # component, heard ns
+
+    def take(self, message: Any, now_ns: int) -> str | None:
+        """Take in a message that was found sound; why it was not, or None."""
+        message_id = message.get_msgId()
+        if message_id == GIMBAL_ATTITUDE:
+            return self._take_gimbal(message, now_ns)
+        time_ns = self._boot_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+        rising = True
+        if message_id == ATTITUDE_QUATERNION:
+            self._quaternion_ns = now_ns
+            q_wxyz = (message.q1, message.q2, message.q3, message.q4)
+            rising = self._own_ship.add_attitude(time_ns, q_wxyz, _rates(message))
+        elif message_id == ATTITUDE:
+            if self._quaternion_ns is None or now_ns - self._quaternion_ns > FALLBACK_NS:
+                R_ned_body = R_from_euler(message.roll, message.pitch, message.yaw)
+                rising = self._own_ship.add_attitude(time_ns, q_wxyz_from_R(R_ned_body), _rates(message))
+        elif message_id == LOCAL_POSITION_NED:
+            t_ned_m, v_ned_mps = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
+            rising = self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
+        # 0, 0 is how an autopilot without a fix says so.
+        elif message_id == GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
+            place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
+            v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+            rising = self._own_ship.add_global(time_ns, place, v_ned_mps)
+        return None if rising else "late"
+
+    def _take_gimbal(self, message: Any, now_ns: int) -> str | None:
+        component = message.get_srcComponent()
+        if not self._heeds(component, now_ns):
+            return "other_gimbal"
+        if message.failure_flags & GIMBAL_FAILURES:
+            return "gimbal_failure"
+        frame = gimbal_frame(message.flags)
+        if frame is None:
+            return "gimbal_frame"
+        if component != AUTOPILOT_COMPONENT and self._gimbal_boot.rebooted(message.time_boot_ms):
+            self._forget_gimbal_clock()
+        if self._gimbal is not None and self._gimbal[0] != component:
+            self._forget_gimbal_clock()
+        self._gimbal = (component, now_ns)
+        clock = self._boot_clock if component == AUTOPILOT_COMPONENT else self._gimbal_clock
+        time_ns = clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+        return None if self._own_ship.add_gimbal(time_ns, message.q, frame) else "late"
+
+    def _forget_gimbal_clock(self) -> None:
+        # A gimbal that is a device of its own counts from its own start.
+        self._gimbal_clock, self._gimbal_boot = BootClock(TimesyncEstimator()), RebootDetector()
+
+    def _heeds(self, component: int, now_ns: int) -> bool:
+        if self._gimbal_component is not None:
+            return component == self._gimbal_component
+        return self._gimbal is None or component == self._gimbal[0] or now_ns - self._gimbal[1] > FALLBACK_NS
+
+
+def _rates(message: Any) -> tuple[float, float, float]:
+    return message.rollspeed, message.pitchspeed, message.yawspeed

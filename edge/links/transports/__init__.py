@@ -1,0 +1,26 @@
+"""How MAVLink's bytes travel: one file a medium behind one interface."""
+
+from __future__ import annotations
+
+from edge.links.errors import LinkError
+from edge.links.mavlink_endpoints import SerialEndpoint, parse_endpoint
+from edge.links.transports.medium import Transport
+from edge.links.transports.serial_port import SerialPort
+from edge.links.transports.tcp import TcpClient, TcpServer
+from edge.links.transports.udp import Udp
+
+
+def open_transport(text: str) -> Transport:
+    """The transport of an endpoint. What can only be there later, a server or a device, is waited for.
+
+    Raises LinkError if the text is no endpoint, its host has no address or our own port is taken.
+    """
+    try:
+        endpoint = parse_endpoint(text)
+    except ValueError as error:
+        raise LinkError(f"MAVLink endpoint {error}") from error
+    if isinstance(endpoint, SerialEndpoint):
+        return SerialPort(endpoint)
+    if endpoint.kind == "tcpin":
+        return TcpServer(endpoint)
+    return TcpClient(endpoint) if endpoint.kind == "tcpout" else Udp(endpoint)

@@ -1,0 +1,230 @@
+"""TCP, IPv4 and IPv6: a client that connects again for ever, and a server."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import socket
+import time
+from collections.abc import Sequence
+
+from edge.links.errors import LinkError
+from edge.links.mavlink_endpoints import NetworkEndpoint
+from edge.links.transports.backoff import Backoff
+from edge.links.transports.medium import RECEIVE_MAX, Address, Outbox, Received, resolve
+from msgs.mavlink import FrameReader
+
+log = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT_NS = 5_000_000_000
+CALLERS_MAX = 8
+
+
+class Connection:
+    """A connected socket with its reader; `open` turns False at its first error or end."""
+
+    def __init__(self, connected: socket.socket, address: Address) -> None:
+        self.address = address
+        self.open = True
+        self._socket = connected
+        self._reader = FrameReader(datagram=False)
+        self._outbox = Outbox()
+        connected.setblocking(False)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def receive(self) -> Received | None:
+        try:
+            data = self._socket.recv(RECEIVE_MAX)
+        except BlockingIOError:
+            return None
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return None
+        return Received(data, self.address, self._reader)
+
+    def send(self, data: bytes) -> bool:
+        fits = self.open and self._outbox.put(data)
+        self.flush()
+        return fits and self.open
+
+    def flush(self) -> None:
+        if not self.open:
+            return
+        try:
+            self._outbox.flush(self._socket.send)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        self.open = False
+        self._socket.close()
+
+
+class TcpClient:
+    """Connects to a server and, when that fails or the connection is lost, again after a growing wait.
+
+    Raises LinkError for a host without an address.
+    """
+
+    finds_peers = False
+    port = None
+
+    def __init__(self, endpoint: NetworkEndpoint) -> None:
+        self.endpoint = endpoint.text
+        self._family, self._address = resolve(endpoint, socket.SOCK_STREAM)
+        self._backoff = Backoff()
+        self._connecting: tuple[socket.socket, int] | None = None
+        self._connection: Connection | None = None
+
+    @property
+    def peer(self) -> Address | None:
+        return self._address if self._connection is not None else None
+
+    def filenos(self) -> Sequence[int]:
+        return () if self._connection is None else (self._connection.fileno(),)
+
+    def tick(self, now_ns: int) -> None:
+        if self._connection is not None:
+            self._connection.flush()
+            self._part_if_closed(now_ns)
+        elif self._connecting is not None:
+            self._look_if_connected(now_ns)
+        elif self._backoff.due(now_ns):
+            self._connect(now_ns)
+
+    def receive(self) -> Received | None:
+        received = self._connection.receive() if self._connection is not None else None
+        self._part_if_closed(time.monotonic_ns())
+        return received
+
+    def send(self, data: bytes, peer: Address) -> bool:
+        return self._connection is not None and self._connection.send(data)
+
+    def reaches(self, peer: Address) -> bool:
+        return self._connection is not None
+
+    def close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        if self._connecting is not None:
+            self._connecting[0].close()
+
+    def _connect(self, now_ns: int) -> None:
+        attempt = socket.socket(self._family, socket.SOCK_STREAM)
+        attempt.setblocking(False)
+        self._connecting = (attempt, now_ns)
+        result = attempt.connect_ex(self._address)
+        if result not in (0, errno.EINPROGRESS):
+            self._give_up(now_ns, result)
+
+    def _look_if_connected(self, now_ns: int) -> None:
+        assert self._connecting is not None, "called only while connecting"
+        attempt, began_ns = self._connecting
+        result = attempt.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if result:
+            self._give_up(now_ns, result)
+            return
+        try:
+            attempt.getpeername()
+        except OSError:
+            if now_ns - began_ns > CONNECT_TIMEOUT_NS:
+                self._give_up(now_ns, errno.ETIMEDOUT)
+            return
+        self._connecting = None
+        self._connection = Connection(attempt, self._address)
+        self._backoff = self._backoff.opened(now_ns)
+        log.info("mavlink: %s: connected", self.endpoint)
+
+    def _give_up(self, now_ns: int, error_number: int) -> None:
+        assert self._connecting is not None, "called only while connecting"
+        self._connecting[0].close()
+        self._connecting = None
+        if self._backoff.failures == 0:
+            log.warning("mavlink: %s: %s; trying again", self.endpoint, errno.errorcode.get(error_number, error_number))
+        self._backoff = self._backoff.failed(now_ns)
+
+    def _part_if_closed(self, now_ns: int) -> None:
+        if self._connection is not None and not self._connection.open:
+            log.warning("mavlink: %s: connection lost", self.endpoint)
+            self._connection = None
+            self._backoff = self._backoff.failed(now_ns)
+
+
+class TcpServer:
+    """Takes up to CALLERS_MAX callers, who must show who they are; with more, the oldest that was not heeded goes.
+
+    Raises LinkError if the port cannot be opened.
+    """
+
+    finds_peers = True
+    peer = None
+
+    def __init__(self, endpoint: NetworkEndpoint) -> None:
+        self.endpoint = endpoint.text
+        self._callers: dict[Address, Connection] = {}
+        self._heeded: Address | None = None
+        family, address = resolve(endpoint, socket.SOCK_STREAM)
+        self._socket = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._socket.bind(address)
+            self._socket.listen(CALLERS_MAX)
+        except OSError as error:
+            self._socket.close()
+            raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._socket.getsockname()[1])
+
+    def filenos(self) -> Sequence[int]:
+        return (self._socket.fileno(), *(caller.fileno() for caller in self._callers.values()))
+
+    def tick(self, now_ns: int) -> None:
+        for caller in self._callers.values():
+            caller.flush()
+        self._forget_closed()
+
+    def receive(self) -> Received | None:
+        self._accept()
+        for caller in list(self._callers.values()):
+            received = caller.receive()
+            if received is not None:
+                # Next time the others come first: one that never stops must not silence them.
+                self._callers[caller.address] = self._callers.pop(caller.address)
+                return received
+        self._forget_closed()
+        return None
+
+    def send(self, data: bytes, peer: Address) -> bool:
+        self._heeded = peer
+        caller = self._callers.get(peer)
+        return caller is not None and caller.send(data)
+
+    def reaches(self, peer: Address) -> bool:
+        return peer in self._callers
+
+    def close(self) -> None:
+        for caller in self._callers.values():
+            caller.close()
+        self._socket.close()
+
+    def _accept(self) -> None:
+        try:
+            connected, address = self._socket.accept()
+        except OSError:
+            return  # nobody calls, or has gone again
+        if len(self._callers) >= CALLERS_MAX:
+            oldest = next(known for known in self._callers if known != self._heeded)
+            self._callers.pop(oldest).close()
+        self._callers[address] = Connection(connected, address)
+
+    def _forget_closed(self) -> None:
+        self._callers = {address: caller for address, caller in self._callers.items() if caller.open}

@@ -1,0 +1,75 @@
+"""What a person asked of the tracker. Pure: every time comes in as an argument.
+
+A box to look into is looked into for LOOK_NS, frame by frame, until a target is found there; it is then the chosen one
+for as long as its track lives. Stopping drops all targets and lets the search rest for REST_NS or until the next box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from edge.requests import Request, TrackBox
+from edge.types import Array, Estimate, Track
+
+LOOK_NS = 1_000_000_000
+REST_NS = 10_000_000_000
+
+
+class ByHand:
+    def __init__(self) -> None:
+        self.chosen_id: int | None = None
+        self._box_share: Array | None = None
+        self._look_until_ns = 0
+        self._rest_until_ns = 0
+        self._found: Array | None = None  # [4] box_xyxy_px of the estimate that is to become the chosen track
+
+    def take(self, request: Request, now_ns: int) -> None:
+        """Take a request that came before the frame of `now_ns`."""
+        self.chosen_id = None
+        if isinstance(request, TrackBox):
+            self._box_share = np.array(request.box_xyxy_share)
+            self._look_until_ns, self._rest_until_ns = now_ns + LOOK_NS, now_ns
+        else:
+            self._box_share, self._rest_until_ns = None, now_ns + REST_NS
+
+    def box_xyxy_px(self, now_ns: int, image_size_wh: tuple[int, int], expected: Iterable[Track]) -> Array | None:
+        """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
+        if self._box_share is None or now_ns > self._look_until_ns:
+            self._box_share = None
+            return None
+        box = self._box_share * np.tile(image_size_wh, 2) - 0.5
+        for track in expected:
+            if _holds(box, _center(track.box_xyxy_px)) or _holds(track.box_xyxy_px, _center(box)):
+                self.chosen_id, self._box_share = track.track_id, None
+                return None
+        return box
+
+    def searches(self, now_ns: int) -> bool:
+        """Whether to look for targets that nobody pointed at."""
+        return now_ns >= self._rest_until_ns
+
+    def found(self, estimate: Estimate) -> None:
+        """A target was there: it is to be the chosen one."""
+        self._box_share = None
+        self._found = estimate.box_xyxy_px
+
+    def settle(self, tracks: Iterable[Track]) -> None:
+        """After the tracks' update: which of them is the chosen one, or that it is gone."""
+        tracks = list(tracks)
+        if self._found is not None and tracks:
+            center = 0.5 * (self._found[:2] + self._found[2:])
+            nearest = min(tracks, key=lambda t: float(np.linalg.norm(_center(t.box_xyxy_px) - center)))
+            self.chosen_id = nearest.track_id
+        self._found = None
+        if all(track.track_id != self.chosen_id for track in tracks):
+            self.chosen_id = None
+
+
+def _holds(box_xyxy_px: Array, point_px: Array) -> bool:
+    return bool(np.all(point_px >= box_xyxy_px[:2]) and np.all(point_px <= box_xyxy_px[2:]))
+
+
+def _center(box_xyxy_px: Array) -> Array:
+    return 0.5 * (box_xyxy_px[:2] + box_xyxy_px[2:])
