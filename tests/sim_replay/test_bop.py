@@ -134,9 +134,8 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 def test_models_come_back_in_metres(tmp_path: Path) -> None:
     points = np.random.default_rng(3).normal(size=(300, 3)) * [4.0, 6.0, 1.0]
-    mesh = Mesh(
-        *(points.astype(np.float32) for _ in range(2)), np.zeros(300, np.uint8), np.array([[0, 1, 2]], np.int32)
-    )
+    single = points.astype(np.float32)
+    mesh = Mesh(single, single, np.zeros(300, np.uint8), np.array([[0, 1, 2]], np.int32))
     write_models(tmp_path, {2: mesh})
     np.testing.assert_allclose(read_ply_vertices_m(tmp_path / "obj_000002.ply"), points, atol=1e-5)
     info = read_models_info(tmp_path)[2]

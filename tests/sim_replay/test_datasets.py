@@ -1,0 +1,296 @@
+"""Datasets of others, written here by hand as they come: what is missing, what is odd, what only they have."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.errors import InputError
+from sim_replay.bop import DISTORTION_KEY, BopError
+from sim_replay.datasets import Dataset, open_dataset
+from sim_replay.ground_truth import read_scene_truth
+
+SIZE_WH = (160, 120)
+K = [1200.0, 0, 79.5, 0, 1200.0, 59.5, 0, 0, 1]
+UNIT = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
+BOX = [50, 40, 30, 12]  # x, y, width, height of the target's pixels
+BOX_EDGES = [49.5, 39.5, 79.5, 51.5]
+T_MM = [-3000.0, -2500.0, 200000.0]
+
+
+def write_json(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value))
+
+
+def picture(gray: bool = False) -> np.ndarray:
+    image = np.full((*SIZE_WH[::-1], 3), (200, 160, 120), np.uint8)
+    image[40:52, 50:80] = 20
+    return image[..., 0] if gray else image
+
+
+def silhouette() -> np.ndarray:
+    mask = np.zeros(SIZE_WH[::-1], np.uint8)
+    mask[40:52, 50:80] = 255
+    return mask
+
+
+def write_scene(
+    folder: Path, image_ids: tuple[int, ...] = (0,), folder_name: str = "rgb", suffix: str = ".jpg", masks: bool = True
+) -> Path:
+    """A scene with one target of object 1 a picture, its index as small as the format allows."""
+    (folder / folder_name).mkdir(parents=True)
+    for image_id in image_ids:
+        cv2.imwrite(str(folder / folder_name / f"{image_id:06d}{suffix}"), picture(gray=folder_name == "gray"))
+        if masks:
+            (folder / "mask_visib").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / "mask_visib" / f"{image_id:06d}_000000.png"), silhouette())
+    write_json(folder / "scene_camera.json", {str(i): {"cam_K": K, "depth_scale": 0.1} for i in image_ids})
+    pose = {"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": T_MM}
+    write_json(folder / "scene_gt.json", {str(i): [pose] for i in image_ids})
+    return folder
+
+
+def write_models_info(root: Path, **more: float) -> None:
+    write_json(root / "models" / "models_info.json", {"1": {"diameter": 6000.0} | more})
+
+
+def write_ply(path: Path, vertices_mm: list[list[float]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices_mm)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    path.write_text(head + "".join(" ".join(map(str, row)) + "\n" for row in vertices_mm))
+
+
+def ids(dataset: Dataset) -> list[tuple[int, int]]:
+    return [(frame.scene_id, frame.image_id) for frame in dataset.frames()]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two splits: scene and image numbers with gaps and not from zero, gray TIFF pictures in one scene."""
+    write_models_info(tmp_path / "hawks")
+    root = tmp_path / "hawks"
+    write_scene(root / "train_pbr" / "000007", (3, 10, 1041))
+    write_scene(root / "test" / "000048", (5,), folder_name="gray", suffix=".tif")
+    write_scene(root / "test" / "000002", (1, 12), suffix=".png")
+    return root
+
+
+def test_splits_scenes_and_pictures_are_found_from_any_folder_of_the_dataset(root: Path) -> None:
+    whole = open_dataset(root)
+    assert (whole.name, whole.root, whole.split) == ("hawks", root, None)
+    assert ids(whole) == [(2, 1), (2, 12), (48, 5), (7, 3), (7, 10), (7, 1041)]
+    for dataset in (open_dataset(root, "train"), open_dataset(root, "train_pbr"), open_dataset(root / "train_pbr")):
+        assert (dataset.name, dataset.split, ids(dataset)) == ("hawks", "train_pbr", [(7, 3), (7, 10), (7, 1041)])
+    scene = open_dataset(root / "test" / "000048")
+    assert (scene.name, scene.split, ids(scene)) == ("hawks", "test", [(48, 5)])
+    assert scene.models[1].diameter_m == 6.0
+
+
+def test_pictures_of_every_kind_come_with_three_channels(root: Path) -> None:
+    for frame in open_dataset(root).frames():
+        image = frame.undistorted_bgr()
+        assert image.shape == (120, 160, 3)
+        assert abs(float(image[60, 10, 0]) - 200) < 4
+        assert image[45, 65].max() < 30
+
+
+def test_a_missing_split_is_told_with_those_that_there_are(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(BopError, match=r"hawks: no split 'val'; it has test, train_pbr"):
+        open_dataset(root, "val")
+    with pytest.raises(BopError, match="no BOP scene"):
+        open_dataset(root / "models")
+    with pytest.raises(BopError, match="nowhere is not a folder"):
+        open_dataset(tmp_path / "nowhere")
+
+
+def test_boxes_come_from_masks_where_the_scene_does_not_tell_them(root: Path) -> None:
+    frame = next(open_dataset(root, "test").frames())
+    np.testing.assert_array_equal(frame.targets[0].box_visible_xyxy_px, BOX_EDGES)
+    assert frame.targets[0].visible_px == 360
+    mask = frame.mask(0)
+    assert mask is not None
+    np.testing.assert_array_equal(mask, silhouette() > 0)
+
+
+def test_boxes_come_from_the_model_where_there_are_no_masks_either(tmp_path: Path) -> None:
+    write_scene(tmp_path / "test" / "000001", masks=False)
+    # Half a metre is 3 px here, at 1,200 px and 200 m; the origin lies at (61.5, 44.5).
+    write_ply(tmp_path / "models" / "obj_000001.ply", [[-500, 0, 0], [500, 0, 0], [0, 1000, 0], [0, -500, 0]])
+    target = next(open_dataset(tmp_path).frames()).targets[0]
+    np.testing.assert_allclose(target.box_whole_xyxy_px, [58.5, 41.5, 64.5, 50.5], atol=1e-6)
+    np.testing.assert_allclose(target.box_visible_xyxy_px, [58.5, 41.5, 64.5, 50.5], atol=1e-6)
+    assert open_dataset(tmp_path).models[1].diameter_m == pytest.approx(1.5)
+
+
+def test_a_projected_box_ends_at_the_picture(tmp_path: Path) -> None:
+    write_scene(tmp_path / "test" / "000001", masks=False)
+    write_models_info(
+        tmp_path, min_x=-20e3, min_y=-1e3, min_z=0, size_x=40e3, size_y=2e3, size_z=0
+    )  # 120 px to each side of column 61.5, 6 px to each side of row 44.5
+    target = next(open_dataset(tmp_path).frames()).targets[0]
+    np.testing.assert_allclose(target.box_whole_xyxy_px, [-58.5, 38.5, 181.5, 50.5], atol=1e-6)
+    np.testing.assert_allclose(target.box_visible_xyxy_px, [-0.5, 38.5, 159.5, 50.5], atol=1e-6)
+
+
+def test_what_the_scene_says_of_a_box_is_believed(root: Path) -> None:
+    info = {"bbox_visib": [1, 2, 3, 4], "bbox_obj": [0, 0, 9, 9], "px_count_visib": 5}
+    write_json(root / "test" / "000002" / "scene_gt_info.json", {"1": [info], "12": [{"bbox_visib": [-1, -1, -1, -1]}]})
+    told, hidden, _ = (frame.targets[0] for frame in open_dataset(root, "test").frames())
+    np.testing.assert_array_equal(told.box_visible_xyxy_px, [0.5, 1.5, 3.5, 5.5])
+    assert hidden.box_visible_xyxy_px is None
+    assert hidden.visible_px == 0
+
+
+def test_without_any_model_the_diameter_comes_from_how_large_targets_look(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "train" / "000000", (0, 1))
+    dataset = open_dataset(tmp_path, "train")
+    assert dataset.split == "train"
+    assert dataset.models[1].diameter_m == pytest.approx(30 * 200.0 / 1200.0)  # 30 px at 200 m
+    assert read_scene_truth(scene).truths[0].diameter_m == pytest.approx(5.0)
+    (tmp_path / "model_frame.toml").write_text("[objects.1]\ndiameter_m = 6.5\n")
+    assert open_dataset(tmp_path, "train").models[1].diameter_m == 6.5
+
+
+def test_a_scene_without_its_own_cameras_takes_the_datasets(root: Path) -> None:
+    (root / "test" / "000048" / "scene_camera.json").unlink()
+    shared = {"fx": 900.0, "fy": 901.0, "cx": 80.0, "cy": 60.0, DISTORTION_KEY: [-0.1, 0, 0, 0, 0]}
+    write_json(root / "camera.json", shared)
+    frame = next(open_dataset(root / "test" / "000048").frames())
+    np.testing.assert_array_equal(frame.K, [[900, 0, 80], [0, 901, 60], [0, 0, 1]])
+    assert frame.distortion == (-0.1, 0, 0, 0, 0)
+    del shared["fx"]
+    write_json(root / "camera.json", shared)
+    with pytest.raises(BopError, match=r"camera\.json: 'camera' has no 'fx'"):
+        list(open_dataset(root / "test" / "000048").frames())
+
+
+def test_listed_pictures_that_are_missing_are_left_out_and_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (root / "train_pbr" / "000007" / "rgb" / "000010.jpg").unlink()
+    assert ids(open_dataset(root, "train")) == [(7, 3), (7, 1041)]
+    assert "000007: 1 listed pictures are missing" in caplog.text
+    for path in (root / "train_pbr" / "000007" / "rgb").iterdir():
+        path.unlink()
+    with pytest.raises(BopError, match="000007 holds no picture of those that it lists"):
+        list(open_dataset(root, "train").frames())
+
+
+def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> None:
+    folder = root / "test" / "000002"
+    poses = [{"obj_id": obj_id, "cam_R_m2c": UNIT, "cam_t_m2c": [x, 0, 2e5]} for x, obj_id in enumerate((1, 1, 8, 1))]
+    write_json(folder / "scene_gt.json", {"1": poses, "12": poses})
+    seen = [{"bbox_visib": BOX, "px_count_visib": count, "px_count_all": 99} for count in (10, 50, 99, 40)]
+    write_json(folder / "scene_gt_info.json", {"1": seen, "12": seen})
+    listed = [{"scene_id": 2, "im_id": 12, "obj_id": 1, "inst_count": 2}]
+    write_json(root / "test_targets_bop19.json", listed)
+    dataset = open_dataset(root)
+    assert ids(dataset) == [(2, 12), (7, 3), (7, 10), (7, 1041)]  # the training split stays whole
+    frame = next(dataset.frames())
+    assert frame.target_indices == (1, 3)  # the two of object 1 of which most is visible
+    assert [target.t_cam_target_m[0] for target in frame.targets] == [0.001, 0.003]
+    write_json(root / "test_targets_bop19.json", [{"scene_id": 2, "obj_id": 1}])
+    with pytest.raises(BopError, match=r"test_targets_bop19\.json: 'entry 0' has no integer 'im_id'"):
+        list(open_dataset(root).frames())
+
+
+def test_scenes_named_by_words_are_counted(tmp_path: Path) -> None:
+    for name in ("pass_b", "pass_a"):
+        write_scene(tmp_path / "val" / name)
+    dataset = open_dataset(tmp_path, "val")
+    assert [(scene.scene_id, scene.folder.name) for scene in dataset.scenes] == [(0, "pass_a"), (1, "pass_b")]
+
+
+def runs(mask: np.ndarray) -> dict[str, Any]:
+    """COCO's uncompressed run lengths, down the columns, beginning with zeros."""
+    groups = [(value, len(list(group))) for value, group in groupby((mask.T.ravel() > 0).tolist())]
+    return {"size": list(mask.shape), "counts": ([0] if groups[0][0] else []) + [count for _, count in groups]}
+
+
+def test_an_imagewise_dataset_reads_as_the_same_scenewise(root: Path, tmp_path: Path) -> None:
+    write_json(root / "test" / "000002" / "scene_gt_info.json", {"1": [{"bbox_visib": BOX}]})
+    flat = tmp_path / "flat"
+    write_models_info(flat)
+    for scene in (root / "test").iterdir():
+        for path in (p for name in ("rgb", "gray") for p in (scene / name).glob("*")):
+            image_id = int(path.stem)
+            key = flat / "test" / f"{int(scene.name):06d}_{image_id:06d}"
+            for kind in ("camera", "gt", "gt_info"):
+                source = scene / f"scene_{kind}.json"
+                entry = json.loads(source.read_text()).get(str(image_id)) if source.exists() else None
+                if entry is not None:
+                    write_json(Path(f"{key}.{kind}.json"), entry)
+            Path(f"{key}.{path.parent.name}{path.suffix}").write_bytes(path.read_bytes())
+            write_json(Path(f"{key}.mask_visib.json"), {"0": runs(silhouette())})
+    one, other = open_dataset(root, "test"), open_dataset(flat, "test")
+    assert ids(one) == ids(other) == [(2, 1), (2, 12), (48, 5)]
+    for a, b in zip(one.frames(), other.frames(), strict=True):
+        np.testing.assert_array_equal(a.image_bgr(), b.image_bgr())
+        np.testing.assert_array_equal(a.targets[0].box_visible_xyxy_px, b.targets[0].box_visible_xyxy_px)
+        np.testing.assert_array_equal(a.targets[0].t_cam_target_m, b.targets[0].t_cam_target_m)
+        mask = b.mask(0)
+        assert mask is not None
+        np.testing.assert_array_equal(mask, silhouette() > 0)
+
+
+def test_a_lens_is_taken_out_and_projected_boxes_lie_in_the_picture_on_disk(tmp_path: Path) -> None:
+    folder, lens = write_scene(tmp_path / "test" / "000001", masks=False), (-0.9, 0.3, 0.0, 0.0, 0.0)
+    wide_K = [150.0, 0, 79.5, 0, 150.0, 59.5, 0, 0, 1]
+    write_json(folder / "scene_camera.json", {"0": {"cam_K": wide_K, DISTORTION_KEY: lens}})
+    pose = {"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": [70e3, 40e3, 200e3]}
+    write_json(folder / "scene_gt.json", {"0": [pose]})
+    write_ply(tmp_path / "models" / "obj_000001.ply", [[0, 0, 0], [4000, 0, 0], [0, 4000, 0]])
+    # Where the lens puts each vertex, by its formula, from x / z and y / z; a white dot marks the first, the origin.
+    rays = np.array([[0.35, 0.2], [0.37, 0.2], [0.35, 0.22]])
+    r2 = (rays**2).sum(axis=1, keepdims=True)
+    vertices_px = 150 * rays * (1 + lens[0] * r2 + lens[1] * r2**2) + (79.5, 59.5)
+    on_disk = vertices_px[0]
+    image = np.zeros((120, 160, 3), np.uint8)
+    cv2.circle(image, [round(v) for v in on_disk], 2, (255, 255, 255), -1)
+    cv2.imwrite(str(folder / "rgb" / "000000.jpg"), image)
+    frame = next(open_dataset(tmp_path).frames())
+    row, column = np.unravel_index(frame.undistorted_bgr()[..., 0].argmax(), (120, 160))
+    assert abs(column - (79.5 + 150 * 0.35)) <= 3
+    assert abs(row - (59.5 + 150 * 0.2)) <= 3
+    assert np.linalg.norm(on_disk - (79.5 + 150 * 0.35, 59.5 + 150 * 0.2)) > 6
+    expected = [*vertices_px.min(axis=0), *vertices_px.max(axis=0)]
+    np.testing.assert_allclose(frame.targets[0].box_visible_xyxy_px, expected, atol=1e-6)
+
+
+def _broken(name: str, value: Any) -> Callable[[Path], None]:
+    return lambda root: write_json(root / name, value)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "said"),
+    [
+        (_broken("test/000002/scene_camera.json", {"1": {}}), r"scene_camera\.json: '1' has no 'cam_K'"),
+        (_broken("models/models_info.json", {"1": {"diameter": "long"}}), r"models_info\.json: 'diameter' of '1'"),
+        (_broken("models/models_info.json", {"1": {"size_x": 5}}), r"models_info\.json: '1' has no 'diameter'"),
+        (_broken("models/models_info.json", {"9": {"diameter": 5}}), r"scene_gt\.json: obj_id 1 is not among"),
+        (_broken("test/000002/scene_gt.json", {"1": [{"obj_id": 1}]}), r"scene_gt\.json: '1' has no 'cam_R_m2c'"),
+        (lambda root: (root / "models" / "models_info.json").write_text("{"), r"models_info\.json line 1 is not JSON"),
+    ],
+)
+def test_what_is_broken_is_told_with_file_and_key(root: Path, breaks: Callable[[Path], object], said: str) -> None:
+    breaks(root)
+    with pytest.raises(InputError, match=said):
+        read_scene_truth(root / "test" / "000002")
+
+
+def test_the_command_ends_with_exit_code_2_and_a_sentence(root: Path) -> None:
+    (root / "model_frame.toml").write_text("R_body = 1\n")
+    command = [Path(sys.executable).parent / "uavpose-replay", "score", "--dataset", root, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2, done.stderr
+    assert f"{root / 'model_frame.toml'}: unknown key 'R_body'" in done.stderr
+    assert "Traceback" not in done.stderr
