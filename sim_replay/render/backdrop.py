@@ -28,8 +28,8 @@ class Backdrop:
     image_rgb: NDArray[np.uint8]  # [H, W, 3], gamma 2
     panorama: bool  # equirectangular, twice as wide as high; else a photograph
 
-    def map_for(self, camera: Camera, seed: int) -> tuple[float, float, float, float]:
-        """(turn, rad; width, rad; height / width; kind): how world directions fall on the picture.
+    def map_for(self, camera: Camera, seed: int) -> tuple[float, float, float]:
+        """(turn, rad; width, rad; height / width, 0 for a panorama): how world directions fall on the picture.
 
         A seed turns it, so that sequences see different parts. A photograph is shown a little wider than the lens
         sees, its middle at the horizon, and repeats mirrored beyond.
@@ -38,7 +38,7 @@ class Backdrop:
         turn = 2.0 * np.pi * ((seed * _GOLDEN) % 1.0)
         seen_rad = 2.0 * np.arctan(0.5 * camera.width_px / camera.K[0, 0])
         wide_rad = 2.0 * np.pi if self.panorama else min(1.6 * seen_rad, float(WIDEST_PHOTOGRAPH_RAD))
-        return float(turn), float(wide_rad), height / width, 2.0 if self.panorama else 1.0
+        return float(turn), float(wide_rad), 0.0 if self.panorama else height / width
 
 
 @lru_cache(maxsize=4)

@@ -79,8 +79,7 @@ def render_frame(scene: Scene, sensor: Sensor | None = None) -> RenderedFrame:
     """
     camera = scene.camera
     renderer = frame_renderer(camera.width_px, camera.height_px)
-    background, cloud = renderer.surroundings(scene)
-    image = np.array(background)
+    image, cloud = renderer.surroundings(scene)
     birds = sprites(scene)
     for bird in birds:
         if not bird.before:

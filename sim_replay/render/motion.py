@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.render.projection import distorted, project_px, solid_vertices_m, undistorted
-from sim_replay.render.scene import Camera, Target
+from sim_replay.render.projection import distorted, project_px, solid_vertices_m
+from sim_replay.render.scene import Camera, Target, rays_ned
 
 Array = NDArray[np.float64]
 FEWEST_PX = 0.7  # shorter motion is lost in the lens's own blur
@@ -61,11 +61,7 @@ def background_motion(camera: Camera, close: Camera) -> Array:
     """[2, 3] affine displacement of sky and ground, pixels, from mid exposure to the shutter's close."""
     u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 6), np.linspace(0, camera.height_px - 1, 5))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
-    if camera.distortion is not None:
-        plane = undistorted(plane, camera.distortion)
-    rays = np.hstack([plane, np.ones((len(plane), 1))]) @ camera.R_ned_cam.T
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = rays_ned(pixels, camera)
     down = np.maximum(rays[:, 2], 1e-9)
     range_m = np.where(rays[:, 2] > 0, np.minimum(-camera.t_ned_cam_m[2] / down, FARTHEST_GROUND_M), FARTHEST_GROUND_M)
     moved = rays * range_m[:, None] + camera.t_ned_cam_m - close.t_ned_cam_m

@@ -76,7 +76,8 @@ def write_lens(program: Any, camera: Camera) -> None:
 
 def sun_basis(sun_body: Array) -> Array:
     """[3, 3] with rows (across, across, towards the sun), orthonormal, in body axes."""
-    s = sun_body / np.linalg.norm(sun_body)
-    u = np.cross(s, [1.0, 0.0, 0.0] if abs(s[0]) < 0.8 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(s, u), s])
+    x, y, z = (sun_body / np.linalg.norm(sun_body)).tolist()
+    # Duff et al., Building an Orthonormal Basis, Revisited, JCGT 2017.
+    sign = 1.0 if z >= 0.0 else -1.0
+    a, b = -1.0 / (sign + z), -x * y / (sign + z)
+    return np.array([[1.0 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], [x, y, z]])

@@ -19,10 +19,16 @@ LONGEST_EDGE = 1 / 40
 FARTHEST_RADIUS2 = 25.0  # squared tangent of 79 degrees: no lens here sees further aside
 
 
+@cache
 def solid_vertices_m(airframe_id: int) -> Array:
-    """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds."""
-    mesh = AIRFRAMES[airframe_id].mesh()
-    return mesh.vertices_m[mesh.part != Part.PROPELLER_DISC].astype(np.float64)
+    """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds; read-only."""
+    return _without_disc(AIRFRAMES[airframe_id].mesh())
+
+
+def _without_disc(mesh: Mesh) -> Array:
+    vertices = mesh.vertices_m[mesh.part != Part.PROPELLER_DISC].astype(np.float64)
+    vertices.setflags(write=False)
+    return vertices
 
 
 @cache
@@ -57,9 +63,8 @@ def fine_mesh(airframe_id: int) -> Mesh:
 
 @cache
 def fine_solid_vertices_m(airframe_id: int) -> Array:
-    """Vertices [V, 3] of `fine_mesh` without the propeller disc."""
-    mesh = fine_mesh(airframe_id)
-    return mesh.vertices_m[mesh.part != Part.PROPELLER_DISC].astype(np.float64)
+    """Vertices [V, 3] of `fine_mesh` without the propeller disc; read-only."""
+    return _without_disc(fine_mesh(airframe_id))
 
 
 def fold_radius2(distortion: Distortion) -> float:

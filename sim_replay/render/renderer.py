@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import pairwise
 from typing import Any
 
+import cv2
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +30,14 @@ from sim_replay.render.packing import (
     write_rows,
 )
 from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, fine_mesh, project_px
-from sim_replay.render.scene import Camera, Scene, Target
+from sim_replay.render.scene import Camera, Scene, Target, rays_ned
 
 Array = NDArray[np.float64]
 Crop = tuple[int, int, int, int]  # x0, y0, x1, y1, pixels
+Parts = tuple[str, ...]
 SUN_THAT_CASTS_SHADOW = 0.2
+HILLS_M = 14_000.0  # as in world.glsl
+PIECES = (8, 6)  # of a whole frame, across and down
 _NOISE_UNIT, _COLOUR_UNIT, _COORDINATE_UNIT, _SHADOW_UNIT, _SKY_UNIT, _BACKDROP_UNIT = range(6)
 
 
@@ -92,7 +97,7 @@ class Renderer:
         self._shadow_map.use(_SHADOW_UNIT)
         self._aircraft["noise"].value, self._aircraft["shadows"].value = _NOISE_UNIT, _SHADOW_UNIT
         self._corners = self._context.buffer(np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32).tobytes())
-        self._screens: dict[str, tuple[Any, Any]] = {}
+        self._screens: dict[tuple[str, Parts | None], tuple[Any, Any]] = {}
         self._meshes: dict[tuple[int, bool], _GpuMesh] = {}
         self._sky: Any = None
         self._backdrop: tuple[Backdrop, Any] | None = None
@@ -109,11 +114,13 @@ class Renderer:
         texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in (vertex, fragment)]
         return self._context.program(texts[0], prelude + texts[1])
 
-    def _screen(self, name: str, world: bool = True) -> tuple[Any, Any]:
-        """(program, vertex array) of a fragment shader that covers its viewport."""
-        if name not in self._screens:
-            text = files("sim_replay").joinpath("shaders", "world.glsl").read_text(encoding="utf-8")
-            prelude = "#version 330 core\n" + text if world else ""
+    def _screen(self, name: str, parts: Parts | None = None) -> tuple[Any, Any]:
+        """(program, vertex array) of a fragment shader that covers its viewport, with those parts of the world."""
+        if (name, parts) not in self._screens:
+            prelude = ""
+            if parts is not None:
+                text = files("sim_replay").joinpath("shaders", "world.glsl").read_text(encoding="utf-8")
+                prelude = "\n".join(["#version 330 core", *(f"#define {part}" for part in parts), text])
             program = self._program("surroundings.vert", f"{name}.frag", prelude)
             units = {
                 "noise": _NOISE_UNIT,
@@ -124,8 +131,9 @@ class Renderer:
             }
             for uniform in set(units) & set(program):
                 program[uniform].value = units[uniform]
-            self._screens[name] = program, self._context.vertex_array(program, [(self._corners, "2f", "in_corner")])
-        return self._screens[name]
+            screen = self._context.vertex_array(program, [(self._corners, "2f", "in_corner")])
+            self._screens[(name, parts)] = program, screen
+        return self._screens[(name, parts)]
 
     def _framebuffer(self, width: int, height: int, depth: bool) -> Any:
         textures = [self._context.texture((width, height), 4, dtype=dtype) for dtype in ("f1", "f2")]
@@ -199,7 +207,8 @@ class Renderer:
         return crop, samples
 
     def _draw_surroundings(self, tile: int, scene: Scene, crop: Crop, samples: int) -> None:
-        program, screen = self._screen("surroundings")
+        whole = (0, 0, scene.camera.width_px, scene.camera.height_px)
+        program, screen = self._screen("surroundings", parts_of(scene, whole))
         column, row = tile % self.columns, tile // self.columns
         self._image.viewport = (
             column * self.width_px,
@@ -221,19 +230,36 @@ class Renderer:
         The scene's camera must be as large as a tile. Raises BackdropError if its backdrop cannot be read.
         """
         backdrop = load_backdrop(scene.backdrop) if scene.backdrop else None
+        if backdrop is not None:
+            frame: Crop = (0, 0, self.width_px, self.height_px)
+            pieces = [
+                (frame, (*(p for p in parts_of(scene, frame) if p in ("LENS", "VEIL", "NEAR_CLOUD")), "BACKDROP"))
+            ]
+        else:
+            pieces = [(piece, parts_of(scene, piece)) for piece in self._pieces()]
         with self._context:
             self._context.enable_only(moderngl.NOTHING)
-            if backdrop is None:
+            if any("SKY" in parts for _, parts in pieces):
                 self._draw_far_sky(scene)
-            program, screen = self._screen("frame")
-            program["backdrop_map"].value = self._use_backdrop(backdrop, scene)
             self._image.use()
             self._image.viewport = (0, 0, self.width_px, self.height_px)
-            _write_world(program, scene)
-            screen.render()
+            for (x0, y0, x1, y1), parts in pieces:
+                program, screen = self._screen("frame", parts)
+                self._image.scissor = (x0, y0, x1 - x0, y1 - y0)
+                _write_world(program, scene)
+                if backdrop is not None:
+                    program["backdrop_map"].value = self._use_backdrop(backdrop, scene)
+                screen.render()
+            self._image.scissor = None
             raw = self._image.read((0, 0, self.width_px, self.height_px), components=4, dtype="f1")
         pixels = np.frombuffer(raw, np.uint8).reshape(self.height_px, self.width_px, 4)
-        return pixels[..., :3], pixels[..., 3]
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2BGR), np.uint8), pixels[..., 3]
+
+    def _pieces(self) -> list[Crop]:
+        """The frame in pieces, most of which show sky or ground alone."""
+        x = np.linspace(0, self.width_px, PIECES[0] + 1).astype(int).tolist()
+        y = np.linspace(0, self.height_px, PIECES[1] + 1).astype(int).tolist()
+        return [(x0, y0, x1, y1) for y0, y1 in pairwise(y) for x0, x1 in pairwise(x)]
 
     def _draw_far_sky(self, scene: Scene) -> None:
         if self._sky is None:
@@ -241,14 +267,12 @@ class Renderer:
             texture.repeat_x = texture.repeat_y = False
             texture.use(_SKY_UNIT)
             self._sky = self._context.framebuffer([texture])
-        program, screen = self._screen("far_sky")
+        program, screen = self._screen("far_sky", ("LENS",) if scene.camera.distortion else ())
         self._sky.use()
         _write_world(program, scene)
         screen.render()
 
-    def _use_backdrop(self, backdrop: Backdrop | None, scene: Scene) -> tuple[float, float, float, float]:
-        if backdrop is None:
-            return (0.0, 1.0, 1.0, 0.0)
+    def _use_backdrop(self, backdrop: Backdrop, scene: Scene) -> tuple[float, float, float]:
         if self._backdrop is None or self._backdrop[0] is not backdrop:
             if self._backdrop is not None:
                 self._backdrop[1].release()
@@ -276,7 +300,7 @@ class Renderer:
             projection = _projection([target], camera, crop)
             self._draw_target(target, scene, projection, 1, slots.get((0, 1)), (0, 0))
             self._context.enable_only(moderngl.NOTHING)
-            program, screen = self._screen("layer", world=False)
+            program, screen = self._screen("layer")
             program["samples"].value = (samples, 0)
             self._image.use()
             self._image.viewport = (0, 0, width, height)
@@ -357,11 +381,37 @@ class Renderer:
 
 def _write_world(program: Any, scene: Scene) -> None:
     camera = scene.camera
-    write_rows(program["environment"], packed_environment(scene.environment))
-    program["K"].value = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])
-    write_lens(program, camera)
-    program["ned_from_cam"].write(columns(camera.R_ned_cam))
-    program["camera_ned_m"].value = tuple(camera.t_ned_cam_m)
+    # Programs that lack parts of the world lack their uniforms.
+    used = set(program)
+    if "K" in used:
+        program["K"].value = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])
+    if "ned_from_cam" in used:
+        program["ned_from_cam"].write(columns(camera.R_ned_cam))
+    if "camera_ned_m" in used:
+        program["camera_ned_m"].value = tuple(camera.t_ned_cam_m)
+    if "environment" in used:
+        write_rows(program["environment"], packed_environment(scene.environment))
+    if "lens" in used:
+        write_lens(program, camera)
+
+
+def parts_of(scene: Scene, crop: Crop) -> Parts:
+    """The parts of world.glsl that a crop of the scene's picture can show."""
+    camera, environment = scene.camera, scene.environment
+    count = 2 if camera.distortion is None else 5
+    u, v = np.meshgrid(np.linspace(crop[0] - 1, crop[2], count), np.linspace(crop[1] - 1, crop[3], count))
+    down = rays_ned(np.stack([u.ravel(), v.ravel()], axis=1), camera)[:, 2]
+    # A lens bends the horizon between the points looked at.
+    margin = 0.0 if camera.distortion is None else 0.02
+    parts = []
+    if down.min() <= margin:
+        parts.append("SKY")
+        if environment.relief_m > 0.0 and -down.max() < 1.01 * environment.relief_m / HILLS_M + margin:
+            parts.append("HILLS")
+    if down.max() >= -margin:
+        parts.append(f"GROUND {environment.ground_kind}")
+    present = {"VEIL": environment.veil > 0, "NEAR_CLOUD": environment.near_cloud > 0, "LENS": bool(camera.distortion)}
+    return (*parts, *(name for name, shown in present.items() if shown))
 
 
 def is_ahead(target: Target, camera: Camera) -> bool:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.render.environment import WEATHERS, Environment, Weather, environment_from_seed
-from sim_replay.render.projection import Distortion
+from sim_replay.render.projection import Distortion, undistorted
 
-__all__ = ["WEATHERS", "Camera", "Environment", "Scene", "Target", "Weather", "environment_from_seed"]
+__all__ = ["WEATHERS", "Camera", "Environment", "Scene", "Target", "Weather", "environment_from_seed", "rays_ned"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,15 @@ class Camera:
     R_ned_cam: Array  # [3, 3]
     t_ned_cam_m: Array  # [3]; height above the ground is -z
     distortion: Distortion | None = None  # k1, k2, p1, p2, k3; None: a pinhole
+
+
+def rays_ned(pixels: Array, camera: Camera) -> Array:
+    """Unit vectors [N, 3], NED, that pixels [N, 2] look along."""
+    plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    if camera.distortion is not None:
+        plane = undistorted(plane, camera.distortion)
+    rays = np.hstack([plane, np.ones((len(plane), 1))]) @ camera.R_ned_cam.T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,12 @@ layout(location = 1) out vec4 coordinate;
 void main() {
     ivec2 pixel = ivec2(gl_FragCoord.xy) - tile.xy;
     vec3 ray = ray_ned(vec2(pixel));
-    vec3 background = ray.z > 0.0 ? ground(ray) : sky(ray);
-    if (ray.z <= 0.0 && environment[9].y > 0.0) background = hills(ray, background);
-    background += veil(ray);
+#ifdef SKY
+    vec3 sky_there = sky(ray);
+#else
+    vec3 sky_there = vec3(0.0);
+#endif
+    vec3 background = surroundings(ray, sky_there) + veil(ray);
     vec3 sum = vec3(0.0);
     vec4 body = vec4(0.0);
     float covered = 0.0, hit = 0.0, number = 0.0, share = 0.0;

@@ -1,4 +1,6 @@
 // Sky, clouds, hills and ground along a ray, shared by every program that draws surroundings.
+// A software driver runs both sides of every branch, so what a picture lacks is left out by SKY, GROUND (its kind),
+// HILLS, VEIL, NEAR_CLOUD and LENS.
 uniform sampler2D noise;
 uniform vec4 environment[10];
 uniform vec4 K;                // fx, fy, cx, cy
@@ -14,20 +16,23 @@ const float HILLS_M = 14000.0, HAZE_LAYER_M = 700.0;
 vec3 ray_ned(vec2 pixel) {
     vec2 seen = (pixel - K.zw) / K.xy;
     vec2 p = seen;
-    if (lens != vec4(0.0) || lens_end.x != 0.0) {
-        for (int k = 0; k < 12; ++k) {
-            float r2 = min(dot(p, p), lens_end.y);
-            float radial = 1.0 + r2 * (lens.x + r2 * (lens.y + r2 * lens_end.x));
-            p = (seen - 2.0 * p.x * p.y * lens.zw - lens.wz * (r2 + 2.0 * p * p)) / radial;
-        }
+#ifdef LENS
+    for (int k = 0; k < 12; ++k) {
+        float r2 = min(dot(p, p), lens_end.y);
+        float radial = 1.0 + r2 * (lens.x + r2 * (lens.y + r2 * lens_end.x));
+        p = (seen - 2.0 * p.x * p.y * lens.zw - lens.wz * (r2 + 2.0 * p * p)) / radial;
     }
+#endif
     return normalize(ned_from_cam * vec3(p, 1.0));
 }
 
 vec3 veil(vec3 d) {
-    if (environment[9].x == 0.0) return vec3(0.0);
+#ifdef VEIL
     float s = max(dot(d, environment[0].xyz), 0.0);
     return environment[1].rgb * environment[9].x * (0.25 + 0.5 * pow(s, 8.0) + 1.2 * pow(s, 120.0));
+#else
+    return vec3(0.0);
+#endif
 }
 
 vec3 sky(vec3 d) {
@@ -37,11 +42,9 @@ vec3 sky(vec3 d) {
     c += environment[1].rgb * environment[8].w * (0.35 * pow(s, 6.0) + 0.5 * pow(s, 60.0));
     float fade = smoothstep(0.015, 0.12, up);
     vec2 plane = d.xy / max(up, 0.015);
-    if (environment[4].a > 0.0) {
-        vec2 high = (camera_ned_m.xy + plane * 9000.0) / 40000.0 + environment[8].xy;
-        float cirrus = smoothstep(0.4, 0.8, texture(noise, high * vec2(1.0, 2.7)).g) * environment[4].a;
-        c = mix(c, environment[4].rgb * 1.1, cirrus * fade);
-    }
+    vec2 high = (camera_ned_m.xy + plane * 9000.0) / 40000.0 + environment[8].xy;
+    float cirrus = smoothstep(0.4, 0.8, texture(noise, high * vec2(1.0, 2.7)).g) * environment[4].a;
+    c = mix(c, environment[4].rgb * 1.1, cirrus * fade);
     vec2 p = (camera_ned_m.xy + plane * (environment[2].a + camera_ned_m.z)) / environment[8].z + environment[8].xy;
     // Octaves turned against each other, and a slow swell, so that the texture's period does not show.
     vec2 p3 = turn * p * 3.3;
@@ -115,6 +118,7 @@ vec3 sea(vec3 d, float near, float fine) {
     return mix(c, environment[7].rgb, 0.4 * smoothstep(0.68, 0.8, fine));
 }
 
+#ifdef GROUND
 vec3 ground(vec3 d) {
     float range_m = -camera_ned_m.z / max(d.z, 1e-4);
     float pixel_m = range_m / K.y / max(sqrt(d.z), 0.05);
@@ -124,29 +128,45 @@ vec3 ground(vec3 d) {
     float wide = texture(noise, g / 9000.0 + environment[8].xy).r;
     float near = 0.5 + 0.7 * (texture(noise, g / 700.0).r + texture(noise, turn * g / 1130.0).g - 1.0);
     float fine = texture(noise, g / 110.0).b;
-    int kind = int(environment[5].a + 0.5);
-    vec3 c;
-    if (kind == 0) {
-        c = fields(g, wide, near, pixel_m);
-    } else if (kind == 3) {
-        c = sea(d, near, fine);
-    } else if (kind == 4) {
-        c = town(g, wide, near, pixel_m);
-    } else {
-        c = mix(environment[5].rgb, environment[6].rgb, smoothstep(0.3, 0.7, near));
-        c = mix(c, environment[7].rgb, smoothstep(0.55, 0.7, kind == 5 ? 0.5 * (wide + near) : wide));
-    }
+#if GROUND == 0
+    vec3 c = fields(g, wide, near, pixel_m);
+#elif GROUND == 3
+    vec3 c = sea(d, near, fine);
+#elif GROUND == 4
+    vec3 c = town(g, wide, near, pixel_m);
+#else
+    vec3 c = mix(environment[5].rgb, environment[6].rgb, smoothstep(0.3, 0.7, near));
+    c = mix(c, environment[7].rgb, smoothstep(0.55, 0.7, GROUND == 5 ? 0.5 * (wide + near) : wide));
+#endif
     c *= 0.7 + 0.6 * mix(fine, near, 0.4);
     return mix(environment[3].rgb, c, exp(-range_m * environment[3].a));
 }
+#endif
 
 // Share of the light that shreds of cloud just ahead of the camera take; they drift past as it flies.
 float near_cloud(vec3 d) {
-    if (environment[9].z == 0.0) return 0.0;
+#ifdef NEAR_CLOUD
     vec2 at = vec2(atan(d.y, d.x), -d.z) * 1.9 + (camera_ned_m.xy + camera_ned_m.z) / 900.0 + environment[8].yx;
     float n = 0.55 * texture(noise, at).r + 0.3 * texture(noise, turn * at * 3.1).g + 0.15 * texture(noise, at * 9.7).b;
     float open = 0.75 - 0.5 * environment[9].z;
     return 0.95 * smoothstep(open, open + 0.22, n);
+#else
+    return 0.0;
+#endif
 }
 
 vec3 near_cloud_colour() { return mix(environment[4].rgb, environment[3].rgb, 0.5); }
+
+// What stands at the end of the ray, `sky_there` where that is the sky.
+vec3 surroundings(vec3 d, vec3 sky_there) {
+#ifdef HILLS
+    sky_there = hills(d, sky_there);
+#endif
+#if defined(GROUND) && defined(SKY)
+    return d.z > 0.0 ? ground(d) : sky_there;
+#elif defined(GROUND)
+    return ground(d);
+#else
+    return sky_there;
+#endif
+}
