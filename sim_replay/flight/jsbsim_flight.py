@@ -9,7 +9,7 @@ from typing import Literal
 import jsbsim
 import numpy as np
 
-from msgs.geometry import Array
+from msgs.geometry import Array, R_from_euler
 from sim_replay.flight.aircraft import Dynamics
 from sim_replay.flight.manoeuvre import Manoeuvre
 from sim_replay.flight.pilot import GLIDE_RAD, AutopilotOperator, Controls, Pilot, Seen
@@ -33,6 +33,8 @@ _RECORDED = (
     *("position/ecef-x-ft", "position/ecef-y-ft", "position/ecef-z-ft"),
     *("velocities/ecef-x-fps", "velocities/ecef-y-fps", "velocities/ecef-z-fps"),
     *("velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
+    *("attitude/phi-rad", "attitude/theta-rad", "attitude/psi-rad"),
+    *("position/lat-geod-rad", "position/long-gc-rad"),
 )
 
 
@@ -59,7 +61,6 @@ class _Aircraft:
 
     def __init__(self, sortie: Sortie) -> None:
         self._fdm = _trimmed(sortie)
-        self._propagate = self._fdm.get_propagate()
         self._seen = [self._node(name) for name in _SEEN]
         self._recorded = [self._node(name) for name in _RECORDED]
         self._stick = [self._node(f"fcs/{name}-cmd-norm") for name in ("aileron", "elevator", "rudder")]
@@ -96,12 +97,6 @@ class _Aircraft:
     def state(self) -> list[float]:
         return [n.get_double_value() for n in self._recorded]
 
-    def R_body_ecef(self) -> Array:
-        return np.asarray(self._propagate.get_Tec2b(), dtype=np.float64)
-
-    def R_ned_body(self) -> Array:
-        return np.asarray(self._propagate.get_Tl2b(), dtype=np.float64).T
-
     def height_m(self) -> float:
         return self._node("position/h-agl-ft").get_double_value() * FOOT_M
 
@@ -124,18 +119,27 @@ def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
     settling, samples = round(SETTLE_S / SAMPLE_S), round((end_s - start_s) / SAMPLE_S) + 1
     for k in range(-settling, 0):
         aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
-    R_ned_ecef, height_m = aircraft.R_ned_body() @ aircraft.R_body_ecef(), aircraft.height_m()
-    values, R_body_ecef = np.empty((samples, len(_RECORDED))), np.empty((samples, 3, 3))
+    values, height_m = np.empty((samples, len(_RECORDED))), aircraft.height_m()
     for k in range(samples):
-        values[k], R_body_ecef[k] = aircraft.state(), aircraft.R_body_ecef()
+        values[k] = aircraft.state()
         aircraft.step(pilot.fly(start_s + k * SAMPLE_S, aircraft.seen()))
+    R_ecef_here = _R_ecef_ned(values[:, 12], values[:, 13])
+    R_ned_ecef = R_ecef_here[0].T
+    R_ned_body: Array = R_ned_ecef @ R_ecef_here @ R_from_euler(values[:, 9], values[:, 10], values[:, 11])
     position = (values[:, :3] - values[0, :3]) @ R_ned_ecef.T * FOOT_M - np.array([0.0, 0.0, height_m])
     velocity = values[:, 3:6] @ R_ned_ecef.T * FOOT_M
-    R_ned_body: Array = R_ned_ecef @ np.swapaxes(R_body_ecef, -1, -2)
     if not np.isfinite(values).all() or R_ned_body[:, 2, 2].min() < 0.2:
         raise FlightError(f"{sortie.dynamics.jsbsim_name} departed from controlled flight")
     t_s: Array = start_s + np.arange(samples, dtype=np.float64) * SAMPLE_S
     return Track(t_s, R_ned_body, position, velocity, values[:, 6:9])
+
+
+def _R_ecef_ned(lat_rad: Array, lon_rad: Array) -> Array:
+    """Axes [N, 3, 3] of north, east and down in ECEF at geodetic latitudes and longitudes [N]."""
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat_rad), np.cos(lat_rad), np.sin(lon_rad), np.cos(lon_rad)
+    north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
+    east = np.stack([-sin_lon, cos_lon, np.zeros_like(lon_rad)], axis=-1)
+    return np.stack([north, east, np.cross(north, east)], axis=-1)
 
 
 def _trimmed(sortie: Sortie) -> jsbsim.FGFDMExec:
@@ -146,6 +150,8 @@ def _trimmed(sortie: Sortie) -> jsbsim.FGFDMExec:
         raise FlightError(f"JSBSim has no aircraft named {sortie.dynamics.jsbsim_name}")
     fdm.set_dt(STEP_S)
     fdm["simulation/randomseed"] = sortie.gust_seed
+    # Adams-Bashforth: JSBSim's default, Euler, leaves the attitude half a step behind the rates that it reports.
+    fdm["simulation/integrator/position/rotational"] = 3
     fdm["ic/h-sl-ft"] = sortie.height_m / FOOT_M
     fdm["ic/vt-fps"] = sortie.speed_mps / FOOT_M
     fdm["ic/lat-geod-deg"], fdm["ic/long-gc-deg"] = 47.0, 8.0
