@@ -51,10 +51,7 @@ class DatasetFrame:
 
     def undistorted_bgr(self) -> Image:
         """The picture [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
-        image_bgr = self.image_bgr()
-        if self.distortion is None:
-            return image_bgr
-        return np.asarray(cv2.undistort(image_bgr, self.K, np.array(self.distortion)), dtype=np.uint8)
+        return read_undistorted_bgr(self.image_path, self.K, self.distortion)
 
     def mask(self, k: int) -> Mask | None:
         """The visible mask [H, W] of targets[k] in the picture on disk; None if the dataset has none."""
@@ -244,6 +241,14 @@ def _widen(largest: dict[int, float], target: BopTarget, box_xyxy_px: Array | No
     if box_xyxy_px is not None:
         sides_m = (box_xyxy_px[2:] - box_xyxy_px[:2]) / np.array([K[0, 0], K[1, 1]]) * target.t_cam_target_m[2]
         largest[target.object_id] = max(largest[target.object_id], float(sides_m.max()))
+
+
+def read_undistorted_bgr(path: Path, K: Array, distortion: Distortion | None) -> Image:
+    """The picture [H, W, 3] that the pinhole camera K would have taken in place of its lens. Raises BopError."""
+    image_bgr = _picture(path)
+    if distortion is None:
+        return image_bgr
+    return np.asarray(cv2.undistort(image_bgr, K, np.array(distortion)), dtype=np.uint8)
 
 
 def _picture(path: Path) -> Image:

@@ -159,25 +159,18 @@ def _draw(sequence: PlayedSequence, result: Result, out: Path, console: Console)
     """overlay.png of a typical frame and overlay.mp4 of all."""
     scene = sequence.scene
     views = frame_views(sequence, result)
-    first = _read(scene.images[0])
+    first = scene.undistorted_bgr(0)
     size_wh = (first.shape[1], first.shape[0])
     overlay = Overlay(views, size_wh)
     shown = showcase_index(views)
-    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, _read(scene.images[shown])))
+    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, scene.undistorted_bgr(shown)))
 
     def frames() -> Iterator[Image]:
         order = range(len(views))
         for index in track(order, "drawing overlay.mp4", console=console, disable=not console.is_terminal):
-            yield overlay.draw(index, _read(scene.images[index]))
+            yield overlay.draw(index, scene.undistorted_bgr(index))
 
     write_video(out / "overlay.mp4", frames(), sequence.fps, size_wh)
-
-
-def _read(path: Path) -> Image:
-    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image_bgr is None:
-        raise OSError(f"{path} is not a readable picture")
-    return np.asarray(image_bgr, dtype=np.uint8)
 
 
 def summary_table(score: dict[str, Any]) -> Table:

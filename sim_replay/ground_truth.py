@@ -13,7 +13,8 @@ from edge.errors import InputError
 from edge.types import Mount
 from msgs.geometry import Array
 from sim_replay.bop import Distortion, Model, read_scene
-from sim_replay.datasets import Dataset
+from sim_replay.bop.scene import Image
+from sim_replay.datasets import Dataset, read_undistorted_bgr
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
 from sim_replay.telemetry import TelemetryError, read_telemetry
@@ -33,6 +34,10 @@ class SceneTruth:
     @property
     def name(self) -> str:
         return self.folder.name
+
+    def undistorted_bgr(self, index: int) -> Image:
+        """The frame's picture [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
+        return read_undistorted_bgr(self.images[index], self.K[index], self.distortions[index])
 
 
 @dataclass(frozen=True, eq=False)

@@ -262,6 +262,7 @@ def test_a_lens_is_taken_out_and_projected_boxes_lie_in_the_picture_on_disk(tmp_
     assert abs(column - (79.5 + 150 * 0.35)) <= 3
     assert abs(row - (59.5 + 150 * 0.2)) <= 3
     assert np.linalg.norm(on_disk - (79.5 + 150 * 0.35, 59.5 + 150 * 0.2)) > 6
+    np.testing.assert_array_equal(read_scene_truth(folder).undistorted_bgr(0), frame.undistorted_bgr())
     expected = [*vertices_px.min(axis=0), *vertices_px.max(axis=0)]
     np.testing.assert_allclose(frame.targets[0].box_visible_xyxy_px, expected, atol=1e-6)
 
