@@ -1,4 +1,4 @@
-"""`uavpose-replay`: play sequences through the real daemon and score what comes out."""
+"""`uavpose-replay`: make datasets, play sequences through the real daemon, and score what comes out."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.progress import Progress
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.estimator.model import load_model
+from sim_replay.benchmark import commands as benchmark
 from sim_replay.datasets import open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE, show
 from sim_replay.evaluation.judge import judge_frames, score_of
@@ -44,6 +45,8 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="folder to write to")
         command.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
 
+    benchmark.register(commands)
+
     score = commands.add_parser(
         "score",
         help="score a model on a BOP dataset frame by frame, without the daemon",
@@ -58,6 +61,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if hasattr(args, "run"):
+        return int(args.run(args))
     console = Console()
     if args.command == "score":
         return _score(args, console)

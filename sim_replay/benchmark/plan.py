@@ -1,7 +1,7 @@
 """From a preset and a seed to the plan of every sequence: pure, quick, and the same on any machine.
 
 Nothing is flown or drawn here. The focal length planned is the lens that suits the airframe at that range on the
-average over aspects; `filming.fly` refines it for the aspect that was flown, so that the box comes out as planned.
+average over aspects; `lenses` settles it once the aspects are flown.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ T = TypeVar("T")
 ASPECTS = 96  # attitudes that stand for all, where the mean size of an airframe is wanted
 PRINCIPAL_SIGMA_PX = 12.0
 LENS_LIMIT = 1.7  # of the scatter, in sigmas
-LONGEST_SCATTER = 0.4  # of the logarithm of the longest lens on board
+LONGEST_SCATTER = 0.25  # of the logarithm of the longest lens on board
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,39 @@
+"""The benchmark's sub-commands of `uavpose-replay`. What they need beyond replay (OpenGL, JSBSim) loads on use."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def register(commands: Any) -> None:
+    """Add them to what argparse's add_subparsers() gave; each sets `run`, a function of the parsed arguments."""
+    _generate(commands)
+
+
+def _generate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "generate",
+        help="make a BOP dataset from a preset and a seed",
+        description="Fly (JSBSim), draw and label every sequence of a preset. The same seed gives the same bytes on "
+        "one machine, the same labels on any. Ctrl-C stops after the frames in hand; --resume goes on.",
+    )
+    parser.add_argument("--preset", required=True, metavar="NAME", help="fw-uav6d, unseen, stress, or a .toml file")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write the dataset to")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="0 or more (default %(default)s)")
+    parser.add_argument("--split", action="append", choices=("train", "val", "test"), help="only this; may be repeated")
+    parser.add_argument("--sequences", metavar="LIST", help="only these, for example 0-9,12")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only each Nth frame of a sequence")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("--resume", action="store_true", help="go on with the dataset that is in --out")
+    parser.add_argument("--labels-only", action="store_true", help="all but pictures and masks: minutes, not hours")
+    parser.add_argument("--undistorted", action="store_true", help="the same through lenses without distortion")
+    parser.add_argument("--backdrops", type=Path, metavar="DIR", help="photographs to use for half of the skies")
+    parser.set_defaults(run=_run_generate)
+
+
+def _run_generate(args: argparse.Namespace) -> int:
+    from sim_replay.benchmark.generate import run
+
+    return run(args)

@@ -1,0 +1,138 @@
+"""`uavpose-replay generate`: a preset and a seed in, a BOP dataset out."""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from edge.errors import InputError
+from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.benchmark.crew import CrewError, available_cores, crew
+from sim_replay.benchmark.lenses import lenses_of
+from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, write_manifest
+from sim_replay.benchmark.plan import SequencePlan, plan_dataset
+from sim_replay.benchmark.preset import Preset, load_preset, preset_text
+from sim_replay.benchmark.progress import Report, flights_bar
+from sim_replay.benchmark.sequence_files import FrameNews, Job, make_sequence
+from sim_replay.bop import write_models
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the dataset. Exit codes: 0 made, 1 a worker could not go on. Raises InputError."""
+    place_and_text = preset_text(args.preset)
+    preset = load_preset(args.preset)
+    plans = _plans(preset, args)
+    chosen = _chosen(plans, args.split, args.sequences)
+    backdrops = _backdrops(args.backdrops)
+    recipe = Recipe(preset.name, args.seed, args.every, args.labels_only, args.undistorted, len(backdrops))
+    workers = available_cores() if args.workers is None else args.workers
+    if workers < 1:
+        raise InputError("--workers: must be at least 1")
+    with _alone_in(args.out):
+        claim(args.out, recipe, place_and_text[1], args.resume)
+        job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
+        write_manifest(job, recipe, plans)
+        names = preset.airframe_names()
+        write_models(args.out / "models", {airframe_id(n) + 1: AIRFRAMES[airframe_id(n)].mesh() for n in names})
+        try:
+            _make(job, plans, chosen, workers)
+        except CrewError as error:
+            print(f"{error}; --resume goes on from here", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print(f"stopped; --resume goes on with {args.out}", file=sys.stderr)
+            raise
+        finally:
+            write_manifest(job, recipe, plans)
+    return 0
+
+
+def _make(job: Job, plans: Sequence[SequencePlan], chosen: Sequence[SequencePlan], workers: int) -> None:
+    console = Console(stderr=True)
+    with flights_bar(console, len(plans)) as on_flown:
+        job = replace(job, focal_px=lenses_of(job.out, job.preset, plans, workers, on_flown))
+    with Report(console, job, chosen) as report:
+        for said in crew(partial(make_sequence, job), chosen, workers):
+            if isinstance(said.value, FrameNews):
+                report.frames(said.value)
+            elif said.kind == "done":
+                report.finished(chosen[said.task])
+
+
+def _plans(preset: Preset, args: argparse.Namespace) -> tuple[SequencePlan, ...]:
+    if args.seed < 0:
+        raise InputError("--seed: must be 0 or more")
+    if args.every < 1:
+        raise InputError("--every: must be at least 1")
+    return plan_dataset(preset, args.seed)
+
+
+def _chosen(plans: Sequence[SequencePlan], splits: list[str] | None, ranges: str | None) -> list[SequencePlan]:
+    numbers = set(range(len(plans))) if ranges is None else sequence_numbers(ranges, len(plans))
+    chosen = [plan for plan in plans if plan.index in numbers and (not splits or plan.split in splits)]
+    if not chosen:
+        raise InputError("--split and --sequences: no sequence is in both")
+    return chosen
+
+
+def sequence_numbers(text: str, count: int) -> set[int]:
+    """The numbers in a list such as `0-9,12`, below `count`. Raises InputError."""
+    numbers: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)(?:-(\d+))?\s*", part)
+        if not match:
+            raise InputError(f"--sequences: {part!r} is neither a number nor a range such as 0-9")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first or last >= count:
+            raise InputError(f"--sequences: {part.strip()!r} is not within 0-{count - 1}")
+        numbers.update(range(first, last + 1))
+    return numbers
+
+
+def _backdrops(folder: Path | None) -> tuple[Path, ...]:
+    if folder is None:
+        return ()
+    if not folder.is_dir():
+        raise InputError(f"--backdrops: {folder} is not a folder")
+    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".hdr", ".exr"))
+    if not found:
+        raise InputError(f"--backdrops: {folder} holds no .jpg, .png, .hdr or .exr file")
+    return tuple(path.resolve() for path in found)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that makes the whole dataset; where it lies and how many workers made it is not told."""
+    words = ["uavpose-replay", "generate", "--preset", str(args.preset), "--seed", str(args.seed)]
+    words += ["--every", str(args.every)] if args.every != 1 else []
+    words += [f"--{name.replace('_', '-')}" for name in ("labels_only", "undistorted") if getattr(args, name)]
+    words += ["--backdrops", str(args.backdrops)] if args.backdrops else []
+    return shlex.join(words).replace('"', "'")
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    """Hold the folder against a second run. The lock goes with the process, however that ends."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = (out / LOCK_FILE).open("w")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{out}: another generate is at work there") from error
+        try:
+            yield
+        finally:
+            (out / LOCK_FILE).unlink(missing_ok=True)

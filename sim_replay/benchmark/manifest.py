@@ -1,0 +1,92 @@
+"""dataset.toml: what a dataset is, in words that make it again, and how much of it is there."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from edge.errors import InputError
+from sim_replay.benchmark.plan import SequencePlan
+from sim_replay.benchmark.preset import SPLITS
+from sim_replay.benchmark.scene_store import is_finished, replace_text
+from sim_replay.benchmark.sequence_files import Job
+
+FILE = "dataset.toml"
+PRESET_FILE = "preset.toml"
+LOCK_FILE = ".lock"
+PACKAGES = ("mf-uavpose6d-edge", "numpy", "opencv-python-headless", "moderngl", "jsbsim", "av")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What decides every byte of a dataset, on one machine."""
+
+    preset: str  # a shipped preset's name, or the file's stem
+    seed: int
+    every: int
+    labels_only: bool
+    undistorted: bool
+    backdrops: int  # photographs offered
+
+    def lines(self) -> list[str]:
+        """Its keys, as TOML."""
+        return [
+            f'preset = "{self.preset}"  # its text is in {PRESET_FILE}',
+            f"seed = {self.seed}",
+            f"every = {self.every}",
+            f"labels_only = {str(self.labels_only).lower()}",
+            f"undistorted = {str(self.undistorted).lower()}",
+            f"backdrops = {self.backdrops}",
+        ]
+
+
+def claim(out: Path, recipe: Recipe, preset_text: str, resume: bool) -> None:
+    """Make the dataset's folder ours, or go on with one that the same recipe began. Raises InputError."""
+    if not (out / FILE).is_file():
+        if out.is_dir() and any(path.name not in (LOCK_FILE, PRESET_FILE) for path in out.iterdir()):
+            raise InputError(f"{out}: is not empty and holds no {FILE}; choose another --out")
+        out.mkdir(parents=True, exist_ok=True)
+        (out / PRESET_FILE).write_text(preset_text, encoding="utf-8")
+        return
+    if not resume:
+        raise InputError(f"{out}: already holds a dataset; --resume goes on with it, or choose another --out")
+    try:
+        found = tomllib.loads((out / FILE).read_text(encoding="utf-8"))
+        text = (out / PRESET_FILE).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{out}: {FILE} or {PRESET_FILE} cannot be read: {error}") from error
+    for key, value in vars(recipe).items():
+        if found.get(key) != value:
+            raise InputError(f"{out / FILE}: {key} is {found.get(key)!r} there and {value!r} now; it must stay")
+    if text != preset_text:
+        raise InputError(f"{out / PRESET_FILE}: differs from the preset given; it must stay")
+
+
+def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> None:
+    """Write dataset.toml: recipe, packages, and what is finished of all planned sequences."""
+    there = [plan for plan in plans if is_finished(job.folder(plan))]
+    lines = [
+        f"# Made by: {job.command}",
+        f'command = "{job.command}"',
+        *recipe.lines(),
+        f"complete = {str(len(there) == len(plans)).lower()}  # every sequence of the preset is there",
+        f"sequences = {len(there)}",
+        f"frames = {sum(len(job.frames(plan)) for plan in there)}",
+    ]
+    for name in SPLITS:
+        chosen = [plan for plan in there if plan.split == name]
+        if chosen:
+            frames = sum(len(job.frames(plan)) for plan in chosen)
+            lines += ["", f"[splits.{name}]", f"sequences = {len(chosen)}", f"frames = {frames}"]
+    lines += ["", "[packages]", *(f'{name} = "{_version(name)}"' for name in PACKAGES), ""]
+    replace_text(job.out / FILE, "\n".join(lines))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed as a package"

@@ -1,0 +1,160 @@
+"""Makes one sequence on disk: draws its frames into a scene folder and writes what flies beside them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from msgs.geometry import Array
+from sim_replay.benchmark.crew import Stopped, Tell
+from sim_replay.benchmark.filming import Film, bop_frame, fly, outline_labels
+from sim_replay.benchmark.plan import SequencePlan
+from sim_replay.benchmark.preset import Preset
+from sim_replay.benchmark.scene_store import SceneStore, is_finished
+from sim_replay.benchmark.video import through_h264
+from sim_replay.bop import BopTarget, write_camera
+from sim_replay.flight.encounter import ORIGIN_DEG_M
+from sim_replay.render.frame import render_frame
+from sim_replay.telemetry import write_telemetry
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all sequences of a run share."""
+
+    preset: Preset
+    out: Path
+    command: str  # that makes the same dataset
+    focal_px: Mapping[int, float]  # by sequence
+    every: int = 1  # of the frames planned, make this one in so many
+    labels_only: bool = False
+    undistorted: bool = False
+    backdrops: tuple[Path, ...] = ()  # photographs; half of the sequences take one for sky and ground
+
+    def folder(self, plan: SequencePlan) -> Path:
+        """The sequence's BOP scene folder."""
+        return self.out / plan.split / f"{plan.index:06d}"
+
+    def frames(self, plan: SequencePlan) -> range:
+        """Numbers of the frames to make; a picture keeps its number whatever `every` is."""
+        return range(0, plan.frames, self.every)
+
+    def film(self, plan: SequencePlan) -> Film:
+        """The flown sequence."""
+        number = plan.environment_seed // 2
+        backdrop = self.backdrops[number % len(self.backdrops)] if self.backdrops and number % 2 else None
+        return fly(plan, self.preset, self.focal_px[plan.index], self.undistorted, backdrop)
+
+
+@dataclass(frozen=True)
+class FrameNews:
+    """Frames that are there: made now, or kept from before."""
+
+    sequence: int
+    made: int = 0
+    kept: int = 0
+
+
+def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) -> bool:
+    """A crew's task: make what is missing of a sequence, tell FrameNews; False if it was stopped between frames."""
+    folder = job.folder(plan)
+    if is_finished(folder):
+        shutil.rmtree(folder / ".part", ignore_errors=True)
+        tell(FrameNews(plan.index, kept=len(job.frames(plan))))
+        return True
+    film = job.film(plan)
+    squeezed = plan.h264_kbps is not None and not job.labels_only
+    with SceneStore(folder, plan.jpeg_quality, pictures=not job.labels_only, keep_raw=squeezed) as store:
+        tell(FrameNews(plan.index, kept=len(store.done)))
+        for number in job.frames(plan):
+            if number in store.done:
+                continue
+            if stopped():
+                return False
+            _add_frame(store, film, number, job.labels_only)
+            tell(FrameNews(plan.index, made=1))
+        if squeezed and plan.h264_kbps is not None:
+            store.replace_images(through_h264(store.raw_images(), plan.fps / job.every, plan.h264_kbps))
+        K, size, distortion = film.K, film.size_wh_px, film.distortion
+        store.finish(
+            {
+                "camera.json": lambda path: write_camera(path, K, *size, distortion),
+                "telemetry.csv": lambda path: write_telemetry(path, film.encounter.telemetry()),
+            },
+            sequence_toml(job, film),
+        )
+    return True
+
+
+def _add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) -> None:
+    scene = film.scene(number)
+    if labels_only:
+        store.add(bop_frame(scene, outline_labels(scene)), None)
+        return
+    drawn = render_frame(scene, film.sensor)
+    targets, visible, whole = [], [], []
+    for target, seen in zip(scene.targets, drawn.targets, strict=True):
+        if seen.visible_px == 0:
+            continue  # out of the picture, or hidden altogether
+        targets.append(
+            BopTarget(
+                target.airframe_id + 1,
+                *target.pose_in(scene.camera),
+                box_visible_xyxy_px=_box(seen.box_visible_xyxy_px),
+                box_whole_xyxy_px=_box(seen.box_whole_xyxy_px),
+                visible_px=seen.visible_px,
+                whole_px=seen.whole_px,
+            )
+        )
+        visible.append(seen.mask_visib)
+        whole.append(seen.mask)
+    store.add(bop_frame(scene, tuple(targets)), drawn.image_bgr, visible, whole)
+
+
+def _box(box_xyxy_px: tuple[float, float, float, float] | None) -> Array | None:
+    return None if box_xyxy_px is None else np.asarray(box_xyxy_px, dtype=np.float64)
+
+
+def _matrix_rows(matrix: Array) -> str:
+    return ", ".join("[" + ", ".join(f"{v + 0.0:.9f}" for v in row) + "]" for row in matrix)
+
+
+def sequence_toml(job: Job, film: Film) -> str:
+    """The text of sequence.toml, which says how the sequence was flown and how to play it."""
+    plan, encounter = film.plan, film.encounter
+    lever = ", ".join(f"{v:.3f}" for v in encounter.t_body_cam_m)
+    origin = ", ".join(str(value) for value in ORIGIN_DEG_M)
+    names = ", ".join(f'"{name}"' for name in plan.airframes[: plan.shown])
+    codec = [] if plan.h264_kbps is None else [f"h264_kbps = {plan.h264_kbps}"]
+    return "\n".join(
+        [
+            f"# Made by: {job.command}",
+            f'command = "{job.command}"',
+            f"sequence = {plan.index}",
+            f'split = "{plan.split}"',
+            f"fps = {plan.fps / job.every}",
+            "t0_ns = 0  # exposure of frame 0 on telemetry.csv's clock",
+            f'airframe = "{plan.airframes[0] if plan.shown else ""}"',
+            f"airframes = [{names}]",
+            f"flight_seed = {plan.flight_seed}",
+            f"range_m = {plan.range_m}  # planned, in the middle of the sequence",
+            f"focal_px = {film.focal_px}",
+            f'weather = "{plan.weather}"',
+            f'camera = "{plan.quality}"',
+            f"exposure_s = {plan.exposure_s}",
+            f"jpeg_quality = {plan.jpeg_quality}",
+            *codec,
+            f'mount = "{encounter.plan.mount}"',
+            "# R_body_cam turns optical axes into body (FRD); on a gimbal it is frame 0's, and scene_camera.json",
+            "# holds the camera's attitude at every frame.",
+            f"R_body_cam = [{_matrix_rows(encounter.R_body_cam[0])}]",
+            f"t_body_cam_m = [{lever}]",
+            "# World of cam_R_w2c: north-east-down at this point, degrees and metres above sea.",
+            f"origin_lat_lon_alt = [{origin}]",
+            "",
+        ]
+    )
