@@ -1,0 +1,160 @@
+"""Commands addressed to us, each with its answer and what follows from it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.requests import RequestQueue, StopTracking, TrackBox
+from msgs.mavlink import dialect
+
+from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
+from .reports import BOX_XYXY_PX, SIZE_WH, K
+from .reports import make_report as report
+from .reports import make_track as track
+
+
+def test_commands_to_others_are_not_answered() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(400, 1.0, component=1)
+        peer.command(400, 1.0, system=SYSTEM_ID + 1)
+        peer.settle(lambda: link.counters().get("refused_not_for_us") == 2, "refusal")
+        peer.command(2010)
+        assert peer.named("COMMAND_ACK").command == 2010, "the first answer is to the command that was ours"
+
+
+ACCEPTED, DENIED, UNSUPPORTED = (
+    dialect.MAV_RESULT_ACCEPTED,
+    dialect.MAV_RESULT_DENIED,
+    dialect.MAV_RESULT_UNSUPPORTED,
+)
+
+
+@pytest.mark.parametrize(
+    ("command", "params", "result"),
+    [
+        (512, (259.0,), ACCEPTED),
+        (512, (275.0,), ACCEPTED),
+        (512, (0.0,), ACCEPTED),
+        (512, (30.0,), UNSUPPORTED),
+        (512, (246.0,), DENIED),
+        (512, (math.inf,), DENIED),
+        (511, (275.0, 100_000.0), ACCEPTED),
+        (511, (275.0, 1_000.0), DENIED),
+        (511, (275.0, -2.0), DENIED),
+        (511, (144.0, 100_000.0), DENIED),
+        (511, (0.0, 100_000.0), UNSUPPORTED),
+        (511, (math.nan, 1_000.0), DENIED),
+        (2004, (1.5, 0.5), DENIED),
+        (2004, (math.nan, 0.5), DENIED),
+        (2005, (0.6, 0.4, 0.5, 0.6), DENIED),
+        (2005, (0.1, 0.4, math.inf, 0.6), DENIED),
+        (400, (1.0,), UNSUPPORTED),
+    ],
+)
+def test_commands_are_answered(command: int, params: tuple[float, ...], result: int) -> None:
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(command, *params)
+        ack = peer.named("COMMAND_ACK")
+        assert (ack.command, ack.result, ack.get_srcComponent()) == (command, result, 100)
+        assert (ack.target_system, ack.target_component) == (SYSTEM_ID, 1)
+    assert requests.take() == []
+
+
+def test_pointing_drawing_and_stopping_reach_the_loop_as_requests() -> None:
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(2004, 0.25, 0.75, 0.1)
+        assert peer.named("COMMAND_ACK").result == ACCEPTED
+        peer.command(2005, 0.1, 0.2, 0.3, 0.4)
+        assert peer.named("COMMAND_ACK").result == ACCEPTED
+        in_int = dialect.MAVLink_command_int_message(SYSTEM_ID, 100, 0, 2010, 0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0)
+        peer.send(in_int)
+        assert peer.named("COMMAND_ACK").result == ACCEPTED
+        point, rectangle, stop = requests.take()
+    aspect = SIZE_WH[0] / SIZE_WH[1]
+    assert isinstance(point, TrackBox)
+    np.testing.assert_allclose(point.box_xyxy_share, [0.15, 0.75 - 0.1 * aspect, 0.35, 0.75 + 0.1 * aspect], atol=1e-6)
+    assert isinstance(rectangle, TrackBox)
+    np.testing.assert_allclose(rectangle.box_xyxy_share, [0.1, 0.2, 0.3, 0.4], atol=1e-6)
+    assert stop == StopTracking()
+
+
+def test_a_loop_that_takes_no_requests_is_told_to_the_sender() -> None:
+    with linked(requests=RequestQueue()) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for _ in range(9):
+            peer.command(2010)
+        peer.until(
+            lambda m: m.get_type() == "COMMAND_ACK" and m.result == dialect.MAV_RESULT_TEMPORARILY_REJECTED,
+            "rejection",
+        )
+
+
+def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> None:
+    for width_mm in (None, 6.4):
+        with linked(sensor_width_mm=width_mm) as (link, _), Peer(link.ports[0]) as peer:
+            meet(link, peer)
+            peer.command(512, 259.0)
+            information = peer.named("CAMERA_INFORMATION")
+        assert (information.resolution_h, information.resolution_v) == SIZE_WH
+        assert information.flags == 512 + 1024 + 2048
+        if width_mm is None:
+            assert math.isnan(information.focal_length), "millimetres are not known from pixels"
+        else:
+            half_field_rad = math.atan2(0.5 * information.sensor_size_h, information.focal_length)
+            assert half_field_rad == pytest.approx(math.atan2(0.5 * SIZE_WH[0], K[0, 0]), abs=1e-6)
+            assert information.sensor_size_v == pytest.approx(6.4 * SIZE_WH[1] / SIZE_WH[0])
+
+
+def test_a_message_switched_off_stays_off_until_it_is_asked_for_or_switched_on() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+
+        def publish() -> None:
+            link.publish(report(track(time.monotonic_ns())))
+
+        peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
+        peer.command(511, 275.0, -1.0)
+        peer.named("COMMAND_ACK")
+        peer.received.clear()
+        poses = 0
+
+        def count(message: Any) -> bool:
+            nonlocal poses
+            poses += message.get_type() == "TARGET_RELATIVE"
+            return poses == 20
+
+        peer.until(count, "20 poses", publish)
+        assert "CAMERA_TRACKING_IMAGE_STATUS" not in {m.get_type() for m in peer.received}
+        peer.command(512, 275.0)
+        peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
+        peer.command(511, 275.0, 0.0)
+        for _ in range(2):
+            peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
+
+
+def test_px4_is_not_given_target_relative_on_request_either() -> None:
+    with linked() as (link, _), Peer(link.ports[0], autopilot=dialect.MAV_AUTOPILOT_PX4) as peer:
+        meet(link, peer)
+        peer.command(512, 511.0)
+        assert peer.named("COMMAND_ACK").result == DENIED
+
+
+def test_the_box_told_is_the_chosen_targets() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        now = time.monotonic_ns()
+        other = track(now, track_id=1, box_xyxy_px=BOX_XYXY_PX + 200.0)
+        link.publish(replace(report(track(now), other, now_ns=now), chosen_id=1))
+        status = peer.named("CAMERA_TRACKING_IMAGE_STATUS")
+    assert status.rec_top_x == pytest.approx((BOX_XYXY_PX[0] + 200.5) / SIZE_WH[0], rel=1e-5)

@@ -1,0 +1,173 @@
+"""What the MAVLink link believes, and what it drops and counts."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edge.health import HealthState
+from edge.requests import RequestQueue, StopTracking
+from msgs.mavlink import MAVLink, dialect
+
+from .mavlink_peer import SYSTEM_ID, Peer, alone, linked, meet
+from .reports import make_report as report
+from .reports import make_track as track
+
+
+def test_strangers_get_nothing_and_change_nothing() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer, Peer(link.ports[0]) as stranger:
+        meet(link, peer)
+        stranger.heartbeat()
+        stranger.attitude(Rotation.from_euler("x", 2.0))
+        peer.settle(lambda: link.counters().get("refused_address", 0) == 2, "refusal")
+        assert own_ship.at(time.monotonic_ns()) is None
+        assert alone(stranger.wire)
+
+
+def test_before_an_autopilots_heartbeat_nothing_is_sent_to_whoever_calls() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as caller, Peer(link.ports[0]) as peer:
+        caller.send(dialect.MAVLink_timesync_message(0, 1))
+        ground = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+        caller.send(ground)
+        firmware = (dialect.MAV_TYPE_ANTENNA_TRACKER, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
+        caller.send(dialect.MAVLink_heartbeat_message(*firmware, 0, 0, 4, 3))
+        meet(link, peer)
+        assert link.counters()["refused_stranger"] == 3
+        assert alone(caller.wire)
+
+
+@pytest.mark.parametrize("field", ["not_finite", "quaternion_norm"])
+def test_attitudes_that_are_none_are_refused(field: str) -> None:
+    q = (math.nan, 0.0, 0.0, 0.0) if field == "not_finite" else (2.0, 0.0, 0.0, 0.0)
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.send(dialect.MAVLink_attitude_quaternion_message(peer.boot_ms(), *q, 0.0, 0.0, 0.0))
+        peer.settle(lambda: link.counters().get(f"refused_{field}") == 1, "refusal")
+        assert own_ship.at(time.monotonic_ns()) is None
+
+
+def test_a_megabyte_of_junk_from_the_autopilots_own_address_is_counted_and_the_link_goes_on() -> None:
+    rng = np.random.default_rng(1)
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        sent = 0
+        for size in [1, 7, 300, 1_400, 9_000, 60_000] * 14:
+            junk = rng.bytes(size)
+            # Half of it begins as MAVLink does, so that it reaches the parser.
+            peer.wire.send((b"\xfd" + junk[1:]) if sent % 2 else junk)
+            sent += 1
+            peer.serve()
+        link.publish(report(track(time.monotonic_ns())))
+        peer.named("TARGET_RELATIVE")
+        peer.settle(
+            lambda: sum(n for name, n in link.counters().items() if name.startswith("refused_")) >= sent / 2,
+            "count of junk",
+        )
+
+
+def test_a_truncated_header_does_not_swallow_what_follows() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.wire.send(b"\xfd\xff\x00\x00")
+        peer.attitude(Rotation.identity())
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+
+
+def hostile() -> dict[str, list[Any]]:
+    """Messages with a valid checksum by the reason they are refused for; 100 000 ms is a boot time that fits."""
+    d, stamp = dialect, 100_000
+    return {
+        "implausible": [
+            d.MAVLink_attitude_quaternion_message(stamp, 1.0, 0.0, 0.0, 0.0, 1e30, 0.0, 0.0),
+            d.MAVLink_attitude_message(stamp, 1e20, 0.0, 0.0, 0.0, 0.0, 0.0),
+            d.MAVLink_local_position_ned_message(stamp, 1e30, 0.0, 0.0, 0.0, 0.0, 0.0),
+            d.MAVLink_local_position_ned_message(stamp, 0.0, 0.0, 0.0, -1e9, 0.0, 0.0),
+            d.MAVLink_global_position_int_message(stamp, 2**31 - 1, 0, 0, 0, 0, 0, 0, 0),
+            d.MAVLink_global_position_int_message(stamp, 1, -(2**31), 0, 0, 0, 0, 0, 0),
+            d.MAVLink_global_position_int_message(stamp, 1, 1, 2**31 - 1, 0, 0, 0, 0, 0),
+        ],
+        "not_finite": [
+            d.MAVLink_attitude_message(stamp, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0),
+            d.MAVLink_local_position_ned_message(stamp, 0.0, math.inf, 0.0, 0.0, 0.0, 0.0),
+        ],
+        "quaternion_norm": [d.MAVLink_attitude_quaternion_message(stamp, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)],
+        "message_id": [
+            d.MAVLink_setup_signing_message(SYSTEM_ID, 191, [7] * 32, 2**48 - 1),
+            d.MAVLink_statustext_message(0, b"x" * 50),
+        ],
+    }
+
+
+@pytest.mark.parametrize("reason", list(hostile()))
+def test_nonsense_with_a_valid_checksum_is_counted_and_changes_nothing(reason: str) -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for message in hostile()[reason]:
+            peer.send(message)
+        expected = len(hostile()[reason])
+        peer.settle(lambda: link.counters().get(f"refused_{reason}", 0) == expected, "refusal")
+        assert own_ship.at(time.monotonic_ns()) is None
+        peer.attitude(Rotation.identity())
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "good attitude after it")
+        assert link.counters().get("failed", 0) == 0
+
+
+def test_another_vehicles_telemetry_from_the_autopilots_address_is_refused() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for system, component in ((SYSTEM_ID + 1, 1), (SYSTEM_ID, 191), (0, 0)):
+            other = MAVLink(None, srcSystem=system, srcComponent=component)
+            peer.wire.send(dialect.MAVLink_attitude_quaternion_message(peer.boot_ms(), 1, 0, 0, 0, 0, 0, 0).pack(other))
+        peer.settle(lambda: link.counters().get("refused_not_our_autopilot") == 3, "refusal")
+        assert own_ship.at(time.monotonic_ns()) is None
+
+
+def test_a_message_no_dialect_knows_is_counted_and_dropped() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        # Id 0x030201 is nobody's, so that neither its checksum nor a signature could be judged.
+        unknown = b"\xfd\x01\x00\x00\x00" + bytes([SYSTEM_ID, 1]) + b"\x01\x02\x03" + b"\x00" + b"\x00\x00"
+        attitude = dialect.MAVLink_attitude_quaternion_message(peer.boot_ms(), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        peer.wire.send(unknown + peer.packed(attitude))
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude behind it")
+        peer.settle(lambda: link.counters()["refused_message_id"] == 1, "count of it")
+
+
+def test_a_flood_from_the_autopilots_own_address_does_not_keep_poses_from_going_out() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, peer.autopilot, 0, 0, 4, 3)
+        flood = b"".join(peer.packed(beat) for _ in range(60))
+
+        def flood_and_publish() -> None:
+            for _ in range(50):
+                peer.wire.send(flood)
+            link.publish(report(track(time.monotonic_ns())))
+
+        peer.named("TARGET_RELATIVE", flood_and_publish)
+        peer.settle(lambda: link.counters().get("refused_rate", 0) > 0, "refusal of the surplus", flood_and_publish)
+
+
+def test_only_commanders_command_where_they_are_named() -> None:
+    requests = RequestQueue()
+    with linked(commanders=[255], requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(2010)
+        peer.settle(lambda: link.counters().get("refused_not_a_commander") == 1, "refusal")
+        peer.mav.srcSystem, vehicle = 255, peer.mav.srcSystem
+        peer.command(2010)
+        peer.mav.srcSystem = vehicle
+        assert peer.named("COMMAND_ACK").target_system == 255
+    assert requests.take() == [StopTracking()]
+
+
+def test_hosts_that_are_not_allowed_are_not_heard() -> None:
+    with linked(allowed_hosts=["127.0.0.9"]) as (link, _), Peer(link.ports[0]) as peer:
+        link.set_health(HealthState.TRACKING)
+        peer.settle(lambda: link.counters().get("refused_host", 0) > 0, "refusal")
+        assert alone(peer.wire)

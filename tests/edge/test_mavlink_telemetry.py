@@ -1,0 +1,223 @@
+"""Own ship, clocks and rates: what the link makes of the autopilot's and the gimbal's telemetry."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from edge.config import MavlinkSettings
+from edge.health import HealthState
+from edge.links.mavlink_station import Station
+from edge.requests import RequestQueue
+from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
+from edge.types import Mount
+from msgs.geometry import rotation_angle
+from msgs.mavlink import FrameReader, MAVLink, dialect
+
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet
+
+
+def test_own_attitude_is_stamped_with_the_time_it_was_measured() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        turning = Rotation.from_euler("ZYX", [0.3, 0.1, -0.2])
+        measured_ns = time.monotonic_ns() - 80_000_000
+        stamp_ms = (measured_ns - peer.boot_at_ns) // 1_000_000
+        # It arrives 80 ms after it was measured, as over a slow link.
+        peer.attitude(turning, stamp_ms)
+        peer.settle(lambda: own_ship.at(measured_ns + 2_000_000) is not None, "attitude")
+        assert own_ship.at(measured_ns - 10_000_000) is None, "not before it was measured"
+        assert own_ship.at(measured_ns + 60_000_000) is None, "not by the time it arrived"
+        now = own_ship.at(measured_ns + 2_000_000)
+        assert now is not None
+        np.testing.assert_allclose(now.R_ned_body, turning.as_matrix(), atol=1e-6)
+
+
+def asks_for_attitude(message: Any) -> bool:
+    return message.get_type() == "COMMAND_LONG" and message.param1 == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+
+
+def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        link.set_health(HealthState.TRACKING)
+        peer.until(asks_for_attitude, "first request")
+        meet(link, peer)
+        peer.attitude(Rotation.identity())
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+        before_ns = time.monotonic_ns()
+        peer.boot_at_ns = before_ns
+        peer.attitude(Rotation.from_euler("x", 1.0))
+        peer.settle(lambda: link.counters()["reboots"] == 1, "reboot")
+        assert own_ship.at(before_ns - 1_000_000) is None, "what was before the reboot is gone"
+        peer.until(asks_for_attitude, "request after the reboot")
+
+
+def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
+    own_ship = OwnShipBuffer()
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
+
+    def tell(system_id: int, now_s: float, boot_s: float, rotation: Rotation) -> None:
+        mav = MAVLink(None, srcSystem=system_id, srcComponent=1)
+        q = np.roll(rotation.as_quat(), 1).tolist()
+        for message in (
+            dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3),
+            dialect.MAVLink_attitude_quaternion_message(round(boot_s * 1000), *q, 0.0, 0.0, 0.0),
+        ):
+            station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, round(now_s * 1e9))
+
+    turned = Rotation.from_euler("x", 1.0)
+    tell(1, now_s=1_000.0, boot_s=500.0, rotation=Rotation.identity())
+    station.tick(1_006_000_000_000)
+    tell(2, now_s=1_006.0, boot_s=20.0, rotation=turned)
+    now = own_ship.at(1_006_010_000_000)
+    assert now is not None, "stamped by the clock of the vehicle that is gone"
+    np.testing.assert_allclose(now.R_ned_body, turned.as_matrix(), atol=1e-6)
+    assert own_ship.at(1_000_000_000_000) is None
+
+
+def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
+    with linked(attitude_rate_hz=50.0) as (link, _), Peer(link.ports[0]) as peer:
+        link.set_health(HealthState.TRACKING)
+        first = peer.until(asks_for_attitude, "request for attitude")
+        assert (first.command, first.param2) == (dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 20_000.0)
+        assert (first.target_system, first.target_component) == (SYSTEM_ID, 1)
+        assert [first.param3, first.param4, first.param5, first.param6, first.param7] == [0.0] * 5
+        sent_at = 0.0
+
+        def ten_a_second() -> None:
+            nonlocal sent_at
+            if time.monotonic() - sent_at > 0.1:
+                sent_at = time.monotonic()
+                peer.attitude(Rotation.identity())
+
+        peer.until(asks_for_attitude, "second request", ten_a_second)
+        peer.settle(lambda: link.counters()["rates_asked_again"] >= 1, "count of what was asked again")
+
+
+def test_our_clock_is_told_to_who_asks() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        before_ns = time.monotonic_ns()
+        peer.send(dialect.MAVLink_timesync_message(0, 123_456_789))
+        reply = peer.until(lambda m: m.get_type() == "TIMESYNC" and m.tc1 != 0, "reply")
+        assert reply.ts1 == 123_456_789
+        assert before_ns <= reply.tc1 <= time.monotonic_ns()
+
+
+def test_a_refused_rate_is_counted_and_asked_for_less_often() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        peer.accepts = False
+        link.set_health(HealthState.TRACKING)
+        peer.settle(lambda: link.counters()["rates_refused"] >= 4, "refusals")
+        asked = [m for m in peer.received if asks_for_attitude(m)]
+        assert len(asked) < 3, "a refusal is not answered with the same request at once"
+
+
+BODY = Rotation.from_euler("ZYX", [1.2, 0.15, -0.4])
+GIMBAL = Rotation.from_euler("ZYX", [0.6, -0.5, 0.05])
+HEADING_ONLY = Rotation.from_euler("Z", 1.2)
+
+
+@pytest.mark.parametrize(
+    ("flags", "R_ned_gimbal"),
+    [
+        (64, GIMBAL),
+        (32, HEADING_ONLY * GIMBAL),
+        (16, GIMBAL),
+        (0, HEADING_ONLY * GIMBAL),
+        (64 + 16, GIMBAL),
+        (32 + 16, HEADING_ONLY * GIMBAL),
+    ],
+)
+def test_a_gimbals_attitude_is_read_as_its_flags_say(flags: int, R_ned_gimbal: Rotation) -> None:
+    with linked(own_ship=OwnShipBuffer(gimballed=True)) as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        rate = peer.until(lambda m: m.get_type() == "COMMAND_LONG" and m.param1 == 285, "request for its rate")
+        assert rate.param2 == 20_000.0
+        gimbal = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=154)
+        q = np.roll(GIMBAL.as_quat(), 1).tolist()
+
+        def both() -> None:
+            peer.attitude(BODY)
+            # Its own boot clock, and rates that it does not know.
+            stamp = peer.boot_ms() + 77_000
+            message = dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, stamp, flags, q, *[math.nan] * 3, 0)
+            peer.wire.send(message.pack(gimbal))
+
+        peer.attitude(BODY)
+        peer.settle(lambda: link.counters().get("received_ATTITUDE_QUATERNION", 0) > 0, "attitude of the body")
+        assert own_ship.at(time.monotonic_ns()) is None, "the body's attitude alone does not say where the camera looks"
+        seen: list[Any] = []
+        peer.settle(lambda: bool(seen), "both", lambda: (both(), seen.extend(filter(None, [own_ship.at(now_ns())]))))
+    R = seen[0].R_ned_body @ seen[0].R_body_gimbal
+    np.testing.assert_allclose(R, R_ned_gimbal.as_matrix(), atol=1e-5)
+    mount = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
+    optical_axis_ned = seen[0].R_ned_body @ seen[0].camera(mount).R_body_cam[:, 2]
+    np.testing.assert_allclose(optical_axis_ned, R_ned_gimbal.apply([1.0, 0.0, 0.0]), atol=1e-5)
+
+
+def now_ns() -> int:
+    return time.monotonic_ns()
+
+
+@pytest.mark.parametrize(
+    ("flags", "failure", "q", "component", "reason"),
+    [
+        (96, 0, [1.0, 0.0, 0.0, 0.0], 154, "gimbal_frame"),
+        (64, 8, [1.0, 0.0, 0.0, 0.0], 154, "gimbal_failure"),
+        (64, 0, [1.0, 1.0, 0.0, 0.0], 154, "quaternion_norm"),
+        (64, 0, [math.nan, 0.0, 0.0, 0.0], 154, "not_finite"),
+        (64, 0, [1.0, 0.0, 0.0, 0.0], 42, "not_our_autopilot"),
+    ],
+)
+def test_a_gimbal_that_cannot_be_right_is_not_believed(
+    flags: int, failure: int, q: list[float], component: int, reason: str
+) -> None:
+    with linked(own_ship=OwnShipBuffer(gimballed=True)) as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        gimbal = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=component)
+        peer.wire.send(
+            dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, 5_000, flags, q, 0, 0, 0, failure).pack(gimbal)
+        )
+        peer.settle(lambda: link.counters().get(f"refused_{reason}") == 1, "refusal")
+        peer.attitude(BODY)
+        peer.settle(lambda: link.counters().get("received_ATTITUDE_QUATERNION", 0) > 0, "attitude of the body")
+        assert own_ship.at(time.monotonic_ns()) is None
+
+
+@given(share=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
+def test_a_gimbals_attitude_between_samples_is_their_slerp(share: float, seed: int) -> None:
+    rotations = Rotation.random(2, rng=np.random.default_rng(seed))
+    buffer = OwnShipBuffer(gimballed=True)
+    for time_ns, rotation in zip((0, 40_000_000), rotations, strict=True):
+        assert buffer.add_attitude(time_ns, [1, 0, 0, 0], np.zeros(3))
+        assert buffer.add_gimbal(time_ns, np.roll(rotation.as_quat(), 1), GimbalFrame.EARTH)
+    time_ns = round(share * 40_000_000)
+    own_ship = buffer.at(time_ns)
+    assert own_ship is not None
+    assert own_ship.R_body_gimbal is not None
+    expected = Slerp([0, 40_000_000], rotations)(time_ns).as_matrix()
+    assert rotation_angle(own_ship.R_body_gimbal, expected) < 1e-6
+
+
+def test_a_turning_gimbal_goes_on_turning_for_fifty_milliseconds_and_is_then_unknown() -> None:
+    buffer = OwnShipBuffer(gimballed=True)
+    rate_radps = 0.8
+    for k in range(6):
+        yaw = Rotation.from_euler("z", rate_radps * 0.02 * k)
+        buffer.add_attitude(k * 20_000_000, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_gimbal(k * 20_000_000, np.roll(yaw.as_quat(), 1), GimbalFrame.HEADING)
+    ahead = buffer.at(150_000_000)
+    assert ahead is not None
+    assert ahead.R_body_gimbal is not None
+    np.testing.assert_allclose(ahead.R_body_gimbal, Rotation.from_euler("z", 0.12).as_matrix(), atol=1e-9)
+    for k in range(6, 20):
+        buffer.add_attitude(k * 20_000_000, [1, 0, 0, 0], np.zeros(3))
+    assert buffer.at(151_000_000) is None
