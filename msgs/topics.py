@@ -26,6 +26,8 @@ FRAME_CAMERA = "camera_optical_frame"  # cam: x right, y down, z forward
 FRAME_TARGET = "target_frd"
 FRAME_BODY = "base_link_frd"
 FRAME_NED = "ned"
+# ned axes at the own ship: where targets are told when its position is not known, moving with it.
+FRAME_BODY_NED = "base_link_ned"
 
 _ROS_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _TARGET_NAME = re.compile(r"t[0-9]{1,3}")
@@ -146,8 +148,9 @@ def publication_key(
 
 
 def subscription_key(topic: Topic, uav: str, target: str | None = None, *, domain: int = 0) -> str:
-    """A key expression for the topic under every distribution; `target` None takes every target."""
-    check_uav_name(uav)
+    """A key expression for the topic under every distribution; `target` None takes every target, `uav` "*" all."""
+    if uav != "*":
+        check_uav_name(uav)
     return f"{domain}/{uav}/{topic.name.format(target=target or '*')}/**"
 
 
@@ -168,6 +171,16 @@ def parse_key(key: str, uav: str, *, domain: int = 0) -> tuple[Topic, str | None
         target = head[stem.index("{target}")]
         return (topic, target) if _TARGET_NAME.fullmatch(target) else None
     return None
+
+
+def parse_any_key(key: str, *, domain: int = 0) -> tuple[str, Topic, str | None] | None:
+    """(uav, topic, target) of a sample's key, whoever's it is; None if it is no topic of this table."""
+    first, _, rest = key.partition("/")
+    uav = rest.partition("/")[0]
+    if first != str(domain) or not _ROS_NAME.fullmatch(uav):
+        return None
+    row = parse_key(key, uav, domain=domain)
+    return None if row is None else (uav, *row)
 
 
 def encoding(topic: Topic) -> str:

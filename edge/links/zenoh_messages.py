@@ -10,8 +10,6 @@ from edge.types import Array, Mount, OwnShip, Report, Track
 from msgs import cdr, topics
 from msgs.geometry import q_wxyz_from_R
 
-# ned axes at the own ship: where targets are told when its position is not known, moving with it.
-FRAME_BODY_NED = "base_link_ned"
 CLASS_FIXED_WING = "fixed_wing"
 # A twist's part that is not estimated: ROS has no other way to say so than a variance that outweighs any use.
 NOT_ESTIMATED = 1e6
@@ -35,7 +33,7 @@ def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
 
 
 def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | None:
-    """The target in `ned`; in FRAME_BODY_NED, velocity relative, without own position. None: no own attitude."""
+    """The target in `ned`; in base_link_ned, velocity relative, without own position. None: no own attitude."""
     R, t_m, v_mps, P = track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned
     if R is None or t_m is None or v_mps is None or P is None:
         return None
@@ -44,7 +42,7 @@ def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | N
     twist[:3, :3] = R.T @ P[3:6, 3:6] @ R
     return cdr.Odometry(
         stamp_ns=stamp_ns,
-        frame_id=topics.FRAME_NED if own_ship.t_ned_body_m is not None else FRAME_BODY_NED,
+        frame_id=topics.FRAME_NED if own_ship.t_ned_body_m is not None else topics.FRAME_BODY_NED,
         child_frame_id=topics.FRAME_TARGET,
         t_ned_target_m=t_m,
         q_ned_target_xyzw=q_xyzw(R),
@@ -69,12 +67,12 @@ def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
     """The own ship: its camera on its body, that in ned axes at itself, and those in `ned` if its position is known."""
     q, q_camera = q_xyzw(own_ship.R_ned_body), q_xyzw(own_ship.camera(mount).R_body_cam)
     chain = [
-        cdr.TransformStamped(stamp_ns, FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q),
+        cdr.TransformStamped(stamp_ns, topics.FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q),
         cdr.TransformStamped(stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, mount.t_body_cam_m, q_camera),
     ]
     if own_ship.t_ned_body_m is not None:
         upright = np.array([0.0, 0.0, 0.0, 1.0])
-        place = cdr.TransformStamped(stamp_ns, topics.FRAME_NED, FRAME_BODY_NED, own_ship.t_ned_body_m, upright)
+        place = cdr.TransformStamped(stamp_ns, topics.FRAME_NED, topics.FRAME_BODY_NED, own_ship.t_ned_body_m, upright)
         chain.insert(0, place)
     return cdr.TFMessage(tuple(chain))
 

@@ -9,6 +9,8 @@ import threading
 from pathlib import Path
 
 from msgs.ground.errors import InputError
+from msgs.session import TlsFiles
+from msgs.topics import check_uav_name
 
 EXIT_BAD_INPUT = 2
 
@@ -28,6 +30,24 @@ def _parser() -> argparse.ArgumentParser:
         prog="uavpose-ground", description="The ground's end: route, watch and record what vehicles tell over zenoh."
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    watch = commands.add_parser("watch", help="a live table of vehicles and their targets")
+    _connection(watch)
+    watch.add_argument("--json", action="store_true", help="one JSON object a line: pose, health, event, vehicle, link")
+    watch.add_argument("--max-age", type=float, default=2.0, metavar="S", help="older poses are refused (default 2)")
+    watch.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    watch.set_defaults(act=_watch)
+
+    record = commands.add_parser("record", help="write what vehicles tell as MCAP files")
+    _connection(record)
+    record.add_argument("--dir", type=Path, default=Path("recordings"), help="folder (default: recordings)")
+    record.add_argument("--file-mb", type=_positive, default=256.0, help="then the next file begins (default 256)")
+    record.add_argument("--file-minutes", type=_positive, default=10.0, help="then the next file begins (default 10)")
+    record.add_argument("--total-mb", type=_positive, help="of all files; then the oldest go (default: the disk's end)")
+    record.add_argument("--free-mb", type=float, default=1000.0, help="left on the disk for others (default 1000)")
+    record.add_argument("--when-full", choices=("oldest", "stop"), default="oldest", help="remove the oldest, or stop")
+    record.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    record.set_defaults(act=_record)
 
     router = commands.add_parser("router", help="what vehicles and tools connect to; no other zenoh router is needed")
     router.add_argument("--config", type=Path, required=True, help="TOML file: listen, [tls], [access]")
@@ -55,8 +75,80 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _stop_on_signal() -> threading.Event:
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _connection(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "-e",
+        "--connect",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="router or daemon (default %(default)s)",
+    )
+    command.add_argument("--uav", action="append", default=[], metavar="NAME", help="only this vehicle; repeatable")
+    command.add_argument("--domain", type=int, default=0, help="ROS domain (default 0)")
+    for name, what in (("ca", "the authority's certificate"), ("cert", "own certificate"), ("key", "its private key")):
+        command.add_argument(f"--{name}", type=Path, metavar="PEM", help=f"{what}, for tls/ and quic/ endpoints")
+
+
+def _tls(options: argparse.Namespace) -> TlsFiles | None:
+    given = (options.ca, options.cert, options.key)
+    if not any(given):
+        return None
+    if not all(given):
+        raise InputError("--ca, --cert and --key belong together")
+    return TlsFiles(*given)
+
+
+def _uavs(options: argparse.Namespace) -> list[str]:
+    try:
+        return [check_uav_name(name) for name in options.uav]
+    except ValueError as error:
+        raise InputError(f"--uav: {error}") from error
+
+
+def _watch(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from msgs.ground.watch import WatchOptions, watch
+
+    asked = WatchOptions(options.connect, _tls(options), _uavs(options), options.domain, options.max_age, options.json)
+    return watch(asked, _stop_on_signal(options.seconds), Console(), _say_aside)
+
+
+def _record(options: argparse.Namespace) -> int:
+    from msgs.ground.record import record
+    from msgs.recording import RecordingLimits
+
+    limits = RecordingLimits(
+        file_bytes_max=round(options.file_mb * 1e6),
+        file_seconds_max=60.0 * options.file_minutes,
+        total_bytes_max=None if options.total_mb is None else round(options.total_mb * 1e6),
+        free_bytes_min=round(options.free_mb * 1e6),
+        when_full=options.when_full,
+    )
+    if options.total_mb is not None and options.total_mb < 2 * options.file_mb:
+        raise InputError("--total-mb must hold two files of --file-mb, or nothing is left when one begins")
+    stop, uavs = _stop_on_signal(options.seconds), _uavs(options)
+    return record(options.connect, _tls(options), uavs, options.domain, options.dir, limits, stop, _say_aside)
+
+
+def _say_aside(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _stop_on_signal(after_s: float | None = None) -> threading.Event:
+    """Set by SIGTERM and Ctrl-C, or when the time is over."""
     stop = threading.Event()
+    if after_s is not None:
+        timer = threading.Timer(after_s, stop.set)
+        timer.daemon = True
+        timer.start()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     return stop

@@ -1,0 +1,111 @@
+"""All that vehicles tell, from one session: samples of every topic, and who is there."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import zenoh
+from zenoh import ext, handlers
+
+from msgs import topics
+from msgs.client import connect
+from msgs.ground.errors import InputError
+from msgs.session import TlsFiles, check_endpoint
+from msgs.topics import Topic
+
+RETRY_S = 0.5
+_ALIVE = "uavpose/@v1/*/alive"
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """One sample as it came."""
+
+    uav: str
+    topic: Topic
+    target: str | None
+    key: str
+    payload: bytes
+    attachment: bytes
+
+
+OnSample = Callable[[Incoming], None]
+OnAlive = Callable[[str, bool], None]
+
+
+@contextmanager
+def session(
+    endpoint: str, tls: TlsFiles | None, stop: threading.Event, say: Callable[[str], None]
+) -> Iterator[zenoh.Session | None]:
+    """A session with a router or daemon, waited for until `stop` is set (then None). Raises InputError for an endpoint
+    or certificates that cannot do."""
+    try:
+        check_endpoint(endpoint, tls=tls is not None)
+        if tls is not None:
+            tls.check()
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    waiting = False
+    while not stop.is_set():
+        try:
+            opened = connect(endpoint, tls=tls)
+        except ConnectionError:
+            if not waiting:
+                say(f"waiting for {endpoint}")
+                waiting = True
+            stop.wait(RETRY_S)
+            continue
+        with opened:
+            yield opened
+        return
+    yield None
+
+
+def linked(opened: zenoh.Session) -> bool:
+    """Whether the other end is there just now; zenoh goes on connecting while it is not."""
+    return bool(opened.info.routers_zid() or opened.info.peers_zid())
+
+
+@contextmanager
+def listening(
+    opened: zenoh.Session, uavs: Sequence[str], domain: int, on_sample: OnSample, on_alive: OnAlive
+) -> Iterator[None]:
+    """Call `on_sample` and `on_alive` for these vehicles, all if none is named, on zenoh's receiving threads.
+
+    What is cached (intrinsics, events) comes with its history.
+    """
+
+    def sample(one: zenoh.Sample) -> None:
+        key = str(one.key_expr)
+        row = topics.parse_any_key(key, domain=domain)
+        if row is not None:
+            attachment = b"" if one.attachment is None else one.attachment.to_bytes()
+            on_sample(Incoming(*row, key, one.payload.to_bytes(), attachment))
+
+    def alive(one: zenoh.Sample) -> None:
+        uav = str(one.key_expr).split("/")[2]
+        if not uavs or uav in uavs:
+            on_alive(uav, one.kind == zenoh.SampleKind.PUT)
+
+    # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
+    handler = handlers.Callback(sample, indirect=False)
+    declared: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
+    for uav in uavs or ("*",):
+        for topic in topics.TOPICS:
+            key = topics.subscription_key(topic, uav, domain=domain)
+            if not topic.cache:
+                declared.append(opened.declare_subscriber(key, handler))
+                continue
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
+            recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+            declared.append(ext.declare_advanced_subscriber(opened, key, handler, history=history, recovery=recovery))
+    tokens = opened.liveliness().declare_subscriber(_ALIVE, handlers.Callback(alive, indirect=False), history=True)
+    try:
+        yield
+    finally:
+        tokens.undeclare()
+        for subscriber in declared:
+            subscriber.undeclare()

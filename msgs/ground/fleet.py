@@ -1,0 +1,225 @@
+"""What is known of each vehicle and its targets, from what came so far. No sockets; safe to use from several threads.
+
+Range and closing speed are from the camera. Bearing (clockwise from north), elevation and attitude are in ned while
+the vehicle tells its own attitude; else bearing and elevation are to the right of and above the optical axis.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from msgs import topics
+from msgs.cdr import DECODERS, Detection3DArray, DiagnosticArray, Log, TFMessage
+from msgs.geometry import R_from_q_wxyz, euler_from_R
+from msgs.ground.feed import Incoming
+from msgs.receive import PoseReceiver, TargetPose
+from msgs.wire import Array, PayloadError
+
+CLOSING_WINDOW_NS = 1_500_000_000
+CLOSING_SPAN_NS = 400_000_000
+ATTITUDE_AGE_NS = 1_000_000_000
+FORGET_TARGET_NS = 10_000_000_000
+RATE_WINDOW_NS = 3_000_000_000
+_RANGES_KEPT = 256
+
+
+@dataclass(frozen=True)
+class TargetRow:
+    """One target at its last pose."""
+
+    uav: str
+    target: str
+    stamp_ns: int  # UTC of the exposure
+    range_m: float
+    bearing_deg: float
+    elevation_deg: float
+    frame: Literal["ned", "cam"]  # of bearing and elevation
+    closing_mps: float | None  # positive: comes nearer
+    attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in ned
+    score: float | None
+    sigma_range_m: float
+    sigma_rotation_deg: float
+    t_cam_target_m: tuple[float, float, float]
+    q_cam_target_xyzw: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class VehicleRow:
+    """One vehicle."""
+
+    uav: str
+    alive: bool  # its daemon's token is there
+    level: int  # as in diagnostic_msgs: 0 ok, 1 warn, 2 error
+    health: str
+    event: str
+    pose_rate_hz: float
+    refused: int
+    targets: tuple[TargetRow, ...]
+
+
+@dataclass
+class _Target:
+    row: TargetRow
+    ranges: deque[tuple[int, float]]
+    seen_ns: int
+
+
+@dataclass
+class _Vehicle:
+    receiver: PoseReceiver
+    alive: bool = False
+    level: int = 0
+    health: str = ""
+    event: str = ""
+    event_stamp_ns: int = 0
+    R_ned_cam: Array | None = None
+    attitude_stamp_ns: int = 0
+    scores: dict[str, float] = field(default_factory=dict)
+    targets: dict[str, _Target] = field(default_factory=dict)
+    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
+
+
+class Fleet:
+    """Takes what comes and says how things stand. `max_age_s` must allow for the clocks' difference."""
+
+    def __init__(self, *, domain: int = 0, max_age_s: float = 2.0) -> None:
+        self._domain = domain
+        self._max_age_s = max_age_s
+        self._lock = threading.Lock()
+        self._vehicles: dict[str, _Vehicle] = {}
+
+    def alive(self, uav: str, alive: bool) -> None:
+        with self._lock:
+            self._vehicle(uav).alive = alive
+
+    def take(self, incoming: Incoming, now_ns: int) -> TargetRow | Log | DiagnosticArray | None:
+        """Note a sample at `now_ns` (UTC); what is new in it for a person, or None. Malformed ones are counted."""
+        with self._lock:
+            vehicle = self._vehicle(incoming.uav)
+            if incoming.topic is topics.POSE:
+                pose = vehicle.receiver.receive(incoming.key, incoming.payload, incoming.attachment, now_ns)
+                return None if pose is None else self._take_pose(vehicle, pose)
+            if incoming.topic not in (topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS):
+                return None
+            try:
+                message = DECODERS[incoming.topic.ros_type](incoming.payload)
+            except PayloadError as error:
+                vehicle.receiver.refused[error.reason] += 1
+                return None
+            return _note(vehicle, message)
+
+    def rows(self, now_ns: int) -> list[VehicleRow]:
+        """Every vehicle that was heard, by name; targets not seen for ten seconds are left out."""
+        with self._lock:
+            return [self._row(uav, vehicle, now_ns) for uav, vehicle in sorted(self._vehicles.items())]
+
+    def _vehicle(self, uav: str) -> _Vehicle:
+        if uav not in self._vehicles:
+            self._vehicles[uav] = _Vehicle(PoseReceiver(uav, domain=self._domain, max_age_s=self._max_age_s))
+        return self._vehicles[uav]
+
+    def _take_pose(self, vehicle: _Vehicle, pose: TargetPose) -> TargetRow:
+        known = vehicle.targets.get(pose.target)
+        ranges = known.ranges if known is not None else deque(maxlen=_RANGES_KEPT)
+        range_m = float(np.linalg.norm(pose.pose.t_cam_target_m))
+        ranges.append((pose.stamp_ns, range_m))
+        while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
+            ranges.popleft()
+        fresh = abs(pose.stamp_ns - vehicle.attitude_stamp_ns) <= ATTITUDE_AGE_NS
+        row = target_row(
+            pose, closing_mps(ranges), vehicle.R_ned_cam if fresh else None, vehicle.scores.get(pose.target)
+        )
+        vehicle.targets[pose.target] = _Target(row, ranges, pose.arrival_ns)
+        vehicle.arrivals_ns.append(pose.arrival_ns)
+        return row
+
+    def _row(self, uav: str, vehicle: _Vehicle, now_ns: int) -> VehicleRow:
+        for target in [name for name, one in vehicle.targets.items() if now_ns - one.seen_ns > FORGET_TARGET_NS]:
+            del vehicle.targets[target]
+        recent = sum(now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
+        targets = tuple(one.row for _, one in sorted(vehicle.targets.items()))
+        return VehicleRow(
+            uav,
+            vehicle.alive,
+            vehicle.level,
+            vehicle.health,
+            vehicle.event,
+            recent / (RATE_WINDOW_NS / 1e9),
+            sum(vehicle.receiver.refused.values()),
+            targets,
+        )
+
+
+def _note(vehicle: _Vehicle, message: object) -> Log | DiagnosticArray | None:
+    match message:
+        case Detection3DArray():
+            vehicle.scores = {one.id: one.hypotheses[0].score for one in message.detections if one.hypotheses}
+        case TFMessage() if message.transforms:
+            vehicle.R_ned_cam = camera_attitude(message)
+            vehicle.attitude_stamp_ns = message.transforms[0].stamp_ns
+        case DiagnosticArray() if message.status:
+            vehicle.level, vehicle.health = message.status[0].level, message.status[0].message
+            return message
+        case Log() if message.stamp_ns >= vehicle.event_stamp_ns:
+            vehicle.event, vehicle.event_stamp_ns = message.msg, message.stamp_ns
+            return message
+    return None
+
+
+def camera_attitude(message: TFMessage) -> Array | None:
+    """R_ned_cam [3, 3] up the chain of frames from the camera, or None if it does not end at ned axes."""
+    links = {one.child_frame_id: one for one in message.transforms}
+    R = np.eye(3)
+    frame = topics.FRAME_CAMERA
+    while frame in links:
+        link = links.pop(frame)
+        R = R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1)) @ R
+        frame = link.frame_id
+    return R if frame in (topics.FRAME_NED, topics.FRAME_BODY_NED) else None
+
+
+def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
+    """How fast a target comes nearer, by a line through (stamp ns, range m); None before there is enough."""
+    if len(ranges) < 4 or ranges[-1][0] - ranges[0][0] < CLOSING_SPAN_NS:
+        return None
+    points = np.array(ranges, dtype=np.float64)
+    return -float(np.polyfit((points[:, 0] - points[0, 0]) / 1e9, points[:, 1], 1)[0])
+
+
+def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None, score: float | None) -> TargetRow:
+    """What a person wants to know of a pose; `R_ned_cam` [3, 3] if own attitude is known."""
+    t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
+    range_m = float(np.linalg.norm(t_m))
+    along = t_m / max(range_m, 1e-9)
+    attitude: tuple[float, float, float] | None = None
+    if R_ned_cam is None:
+        right, down, ahead = t_m
+    else:
+        ahead, right, down = R_ned_cam @ t_m
+        R_cam_target = R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
+        roll, pitch, yaw = np.degrees(euler_from_R(R_ned_cam @ R_cam_target))
+        attitude = (float(roll), float(pitch), float(yaw) % 360.0)
+    bearing_deg = math.degrees(math.atan2(right, ahead))
+    x, y, z, w = map(float, pose.pose.q_cam_target_xyzw)
+    return TargetRow(
+        uav=pose.uav,
+        target=pose.target,
+        stamp_ns=pose.stamp_ns,
+        range_m=range_m,
+        bearing_deg=bearing_deg if R_ned_cam is None else bearing_deg % 360.0,
+        elevation_deg=math.degrees(math.atan2(-down, math.hypot(right, ahead))),
+        frame="cam" if R_ned_cam is None else "ned",
+        closing_mps=closing,
+        attitude_deg=attitude,
+        score=score,
+        sigma_range_m=math.sqrt(max(float(along @ covariance[:3, :3] @ along), 0.0)),
+        sigma_rotation_deg=math.degrees(math.sqrt(max(float(np.trace(covariance[3:, 3:])), 0.0) / 3.0)),
+        t_cam_target_m=(float(t_m[0]), float(t_m[1]), float(t_m[2])),
+        q_cam_target_xyzw=(x, y, z, w),
+    )

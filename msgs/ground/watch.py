@@ -1,0 +1,154 @@
+"""`uavpose-ground watch`: who is there, how they are, and where their targets are, live."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import zenoh
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from msgs.cdr import DiagnosticArray, Log
+from msgs.ground.feed import Incoming, linked, listening, session
+from msgs.ground.fleet import Fleet, TargetRow, VehicleRow
+from msgs.session import TlsFiles
+
+REFRESH_S = 0.25
+STALE_S = 1.0
+_LEVEL_STYLE = {0: "green", 1: "yellow", 2: "bold red"}
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """Whom to watch, and how."""
+
+    endpoint: str
+    tls: TlsFiles | None = None
+    uavs: Sequence[str] = ()  # empty: all
+    domain: int = 0
+    max_age_s: float = 2.0
+    as_json: bool = False
+
+
+def watch(options: WatchOptions, stop: threading.Event, console: Console, say: Callable[[str], None]) -> int:
+    """Show what comes until `stop` is set; 0. Raises InputError for a bad endpoint."""
+    fleet = Fleet(domain=options.domain, max_age_s=options.max_age_s)
+    show = _watch_json if options.as_json else _watch_table
+    with session(options.endpoint, options.tls, stop, say) as opened:
+        if opened is not None:
+            show(options, fleet, opened, stop, console)
+    return 0
+
+
+def _watch_table(
+    options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
+) -> None:
+    def take(incoming: Incoming) -> None:
+        fleet.take(incoming, time.time_ns())
+
+    def picture() -> Group:
+        now_ns = time.time_ns()
+        return table(fleet.rows(now_ns), linked(opened), options.endpoint, now_ns)
+
+    with (
+        listening(opened, options.uavs, options.domain, take, fleet.alive),
+        Live(picture(), console=console, auto_refresh=False) as live,
+    ):
+        while not stop.wait(REFRESH_S):
+            live.update(picture(), refresh=True)
+        live.update(picture(), refresh=True)
+
+
+def _watch_json(
+    options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
+) -> None:
+    """One JSON object a line: `pose`, `health`, `event`, `vehicle` (here or gone) and `link` (up or down)."""
+    lock = threading.Lock()
+
+    def tell(**values: object) -> None:
+        line = json.dumps(values)
+        with lock:
+            try:
+                console.file.write(line + "\n")
+                console.file.flush()
+            except BrokenPipeError:
+                stop.set()
+
+    def take(incoming: Incoming) -> None:
+        now_ns = time.time_ns()
+        match fleet.take(incoming, now_ns):
+            case TargetRow() as row:
+                tell(type="pose", age_s=(now_ns - row.stamp_ns) / _NS, **asdict(row))
+            case DiagnosticArray(stamp_ns=stamp_ns, status=status):
+                one = status[0]
+                tell(
+                    type="health",
+                    uav=incoming.uav,
+                    stamp_ns=stamp_ns,
+                    level=one.level,
+                    health=one.message,
+                    values=dict(one.values),
+                )
+            case Log() as event:
+                tell(type="event", uav=incoming.uav, stamp_ns=event.stamp_ns, level=event.level, event=event.msg)
+
+    def alive(uav: str, here: bool) -> None:
+        fleet.alive(uav, here)
+        tell(type="vehicle", uav=uav, alive=here)
+
+    with listening(opened, options.uavs, options.domain, take, alive):
+        up: bool | None = None
+        while True:
+            if linked(opened) != up:
+                up = not up
+                tell(type="link", up=up)
+            if stop.wait(REFRESH_S):
+                return
+
+
+def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) -> Group:
+    """The picture at `now_ns` (UTC): a line for each vehicle, and one for each of its targets.
+
+    A bearing with a `c` is to the right of the optical axis, for want of the vehicle's attitude.
+    """
+    link = Text(f"{endpoint}: up" if up else f"{endpoint}: no link", style="green" if up else "bold red")
+    fleet = Table("vehicle", "link", "health", "poses/s", "refused", "last event", box=box.SIMPLE_HEAD, pad_edge=False)
+    # Eighty columns are enough; one that is narrower still wraps rather than cuts.
+    found = Table("target", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in ("range m", "±", "close m/s", "brg °", "el °", "hdg/pit/rol °", "±°", "score", "age s"):
+        found.add_column(name, justify="right")
+    for one in vehicles:
+        here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
+        health = Text(one.health or "–", style=_LEVEL_STYLE.get(one.level, "dim"))
+        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused), one.event or "–")
+        for target in one.targets:
+            found.add_row(*_cells(target, now_ns), style="dim" if _age_s(target, now_ns) > STALE_S else None)
+    return Group(link, fleet, found)
+
+
+def _cells(row: TargetRow, now_ns: int) -> tuple[str, ...]:
+    roll, pitch, heading = row.attitude_deg or (None, None, None)
+    return (
+        f"{row.uav}/{row.target}",
+        f"{row.range_m:.1f}",
+        f"{row.sigma_range_m:.1f}",
+        "–" if row.closing_mps is None else f"{row.closing_mps:+.1f}",
+        f"{row.bearing_deg:.1f}" + ("" if row.frame == "ned" else "c"),
+        f"{row.elevation_deg:+.1f}",
+        "–" if heading is None else f"{heading:.0f}/{pitch:+.0f}/{roll:+.0f}",
+        f"{row.sigma_rotation_deg:.0f}",
+        "–" if row.score is None else f"{row.score:.2f}",
+        f"{_age_s(row, now_ns):.2f}",
+    )
+
+
+def _age_s(row: TargetRow, now_ns: int) -> float:
+    return (now_ns - row.stamp_ns) / _NS

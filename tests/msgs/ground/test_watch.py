@@ -1,0 +1,254 @@
+"""What the ground sees and keeps: `watch` and `record` as processes beside real sessions."""
+
+from __future__ import annotations
+
+import json
+import random
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from mcap.reader import make_reader
+from scipy.spatial.transform import Rotation
+
+from msgs import cdr, topics
+from msgs.ground.router import load_settings, open_router
+from msgs.publish import Node, TopicPublisher
+from msgs.session import TlsFiles, peer_config
+
+from ..conftest import Network, free_endpoint, until
+from .conftest import write_router_config
+
+R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
+R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+R_NED_TARGET = Rotation.from_euler("ZYX", [200.0, 12.0, 33.0], degrees=True)
+
+
+class Vehicle:
+    """A vehicle that flies at its target at 20 m/s, on a session of its own or another's."""
+
+    def __init__(self, session: zenoh.Session, name: str, stack: ExitStack) -> None:
+        self.node = stack.enter_context(Node(session, name))
+        self.token = session.liveliness().declare_token(topics.alive_token(name))
+        self.publishers: dict[str, TopicPublisher] = {}
+        self.began_s = time.monotonic()
+        self.last_z_m = 0.0
+
+    def put(self, topic: topics.Topic, message: cdr.Payload, target: str | None = None) -> None:
+        if topic.name not in self.publishers:
+            self.publishers[topic.name] = self.node.publisher(topic, target)
+        self.publishers[topic.name].put(message.encode())
+
+    def tell(self) -> None:
+        """One frame's worth."""
+        stamp_ns = time.time_ns()
+        self.last_z_m = 300.0 - 20.0 * (time.monotonic() - self.began_s)
+        t, R = np.array([30.0, -40.0, self.last_z_m]), (R_NED_BODY * R_BODY_CAM).inv() * R_NED_TARGET
+        covariance = np.diag([1.0, 1.0, 25.0, 0.01, 0.01, 0.01])
+        hypothesis = cdr.Hypothesis("fixed_wing", 0.83, t, R.as_quat(), covariance)
+        one = cdr.Detection3D(stamp_ns, "camera_optical_frame", (hypothesis,), t, R.as_quat(), np.zeros(3), "t0")
+        body = cdr.TransformStamped(stamp_ns, "base_link_ned", "base_link_frd", np.zeros(3), R_NED_BODY.as_quat())
+        camera = cdr.TransformStamped(
+            stamp_ns, "base_link_frd", "camera_optical_frame", np.zeros(3), R_BODY_CAM.as_quat()
+        )
+        self.put(topics.TF, cdr.TFMessage((body, camera)))
+        self.put(topics.DETECTIONS, cdr.Detection3DArray(stamp_ns, "camera_optical_frame", (one,)))
+        pose = cdr.PoseWithCovarianceStamped(stamp_ns, "camera_optical_frame", t, R.as_quat(), covariance)
+        self.put(topics.POSE, pose, "t0")
+        time.sleep(0.01)
+
+    def tell_health(self) -> None:
+        status = cdr.DiagnosticStatus(1, "uavpose_edge", "degraded; no own attitude", "uav", (("dropped", "3"),))
+        self.put(topics.DIAGNOSTICS, cdr.DiagnosticArray(time.time_ns(), "", (status,)))
+
+
+class Lines:
+    """What a process prints, read as it comes."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.all: list[str] = []
+        self._thread = threading.Thread(target=self._read, args=(process,), daemon=True)
+        self._thread.start()
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            self.all.append(line)
+
+    def objects(self, kind: str) -> list[dict[str, object]]:
+        return [one for one in map(json.loads, list(self.all)) if one["type"] == kind]
+
+
+@contextmanager
+def ground(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], Lines]]:
+    """`uavpose-ground` as a process."""
+    command = [sys.executable, "-m", "msgs.ground.cli", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process, Lines(process)
+        finally:
+            process.kill()
+
+
+def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Network) -> None:
+    with ExitStack() as stack, ground("watch", "--json", "-e", network.endpoint) as (process, lines):
+        uav1, uav2 = (Vehicle(network.daemon, name, stack) for name in ("uav1", "uav2"))
+        uav1.put(topics.EVENTS, cdr.Log(time.time_ns(), 20, "uavpose_edge", "tracking"))
+
+        def tell() -> None:
+            uav1.tell()
+            uav2.tell()
+            uav1.tell_health()
+
+        def complete() -> bool:
+            poses = lines.objects("pose")
+            full = {one["uav"] for one in poses if None not in (one["closing_mps"], one["attitude_deg"], one["score"])}
+            return full == {"uav1", "uav2"} and bool(lines.objects("health")) and bool(lines.objects("event"))
+
+        until(complete, tell)
+        last = lines.objects("pose")[-1]
+        x, y, z = last["t_cam_target_m"]  # type: ignore[misc]
+        direction = (R_NED_BODY * R_BODY_CAM).apply([x, y, z])
+        assert last["range_m"] == pytest.approx(np.linalg.norm([x, y, z]))
+        assert last["bearing_deg"] == pytest.approx(np.degrees(np.arctan2(direction[1], direction[0])) % 360)
+        assert last["elevation_deg"] == pytest.approx(np.degrees(np.arcsin(-direction[2] / np.linalg.norm(direction))))
+        assert last["attitude_deg"] == pytest.approx([33.0, 12.0, 200.0])
+        assert 15.0 < last["closing_mps"] < 25.0  # type: ignore[operator]
+        assert (last["score"], last["frame"]) == (0.83, "ned")
+        assert last["sigma_rotation_deg"] == pytest.approx(np.degrees(0.1))
+        assert 0.0 <= last["age_s"] < 2.0  # type: ignore[operator]
+        assert lines.objects("health")[0]["values"] == {"dropped": "3"}
+        assert [one["event"] for one in lines.objects("event")] == ["tracking"]
+        assert {(one["uav"], one["alive"]) for one in lines.objects("vehicle")} == {("uav1", True), ("uav2", True)}
+        assert [one["up"] for one in lines.objects("link")] == [True]
+        uav2.token.undeclare()
+        until(lambda: lines.objects("vehicle")[-1] == {"type": "vehicle", "uav": "uav2", "alive": False})
+        process.terminate()
+        assert process.wait(20.0) == 0
+
+
+def test_the_table_shows_vehicles_and_targets_and_junk_is_refused(network: Network) -> None:
+    with ExitStack() as stack, ground("watch", "--seconds", 3, "-e", network.endpoint) as (process, lines):
+        uav1 = Vehicle(network.daemon, "uav1", stack)
+
+        def tell() -> None:
+            uav1.tell()
+            uav1.tell_health()
+            uav1.publishers[topics.POSE.name].put(b"junk")
+
+        until(lambda: process.poll() is not None, tell)
+        assert process.returncode == 0, process.stderr and process.stderr.read()
+        until(lambda: any("score" in line for line in lines.all))
+        text = "".join(lines.all)
+    assert "uav1/t0" in text
+    assert "200/+12/+33" in text
+    assert "degraded" in text
+    assert f"{network.endpoint}: up" in text
+
+
+def test_the_router_may_come_later_and_come_again(tmp_path: Path) -> None:
+    from msgs.session import router_config
+
+    endpoint = free_endpoint()
+    with ExitStack() as stack, ground("watch", "--json", "-e", endpoint) as (_, lines):
+        daemon = stack.enter_context(zenoh.open(peer_config([], [endpoint])))
+        uav1 = Vehicle(daemon, "uav1", stack)
+        for turn in range(2):
+            before = len(lines.objects("pose"))
+            with zenoh.open(router_config([endpoint])):
+                until(lambda before=before: len(lines.objects("pose")) > before + 3, uav1.tell)  # type: ignore[misc]
+            until(lambda turn=turn: [one["up"] for one in lines.objects("link")] == [True, False] * (turn + 1))  # type: ignore[misc]
+
+
+def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_path: Path) -> None:
+    with (
+        ExitStack() as stack,
+        ground("record", "-e", network.endpoint, "--dir", tmp_path, "--free-mb", 0) as (
+            process,
+            _,
+        ),
+    ):
+        uav1, uav2 = (Vehicle(network.daemon, name, stack) for name in ("uav1", "uav2"))
+        uav1.put(topics.EVENTS, cdr.Log(time.time_ns(), 20, "uavpose_edge", "before"))
+
+        def tell() -> None:
+            uav1.tell()
+            uav2.tell()
+
+        until(lambda: any(path.stat().st_size > 20_000 for path in tmp_path.iterdir()), tell)
+        process.terminate()
+        assert process.wait(20.0) == 0
+    (path,) = tmp_path.iterdir()
+    with open(path, "rb") as file:
+        came = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
+    for uav in ("uav1", "uav2"):
+        poses = [cdr.PoseWithCovarianceStamped.decode(m.data) for name, m in came if name == f"/{uav}/target/t0/pose"]
+        assert all(pose.t_cam_target_m[0] == 30.0 for pose in poses)
+        assert len(poses) > 3
+    assert [cdr.Log.decode(m.data).msg for name, m in came if name == "/uav1/events"] == ["before"]
+    assert all(0 <= m.log_time - m.publish_time < 10**10 for _, m in came)
+
+
+class LossyRelay(threading.Thread):
+    """Passes datagrams between a vehicle and the ground and loses a fifth of them."""
+
+    def __init__(self, to_port: int) -> None:
+        super().__init__(daemon=True)
+        self.listening, self.asking = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(2))
+        self.listening.bind(("127.0.0.1", 0))
+        self.asking.connect(("127.0.0.1", to_port))
+        self.port = self.listening.getsockname()[1]
+        self.lost = self.passed = 0
+        self.done = threading.Event()
+
+    def run(self) -> None:
+        chance, client = random.Random(7), None
+        while not self.done.is_set():
+            for ready in select.select([self.listening, self.asking], [], [], 0.1)[0]:
+                try:
+                    data, sender = ready.recvfrom(65536)
+                except ConnectionRefusedError:
+                    continue
+                if ready is self.listening:
+                    client = sender
+                if chance.random() < 0.2:
+                    self.lost += 1
+                elif ready is self.listening:
+                    self.asking.send(data)
+                    self.passed += 1
+                elif client is not None:
+                    self.listening.sendto(data, client)
+        self.listening.close()
+        self.asking.close()
+
+
+def test_over_a_radio_that_loses_a_fifth_poses_come_in_order_and_fresh(
+    tmp_path: Path, keys: dict[str, TlsFiles]
+) -> None:
+    secure, loopback = free_endpoint().replace("tcp/", "quic/") + "?mixed_rel=1", free_endpoint()
+    path = write_router_config(
+        tmp_path, [secure, loopback], keys["ground"], 'vehicles = ["uav1"]\nloopback_reads = true\n'
+    )
+    relay = LossyRelay(int(secure.partition("?")[0].rpartition(":")[2]))
+    relay.start()
+    with ExitStack() as stack:
+        stack.callback(relay.done.set)
+        stack.enter_context(open_router(load_settings(path), tmp_path))
+        far = f"quic/127.0.0.1:{relay.port}?mixed_rel=1"
+        uav1 = Vehicle(stack.enter_context(zenoh.open(peer_config([], [far], tls=keys["uav1"]))), "uav1", stack)
+        _, lines = stack.enter_context(ground("watch", "--json", "-e", loopback))
+        until(lambda: len(lines.objects("pose")) >= 60, uav1.tell, timeout_s=60.0)
+        poses = lines.objects("pose")
+    stamps = [one["stamp_ns"] for one in poses]
+    assert stamps == sorted(stamps)  # type: ignore[type-var]
+    assert all(one["age_s"] < 2.0 for one in poses)  # type: ignore[operator]
+    assert relay.lost > 10
