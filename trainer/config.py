@@ -67,6 +67,15 @@ class LossConfig(_Section):
     uncertainty: float = Field(0.0, ge=0)
 
 
+class DatasetSource(_Section):
+    """A BOP dataset whose pictures are trained on beside rendered windows."""
+
+    path: Path
+    split: str = Field("train", description="folder of the dataset that is trained on")
+    validation_split: str | None = Field(None, description="folder to validate on; absent: rendered windows only")
+    share: float = Field(gt=0, le=1, description="of every batch")
+
+
 class DataConfig(_Section):
     seed: int = Field(ge=0)
     validation_seed: int = Field(ge=0)
@@ -77,6 +86,13 @@ class DataConfig(_Section):
     workers: int = Field(1, ge=1, description="rendering processes")
     prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")
     validation_samples: int = Field(256, ge=8)
+    datasets: list[DatasetSource] = Field([], description="absent: rendered windows alone")
+
+    @model_validator(mode="after")
+    def _shares_fit(self) -> DataConfig:
+        if sum(source.share for source in self.datasets) > 1.0 + 1e-9:
+            raise ValueError("the shares of datasets add up to more than 1")
+        return self
 
     @model_validator(mode="after")
     def _seeds_differ(self) -> DataConfig:

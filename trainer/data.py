@@ -28,9 +28,9 @@ POLL_S = 1.0
 
 
 class Sampler(Protocol):
-    """What a feed needs of sim_replay.sampler.WindowSampler."""
+    """What a feed needs: sim_replay.sampler.WindowSampler, or windows of a dataset, made ready to travel."""
 
-    def batch(self, first_index: int, count: int) -> SampleBatch: ...
+    def batch(self, first_index: int, count: int) -> SampleBatch | TrainingBatch: ...
 
 
 class TrainingBatch(NamedTuple):
@@ -43,8 +43,8 @@ class TrainingBatch(NamedTuple):
     t_cam_target_m: NDArray[np.float32]
     center_px: NDArray[np.float32]
     size_px: NDArray[np.float32]
-    coverage: NDArray[np.float32]  # [N, H/4, W/4]
-    noc: NDArray[np.float32]  # [N, 3, H/4, W/4]
+    coverage: NDArray[np.float32]  # [N, H/4, W/4]; NaN where the mask is not known
+    noc: NDArray[np.float32]  # [N, 3, H/4, W/4]; NaN where not known
     diameter_m: NDArray[np.float32]
 
 
@@ -88,13 +88,27 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
 
 def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler:
     from sim_replay.sampler import WindowSampler
+    from trainer.dataset_windows import DatasetSampler, MixedSampler
 
-    ids = config.airframe_ids
-    return WindowSampler(seed, size_px, ids, acquire_share=config.acquire_share, empty_share=config.empty_share)
+    validating = seed == config.validation_seed
+    samplers: list[Sampler] = []
+    shares: list[float] = []
+    for source in config.datasets:
+        split = source.validation_split if validating else source.split
+        if split is not None:
+            samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
+            shares.append(source.share)
+    if sum(shares) < 1.0:
+        ids = config.airframe_ids
+        samplers.append(
+            WindowSampler(seed, size_px, ids, acquire_share=config.acquire_share, empty_share=config.empty_share)
+        )
+        shares.append(1.0 - sum(shares))
+    return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
 
 
 def window_sampler(config: DataConfig, seed: int, size_px: int) -> Callable[[], Sampler]:
-    """A picklable opener of the renderer's sampler; the renderer starts in the process that calls it."""
+    """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it."""
     return partial(_open_window_sampler, config, seed, size_px)
 
 
@@ -109,7 +123,8 @@ def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, str
         sampler = open_sampler()
         start = first
         while True:
-            batch = training_batch(sampler.batch(start, batch_size))
+            drawn = sampler.batch(start, batch_size)
+            batch = training_batch(drawn) if isinstance(drawn, SampleBatch) else drawn
             start += stride
             while True:
                 try:

@@ -136,13 +136,19 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, T
 
 
 def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
-    """Training-only heads [N, 4, H/4, W/4]: mask over all windows, object coordinates where the target is seen."""
-    mask = F.binary_cross_entropy_with_logits(dense[:, 0], labels.coverage, reduction="none").mean((1, 2))
-    seen = (labels.coverage > 0.3).to(dense.dtype)
+    """Training-only heads [N, 4, H/4, W/4]: mask over all windows, object coordinates where the target is seen.
+
+    Where a label is NaN, not known, nothing is asked.
+    """
+    known = labels.coverage.isfinite()
+    coverage = torch.where(known, labels.coverage, 0.0)
+    mask = F.binary_cross_entropy_with_logits(dense[:, 0], coverage, reduction="none") * known
+    seen = (coverage > 0.3) & labels.noc.isfinite().all(dim=1)
+    true_noc = torch.where(seen[:, None], labels.noc, 0.0)
     # Object coordinates lie within half a diameter: 10 brings their errors to the size of the other terms.
-    error = F.smooth_l1_loss(10 * dense[:, 1:], 10 * labels.noc, reduction="none").mean(1)
-    noc = (error * seen).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1.0)
-    return {"mask": mask, "noc": noc}
+    error = F.smooth_l1_loss(10 * dense[:, 1:], 10 * true_noc, reduction="none").mean(1)
+    noc = (error * seen).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1)
+    return {"mask": mask.mean((1, 2)), "noc": noc}
 
 
 def joint_loss(

@@ -1,0 +1,95 @@
+"""Windows cut from a dataset's pictures: the camera follows exactly, labels are where the picture shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import synthetic_sampler
+import tiny
+import torch
+
+from sim_replay.bop import BopFrame, BopTarget, SceneWriter
+from trainer.config import ConfigError, parse_config
+from trainer.data import to_tensors, training_batch
+from trainer.dataset_windows import DatasetSampler, MixedSampler
+from trainer.losses import dense_terms
+from trainer.train import run_training
+
+K = np.array([[1500.0, 0, 320], [0, 1480, 180], [0, 0, 1]])
+WIDTH, HEIGHT = 640, 360
+DOT_BGR = (0, 0, 255)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames whose target is a red disc around the projected origin; the last has none."""
+    root = tmp_path_factory.mktemp("dots")
+    rng = np.random.default_rng(3)
+    with SceneWriter(root / "train" / "000003", jpeg_quality=98) as writer:
+        for image_id in range(6):
+            t = np.array([*rng.uniform([-40, -20], [40, 20]), 260.0])
+            pixel = (K @ t)[:2] / t[2]
+            image, mask = np.full((HEIGHT, WIDTH, 3), 128, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+            targets: tuple[BopTarget, ...] = ()
+            if image_id < 5:
+                centre = tuple(round(v * 16) for v in pixel)
+                cv2.circle(image, centre, 12 * 16, DOT_BGR, -1, cv2.LINE_AA, shift=4)
+                cv2.circle(mask, centre, 12 * 16, 255, -1, shift=4)
+                y, x = np.nonzero(mask)
+                box = np.array([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
+                pixels = int((mask > 0).sum())
+                targets = (BopTarget(1, np.eye(3), t, box, box, pixels, pixels),)
+            writer.add(BopFrame(image_id, K, targets), image, [mask > 0][: len(targets)])
+    return root
+
+
+@pytest.mark.parametrize("acquire_share", [0.0, 1.0])
+def test_the_target_is_seen_where_its_pose_and_K_project_it(dataset: Path, acquire_share: float) -> None:
+    batch = DatasetSampler(dataset, "train", 5, 96, acquire_share).batch(0, 48)
+    assert 0 < batch.present.sum() < 48
+    for k in np.flatnonzero(batch.present):
+        projected = batch.K[k] @ batch.t_cam_target_m[k]
+        projected = projected[:2] / projected[2]
+        redness = batch.image_bgr[k, ..., 2].astype(float) - batch.image_bgr[k, ..., 1]
+        y, x = np.nonzero(redness > 100)
+        if min(x.min(), y.min()) > 0 and max(x.max(), y.max()) < 95:
+            np.testing.assert_allclose(projected, [x.mean(), y.mean()], atol=0.6)
+            np.testing.assert_allclose(batch.center_px[k], projected, atol=1.5)
+        assert np.isnan(batch.noc[k]).all()
+        assert batch.coverage[k].max() > 0.9
+
+
+def test_a_window_depends_on_its_index_alone(dataset: Path) -> None:
+    one = DatasetSampler(dataset, "train", 5, 64, 0.3)
+    np.testing.assert_array_equal(one.batch(0, 8).image_bgr[3:], one.batch(3, 5).image_bgr)
+
+
+def test_mixing_keeps_the_share_and_unknown_labels_teach_nothing(dataset: Path) -> None:
+    plates = synthetic_sampler.PlateSampler(1, 64)
+    mixed = MixedSampler([DatasetSampler(dataset, "train", 5, 64, 0.0), plates], [0.25, 0.75]).batch(0, 8)
+    assert np.isnan(mixed.noc).any(axis=(1, 2, 3)).tolist() == [True] * 2 + [False] * 6
+    np.testing.assert_array_equal(mixed.image_bgr[2:], training_batch(plates.batch(0, 6)).image_bgr)
+    _, labels = to_tensors(mixed, torch.device("cpu"))
+    dense = torch.zeros(8, 4, 16, 16, requires_grad=True)
+    terms = dense_terms(dense, labels)
+    (terms["noc"].sum() + terms["mask"].sum()).backward()
+    assert torch.isfinite(dense.grad).all()
+    assert (dense.grad[:2, 1:] == 0).all()
+
+
+def test_a_network_trains_on_a_dataset_named_in_its_configuration(dataset: Path, tmp_path: Path) -> None:
+    source = f'[[data.datasets]]\npath = "{dataset}"\nshare = 1.0\nvalidation_split = "train"\n[schedule]'
+    text = tiny.TOML.replace("[schedule]", source)
+    trainer = run_training(parse_config(text, "own.toml"), text, tmp_path / "run", max_steps=1)
+    assert trainer.samples == 4
+
+
+def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=str(tmp_path)):
+        DatasetSampler(tmp_path, None, 1, 64, 0.3)
+    shares = '[[data.datasets]]\npath = "a"\nshare = 0.7\n[[data.datasets]]\npath = "b"\nshare = 0.6\n[schedule]'
+    with pytest.raises(ConfigError, match=r"own\.toml: data: .*add up to more than 1"):
+        parse_config(tiny.TOML.replace("[schedule]", shares), "own.toml")

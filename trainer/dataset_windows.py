@@ -1,0 +1,161 @@
+"""Training windows cut from the pictures of a BOP dataset, as the daemon cuts them, mixed with rendered ones.
+
+What a picture does not tell is NaN: object coordinates always, the mask where the dataset has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay.bop import BopError
+from sim_replay.datasets import DatasetFrame, open_dataset
+from sim_replay.sample import SampleBatch
+from trainer.config import ConfigError
+from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
+
+TRACK_SCALE = 1.8
+TRACK_JITTER = 0.15  # of the window's side
+TRACK_ZOOM = (0.75, 1.33)
+ACQUIRE_WIDTH_PX = 640  # of the whole frame when the acquire stage sees it
+VISIBLE_MIN = 0.35  # of the box inside the window, below which it counts as empty
+Array = NDArray[np.float64]
+
+
+class DatasetSampler:
+    """Window i is a pure function of (seed, i, size) and the dataset. Raises ConfigError where that is unreadable."""
+
+    def __init__(self, root: Path, split: str | None, seed: int, size_px: int, acquire_share: float) -> None:
+        self.seed, self.size_px, self.acquire_share = seed, size_px, acquire_share
+        try:
+            dataset = open_dataset(root, split)
+            self._frames = list(dataset.frames())
+            self._diameter_m = {key: model.diameter_m for key, model in dataset.models.items()}
+        except BopError as error:
+            raise ConfigError(str(error)) from error
+        if not self._frames:
+            raise ConfigError(f"{root}: holds no frames to train on")
+
+    def batch(self, first_index: int, count: int) -> TrainingBatch:
+        """Windows first_index .. first_index + count - 1."""
+        return joined([self._window(i) for i in range(first_index, first_index + count)])
+
+    def _window(self, index: int) -> TrainingBatch:
+        rng = np.random.default_rng([self.seed, index, self.size_px])
+        frame = self._frames[int(rng.integers(len(self._frames)))]
+        try:
+            picture = frame.undistorted_bgr()
+        except BopError as error:
+            raise ConfigError(str(error)) from error
+        boxes = [target.box_visible_xyxy_px for target in frame.targets]
+        seen = [k for k, box in enumerate(boxes) if box is not None]
+        chosen = int(rng.choice(seen)) if seen else None
+        box = None if chosen is None else boxes[chosen]
+        height, width = picture.shape[:2]
+        if box is not None and rng.random() >= self.acquire_share:
+            low, side = _track_square(rng, box)
+        else:
+            low, side = _acquire_square(rng, box, (width, height), self.size_px)
+        scale = self.size_px / side
+        to_window = np.array([[scale, 0, (0.5 - low[0]) * scale - 0.5], [0, scale, (0.5 - low[1]) * scale - 0.5]])
+        image = _resampled(picture, to_window, scale, self.size_px)
+        out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
+        if chosen is not None:
+            self._label(out, frame, chosen, to_window)
+        return out
+
+    def _label(self, out: TrainingBatch, frame: DatasetFrame, chosen: int, to_window: Array) -> None:
+        target = frame.targets[chosen]
+        assert target.box_visible_xyxy_px is not None
+        corners = target.box_visible_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
+        inside = np.clip(corners, -0.5, self.size_px - 0.5)
+        if np.prod(inside[1] - inside[0]) < VISIBLE_MIN * np.prod(corners[1] - corners[0]):
+            return
+        out.present[0] = True
+        out.R_cam_target[0], out.t_cam_target_m[0] = target.R_cam_target, target.t_cam_target_m
+        out.center_px[0], out.size_px[0] = inside.mean(axis=0), inside[1] - inside[0]
+        out.diameter_m[0] = self._diameter_m.get(target.object_id, 0.0)
+        mask = frame.mask(chosen) if frame.distortion is None else None
+        out.coverage[0] = np.nan if mask is None else _coverage(mask, to_window, self.size_px)
+
+
+def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, float]:
+    """First pixel's place [2] and side, frame pixels, of a jittered window around the box."""
+    low, high = box_xyxy_px[:2], box_xyxy_px[2:]
+    side = TRACK_SCALE * float((high - low).max()) * float(np.exp(rng.uniform(*np.log(TRACK_ZOOM))))
+    centre = 0.5 * (low + high) + side * rng.uniform(-TRACK_JITTER, TRACK_JITTER, 2)
+    return centre - side / 2 + 0.5, side
+
+
+def _acquire_square(
+    rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: tuple[int, int], size_px: int
+) -> tuple[Array, float]:
+    """The same of a window of the reduced frame, anywhere around the box, or anywhere at all."""
+    side = size_px * frame_wh[0] / ACQUIRE_WIDTH_PX
+    around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
+    low = around - rng.uniform(0.0, 1.0, 2) * side
+    return np.where(np.array(frame_wh) > side, np.clip(low, 0.0, np.maximum(np.array(frame_wh) - side, 0.0)), low), side
+
+
+def _resampled(picture: NDArray[np.uint8], to_window: Array, scale: float, size_px: int) -> NDArray[np.uint8]:
+    """Averages where it shrinks: the picture is blurred to the window's pixel before it is sampled."""
+    if scale < 1.0:
+        margin = np.array([2.0, 2.0]) / scale
+        start = np.floor(-(to_window[:, 2] + 0.5) / scale - margin).astype(int)
+        stop = start + np.ceil(size_px / scale + 2 * margin).astype(int) + 1
+        start, stop = np.maximum(start, 0), np.minimum(stop, [picture.shape[1], picture.shape[0]])
+        if (stop > start).all():
+            crop = picture[start[1] : stop[1], start[0] : stop[0]]
+            picture = np.asarray(cv2.GaussianBlur(crop, (0, 0), 0.4 / scale), np.uint8)
+            to_window = to_window.copy()
+            to_window[:, 2] += to_window[:, :2] @ start
+    return np.asarray(
+        cv2.warpAffine(picture, to_window, (size_px, size_px), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        np.uint8,
+    )
+
+
+def _coverage(mask: NDArray[np.bool_], to_window: Array, size_px: int) -> NDArray[np.float32]:
+    """Share of visible target pixels [S/4, S/4]."""
+    window = cv2.warpAffine(mask.astype(np.float32), to_window, (size_px, size_px), flags=cv2.INTER_LINEAR)
+    side = size_px // DENSE_STRIDE
+    return window.reshape(side, DENSE_STRIDE, side, DENSE_STRIDE).mean((1, 3))
+
+
+def _blank(image_bgr: NDArray[np.uint8], K: Array) -> TrainingBatch:
+    side = image_bgr.shape[0] // DENSE_STRIDE
+    return TrainingBatch(
+        image_bgr=image_bgr[None],
+        K=K[None].astype(np.float32),
+        present=np.zeros(1, np.bool_),
+        R_cam_target=np.eye(3, dtype=np.float32)[None],
+        t_cam_target_m=np.zeros((1, 3), np.float32),
+        center_px=np.zeros((1, 2), np.float32),
+        size_px=np.zeros((1, 2), np.float32),
+        coverage=np.zeros((1, side, side), np.float32),
+        noc=np.full((1, 3, side, side), np.nan, np.float32),
+        diameter_m=np.zeros(1, np.float32),
+    )
+
+
+def joined(batches: Sequence[TrainingBatch]) -> TrainingBatch:
+    """One batch of all."""
+    return TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
+
+
+class MixedSampler:
+    """The same share of every batch from each sampler; what the shares leave comes from the last."""
+
+    def __init__(self, samplers: Sequence[Sampler], shares: Sequence[float]) -> None:
+        self._samplers, self._shares = tuple(samplers), tuple(shares)
+
+    def batch(self, first_index: int, count: int) -> TrainingBatch:
+        """Samples of the batch that starts at first_index; distinct for distinct batches."""
+        counts = [round(share * count) for share in self._shares[:-1]]
+        counts.append(count - sum(counts))
+        drawn = [sampler.batch(first_index, n) for sampler, n in zip(self._samplers, counts, strict=True) if n > 0]
+        return joined([training_batch(one) if isinstance(one, SampleBatch) else one for one in drawn])
