@@ -136,8 +136,8 @@ def statistics(frames: int, matches: Sequence[Match], false_poses: Sequence[Targ
 def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1000: float | None) -> dict[str, Any]:
     """The figures of one group of targets: degrees, metres and shares 0..1; None where there is nothing to tell."""
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
-    R_gt, t_gt = _stack([truth for truth, _ in found])
-    R_est, t_est = _stack([estimate for _, estimate in found])
+    R_gt, t_gt = stacked([truth for truth, _ in found])
+    R_est, t_est = stacked([estimate for _, estimate in found])
     rate = lambda good: _share(int(np.sum(good)), len(matches))  # noqa: E731
     return {
         "frames": frames,
@@ -165,8 +165,8 @@ def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
     sure = [(m.truth, m.estimate) for m in matches if m.estimate is not None and m.estimate.covariance is not None]
     if not sure:
         return None
-    R_gt, t_gt = _stack([truth for truth, _ in sure])
-    R_est, t_est = _stack([estimate for _, estimate in sure])
+    R_gt, t_gt = stacked([truth for truth, _ in sure])
+    R_est, t_est = stacked([estimate for _, estimate in sure])
     covariance = np.array([estimate.covariance for _, estimate in sure])
     inside: dict[str, Callable[[float], metrics.Booleans]] = {
         "depth": lambda sigmas: metrics.depth_inside(t_est, t_gt, covariance, sigmas),
@@ -196,6 +196,12 @@ def range_band(range_m: float) -> str:
     return f"below-{RANGE_BANDS_M[0][0]:.0f}" if range_m < RANGE_BANDS_M[0][0] else f"above-{RANGE_BANDS_M[-1][1]:.0f}"
 
 
+def stacked(poses: Sequence[TargetPose]) -> tuple[Array, Array]:
+    """R_cam_target [N, 3, 3] and t_cam_target_m [N, 3] of N poses."""
+    R = np.array([pose.R_cam_target for pose in poses], dtype=np.float64).reshape(-1, 3, 3)
+    return R, np.array([pose.t_cam_target_m for pose in poses], dtype=np.float64).reshape(-1, 3)
+
+
 def _bands(items: Sequence[Any], pose: Callable[[Any], TargetPose]) -> dict[str, list[Any]]:
     """Items by the range of their pose, near to far: the paper's bands always, those beyond where they hold one."""
     order = ["below-100", *(f"{low:.0f}-{high:.0f}" for low, high in RANGE_BANDS_M), "above-500"]
@@ -218,11 +224,6 @@ def _add_rates(matches: Sequence[Match]) -> dict[str, float | None]:
         name: _share(int(np.sum(metrics.add_within(add, diameter_m, fraction))), len(modelled))
         for name, fraction in ADD_FRACTIONS.items()
     }
-
-
-def _stack(poses: Sequence[TargetPose]) -> tuple[Array, Array]:
-    R = np.array([pose.R_cam_target for pose in poses], dtype=np.float64).reshape(-1, 3, 3)
-    return R, np.array([pose.t_cam_target_m for pose in poses], dtype=np.float64).reshape(-1, 3)
 
 
 def _share(part: int, whole: int) -> float | None:

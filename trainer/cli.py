@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import os
 import sys
 from pathlib import Path
 
+from trainer import evaluate_command
 from trainer.config import ConfigError, RenderingError, load_config
 
 
@@ -41,25 +40,6 @@ def _export(arguments: argparse.Namespace) -> None:
     )
 
 
-def _evaluate(arguments: argparse.Namespace) -> None:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from trainer.held_out import Request, evaluate_file
-
-    request = Request(
-        arguments.checkpoint, arguments.onnx, arguments.samples, arguments.seed, arguments.stage, arguments.size
-    )
-    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task("rendering", total=arguments.samples)
-        metrics = evaluate_file(request, rendered=lambda count: progress.update(task, completed=count))
-    if arguments.json:
-        print(json.dumps({name: value if math.isfinite(value) else None for name, value in metrics.items()}, indent=2))
-        return
-    for name, value in metrics.items():
-        print(f"{name:22} {value:.4g}")
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="uavpose-trainer", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -78,28 +58,9 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="begin with another run's weights.pt")
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
-    _add_evaluate(commands)
+    evaluate_command.register(commands)
     _add_export(commands)
     return parser
-
-
-def _add_evaluate(commands: argparse._SubParsersAction) -> None:
-    evaluate = commands.add_parser(
-        "evaluate",
-        help="measure a checkpoint or a model file on rendered windows",
-        description="Measure a checkpoint or a model file on windows that training never saw: the paper's errors "
-        "over every window with a target, found or not, and how well targets are found. A seed always gives the same "
-        "windows.",
-    )
-    source = evaluate.add_mutually_exclusive_group(required=True)
-    source.add_argument("--checkpoint", type=Path, help="run folder or its weights.pt")
-    source.add_argument("--onnx", type=Path, metavar="FILE", help="exported model file")
-    evaluate.add_argument("--samples", type=int, default=1000, help="windows (default %(default)s)")
-    evaluate.add_argument("--seed", type=int, default=930001, help="seed of the windows (default %(default)s)")
-    evaluate.add_argument("--stage", choices=("track", "acquire"), default="track", help="windows as it sees them")
-    evaluate.add_argument("--size", type=int, help="side of the windows in pixels; default: the model's")
-    evaluate.add_argument("--json", action="store_true", help="print one JSON object")
-    evaluate.set_defaults(run=_evaluate)
 
 
 def _add_export(commands: argparse._SubParsersAction) -> None:

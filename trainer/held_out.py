@@ -15,10 +15,9 @@ from trainer.graph import onnx_predictor, read_contract
 
 
 class Request(NamedTuple):
-    """What to measure: one of `checkpoint` and `onnx`, and which windows."""
+    """What to measure, on which windows."""
 
-    checkpoint: Path | None
-    onnx: Path | None
+    model: Path  # ONNX file, else a checkpoint: run folder or weights.pt
     samples: int
     seed: int
     stage: Literal["track", "acquire"]
@@ -61,12 +60,8 @@ def evaluate_file(
     request: Request, *, open_view: OpenView | None = None, rendered: Callable[[int], None] | None = None
 ) -> dict[str, float]:
     """Metrics of trainer.evaluate.measure at the file's own threshold. Raises ConfigError when asked the impossible."""
-    if request.checkpoint is not None:
-        subject = _checkpoint(request.checkpoint)
-    elif request.onnx is not None:
-        subject = _model_file(request.onnx, request.seed)
-    else:
-        raise ConfigError("give --checkpoint or --onnx")
+    is_onnx = request.model.suffix == ".onnx"
+    subject = _model_file(request.model, request.seed) if is_onnx else _checkpoint(request.model)
     if request.seed == subject.training_seed:
         raise ConfigError(f"--seed {request.seed}: is the training seed; give another")
     size_px = request.size_px or (subject.track_px if request.stage == "track" else None)
@@ -74,7 +69,7 @@ def evaluate_file(
     if size_px < 32 or size_px % 32:
         raise ConfigError(f"--size {size_px}: must be a multiple of 32")
     if request.samples < 16:
-        raise ConfigError(f"--samples {request.samples}: must be at least 16")
+        raise ConfigError(f"--windows {request.samples}: must be at least 16")
     view = open_view or (lambda seed, size, share: stage_sampler(subject.data, seed, size, share))
     opener = view(request.seed, size_px, 0.0 if request.stage == "track" else 1.0)
     batches = render_once(opener, request.samples, rendered=rendered)

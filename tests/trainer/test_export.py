@@ -112,7 +112,7 @@ def test_an_int8_file_that_strays_is_not_written(exported: Exported, tmp_path: P
 
 
 def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None:
-    request = Request(checkpoint=None, onnx=exported.fp32, samples=16, seed=77, stage="track")
+    request = Request(exported.fp32, samples=16, seed=77, stage="track")
     got = evaluate_file(request, open_view=open_view)
     batches = [windows(77, 64)]
     threshold = read_contract(exported.fp32).track_score_min

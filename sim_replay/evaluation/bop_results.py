@@ -1,0 +1,127 @@
+"""BOP results files (bop_toolkit docs/bop_challenge_2019 format): any method's poses in, the evaluated model's out.
+
+METHOD_DATASET-SPLIT.csv with a header and one pose a line: scene_id,im_id,obj_id,score,R,t,time. R is nine and t
+three numbers parted by spaces, of the dataset's model axes, t in millimetres; time in seconds, -1 where not known.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import InputError
+from sim_replay.bop.records import MM_PER_M
+from sim_replay.datasets import Dataset, DatasetFrame
+from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame
+from sim_replay.score import TargetPose
+
+COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1
+UNKNOWN_TIME_S = -1.0
+_ROTATION_TOLERANCE = 0.02
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ResultRow:
+    """One pose as the file has it, lengths in metres."""
+
+    scene_id: int
+    image_id: int
+    object_id: int
+    score: float
+    R_cam_model: Array  # [3, 3]
+    t_cam_model_m: Array  # [3]
+    time_s: float
+
+
+def read_results(path: Path) -> list[ResultRow]:
+    """All rows of a results file. Raises InputError, naming file, line and column."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            if tuple(header) != COLUMNS:
+                raise InputError(f"{path} line 1: its columns are not {','.join(COLUMNS)}")
+            return [_row(path, reader.line_num, cells) for cells in reader if cells]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
+    if len(cells) != len(COLUMNS):
+        raise InputError(f"{path} line {line}: {len(cells)} columns, not {len(COLUMNS)}")
+    values = {}
+    for name, cell, count in zip(COLUMNS, cells, (1, 1, 1, 1, 9, 3, 1), strict=True):
+        try:
+            values[name] = np.array([float(number) for number in cell.split()])
+        except ValueError as error:
+            raise InputError(f"{path} line {line}: {name} is not a number: {cell!r}") from error
+        if values[name].shape != (count,) or not np.isfinite(values[name]).all():
+            raise InputError(f"{path} line {line}: {name} is not {count} finite number{'s' * (count > 1)}")
+    R = values["R"].reshape(3, 3)
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        raise InputError(f"{path} line {line}: R is not a rotation")
+    scene_id, image_id, object_id = (int(values[name][0]) for name in COLUMNS[:3])
+    score, time_s = float(values["score"][0]), float(values["time"][0])
+    return ResultRow(scene_id, image_id, object_id, score, R, values["t"] / MM_PER_M, time_s)
+
+
+def file_answers(path: Path, dataset: Dataset) -> Answerer:
+    """Answers from a results file; poses of pictures that are not asked for stay unused.
+
+    Raises InputError if the file is not as it should be, or none of its rows is of the dataset's pictures.
+    """
+    by_picture: dict[tuple[int, int], list[ResultRow]] = {}
+    for row in read_results(path):
+        by_picture.setdefault((row.scene_id, row.image_id), []).append(row)
+    known = {(scene.scene_id, frame.image_id) for scene in dataset.scenes for frame in scene.frames}
+    if by_picture and not known & by_picture.keys():
+        raise InputError(f"{path}: none of its scene_id and im_id is a picture of {dataset.name}")
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        rows = by_picture.get((picture.scene_id, picture.image_id), [])
+        times_s = [row.time_s for row in rows if row.time_s >= 0]
+        return Answer(tuple(_pose(index, row, picture) for row in rows), 1e3 * max(times_s) if times_s else None)
+
+    return answer
+
+
+def _pose(index: int, row: ResultRow, picture: DatasetFrame) -> TargetPose:
+    """The pose of the body axes that the row's model axes stand for."""
+    u, _, vt = np.linalg.svd(row.R_cam_model)
+    R, t_m = picture.scene.models.of(row.object_id).pose_of_body(u @ vt, row.t_cam_model_m)
+    return TargetPose(index, R, t_m, score=row.score)
+
+
+def results_name(method: str, dataset: Dataset) -> str:
+    """METHOD_DATASET-SPLIT.csv; BOP parts the name at the underscore."""
+    parts = (part.replace("_", "-") for part in (method, dataset.name, dataset.split or "all"))
+    return "{}_{}-{}.csv".format(*parts)
+
+
+def write_results(path: Path, judged: Iterable[JudgedFrame]) -> None:
+    """Write every pose, found targets under their true obj_id (a model-free method names none), others under 0."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for frame in judged:
+            time_s = UNKNOWN_TIME_S if frame.time_ms is None else frame.time_ms * 1e-3
+            found = [(m.truth.object_id, m.estimate) for m in frame.matches if m.estimate is not None]
+            for object_id, pose in [*found, *((NO_OBJECT, pose) for pose in frame.false_poses)]:
+                model = frame.picture.scene.models.of(object_id)
+                R = pose.R_cam_target @ model.R_body_model
+                t_mm = (pose.t_cam_target_m + pose.R_cam_target @ model.t_body_model_m) * MM_PER_M
+                score = 1.0 if pose.score is None else pose.score
+                ids = (frame.picture.scene_id, frame.picture.image_id, object_id)
+                writer.writerow([*ids, f"{score:.6f}", _numbers(R.ravel(), 9), _numbers(t_mm, 4), f"{time_s:.6f}"])
+
+
+def _numbers(values: Array, digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)

@@ -1,0 +1,97 @@
+"""The worst frames of an evaluation as one sheet of pictures, true and estimated box drawn on each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_replay import metrics
+from sim_replay.bop import Model
+from sim_replay.evaluation.judge import JudgedFrame
+from sim_replay.ground_truth import extents_of
+from sim_replay.overlay import ESTIMATE_BGR, TRUTH_BGR, draw_pose, project, window_camera
+from sim_replay.score import Match
+
+Image = NDArray[np.uint8]
+
+SHOWN = 12
+MISSES_SHOWN_MAX = 4
+_COLUMNS = 4
+_TILE_PX = 420
+_CAPTION_PX = 54
+_VIEW_SCALE = 2.6  # side of what is shown over the target's projected box
+_VIEW_MIN_PX = 96
+
+
+def badness(match: Match) -> float:
+    """How many times over the limits of Pose@10°/5 % an estimate is; infinite for a target that was not found."""
+    if match.estimate is None:
+        return float("inf")
+    truth, estimate = match.truth, match.estimate
+    rotation_deg = metrics.rotation_error_deg(estimate.R_cam_target, truth.R_cam_target)
+    translation_rel = metrics.translation_error_rel(estimate.t_cam_target_m, truth.t_cam_target_m)
+    return float(max(rotation_deg / metrics.ROTATION_LIMIT_DEG, translation_rel / metrics.TRANSLATION_LIMIT_REL))
+
+
+def worst_matches(judged: Sequence[JudgedFrame], shown: int = SHOWN) -> list[tuple[JudgedFrame, Match]]:
+    """The `shown` worst targets, worst first; a few evenly spread misses stand for all of them."""
+    ordered = sorted(((frame, match) for frame in judged for match in frame.matches), key=lambda p: -badness(p[1]))
+    missed = [pair for pair in ordered if pair[1].estimate is None]
+    found = [pair for pair in ordered if pair[1].estimate is not None]
+    count = min(MISSES_SHOWN_MAX, len(missed))
+    spread = [missed[int(i)] for i in np.linspace(0, len(missed) - 1, count).round()] if count else []
+    return [*spread, *found[: shown - count]]
+
+
+def write_worst(path: Path, judged: Sequence[JudgedFrame], models: Mapping[int, Model]) -> Path | None:
+    """Write the sheet; None, and no file, where there is no target. Raises BopError on an unreadable picture."""
+    tiles = [_tile(frame, match, models) for frame, match in worst_matches(judged)]
+    if not tiles:
+        return None
+    blank = np.full_like(tiles[0], 255)
+    tiles += [blank] * (-len(tiles) % _COLUMNS)
+    rows = [np.hstack(tiles[i : i + _COLUMNS]) for i in range(0, len(tiles), _COLUMNS)]
+    if not cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 88]):
+        raise OSError(f"{path} cannot be written")
+    return path
+
+
+def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Image:
+    """The target's surroundings, enlarged, with a caption above."""
+    truth, estimate = match.truth, match.estimate
+    image_bgr, K = frame.picture.undistorted_bgr(), frame.picture.K
+    extents = extents_of(models[truth.object_id])
+    corners = project(extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, K)
+    low, high = (np.zeros(2), np.array(image_bgr.shape[1::-1])) if corners is None else (corners.min(0), corners.max(0))
+    side = int(min(max(_VIEW_SCALE * float(np.max(high - low)), _VIEW_MIN_PX), 2 * max(image_bgr.shape)))
+    left, top = (int(value) for value in np.round(0.5 * (low + high - side)))
+    view = _cut(image_bgr, left, top, side)
+    tile = np.full((_TILE_PX + _CAPTION_PX, _TILE_PX, 3), 255, dtype=np.uint8)
+    inset = np.asarray(cv2.resize(view, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    K_view = window_camera(K, (left, top), _TILE_PX / side)
+    draw_pose(inset, K_view, truth, extents, TRUTH_BGR, 2)
+    if estimate is not None:
+        draw_pose(inset, K_view, estimate, extents, ESTIMATE_BGR, 1)
+    tile[_CAPTION_PX:] = inset
+    range_m = float(np.linalg.norm(truth.t_cam_target_m))
+    told = "not found"
+    if match.rotation_error_deg is not None and match.translation_error_m is not None:
+        told = f"E_r {match.rotation_error_deg:.0f} deg, E_t {match.translation_error_m:.1f} m"
+    where = f"scene {frame.picture.scene_id} image {frame.picture.image_id}, {range_m:.0f} m"
+    for line, text in enumerate((where, told)):
+        cv2.putText(tile, text, (8, 22 + 23 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (20, 20, 20), 1, cv2.LINE_AA)
+    return tile
+
+
+def _cut(image_bgr: Image, left: int, top: int, side: int) -> Image:
+    """A square of the picture; black where it reaches beyond."""
+    height, width = image_bgr.shape[:2]
+    out = np.zeros((side, side, 3), dtype=np.uint8)
+    rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))
+    if rows.start < rows.stop and columns.start < columns.stop:
+        out[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image_bgr[rows, columns]
+    return out

@@ -1,0 +1,135 @@
+"""Evaluate a checkpoint, a model file or another method's results file on the pictures of a BOP dataset.
+
+Models run in the daemon's own estimator, so what is scored is what flies; a checkpoint is exported to FP32 for it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from msgs.contract import CONTRACT_VERSION, ModelContract
+from sim_replay.bop import Model as TargetModel
+from sim_replay.datasets import Dataset, open_dataset
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.evaluation.bop_results import file_answers
+from sim_replay.evaluation.files import write_files
+from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
+from sim_replay.offline import (
+    DEFAULT_THREADS,
+    SHIPPED_MODEL,
+    InputError,
+    estimator_answers,
+    load_model,
+    method_of,
+)
+from trainer.config import ConfigError
+
+
+class DatasetRequest(NamedTuple):
+    """What to hold against which pictures."""
+
+    model: Path | None = None  # ONNX file or checkpoint; None: the shipped INT8 file, unless there are results
+    results: Path | None = None  # BOP results file of any method
+    dataset: Path | None = None  # None: the bundled scene
+    split: str | None = None
+    every: int = 1  # take every n-th picture
+
+
+class Evaluation(NamedTuple):
+    """What came of it: `score` has the keys of sim_replay.score.statistics and says what was judged."""
+
+    score: dict[str, Any]
+    method: str  # name for the results file
+    dataset: Dataset
+    judged: list[JudgedFrame]
+    models: Mapping[int, TargetModel]
+
+    def write(self, out: Path) -> list[Path]:
+        """metrics.json, frames.jsonl, the BOP results file and the figures into `out`. Raises ConfigError."""
+        from sim_replay.evaluation.figures import write_figures  # matplotlib takes its time
+
+        try:
+            files = write_files(out, self.method, self.dataset, self.score, self.judged)
+            return [*files, *write_figures(out, self.score, self.judged, self.models)]
+        except OSError as error:
+            raise ConfigError(f"{out}: cannot be written: {error.strerror or error}") from error
+        except InputError as error:
+            raise ConfigError(str(error)) from error
+
+
+def evaluate_dataset(
+    request: DatasetRequest,
+    *,
+    on_start: Callable[[int], None] = lambda _: None,
+    on_frame: Callable[[JudgedFrame], None] = lambda _: None,
+) -> Evaluation:
+    """Judge every picture asked for; `on_start` hears how many there are. Raises ConfigError, naming file and key."""
+    if request.every < 1:
+        raise ConfigError(f"--every {request.every}: must be at least 1")
+    try:
+        dataset = open_dataset(request.dataset or BUNDLED_SEQUENCE, request.split)
+        pictures = list(dataset.frames())[:: request.every]
+        if not pictures:
+            raise ConfigError(f"{request.dataset}: holds no picture to evaluate on")
+        method, answer = _subject(request, dataset)
+        on_start(len(pictures))
+        judged = judge_frames(pictures, dataset.models, answer, on_frame)
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
+    return Evaluation(score_of(dataset, method, judged), name, dataset, judged, dataset.models)
+
+
+def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any], Answerer]:
+    """How the score names what is judged, and what answers for it."""
+    if request.results is not None:
+        return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
+    path = request.model or SHIPPED_MODEL
+    if path.suffix == ".onnx":
+        model = load_model(path, DEFAULT_THREADS)
+        return method_of(model), estimator_answers(model)
+    with tempfile.TemporaryDirectory() as folder:
+        model = load_model(export_for_now(path, Path(folder)), DEFAULT_THREADS)
+    return method_of(model) | {"file": path.name}, estimator_answers(model)
+
+
+def export_for_now(checkpoint: Path, folder: Path) -> Path:
+    """Write the checkpoint as an FP32 model file for one evaluation; nothing is measured for its contract.
+
+    The score threshold is trainer.evaluate.SCORE_THRESHOLD for both stages. Raises ConfigError.
+    """
+    from trainer.checkpoint import load_model as load_checkpoint  # torch takes its time
+    from trainer.evaluate import SCORE_THRESHOLD
+    from trainer.export import airframe_names
+    from trainer.graph import write_contract, write_graph
+
+    network, config, training, sha256 = load_checkpoint(checkpoint)
+    promised = config.contract
+    path = folder / f"{promised.name}-fp32.onnx"
+    write_graph(network, path)
+    contract = ModelContract(
+        version=CONTRACT_VERSION,
+        name=promised.name,
+        configuration=config.model.configuration,
+        backbone=config.model.backbone,
+        precision="fp32",
+        max_peaks=config.model.max_peaks,
+        acquire_size_wh=promised.acquire_size_wh,
+        acquire_fit=promised.acquire_fit,
+        track_size_wh=promised.track_size_wh,
+        track_window_scale=promised.track_window_scale,
+        acquire_score_min=SCORE_THRESHOLD,
+        track_score_min=SCORE_THRESHOLD,
+        trained_range_m=promised.trained_range_m,
+        trained_focal_px=(0.0, 0.0),
+        trained_box_px=(0.0, 0.0),
+        airframes=airframe_names(config.data.airframe_ids),
+        training=training,
+        metrics={},
+        weights_sha256=sha256,
+    )
+    write_contract(path, contract)
+    return path
