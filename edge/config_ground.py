@@ -43,6 +43,7 @@ class ZenohSettings(Section):
         le=240,
         description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
     )
+    commands: bool = Field(default=True, description="obey commands: track, stop, record, rate")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
         default="jazzy", description="whose keys and type hashes"

@@ -85,7 +85,7 @@ def start_outlets(
         )
         cleanup.callback(recorder.stop)
         with file.blame("zenoh", "listen"):
-            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder)
+            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests)
             cleanup.callback(zenoh.stop)
             zenoh.start()
     if config.mavlink.enabled:

@@ -22,6 +22,8 @@ from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
 from edge.links.outgoing import UtcClock, sendable
+from edge.links.zenoh_commands import Actions, declare_commands
+from edge.requests import RequestQueue
 from edge.types import Mount, Report
 from msgs import topics
 from msgs.cdr import Log, Payload
@@ -53,9 +55,15 @@ class ZenohLink:
     """Publishes reports, diagnostics and events of one vehicle. The publish methods never block."""
 
     def __init__(
-        self, settings: ZenohSettings, vehicle_name: str, mount: Mount, recorder: Recorder | None = None
+        self,
+        settings: ZenohSettings,
+        vehicle_name: str,
+        mount: Mount,
+        recorder: Recorder | None = None,
+        requests: RequestQueue | None = None,
     ) -> None:
         self._settings = settings
+        self._requests = requests
         self._recorder = recorder
         self._vehicle_name = vehicle_name
         self._mount = mount
@@ -138,6 +146,10 @@ class ZenohLink:
                 token = session.liveliness().declare_token(topics.alive_token(self._vehicle_name))
                 stack.enter_context(token)
             desk = Desk(node, self._recorder, self._vehicle_name, self._mount, self._settings.max_age_ms)
+            if session is not None and self._settings.commands:
+                request = self._requests.put if self._requests is not None else None
+                actions = Actions(request, self._recorder, desk.set_pose_rate)
+                stack.enter_context(declare_commands(session, self._vehicle_name, actions))
             while True:
                 mail = self._take()
                 counted = self._deliver(desk, mail)
@@ -177,10 +189,17 @@ class Desk:
         self._clock = UtcClock()
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
         self._intrinsics: tuple[bytes, tuple[int, int]] | None = None
+        self._pose_period_s = 0.0
+        self._pose_due_s: dict[tuple[str, str | None], float] = {}
         shared = (topics.DETECTIONS, topics.TF, topics.CAMERA_INFO, topics.DIAGNOSTICS, topics.EVENTS)
         if node is not None:
             for topic in shared:
                 self._publisher(node, topic, None)
+
+    def set_pose_rate(self, max_hz: float | None) -> None:
+        """Send poses and odometry no more often than this, None for all; they are recorded all the same. From any
+        thread."""
+        self._pose_period_s = 0.0 if max_hz is None else 1.0 / max_hz
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
@@ -212,9 +231,20 @@ class Desk:
         payload = message.encode()
         if self._recorder is not None and topic.recorded:
             self._recorder.record(topic, self._vehicle_name, target, payload, time.time_ns())
-        if self._node is not None:
+        if self._node is not None and self._due(topic, target):
             self._publisher(self._node, topic, target).put(payload)
             self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
+
+    def _due(self, topic: Topic, target: str | None) -> bool:
+        if not topic.per_target or self._pose_period_s == 0.0:
+            return True
+        now_s = time.monotonic()
+        due_s = self._pose_due_s.get((topic.name, target), 0.0)
+        if now_s < due_s:
+            return False
+        # Counted on from when it was due, so that the rate is met though frames come at their own times.
+        self._pose_due_s[topic.name, target] = max(due_s, now_s - self._pose_period_s) + self._pose_period_s
+        return True
 
     def _publisher(self, node: Node, topic: Topic, target: str | None) -> TopicPublisher:
         key = (topic.name, target)

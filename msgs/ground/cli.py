@@ -49,6 +49,15 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     record.set_defaults(act=_record)
 
+    command = commands.add_parser("command", help="tell one vehicle to track, stop, record or send less")
+    _endpoint(command)
+    command.add_argument("uav", help="the vehicle's name")
+    command.add_argument("name", metavar="command", help="track, stop, record or rate")
+    command.add_argument(
+        "words", nargs="*", help="track: LEFT TOP RIGHT BOTTOM, 0 to 1; record: on, off; rate: HZ, all"
+    )
+    command.set_defaults(act=_command)
+
     router = commands.add_parser("router", help="what vehicles and tools connect to; no other zenoh router is needed")
     router.add_argument("--config", type=Path, required=True, help="TOML file: listen, [tls], [access]")
     router.set_defaults(act=_router)
@@ -83,6 +92,12 @@ def _positive(text: str) -> float:
 
 
 def _connection(command: argparse.ArgumentParser) -> None:
+    _endpoint(command)
+    command.add_argument("--uav", action="append", default=[], metavar="NAME", help="only this vehicle; repeatable")
+    command.add_argument("--domain", type=int, default=0, help="ROS domain (default 0)")
+
+
+def _endpoint(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "-e",
         "--connect",
@@ -90,8 +105,6 @@ def _connection(command: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help="router or daemon (default %(default)s)",
     )
-    command.add_argument("--uav", action="append", default=[], metavar="NAME", help="only this vehicle; repeatable")
-    command.add_argument("--domain", type=int, default=0, help="ROS domain (default 0)")
     for name, what in (("ca", "the authority's certificate"), ("cert", "own certificate"), ("key", "its private key")):
         command.add_argument(f"--{name}", type=Path, metavar="PEM", help=f"{what}, for tls/ and quic/ endpoints")
 
@@ -105,11 +118,11 @@ def _tls(options: argparse.Namespace) -> TlsFiles | None:
     return TlsFiles(*given)
 
 
-def _uavs(options: argparse.Namespace) -> list[str]:
+def _uav(name: str) -> str:
     try:
-        return [check_uav_name(name) for name in options.uav]
+        return check_uav_name(name)
     except ValueError as error:
-        raise InputError(f"--uav: {error}") from error
+        raise InputError(str(error)) from error
 
 
 def _watch(options: argparse.Namespace) -> int:
@@ -117,7 +130,14 @@ def _watch(options: argparse.Namespace) -> int:
 
     from msgs.ground.watch import WatchOptions, watch
 
-    asked = WatchOptions(options.connect, _tls(options), _uavs(options), options.domain, options.max_age, options.json)
+    asked = WatchOptions(
+        options.connect,
+        _tls(options),
+        [_uav(name) for name in options.uav],
+        options.domain,
+        options.max_age,
+        options.json,
+    )
     return watch(asked, _stop_on_signal(options.seconds), Console(), _say_aside)
 
 
@@ -134,8 +154,15 @@ def _record(options: argparse.Namespace) -> int:
     )
     if options.total_mb is not None and options.total_mb < 2 * options.file_mb:
         raise InputError("--total-mb must hold two files of --file-mb, or nothing is left when one begins")
-    stop, uavs = _stop_on_signal(options.seconds), _uavs(options)
+    stop, uavs = _stop_on_signal(options.seconds), [_uav(name) for name in options.uav]
     return record(options.connect, _tls(options), uavs, options.domain, options.dir, limits, stop, _say_aside)
+
+
+def _command(options: argparse.Namespace) -> int:
+    from msgs.ground.command import command
+
+    uav, stop = _uav(options.uav), _stop_on_signal(10.0)
+    return command(options.connect, _tls(options), uav, options.name, options.words, stop, _say_aside)
 
 
 def _say_aside(text: str) -> None:

@@ -1,0 +1,145 @@
+"""Commands over zenoh: queries on `uavpose/@v1/<uav>/cmd/<name>` with a JSON object, answered with one.
+
+| command  | body                              | done                                                             |
+|----------|-----------------------------------|------------------------------------------------------------------|
+| `track`  | `{"box": [x0, y0, x1, y1]}`       | look for a target there; shares of the picture's width and height |
+| `stop`   | `{}`                              | drop all targets                                                 |
+| `record` | `{"on": true}` or `{"on": false}` | begin a recording, or end it                                     |
+| `rate`   | `{"max_hz": 10}` or `{"max_hz": null}` | send poses and odometry no more often; null: every one      |
+
+The answer is `{"ok": true, "command": ..., "done": ...}` or `{"ok": false, "command": ..., "error": "a sentence"}`.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import zenoh
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from zenoh import handlers
+
+from edge.requests import Request, StopTracking, TrackBox
+from msgs.recording import Recorder
+
+log = logging.getLogger(__name__)
+
+BODY_BYTES_MAX = 4096
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Track(_Body):
+    box: list[Share] = Field(min_length=4, max_length=4)
+
+    @model_validator(mode="after")
+    def _corners(self) -> Track:
+        x0, y0, x1, y1 = self.box
+        if x1 <= x0 or y1 <= y0:
+            raise ValueError("a box is [left, top, right, bottom]")
+        return self
+
+
+class Stop(_Body):
+    pass
+
+
+class Record(_Body):
+    on: bool
+
+
+class Rate(_Body):
+    max_hz: Annotated[float, Field(gt=0.0, le=240.0, allow_inf_nan=False)] | None
+
+
+Command = Track | Stop | Record | Rate
+COMMANDS: dict[str, type[Command]] = {"track": Track, "stop": Stop, "record": Record, "rate": Rate}
+
+
+class Refused(Exception):
+    """Why a command is not done; the text is for a person."""
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What a vehicle can be told; None where it has no such function."""
+
+    request: Callable[[Request], bool] | None  # False: too many wait
+    recorder: Recorder | None
+    set_rate: Callable[[float | None], None]
+
+
+def commands_key(uav: str) -> str:
+    return f"uavpose/@v1/{uav}/cmd/*"
+
+
+def parse(name: str, body: bytes) -> Command:
+    """The command, or Refused. An empty body is an empty object."""
+    if name not in COMMANDS:
+        raise Refused(f"no such command; there are {', '.join(COMMANDS)}")
+    if len(body) > BODY_BYTES_MAX:
+        raise Refused(f"a body of {len(body)} bytes is too long")
+    try:
+        return COMMANDS[name].model_validate_json(body or b"{}")
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        reason = str(first["msg"]).removeprefix("Value error, ")
+        raise Refused(f"{key}: {reason}" if key else reason) from error
+
+
+def carry_out(command: Command, actions: Actions) -> dict[str, Any]:
+    """Do it and say what was done, or raise Refused. Never waits."""
+    match command:
+        case Record(on=on):
+            if actions.recorder is None:
+                raise Refused("this vehicle has no recorder")
+            actions.recorder.switch(on)
+            if on and not actions.recorder.recording:
+                raise Refused("switched on, but the disk takes nothing just now; it is tried again and again")
+            return {"recording": on}
+        case Rate(max_hz=max_hz):
+            actions.set_rate(max_hz)
+            return {"max_hz": max_hz}
+        case Track() | Stop():
+            if actions.request is None:
+                raise Refused("this vehicle does not take requests")
+            asked: Request = StopTracking()
+            if isinstance(command, Track):
+                x0, y0, x1, y1 = command.box
+                asked = TrackBox((x0, y0, x1, y1))
+            if not actions.request(asked):
+                raise Refused("too many requests wait; try again")
+            return command.model_dump()
+
+
+def answer(name: str, body: bytes, actions: Actions) -> dict[str, Any]:
+    """What goes back."""
+    try:
+        return {"ok": True, "command": name, "done": carry_out(parse(name, body), actions)}
+    except Refused as error:
+        return {"ok": False, "command": name, "error": str(error)}
+
+
+def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zenoh.Queryable:
+    """Answer commands until the queryable is undeclared, on zenoh's receiving thread."""
+
+    def on_query(query: zenoh.Query) -> None:
+        with query:
+            key = str(query.key_expr)
+            if "*" in key:
+                # One word must not turn all vehicles at once, nor run every command.
+                query.reply_err(b'{"ok": false, "error": "name one vehicle and one command"}')
+                return
+            body = b"" if query.payload is None else query.payload.to_bytes()
+            said = answer(key.rpartition("/")[2], body, actions)
+            log.info("command over zenoh: %s", said)
+            query.reply(key, json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    return session.declare_queryable(commands_key(uav), handlers.Callback(on_query, indirect=False))

@@ -1,0 +1,76 @@
+"""`uavpose-ground command`: tell one vehicle to track, stop, record or send less, and print its answer."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import zenoh
+
+from msgs.ground.errors import InputError
+from msgs.ground.feed import session
+from msgs.session import TlsFiles
+
+ANSWER_S = 5.0
+EXIT_REFUSED = 1
+
+
+def body(name: str, words: Sequence[str]) -> dict[str, Any]:
+    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `stop`, `record on|off`, `rate HZ|all`.
+
+    Raises InputError.
+    """
+    try:
+        match name, *words:
+            case ["track", _, _, _, _]:
+                return {"box": [float(word) for word in words]}
+            case ["stop"]:
+                return {}
+            case ["record", ("on" | "off") as state]:
+                return {"on": state == "on"}
+            case ["rate", rate]:
+                return {"max_hz": None if rate == "all" else float(rate)}
+    except ValueError as error:
+        raise InputError(f"{name}: {error}") from error
+    raise InputError("a command is one of: track LEFT TOP RIGHT BOTTOM (shares of the picture, 0 to 1); stop; "
+                     "record on|off; rate HZ|all")  # fmt: skip
+
+
+def ask(
+    opened: zenoh.Session, uav: str, name: str, asked: dict[str, Any], timeout_s: float = ANSWER_S
+) -> dict[str, Any]:
+    """The vehicle's answer; `ok` is false, with an `error`, where it refuses or none comes."""
+    key = f"uavpose/@v1/{uav}/cmd/{name}"
+    for reply in opened.get(
+        key, payload=json.dumps(asked), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s
+    ):
+        said = reply.ok if reply.ok is not None else reply.err
+        try:
+            answer = json.loads(said.payload.to_bytes()) if said is not None else None
+        except ValueError:
+            answer = None
+        if isinstance(answer, dict) and "ok" in answer:
+            return answer
+    return {"ok": False, "command": name, "error": f"{uav} does not answer: not there, or not for you to command"}
+
+
+def command(
+    endpoint: str,
+    tls: TlsFiles | None,
+    uav: str,
+    name: str,
+    words: Sequence[str],
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> int:
+    """Send one command and print the answer as JSON; 0, or 1 if it is refused. Raises InputError for words that are
+    no command."""
+    asked = body(name, words)
+    with session(endpoint, tls, stop, say) as opened:
+        answer = {"ok": False, "command": name, "error": f"no link to {endpoint}"}
+        if opened is not None:
+            answer = ask(opened, uav, name, asked)
+    print(json.dumps(answer))
+    return 0 if answer["ok"] is True else EXIT_REFUSED
