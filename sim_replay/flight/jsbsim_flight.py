@@ -21,9 +21,10 @@ STEP_S = 0.01
 STEPS_PER_SAMPLE = 2  # the track's 50 Hz, at which the pilot acts too
 SAMPLE_S = STEP_S * STEPS_PER_SAMPLE
 SETTLE_S = 6.0
+LEAST_AHEAD = math.cos(math.radians(25.0))  # of the flight path along the nose: beyond, it stalls or spins
 SAILPLANE_INCIDENCE_DEG = 2.0
 # MIL-F-8785C: wind at 20 ft above the ground, ft/s, and severity index (probability of exceedance).
-TURBULENCE: dict[Gust, tuple[float, int]] = {"light": (15.0, 2), "moderate": (25.0, 3)}
+TURBULENCE: dict[Gust, tuple[float, int]] = {"light": (25.0, 3), "moderate": (50.0, 4)}
 _SEEN = (
     *("attitude/phi-rad", "attitude/theta-rad", "velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
     *("aero/beta-rad", "velocities/vt-fps", "velocities/h-dot-fps", "velocities/ned-velocity-mag-fps"),
@@ -128,7 +129,8 @@ def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
     R_ned_body: Array = R_ned_ecef @ R_ecef_here @ R_from_euler(values[:, 9], values[:, 10], values[:, 11])
     position = (values[:, :3] - values[0, :3]) @ R_ned_ecef.T * FOOT_M - np.array([0.0, 0.0, height_m])
     velocity = values[:, 3:6] @ R_ned_ecef.T * FOOT_M
-    if not np.isfinite(values).all() or R_ned_body[:, 2, 2].min() < 0.2:
+    ahead = np.einsum("ni,ni->n", R_ned_body[:, :, 0], velocity) / np.maximum(np.linalg.norm(velocity, axis=1), 1.0)
+    if not np.isfinite(values).all() or R_ned_body[:, 2, 2].min() < 0.2 or ahead.min() < LEAST_AHEAD:
         raise FlightError(f"{sortie.dynamics.jsbsim_name} departed from controlled flight")
     t_s: Array = start_s + np.arange(samples, dtype=np.float64) * SAMPLE_S
     return Track(t_s, R_ned_body, position, velocity, values[:, 6:9])

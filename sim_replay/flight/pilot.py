@@ -10,7 +10,7 @@ from sim_replay.flight.manoeuvre import Manoeuvre
 
 GRAVITY_MPS2 = 9.80665
 GLIDE_RAD = -0.05  # a sailplane's path at its cruise
-GLIDE_PER_MPS = 0.02  # rad of path for each m/s too fast: a sailplane trades height for speed
+GLIDE_PER_MPS = 0.04  # rad of path for each m/s too fast: a sailplane trades height for speed
 PATH_BANDWIDTH = 0.7  # rad/s, flight path angle
 QUARTER_RAD = math.pi / 2.0
 ROLL_BANDWIDTH = 1.6  # rad/s, bank angle
