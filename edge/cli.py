@@ -85,7 +85,7 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _keygen(options: argparse.Namespace) -> int:
-    from edge.links.signing import write_new_key
+    from edge.links.signing_key import write_new_key
 
     write_new_key(options.out)
     print(f"{options.out}: 32 random bytes, readable by its owner alone; the autopilot needs the same key")

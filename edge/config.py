@@ -20,6 +20,7 @@ from edge.config_ground import RecorderSettings, ZenohSettings
 from edge.config_section import ConfigPath, Section
 from edge.errors import InputError
 from edge.links.mavlink_endpoints import parse_endpoint
+from edge.links.signing_key import load_key
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
 
@@ -27,6 +28,14 @@ SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-e
 
 # Optical axis along the nose, image right along the right wing: the mount when all three angles are zero.
 R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def _signing_key(path: Path) -> Path:
+    try:
+        load_key(path)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+    return path
 
 
 def _endpoint(text: str) -> str:
@@ -198,7 +207,7 @@ class MavlinkSettings(Section):
     commanders: list[Annotated[int, Field(ge=1, le=255)]] = Field(
         default_factory=list, description="system ids whose commands are obeyed; empty: all heard on an endpoint"
     )
-    signing_key: ConfigPath | None = Field(
+    signing_key: Annotated[ConfigPath, AfterValidator(_signing_key)] | None = Field(
         default=None, description="file of 32 bytes by `uavpose-edge keygen`; all is signed, nothing unsigned is heard"
     )
     signing_state: ConfigPath | None = Field(

@@ -9,19 +9,15 @@ from __future__ import annotations
 import hashlib
 import hmac
 import logging
-import os
-import secrets
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from edge.errors import InputError
+from edge.links.signing_key import KEY_BYTES, load_key
 from msgs.mavlink import dialect
 
 log = logging.getLogger(__name__)
 
-KEY_BYTES = 32
 SIGNATURE_BYTES = 6
 TIMESTAMP_MAX = 2**48 - 1
 EPOCH_S = 1_420_070_400  # 2015-01-01 UTC
@@ -92,34 +88,6 @@ class Signing:
 def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) -> Signing:
     """Signing with the key of a file, its timestamps kept in another. Raises InputError for a key file that is none."""
     return Signing(load_key(key_file), _load_state(state_file), lambda stamp: _save_state(state_file, stamp), utc_ns)
-
-
-def load_key(path: Path) -> bytes:
-    """The 32 bytes of a key file. Raises InputError if it is absent, of another length or readable by others."""
-    try:
-        with path.open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode
-            key = file.read(KEY_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"signing key {path} cannot be read: {error.strerror}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise InputError(f"signing key {path} is open to group or others; chmod 600 it")
-    if len(key) != KEY_BYTES:
-        raise InputError(f"signing key {path} does not hold {KEY_BYTES} bytes")
-    return key
-
-
-def write_new_key(path: Path) -> None:
-    """Write 32 random bytes to a new file that only its owner can read. Raises InputError; never overwrites."""
-    try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError as error:
-        raise InputError(f"{path} exists; a key is never overwritten") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from error
-    with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(file.fileno(), 0o600)
-        file.write(secrets.token_bytes(KEY_BYTES))
 
 
 def _load_state(path: Path) -> int:

@@ -1,0 +1,197 @@
+"""Signing both ways: what pymavlink and the guide's algorithm accept, and what forgers and listeners achieve."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edge.config import load_config
+from edge.errors import InputError
+from edge.links.signing import RESERVED_AHEAD, TIMESTAMP_MAX, Signing, open_signing, timestamp_of
+from edge.links.signing_key import load_key, write_new_key
+from msgs.mavlink import FrameReader, MAVLink, dialect, pack
+
+from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
+from .reports import make_report as report
+from .reports import make_track as track
+
+KEY = bytes(range(32))
+NOW_NS = 1_800_000_000_000_000_000  # UTC
+
+
+def signing(key: bytes = KEY, saved: int = 0, utc_ns: Any = time.time_ns) -> Signing:
+    return Signing(key, saved, lambda stamp: None, utc_ns)
+
+
+def signed_frame(stamp: int, key: bytes = KEY, link: int = 0, system: int = SYSTEM_ID) -> bytes:
+    """A heartbeat signed by the guide's algorithm, with hashlib alone."""
+    mav = MAVLink(None, system, 1)
+    mav.signing.secret_key, mav.signing.sign_outgoing = b"\0" * 32, True
+    frame = pack(mav, dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))[:-13]
+    body = frame + bytes([link]) + stamp.to_bytes(6, "little")
+    return body + hashlib.sha256(key + body).digest()[:6]
+
+
+def parsed(frame: bytes) -> Any:
+    (message,) = FrameReader(datagram=True).feed(frame)
+    return message
+
+
+def test_both_ways_over_the_link_with_pymavlink_verifying() -> None:
+    with linked(signing=signing()) as (link, own_ship), Peer(link.ports[0], key=KEY) as peer:
+        verifier = MAVLink(None)
+        verifier.signing.secret_key = KEY
+        meet(link, peer)
+        peer.attitude(Rotation.identity())
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+        peer.received.clear()
+        link.publish(report(track(time.monotonic_ns())))
+        peer.named("TARGET_RELATIVE")
+        for message in peer.received:
+            assert verifier.decode(bytearray(message.get_msgbuf())).get_signed()
+
+
+def test_nothing_unsigned_or_signed_with_another_key_is_believed_or_answered() -> None:
+    with (
+        linked(signing=signing()) as (link, own_ship),
+        Peer(link.ports[0]) as unsigned,
+        Peer(link.ports[0], key=bytes(32)) as forger,
+        Peer(link.ports[0], key=KEY) as peer,
+    ):
+        unsigned.heartbeat()
+        forger.heartbeat()
+        meet(link, peer)
+        # From the autopilot's own address too.
+        attitude = dialect.MAVLink_attitude_quaternion_message(peer.boot_ms(), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        peer.wire.send(unsigned.packed(attitude))
+        peer.wire.send(forger.packed(attitude))
+        peer.settle(lambda: link.counters().get("refused_signature") == 2, "refusal of the forged")
+        assert link.counters()["refused_unsigned"] == 2
+        assert own_ship.at(time.monotonic_ns()) is None
+
+
+def test_a_recorded_message_played_again_is_refused() -> None:
+    with linked(signing=signing()) as (link, _), Peer(link.ports[0], key=KEY) as peer:
+        meet(link, peer)
+        stop = dialect.MAVLink_command_long_message(SYSTEM_ID, 100, 2010, 0, *[0.0] * 7)
+        recorded = peer.packed(stop)
+        peer.wire.send(recorded)
+        peer.named("COMMAND_ACK")
+        peer.wire.send(recorded)
+        peer.settle(lambda: link.counters().get("refused_replay") == 1, "refusal")
+        assert link.counters()["received_COMMAND_LONG"] == 1
+
+
+def test_a_forged_timestamp_from_the_far_future_does_not_block_the_stream() -> None:
+    one = signing(utc_ns=lambda: NOW_NS)
+    now = timestamp_of(NOW_NS)
+    assert one.refusal(parsed(signed_frame(now))) is None
+    assert one.refusal(parsed(signed_frame(TIMESTAMP_MAX, key=bytes(32)))) == "signature"
+    assert one.refusal(parsed(signed_frame(now + 1))) is None
+    assert one.next_timestamp() < now + 10
+
+
+@given(flipped=st.integers(0, 12 * 8 - 1), stamp=st.integers(0, 1_000_000))
+def test_every_bit_of_the_signature_block_counts(flipped: int, stamp: int) -> None:
+    one = signing(utc_ns=lambda: NOW_NS)
+    frame = bytearray(signed_frame(timestamp_of(NOW_NS) + stamp))
+    frame[-1 - flipped // 8] ^= 1 << flipped % 8
+    assert one.refusal(parsed(bytes(frame))) == "signature"
+    assert one.next_timestamp() <= timestamp_of(NOW_NS) + 1
+
+
+def test_streams_rise_each_for_itself_and_new_ones_start_no_earlier_than_a_minute_ago() -> None:
+    one = signing(utc_ns=lambda: NOW_NS)
+    now = timestamp_of(NOW_NS)
+    assert one.refusal(parsed(signed_frame(now + 50))) is None
+    assert one.refusal(parsed(signed_frame(now + 50))) == "replay"
+    assert one.refusal(parsed(signed_frame(now + 49))) == "replay"
+    assert one.refusal(parsed(signed_frame(now + 49, link=1))) is None
+    assert one.refusal(parsed(signed_frame(now + 49, system=7))) is None
+    assert one.refusal(parsed(signed_frame(now - 59 * 100_000, system=8))) is None
+    assert one.refusal(parsed(signed_frame(now - 61 * 100_000, system=9))) == "replay"
+
+
+@given(clock_ns=st.lists(st.integers(0, 4 * 10**18), min_size=1, max_size=20))
+def test_own_timestamps_rise_whatever_the_wall_clock_does_and_keep_up_with_it(clock_ns: list[int]) -> None:
+    readings = iter(clock_ns)
+    saves: list[int] = []
+    one = Signing(KEY, 0, saves.append, lambda: next(readings))
+    last = 0
+    for utc_ns in clock_ns:
+        stamp = one.next_timestamp()
+        assert stamp > last
+        assert timestamp_of(utc_ns) <= stamp <= saves[-1]
+        last = stamp
+
+
+def test_a_restart_repeats_no_timestamp_even_without_a_clock(tmp_path: Path) -> None:
+    key, state = tmp_path / "key", tmp_path / "state"
+    write_new_key(key)
+    used = [open_signing(key, state, lambda: NOW_NS).next_timestamp()]
+    for _ in range(3):
+        # No battery keeps the time: after power-up it is 1970.
+        one = open_signing(key, state, lambda: 0)
+        stamps = [one.next_timestamp() for _ in range(3)]
+        assert stamps[0] > used[-1]
+        used += stamps
+    assert used[-1] - used[0] < 4 * RESERVED_AHEAD
+    state.write_bytes(b"\xff torn")
+    assert open_signing(key, state, lambda: NOW_NS).next_timestamp() == timestamp_of(NOW_NS)
+
+
+def test_a_state_that_cannot_be_saved_does_not_stop_the_link(tmp_path: Path) -> None:
+    write_new_key(tmp_path / "key")
+    one = open_signing(tmp_path / "key", tmp_path / "absent" / "state", time.time_ns)
+    assert one.next_timestamp() < one.next_timestamp()
+
+
+def test_keygen_writes_a_key_for_its_owner_alone_and_never_over_another(tmp_path: Path) -> None:
+    out = tmp_path / "mavlink.key"
+    command = [sys.executable, "-m", "edge.cli", "keygen", "--out", str(out)]
+    made = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: os.umask(0))
+    assert made.returncode == 0, made.stderr
+    assert stat.S_IMODE(out.stat().st_mode) == 0o600
+    key = load_key(out)
+    assert len(set(key)) > 10
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert (again.returncode, again.stderr) == (2, f"{out} exists; a key is never overwritten\n")
+    assert load_key(out) == key
+
+
+@pytest.mark.parametrize("spoil", ["open", "short", "absent"])
+def test_a_key_file_that_does_not_do_is_a_sentence_that_names_file_and_key(tmp_path: Path, spoil: str) -> None:
+    key = tmp_path / "mavlink.key"
+    write_new_key(key)
+    if spoil == "open":
+        key.chmod(0o640)
+    elif spoil == "short":
+        key.write_bytes(b"password")
+    else:
+        key.unlink()
+    with pytest.raises(InputError, match=str(key)):
+        load_key(key)
+    config = tmp_path / "flight.toml"
+    config.write_text('[camera]\ntype = "sequence"\npath = "."\n[mavlink]\nsigning_key = "mavlink.key"\n')
+    with pytest.raises(InputError, match=rf"^{config}:5: \[mavlink\] signing_key: signing key {key} .*[^\n]$"):
+        load_config(config)
+
+
+def test_a_key_from_the_wire_is_not_taken() -> None:
+    with linked(signing=signing()) as (link, _), Peer(link.ports[0], key=KEY) as peer:
+        meet(link, peer)
+        peer.send(dialect.MAVLink_setup_signing_message(SYSTEM_ID, 191, [7] * 32, 2**48 - 1))
+        peer.settle(lambda: link.counters().get("refused_message_id") == 1, "refusal")
+        peer.command(2010)
+        assert peer.named("COMMAND_ACK").command == 2010
