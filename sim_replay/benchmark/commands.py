@@ -10,6 +10,9 @@ from typing import Any
 def register(commands: Any) -> None:
     """Add them to what argparse's add_subparsers() gave; each sets `run`, a function of the parsed arguments."""
     _generate(commands)
+    _stats(commands)
+    _bench(commands)
+    _sheet(commands)
 
 
 def _generate(commands: Any) -> None:
@@ -35,5 +38,65 @@ def _generate(commands: Any) -> None:
 
 def _run_generate(args: argparse.Namespace) -> int:
     from sim_replay.benchmark.generate import run
+
+    return run(args)
+
+
+def _stats(commands: Any) -> None:
+    parser = commands.add_parser(
+        "stats",
+        help="measure what a BOP dataset holds, beside the paper's figures",
+        description="Sequences, frames, ranges, box sizes, lenses, targets and airframes, measured from the files.",
+    )
+    parser.add_argument("--dataset", type=Path, required=True, metavar="DIR", help="BOP dataset, split or scene folder")
+    parser.add_argument("--json", action="store_true", help="print the statistics as JSON")
+    parser.set_defaults(run=_run_stats)
+
+
+def _run_stats(args: argparse.Namespace) -> int:
+    from sim_replay.benchmark.stats import run
+
+    return run(args.dataset, args.json)
+
+
+def _bench(commands: Any) -> None:
+    parser = commands.add_parser(
+        "bench",
+        help="measure how fast this machine draws",
+        description="Whole frames a second as generate writes them, and training windows a second, of all workers "
+        "drawing at once.",
+    )
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="N", help="for each figure (default 10)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    parser.set_defaults(run=_run_bench)
+
+
+def _run_bench(args: argparse.Namespace) -> int:
+    from sim_replay.benchmark.bench import run
+
+    return run(args.seconds, args.workers, args.json)
+
+
+def _sheet(commands: Any) -> None:
+    parser = commands.add_parser(
+        "sheet",
+        help="one picture of the airframes from all sides, or of a dataset's frames",
+        description="Draw each airframe from the front, rear, side, top, below and two oblique sides; or, with "
+        "--dataset, frames of a dataset with the target's box and its surroundings enlarged.",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JPEG to write")
+    parser.add_argument("--airframe", nargs="+", metavar="NAME", help="which to draw (default: all)")
+    parser.add_argument("--livery-seed", type=int, default=0, metavar="N", help="paint (default %(default)s)")
+    parser.add_argument("--dataset", type=Path, metavar="DIR", help="show frames of this BOP dataset instead")
+    parser.set_defaults(run=_run_sheet)
+
+
+def _run_sheet(args: argparse.Namespace) -> int:
+    if args.dataset is not None:
+        from sim_replay.benchmark.contact_sheet import run as run_contact_sheet
+
+        return run_contact_sheet(args.dataset, args.out)
+    from sim_replay.sheet import run
 
     return run(args)

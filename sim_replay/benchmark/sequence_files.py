@@ -75,7 +75,7 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
                 continue
             if stopped():
                 return False
-            _add_frame(store, film, number, job.labels_only)
+            add_frame(store, film, number, job.labels_only)
             tell(FrameNews(plan.index, made=1))
         if squeezed and plan.h264_kbps is not None:
             store.replace_images(through_h264(store.raw_images(), plan.fps / job.every, plan.h264_kbps))
@@ -90,7 +90,8 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
     return True
 
 
-def _add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) -> None:
+def add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) -> None:
+    """Draw and store one frame. A target of which nothing is seen is not listed."""
     scene = film.scene(number)
     if labels_only:
         store.add(bop_frame(scene, outline_labels(scene)), None)
@@ -99,7 +100,7 @@ def _add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) ->
     targets, visible, whole = [], [], []
     for target, seen in zip(scene.targets, drawn.targets, strict=True):
         if seen.visible_px == 0:
-            continue  # out of the picture, or hidden altogether
+            continue
         targets.append(
             BopTarget(
                 target.airframe_id + 1,

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,7 +26,7 @@ def through_h264(images_bgr: Iterator[Image], fps: float, kbps: int) -> Iterator
         given = 0
         for frame in container.decode(video=0):
             given += 1
-            yield np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+            yield np.asarray(cv2.cvtColor(frame.to_ndarray(format="yuv420p"), cv2.COLOR_YUV2BGR_I420), np.uint8)
     if given != count:
         raise RuntimeError(f"the codec gave {given} pictures for {count}")
 
@@ -43,7 +44,8 @@ def _encode(images_bgr: Iterator[Image], target: io.BytesIO, fps: float, kbps: i
         for image in images_bgr:
             if count == 0:
                 stream.height, stream.width = image.shape[:2]
-            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            # OpenCV's conversion both ways: libswscale's quick one tints every colour by a few levels.
+            frame = av.VideoFrame.from_ndarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420), format="yuv420p")
             frame.pts, frame.time_base = count, 1 / rate
             container.mux(stream.encode(frame))
             count += 1

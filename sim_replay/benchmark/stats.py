@@ -1,0 +1,218 @@
+"""`uavpose-replay stats`: what a BOP dataset holds, measured from its files and set beside the paper's figures."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from edge.errors import InputError
+from sim_replay.airframes import AIRFRAMES
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
+
+RANGE_EDGES_M = tuple(range(100, 501, 50))
+# FW-UAV6DPose as the paper's section on the dataset gives it. It prints 7,725 training images; its total needs 8,425.
+PAPER = {
+    "sequences": "161",
+    "frames": "15,325",
+    "splits": "train 8,425 (7,725 printed), val 2,400, test 4,500",
+    "picture": "1920×1080",
+    "range": "about 100–500 m",
+    "box_share": "about 1.20 %",
+}
+
+
+@dataclass
+class _Counts:
+    """What is gathered while scenes are read."""
+
+    sequences: Counter[str] = field(default_factory=Counter)  # by split
+    frames: Counter[str] = field(default_factory=Counter)
+    pictures: Counter[tuple[int, int]] = field(default_factory=Counter)  # width, height; a scene once
+    targets_in_frame: Counter[int] = field(default_factory=Counter)
+    airframes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))  # frames, by split
+    flights: dict[str, set[tuple[str, int]]] = field(default_factory=lambda: defaultdict(set))
+    range_m: list[float] = field(default_factory=list)
+    focal_px: list[float] = field(default_factory=list)  # one a scene
+    box_share: list[float] = field(default_factory=list)
+    visible_fraction: list[float] = field(default_factory=list)
+    distorted: int = 0  # scenes
+
+
+def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """Measure a BOP dataset, split or scene folder. Raises InputError, naming file and key.
+
+    Ranges are distances of target origins from the camera; box shares are those of the first target listed in each
+    frame that shows one, of its visible box in the picture's area. Sizes are of each scene's first picture, or of its
+    camera.json where there are labels alone. A value that the files do not hold is None.
+    """
+    counts = _Counts()
+    try:
+        for scene in find_scenes(root):
+            _take_scene(counts, scene)
+            on_scene()
+    except BopError as error:
+        raise InputError(str(error)) from error
+    return {"dataset": str(root), **_recipe(root), **_summary(counts)}
+
+
+def _take_scene(counts: _Counts, scene: BopScene) -> None:
+    split = scene.split or scene.folder.parent.name
+    frames = scene.frames
+    if not frames:
+        return
+    size = _picture_size(scene, frames[0])
+    counts.sequences[split] += 1
+    counts.frames[split] += len(frames)
+    counts.pictures[size] += 1
+    counts.focal_px.append(float(np.sqrt(frames[0].K[0, 0] * frames[0].K[1, 1])))
+    counts.distorted += frames[0].distortion is not None
+    for frame in frames:
+        _take_frame(counts, split, frame, size[0] * size[1])
+    flown = _toml(scene.folder / "sequence.toml")
+    if flown.get("airframe") and "flight_seed" in flown:
+        counts.flights[split].add((str(flown["airframe"]), int(flown["flight_seed"])))
+
+
+def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int) -> None:
+    counts.targets_in_frame[len(frame.targets)] += 1
+    for k, target in enumerate(frame.targets):
+        counts.range_m.append(float(np.linalg.norm(target.t_cam_target_m)))
+        box = target.box_visible_xyxy_px
+        if k == 0 and box is not None and area_px:
+            counts.box_share.append(float(np.prod(box[2:] - box[:2])) / area_px)
+        if target.whole_px:
+            counts.visible_fraction.append((target.visible_px or 0) / target.whole_px)
+        counts.airframes[split][_airframe(target.object_id)] += 1
+
+
+def _airframe(object_id: int) -> str:
+    return AIRFRAMES[object_id - 1].name if 1 <= object_id <= len(AIRFRAMES) else f"object {object_id}"
+
+
+def _picture_size(scene: BopScene, frame: BopFrame) -> tuple[int, int]:
+    try:
+        height, width = scene.image_bgr(frame).shape[:2]
+        return width, height
+    except BopError:
+        path = scene.folder / "camera.json"
+        entry = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return int(entry.get("width", 0)), int(entry.get("height", 0))
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+
+
+def _recipe(root: Path) -> dict[str, Any]:
+    made = _toml(root / "dataset.toml")
+    return {key: made.get(key) for key in ("command", "preset", "seed", "every", "complete")}
+
+
+def _spread(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    low, middle, high = (float(v) for v in np.percentile(values, (5, 50, 95)))
+    return {
+        "mean": float(np.mean(values)),
+        "min": min(values),
+        "p5": low,
+        "median": middle,
+        "p95": high,
+        "max": max(values),
+    }
+
+
+def _summary(counts: _Counts) -> dict[str, Any]:
+    frames = counts.frames.total()
+    histogram, _ = np.histogram(counts.range_m, bins=[0.0, *RANGE_EDGES_M, np.inf])
+    edges = ["below 100", *(f"{a}-{a + 50}" for a in RANGE_EDGES_M[:-1]), "500 and above"]
+    return {
+        "sequences": dict(counts.sequences),
+        "frames": dict(counts.frames),
+        "pictures": {f"{width}x{height}": n for (width, height), n in counts.pictures.items()},
+        "range_m": _spread(counts.range_m),
+        "range_histogram_m": dict(zip(edges, (int(n) for n in histogram), strict=True)),
+        "box_share": _spread(counts.box_share),
+        "focal_px": _spread(counts.focal_px),
+        "distorted_sequences": counts.distorted,
+        "targets_per_frame": {str(n): counts.targets_in_frame[n] for n in sorted(counts.targets_in_frame)},
+        "target_free_share": counts.targets_in_frame[0] / frames if frames else None,
+        "visible_fraction": _spread(counts.visible_fraction),
+        "partly_hidden_share": float(np.mean(np.array(counts.visible_fraction) < 0.98))
+        if counts.visible_fraction
+        else None,
+        "airframes": {split: dict(sorted(names.items())) for split, names in counts.airframes.items()},
+        "airframe_flights_in_two_splits": _shared(counts.flights),
+    }
+
+
+def _shared(flights: dict[str, set[tuple[str, int]]]) -> int:
+    seen = Counter(flight for split in flights.values() for flight in split)
+    return sum(number > 1 for number in seen.values())
+
+
+def statistics_table(s: dict[str, Any]) -> Table:
+    """The statistics as a table, beside the paper's."""
+    table = Table(title=str(s["dataset"]), show_lines=False)
+    for column in ("", "here", "paper"):
+        table.add_column(column)
+    for row in _rows(s):
+        table.add_row(*row)
+    return table
+
+
+def _rows(s: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    yield "sequences", _of_splits(s["sequences"]), PAPER["sequences"]
+    yield "frames", f"{sum(s['frames'].values()):,}", PAPER["frames"]
+    yield "frames by split", _of_splits(s["frames"]), PAPER["splits"]
+    yield "pictures", ", ".join(name.replace("x", "×") for name in s["pictures"]), PAPER["picture"]
+    if r := s["range_m"]:
+        yield "range", f"{r['min']:.0f}–{r['max']:.0f} m, mean {r['mean']:.0f} m", PAPER["range"]
+        total = sum(s["range_histogram_m"].values())
+        for name, count in s["range_histogram_m"].items():
+            yield f"  {name} m", f"{100 * count / total:.1f} %", ""
+    if b := s["box_share"]:
+        spread = f"(5 % to 95 %: {100 * b['p5']:.2f}–{100 * b['p95']:.2f} %)"
+        yield "visible box / picture", f"{100 * b['mean']:.3f} % {spread}", PAPER["box_share"]
+    if f := s["focal_px"]:
+        yield "focal length", f"{f['min']:.0f}–{f['max']:.0f} px, median {f['median']:.0f}", "not given"
+    yield "distorted sequences", str(s["distorted_sequences"]), "not given"
+    yield "targets in a frame", ", ".join(f"{n}: {c:,}" for n, c in s["targets_per_frame"].items()), "1"
+    if s["target_free_share"] is not None:
+        yield "frames without target", f"{100 * s['target_free_share']:.1f} %", "not given"
+    if v := s["visible_fraction"]:
+        hidden = f"{100 * s['partly_hidden_share']:.1f} % of targets below 0.98"
+        yield "visible fraction", f"mean {v['mean']:.3f}; {hidden}", "not given"
+    for split, names in s["airframes"].items():
+        yield f"airframes, {split}", f"{len(names)}: " + ", ".join(names), "not given"
+    yield "airframe-flights in two splits", str(s["airframe_flights_in_two_splits"]), "not given"
+
+
+def _of_splits(counts: dict[str, int]) -> str:
+    return f"{sum(counts.values()):,}: " + ", ".join(f"{name} {count:,}" for name, count in counts.items())
+
+
+def run(dataset: Path, as_json: bool) -> int:
+    """Measure and print. Raises InputError."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=as_json or not console.is_terminal) as bar:
+        task = bar.add_task("reading scenes", total=None)
+        statistics = dataset_statistics(dataset, lambda: bar.advance(task))
+    if as_json:
+        print(json.dumps(statistics, indent=2))
+    else:
+        Console().print(statistics_table(statistics))
+    return 0

@@ -1,0 +1,102 @@
+"""Statistics are those of the files: a small dataset whose every figure was worked out by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sim_replay.cli import main
+
+# Scene: split, focal length, airframe, flight seed; of each frame the targets' (object id, z in m, box, seen of all).
+SCENES: dict[str, tuple[float, str, int, list[list[tuple[int, float, list[int], int, int]]]]] = {
+    "train/000000": (1500.0, "male_v_tail", 11, [[(1, 120.0, [10, 20, 64, 36], 100, 100)], []]),
+    "train/000001": (2500.0, "light_aircraft", 12, [[(4, 480.0, [0, 0, 32, 18], 40, 80)]]),
+    "test/000002": (8000.0, "male_v_tail", 11, [[(1, 300.0, [5, 5, 64, 18], 9, 9), (2, 330.0, [100, 9, 9, 9], 8, 8)]]),
+}
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    root = tmp_path / "data"
+    for name, (focal, airframe, seed, frames) in SCENES.items():
+        folder = root / name
+        (folder / "rgb").mkdir(parents=True)
+        cameras: dict[str, Any] = {}
+        poses: dict[str, Any] = {}
+        info: dict[str, Any] = {}
+        for k, targets in enumerate(frames):
+            image = np.full((180, 320, 3), 90, np.uint8)
+            for _, _, (x, y, w, h), _, _ in targets:
+                image[y : y + h, x : x + w] = 30
+            cv2.imwrite(str(folder / "rgb" / f"{k:06d}.jpg"), image)
+            cameras[str(k)] = {"cam_K": [focal, 0, 159.5, 0, focal, 89.5, 0, 0, 1], "depth_scale": 1.0}
+            poses[str(k)] = [
+                {"obj_id": i, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 1e3 * z]}
+                for i, z, *_ in targets
+            ]
+            info[str(k)] = [
+                {"bbox_obj": box, "bbox_visib": box, "px_count_all": whole, "px_count_valid": 0,
+                 "px_count_visib": seen, "visib_fract": seen / whole}
+                for _, _, box, seen, whole in targets
+            ]  # fmt: skip
+        for file, content in (("camera", cameras), ("gt", poses), ("gt_info", info)):
+            (folder / f"scene_{file}.json").write_text(json.dumps(content))
+        (folder / "sequence.toml").write_text(f'airframe = "{airframe}"\nflight_seed = {seed}\n')
+    return root
+
+
+def test_every_figure_is_that_of_the_files(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+    s = json.loads(capsys.readouterr().out)
+    assert s["sequences"] == {"train": 2, "test": 1}
+    assert s["frames"] == {"train": 3, "test": 1}
+    assert s["pictures"] == {"320x180": 3}
+    assert s["range_m"]["min"] == pytest.approx(120.0)
+    assert s["range_m"]["mean"] == pytest.approx((120 + 480 + 300 + 330) / 4)
+    assert {k: n for k, n in s["range_histogram_m"].items() if n} == {"100-150": 1, "300-350": 2, "450-500": 1}
+    share = [64 * 36 / 57600, 32 * 18 / 57600, 64 * 18 / 57600]  # of the first target in each frame that has one
+    assert s["box_share"]["mean"] == pytest.approx(np.mean(share))
+    assert (s["focal_px"]["min"], s["focal_px"]["median"], s["focal_px"]["max"]) == (1500, 2500, 8000)
+    assert s["targets_per_frame"] == {"0": 1, "1": 2, "2": 1}
+    assert s["target_free_share"] == pytest.approx(0.25)
+    assert s["visible_fraction"]["min"] == pytest.approx(0.5)
+    assert s["partly_hidden_share"] == pytest.approx(0.25)
+    assert s["airframes"]["train"] == {"light_aircraft": 1, "male_v_tail": 1}
+    assert s["airframe_flights_in_two_splits"] == 1  # flight 11, on purpose
+
+
+def test_the_table_stands_beside_the_papers(dataset: Path, capsys: pytest.CaptureFixture[str],
+                                            monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["stats", "--dataset", str(dataset)]) == 0
+    said = capsys.readouterr().out
+    for words in ("161", "15,325", "2.333 %", "about 1.20 %", "1500–8000 px", "25.0 %"):
+        assert words in said
+
+
+def test_a_folder_without_scenes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stats", "--dataset", str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_a_contact_sheet_boxes_the_targets_and_is_small(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "sheet.jpg"
+    assert main(["sheet", "--dataset", str(dataset), "--out", str(out)]) == 0
+    assert out.stat().st_size <= 300_000
+    sheet = cv2.imread(str(out)).astype(int)
+    assert sheet.shape == (225, 1600, 3)  # four pictures in all
+    cyan = (sheet[..., 0] - sheet[..., 2] > 60) & (sheet[..., 1] - sheet[..., 2] > 60)
+    # Scene 0's box, x 10..74 and y 20..56 of a 320 pixel wide picture, in a tile of 400.
+    expected = np.array([10, 20, 74, 56]) * 1.25 + [-2, -2, 2, 2]
+    found = []
+    for left in range(0, 1600, 400):
+        rows, columns = np.nonzero(cyan[:, left : left + 400])
+        if len(rows):
+            found.append([columns.min(), rows.min(), columns.max(), rows.max()])
+    assert len(found) == 3  # the fourth picture shows no target
+    assert min(np.abs(np.array(box) - expected).max() for box in found) <= 2
