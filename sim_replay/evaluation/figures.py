@@ -73,7 +73,7 @@ def error_by_range(score: dict[str, Any]) -> Figure:
     for axes in (rotation, translation, rates):
         axes.set_xlabel("true range, m")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, framealpha=0.6)
     figure.suptitle(f"{score['method']['file']} on {score['dataset']}")
     return figure
 
@@ -134,11 +134,11 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
             label = {"label": "estimate"} if k == 0 else {}
             axes.plot([i for i, _, _ in found], estimated[:, column], ".", ms=3, color=ESTIMATE_COLOR, **label)
             squares[column].append(error[:, column] ** 2)
-    names = ("X, m", "Y, m", "Z, m", "roll, °", "pitch, °", "yaw, °")
-    for axes, name, parts in zip(panels, names, squares, strict=True):
-        all_squares = np.concatenate([*parts, np.zeros(0)])
-        rmse = f"RMSE {np.sqrt(all_squares.mean()):.2f}" if all_squares.size else "nothing found"
-        axes.set(title=f"{name.split(',')[0]}: {rmse}{name.split(',')[1] if all_squares.size else ''}", ylabel=name)
+    names = ("X", "Y", "Z", "roll", "pitch", "yaw")
+    for axes, name, unit, parts in zip(panels, names, [" m"] * 3 + ["°"] * 3, squares, strict=True):
+        square = np.concatenate([*parts, np.zeros(0)])
+        told = f"RMSE {np.sqrt(square.mean()):.2f}{unit}" if square.size else "nothing found"
+        axes.set(title=f"{name}: {told}", ylabel=f"{name}, {unit.strip()}")
         axes.grid(alpha=0.3)
     for axes in panels[3:]:
         axes.set_xlabel("image")
