@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from pathlib import Path
 
 from trainer import evaluate_command
 from trainer.config import ConfigError, RenderingError, load_config
+
+EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -40,6 +43,16 @@ def _export(arguments: argparse.Namespace) -> None:
     )
 
 
+def _ablate(arguments: argparse.Namespace) -> None:
+    from trainer.ablate import Scale, ablate, chosen, table
+
+    config = load_config(arguments.config)
+    variants = chosen(arguments.variants.split(",") if arguments.variants else None)
+    scale = Scale(arguments.samples, arguments.size, arguments.windows)
+    result = ablate(config, variants, scale, arguments.out, lambda text: print(text, flush=True))
+    print(json.dumps(result, indent=2) if arguments.json else table(result))
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="uavpose-trainer", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -59,8 +72,26 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
     evaluate_command.register(commands)
+    _add_ablate(commands)
     _add_export(commands)
     return parser
+
+
+def _add_ablate(commands: argparse._SubParsersAction) -> None:
+    ablate = commands.add_parser(
+        "ablate",
+        help="train the same network with one thing left out at a time, and print the table",
+        description="Train every variant for the same number of windows, measure all on the same held-out ones, and "
+        "write table.md and ablation.json. Runs that are there already are kept, and an interrupted one goes on.",
+    )
+    ablate.add_argument("--config", type=Path, default=EDGE_CONFIG, help="what is varied (default: configs/edge.toml)")
+    ablate.add_argument("--out", type=Path, required=True, help="folder of the runs and the table")
+    ablate.add_argument("--variants", metavar="A,B", help="only these (default: all)")
+    ablate.add_argument("--samples", type=int, default=20000, help="training windows a variant (default %(default)s)")
+    ablate.add_argument("--size", type=int, default=128, metavar="PX", help="side of a window (default %(default)s)")
+    ablate.add_argument("--windows", type=int, default=512, help="held-out windows (default %(default)s)")
+    ablate.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    ablate.set_defaults(run=_ablate)
 
 
 def _add_export(commands: argparse._SubParsersAction) -> None:

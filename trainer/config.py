@@ -33,7 +33,14 @@ class ModelConfig(_Section):
     box_anchor_px: float | None = Field(None, gt=0, description="scale anchor a in pixels; absent: (0.1 W, 0.1 H)")
     origin_range: float = Field(1.25, gt=0, description="lambda_o")
     focal: Literal["mean", "geometric"] = Field(description="(fx + fy) / 2 or sqrt(fx fy)")
-    depth: Literal["plain", "rotation_aware"] = Field(description="APDD's scale: free, or latent extents seen from R")
+    center: Literal["heatmap", "regressed"] = Field(
+        "heatmap", description="where a target's features come from: a heatmap's peak, or the whole image's mean"
+    )
+    ray: bool = Field(True, description="PAM: modulate by the observation ray, and turn rotations by it")
+    topology: bool = Field(True, description="DTS: the eight-point context, beside the dense region")
+    depth: Literal["direct", "plain", "rotation_aware"] = Field(
+        description="Z itself, or APDD with a scale that is free or made of latent extents seen from R"
+    )
     uncertainty: bool = Field(description="train the sigma heads")
     hypotheses: int = Field(
         1, ge=1, description="rotations proposed for a target, each for headings around its own; the likeliest is said"

@@ -97,8 +97,11 @@ def _laplace_nll(residual: Tensor, log_scale: Tensor) -> Tensor:
     return residual.abs() * torch.exp(-log_scale) + log_scale
 
 
-def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, Tensor]:
-    """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels."""
+def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = True) -> dict[str, Tensor]:
+    """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels.
+
+    Without `ray` the network's allocentric rotation is the one in `cam`.
+    """
     center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma = (value[:, 0] for value in out)
     t, K = labels.t_cam_target_m, labels.K
     Z = torch.clamp(t[:, 2], min=1.0)
@@ -108,7 +111,8 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig) -> dict[str, T
     true_log_size = torch.log(torch.clamp(labels.size_px, min=SMALLEST_SIZE_PX))
     longer = torch.exp(true_log_size).amax(-1, keepdim=True)
     t_xy = eq.back_project(eq.image_plane_point(origin, K), torch.exp(log_Z))[:, :2]
-    R_allo_true = eq.ray_rotation(eq.unit_ray(true_plane)).transpose(-1, -2) @ labels.R_cam_target
+    R_ray = eq.ray_rotation(eq.unit_ray(true_plane if ray else torch.zeros_like(true_plane)))
+    R_allo_true = R_ray.transpose(-1, -2) @ labels.R_cam_target
 
     share = hypothesis_share(R_allo_true, logits.shape[-1])
     terms = {
@@ -152,11 +156,11 @@ def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
 
 
 def joint_loss(
-    heat_logits: Tensor, out: Decoded, dense: Tensor | None, labels: Labels, weights: LossConfig
+    heat_logits: Tensor, out: Decoded, dense: Tensor | None, labels: Labels, weights: LossConfig, ray: bool = True
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """L_total and its unweighted terms, each a scalar."""
     count = labels.present.sum().clamp(min=1.0)
-    over_targets = {k: (v * labels.present).sum() / count for k, v in pose_terms(out, labels, weights).items()}
+    over_targets = {k: (v * labels.present).sum() / count for k, v in pose_terms(out, labels, weights, ray).items()}
     terms = {"heatmap": heatmap_loss(heat_logits, heatmap_target(labels, *heat_logits.shape[-2:])), **over_targets}
     if dense is not None:
         by_window = dense_terms(dense, labels)

@@ -52,14 +52,16 @@ def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class PerspectiveAwareModule(nn.Module):
-    """PAM: f_pam = Proj(f_c) * sigmoid(gamma) + beta, with [gamma, beta] = MLP_ray(x/z, y/z)."""
+    """PAM: f_pam = Proj(f_c) * sigmoid(gamma) + beta, with [gamma, beta] = MLP_ray(x/z, y/z); Proj(f_c) without ray."""
 
-    def __init__(self, channels: int, hidden: int) -> None:
+    def __init__(self, channels: int, hidden: int, ray: bool) -> None:
         super().__init__()
-        self.ray_encoder = mlp(2, hidden // 2, 2 * hidden)
+        self.ray_encoder = mlp(2, hidden // 2, 2 * hidden) if ray else None
         self.project = nn.Linear(channels, hidden)
 
     def forward(self, f_c: Tensor, plane_xy: Tensor) -> Tensor:
+        if self.ray_encoder is None:
+            return self.project(f_c)
         gamma, beta = self.ray_encoder(plane_xy).chunk(2, dim=-1)
         return self.project(f_c) * torch.sigmoid(gamma) + beta
 
@@ -106,6 +108,13 @@ class GatedFusion(nn.Module):
         return f_reg + torch.sigmoid(self.gate(torch.cat([f_reg, context], dim=-1))) * context
 
 
+class RegionOnly(nn.Module):
+    """What the decoders get without DTS's context: f_reg."""
+
+    def forward(self, f_reg: Tensor, f_geo: Tensor) -> Tensor:
+        return f_reg
+
+
 class PoseNet(nn.Module):
     """The network. `forward` is the exported graph (see msgs.contract); a train step calls `forward_guided`."""
 
@@ -118,11 +127,12 @@ class PoseNet(nn.Module):
         self.backbone = build_backbone(config.backbone, config.pretrained)
         self.neck = AlignFuseNeck(self.backbone.channels, C)
         self.head_hm = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 1, 1))
-        self.pam = PerspectiveAwareModule(C, hidden)
+        self.head_center = mlp(C, C // 2, 2) if config.center == "regressed" else None
+        self.pam = PerspectiveAwareModule(C, hidden, config.ray)
         self.mlp_wh = mlp(hidden, hidden // 2, 2)
         self.dts = DynamicTopologicalSampling(C, hidden)
         geo = C + 8 * C + hidden + 2
-        self.fuse_t, self.fuse_r = GatedFusion(geo, hidden), GatedFusion(geo, hidden)
+        self.fuse_t, self.fuse_r = (GatedFusion(geo, hidden) if config.topology else RegionOnly() for _ in range(2))
         self.mlp_t, self.mlp_r = (nn.Sequential(mlp(hidden, hidden, hidden), nn.ReLU(inplace=True)) for _ in range(2))
         self.head_trans = nn.Linear(hidden, 3)
         self.head_rot = nn.Linear(hidden, 6 * config.hypotheses)
@@ -152,7 +162,7 @@ class PoseNet(nn.Module):
         if self.head_extents is not None:
             self.head_extents.bias.copy_(torch.log(torch.tensor([4.5, 5.5, 1.5])))
         else:
-            self.head_trans.bias[2] = math.log(8.0)
+            self.head_trans.bias[2] = math.log(250.0 if self.config.depth == "direct" else 8.0)
 
     def perceive(self, image_bgr: Tensor) -> Perception:
         """uint8 image [N, H, W, 3] to F_global and the heatmap's logits."""
@@ -171,8 +181,7 @@ class PoseNet(nn.Module):
         """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box."""
         F_global, log_P = seen.F_global, F.logsigmoid(seen.heat_logits)
         K = K[:, None]
-        W, center_px = eq.soft_argmax(log_P, peaks_xy.to(log_P.dtype), self._sigma_g(log_P))
-        f_c = W @ F_global.flatten(2).transpose(1, 2)
+        f_c, center_px = self._anchor_of(F_global, log_P, peaks_xy)
         f_pam = self.pam(f_c, eq.image_plane_point(center_px, K))
         log_size = self.mlp_wh(f_pam) + torch.log(self._anchor(F_global))
         size_px = torch.exp(log_size)
@@ -192,11 +201,24 @@ class PoseNet(nn.Module):
         S = torch.exp(s[..., 0])
         if self.head_extents is not None:
             S = S * eq.seen_scale(torch.exp(self.head_extents(f_trans)), R_allo.detach())
-        log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
-        R_ray = eq.ray_rotation(eq.unit_ray(eq.image_plane_point(origin_px, K)))
+        if self.config.depth == "direct":
+            log_Z = s[..., 0]
+        else:
+            log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
+        plane_xy = eq.image_plane_point(origin_px, K)
+        R_ray = eq.ray_rotation(eq.unit_ray(plane_xy if self.config.ray else torch.zeros_like(plane_xy)))
         log_sigma = self._log_sigma(f_trans, f_rot)
         R_ego_k = R_ray[:, :, None] @ R_allo_k
         return Decoded(center_px, log_size, origin_px, log_Z, logits, R_allo_k, R_ego_k, R_ray @ R_allo, log_sigma)
+
+    def _anchor_of(self, F_global: Tensor, log_P: Tensor, peaks_xy: Tensor) -> tuple[Tensor, Tensor]:
+        """Features [N, M, C] and centre [N, M, 2] px of each peak, or of the whole image if centres are regressed."""
+        if self.head_center is None:
+            W, center_px = eq.soft_argmax(log_P, peaks_xy.to(log_P.dtype), self._sigma_g(log_P))
+            return W @ F_global.flatten(2).transpose(1, 2), center_px
+        f_c = F_global.mean((2, 3))[:, None].expand(-1, peaks_xy.shape[1], -1)
+        extent = eq.STRIDE * torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
+        return f_c, 0.5 * (extent - 1) + 0.5 * extent * torch.tanh(self.head_center(f_c))
 
     def _likeliest(self, f_rot: Tensor, R_allo_k: Tensor) -> tuple[Tensor, Tensor]:
         """Logits [N, M, K] and the rotation [N, M, 3, 3] of the highest: one mode, never a mean of two."""

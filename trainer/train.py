@@ -126,7 +126,7 @@ class Trainer:
         teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
         peaks, guide_size = guided_peaks(seen.heat_logits, labels, teacher, generator)
         out = self.model.decode(seen, labels.K, peaks, guide_size)
-        loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss)
+        loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss, self.config.model.ray)
 
         rate = learning_rate(schedule, self.samples, progress)
         for group in self.optimizer.param_groups:

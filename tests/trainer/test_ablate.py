@@ -1,0 +1,72 @@
+"""One command trains the variants, each with one thing changed, and puts them side by side."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_sampler
+import tiny
+import torch
+
+from trainer.ablate import FULL, VARIANTS, Scale, ablate, chosen, table, varied
+from trainer.config import ConfigError, DataConfig, parse_config
+from trainer.model import PoseNet
+
+SCALE = Scale(samples=8, size_px=64, windows=16)
+
+
+def open_view(data: DataConfig, seed: int, size_px: int) -> partial:
+    return synthetic_sampler.opener(seed, size_px)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.name)
+def test_a_variant_is_another_configuration_of_the_same_code(variant) -> None:
+    base, config = tiny.config(), parse_config(varied(tiny.config(), variant, SCALE), variant.name)
+    differing = {k for k in base.model.model_dump() if getattr(base.model, k) != getattr(config.model, k)}
+    assert differing == set(variant.change.get("model", {}))
+    torch.manual_seed(0)
+    image = torch.randint(0, 255, (1, 64, 64, 3), dtype=torch.uint8)
+    K = torch.tensor([[[900.0, 0, 32], [0, 900.0, 32], [0, 0, 1]]])
+    outputs = PoseNet(config.model).eval()(image, K)
+    assert all(torch.isfinite(value).all() for value in outputs)
+
+
+def test_without_the_ray_a_target_off_the_axis_is_not_turned() -> None:
+    """The same picture with the principal point elsewhere: the ray alone differs."""
+    image = torch.randint(0, 255, (1, 64, 64, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    turns = {}
+    for name in ("full", "no-ray"):
+        text = varied(tiny.config(), chosen([name])[0], SCALE)
+        torch.manual_seed(2)
+        network = PoseNet(parse_config(text, name).model).eval()
+        rotations = []
+        for cx in (32.0, 432.0):
+            K = torch.tensor([[[900.0, 0, cx], [0, 900.0, 32], [0, 0, 1]]])
+            rotations.append(network(image, K)[5][0, 0].detach().numpy())
+        turns[name] = np.abs(rotations[0] - rotations[1]).max()
+    assert turns["no-ray"] < 1e-5
+    assert turns["full"] > 0.1
+
+
+def test_rows_are_trained_once_and_stand_in_one_table(tmp_path: Path) -> None:
+    said: list[str] = []
+    variants = chosen(["full", "direct-depth"])
+    first = ablate(tiny.config(), variants, SCALE, tmp_path, said.append, open_view)
+    assert [row["trained_samples"] for row in first["rows"].values()] == [8, 8]
+    written = (tmp_path / "table.md").read_text()
+    assert written == table(json.loads((tmp_path / "ablation.json").read_text()))
+    assert "8 training windows of 64 px" in written
+    again = ablate(tiny.config(), variants, SCALE, tmp_path, said.append, open_view)
+    assert again == first
+    assert json.loads((tmp_path / "full" / "log.jsonl").read_text().splitlines()[-1])["samples"] == 8
+    with pytest.raises(ConfigError, match="another configuration or scale"):
+        ablate(tiny.config(), [FULL], Scale(12, 64, 16), tmp_path, said.append, open_view)
+
+
+def test_an_unknown_variant_is_named_with_those_there_are() -> None:
+    with pytest.raises(ConfigError, match="'no-such'; there are full, no-ray"):
+        chosen(["no-such"])

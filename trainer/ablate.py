@@ -1,0 +1,143 @@
+"""Ablations: the same training with one thing changed, one row each.
+
+The paper's four (observation ray, eight-point context, perspective-scale depth, heatmap centre) and this project's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model
+from trainer.config import ConfigError, TrainerConfig, parse_config
+from trainer.data import DataConfig, Sampler, render_once, window_sampler
+from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.train import run_training
+
+OpenView = Callable[[DataConfig, int, int], Callable[[], Sampler]]
+RESULT_NAME = "ablation.json"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A change of the configuration; `says` is its row's name."""
+
+    name: str
+    says: str
+    change: dict[str, dict[str, Any]]
+
+
+FULL = Variant("full", "all of it", {})
+VARIANTS = (
+    FULL,
+    Variant("no-ray", "without PAM: no observation ray", {"model": {"ray": False}}),
+    Variant("no-topology", "without DTS: no eight-point context", {"model": {"topology": False}}),
+    Variant("direct-depth", "direct Z instead of APDD", {"model": {"depth": "direct"}}),
+    Variant("regressed-center", "centre regressed, no heatmap features", {"model": {"center": "regressed"}}),
+    Variant("plain-depth", "APDD's scale free of rotation", {"model": {"depth": "plain"}}),
+    Variant("one-hypothesis", "one rotation hypothesis", {"model": {"hypotheses": 1}, "loss": {"hypothesis": 0.0}}),
+    Variant(
+        "no-dense", "no dense heads while training", {"model": {"dense": False}, "loss": {"mask": 0.0, "noc": 0.0}}
+    ),
+    Variant("no-uncertainty", "no uncertainty heads", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
+    Variant("no-window", "whole reduced frames only, no native window", {"data": {"acquire_share": 1.0}}),
+)
+COLUMNS = {
+    "E_r_mean_deg": ("E_r mean °", 1.0, 1),
+    "E_r_median_deg": ("median °", 1.0, 1),
+    "rot_lt_10deg": ("Rot<10° %", 100.0, 1),
+    "depth_rel_median": ("depth median %", 100.0, 1),
+    "depth_lt_5pct": ("Depth<5 % %", 100.0, 1),
+    "pose_10deg_5pct": ("Pose@10°/5 % %", 100.0, 1),
+    "bearing_median_deg": ("bearing median °", 1.0, 3),
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much each variant is trained and measured."""
+
+    samples: int
+    size_px: int
+    windows: int
+
+
+def chosen(names: Sequence[str] | None) -> tuple[Variant, ...]:
+    """Variants of those names, in the table's order; None: all. Raises ConfigError that lists the names there are."""
+    known = {variant.name: variant for variant in VARIANTS}
+    for name in names or ():
+        if name not in known:
+            raise ConfigError(f"--variants: no variant is called {name!r}; there are {', '.join(known)}")
+    return tuple(v for v in VARIANTS if names is None or v.name in names)
+
+
+def varied(base: TrainerConfig, variant: Variant, scale: Scale) -> str:
+    """The TOML of a variant: the base's with its change and one window size."""
+    tree = base.model_dump(mode="json", exclude_none=True)
+    for section, values in variant.change.items():
+        tree[section].update(values)
+    tree["schedule"].update(samples=scale.samples, sizes=[{"from_progress": 0.0, "size_px": scale.size_px}])
+    tree["schedule"]["warmup_samples"] = min(base.schedule.warmup_samples, scale.samples // 10)
+    tree["run"]["validate_every_samples"] = scale.samples
+    return tomli_w.dumps(tree)
+
+
+def ablate(
+    base: TrainerConfig,
+    variants: Sequence[Variant],
+    scale: Scale,
+    out: Path,
+    say: Callable[[str], None],
+    open_view: OpenView = window_sampler,
+) -> dict[str, Any]:
+    """Train what is not trained yet, measure all on the same held-out windows, write ablation.json and table.md.
+
+    A run that was interrupted goes on where it stopped. Raises ConfigError where `out` holds runs of another scale.
+    """
+    rows = {}
+    for variant in variants:
+        text = varied(base, variant, scale)
+        config = parse_config(text, f"variant {variant.name}")
+        folder = out / variant.name
+        say(f"{variant.name}: {variant.says}")
+        started = (folder / WEIGHTS_NAME).exists()
+        if started and load_file(folder)["config"] != text:
+            raise ConfigError(f"{folder}: holds a run of another configuration or scale; give another --out")
+        if not started or int(load_model(folder)[2]["samples"]) < scale.samples:
+            opener = lambda seed, size, data=config.data: open_view(data, seed, size)  # noqa: E731
+            run_training(config, text, folder, resume=started, open_sampler=opener)
+        rows[variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
+        result = {"samples": scale.samples, "size_px": scale.size_px, "windows": scale.windows, "rows": rows}
+        result["seed"], result["validation_seed"] = config.data.seed, config.data.validation_seed
+        (out / RESULT_NAME).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        (out / "table.md").write_text(table(result), encoding="utf-8")
+    return result
+
+
+def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: OpenView) -> dict[str, Any]:
+    """Metrics on windows of the view that the variant was trained for, and the weights' hash."""
+    model, _, training, sha256 = load_model(folder)
+    only_frames = config.data.acquire_share == 1.0
+    data = config.data.model_copy(update={"acquire_share": 1.0 if only_frames else 0.0})
+    batches = render_once(open_view(data, config.data.validation_seed, scale.size_px), scale.windows)
+    metrics = measure(predict_all(torch_predictor(model), batches), batches)
+    return {"weights_sha256": sha256, "trained_samples": training["samples"], **metrics}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown of the rows and of the scale they were run at."""
+    head = ["variant", *(title for title, _, _ in COLUMNS.values()), "weights"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in result["rows"].values():
+        cells = [f"{scale * row[key]:.{digits}f}" for key, (_, scale, digits) in COLUMNS.items()]
+        lines.append("| " + " | ".join([row["says"], *cells, f"`{row['weights_sha256'][:12]}`"]) + " |")
+    scale = (
+        f"{result['samples']} training windows of {result['size_px']} px a variant (seed {result['seed']}), "
+        f"{result['windows']} held-out windows (seed {result['validation_seed']})."
+    )
+    return "\n".join([*lines, "", scale, ""])
