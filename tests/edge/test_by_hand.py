@@ -1,0 +1,106 @@
+"""A person points at a target, or lets go of it: through the running daemon, and the rules by themselves."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.requests import StopTracking, TrackBox
+from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
+from msgs.mavlink import dialect
+
+from . import toy_scene
+from .mavlink_peer import Peer
+from .reports import SIZE_WH
+from .reports import make_track as track
+
+CENTER_PX = (700.5, 500.5)
+IDLE, ACTIVE = 0, 1
+
+
+def still_scene(folder: Path) -> Path:
+    """One target that stands still, as a looping sequence."""
+    (folder / "rgb").mkdir(parents=True)
+    for index in range(3):
+        cv2.imwrite(str(folder / "rgb" / f"{index:06d}.png"), toy_scene.draw(CENTER_PX))
+    camera = {"cam_K": toy_scene.K.ravel().tolist(), "depth_scale": 1.0}
+    (folder / "scene_camera.json").write_text(json.dumps({str(index): camera for index in range(3)}))
+    return folder
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_stopping_drops_the_target_and_drawing_a_box_takes_it_up_again(tmp_path: Path, toy_model: Path) -> None:
+    port = free_port()
+    config = tmp_path / "flight.toml"
+    config.write_text(
+        f'[camera]\ntype = "sequence"\npath = "{still_scene(tmp_path / "000001")}"\nfps = 10\nloop = true\n'
+        f'[model]\npath = "{toy_model}"\nthreads = 1\n[zenoh]\nenabled = false\n'
+        f'[mavlink]\nendpoints = ["udpin:127.0.0.1:{port}"]\n'
+    )
+    run = [sys.executable, "-m", "edge.cli", "run", "--config", str(config)]
+    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True) as daemon, Peer(port) as peer:
+        try:
+            assert daemon.stderr is not None
+            assert any("ready: " in line for line in daemon.stderr)
+            status_in(peer, ACTIVE)
+            peer.command(2010)
+            assert peer.named("COMMAND_ACK").result == dialect.MAV_RESULT_ACCEPTED
+            status_in(peer, IDLE)
+            # Unasked, it would be confirmed again after three frames.
+            for _ in range(10):
+                assert peer.named("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == IDLE
+            left, top = (CENTER_PX[0] - 80) / SIZE_WH[0], (CENTER_PX[1] - 60) / SIZE_WH[1]
+            right, bottom = (CENTER_PX[0] + 80) / SIZE_WH[0], (CENTER_PX[1] + 60) / SIZE_WH[1]
+            peer.command(2005, left, top, right, bottom)
+            assert peer.named("COMMAND_ACK").result == dialect.MAV_RESULT_ACCEPTED
+            status = status_in(peer, ACTIVE)
+        finally:
+            daemon.kill()
+    center = [0.5 * (status.rec_top_x + status.rec_bottom_x), 0.5 * (status.rec_top_y + status.rec_bottom_y)]
+    np.testing.assert_allclose(np.array(center) * SIZE_WH, np.array(CENTER_PX) + 0.5, atol=10.0)
+
+
+def status_in(peer: Peer, tracking_status: int):  # type: ignore[no-untyped-def]
+    return peer.until(
+        lambda m: m.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and m.tracking_status == tracking_status,
+        f"tracking status {tracking_status}",
+    )
+
+
+def test_a_box_is_looked_into_for_a_second() -> None:
+    by_hand = ByHand()
+    by_hand.take(TrackBox((0.25, 0.5, 0.75, 1.0)), 0)
+    np.testing.assert_allclose(by_hand.box_xyxy_px(LOOK_NS, SIZE_WH, []), [479.5, 539.5, 1439.5, 1079.5])
+    assert by_hand.box_xyxy_px(LOOK_NS + 1, SIZE_WH, []) is None
+
+
+def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends() -> None:
+    by_hand, there, elsewhere = ByHand(), track(0, track_id=2), track(0, track_id=0, box_xyxy_px=np.full(4, 50.0))
+    by_hand.take(TrackBox((0.5, 0.4, 0.6, 0.5)), 0)
+    assert by_hand.box_xyxy_px(1, SIZE_WH, [elsewhere, there]) is None
+    by_hand.settle([elsewhere, there])
+    assert by_hand.chosen_id == 2
+    by_hand.settle([elsewhere])
+    by_hand.settle([elsewhere, there])
+    assert by_hand.chosen_id is None, "its number may be another target's by now"
+
+
+def test_the_search_rests_after_stopping_until_the_next_box_or_ten_seconds() -> None:
+    by_hand = ByHand()
+    assert by_hand.searches(0)
+    by_hand.take(StopTracking(), 0)
+    assert not by_hand.searches(REST_NS - 1)
+    assert by_hand.searches(REST_NS)
+    by_hand.take(TrackBox((0.0, 0.0, 0.1, 0.1)), 5)
+    assert by_hand.searches(5)
