@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import xxhash
@@ -154,6 +155,7 @@ def subscription_key(topic: Topic, uav: str, target: str | None = None, *, domai
     return f"{domain}/{uav}/{topic.name.format(target=target or '*')}/**"
 
 
+@lru_cache(maxsize=1024)  # the same few keys come at frame rate
 def parse_key(key: str, uav: str, *, domain: int = 0) -> tuple[Topic, str | None] | None:
     """(topic, target) that a sample's key belongs to, or None if it is no topic of this table."""
     prefix = f"{domain}/{uav}/"
@@ -186,6 +188,21 @@ def parse_any_key(key: str, *, domain: int = 0) -> tuple[str, Topic, str | None]
 def encoding(topic: Topic) -> str:
     """The zenoh encoding of its samples, e.g. `application/cdr;nav_msgs/msg/Odometry`."""
     return f"application/cdr;{topic.ros_type}"
+
+
+def table_markdown() -> str:
+    """The table of topics as the documents show it."""
+    lines = [
+        "| topic | type | reliability | priority | rate | kept for late joiners | recorded |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for one in TOPICS:
+        name = f"`<uav>/{one.name}`".replace("{target}", "<tN>")
+        reliability = "best effort" if one.reliability == Reliability.BEST_EFFORT else "reliable"
+        priority = str(one.priority).rpartition(".")[2].lower().replace("_", " ") + (", express" if one.express else "")
+        kept, recorded = str(one.cache or "–"), "yes" if one.recorded else "no"
+        lines.append(f"| {name} | {one.ros_type} | {reliability} | {priority} | {one.rate} | {kept} | {recorded} |")
+    return "\n".join(lines) + "\n"
 
 
 def _mangle(name: str) -> str:

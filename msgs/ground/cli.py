@@ -7,12 +7,15 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from typing import TypeAlias
 
 from msgs.ground.errors import InputError
 from msgs.session import TlsFiles
-from msgs.topics import check_uav_name
+from msgs.topics import check_uav_name, table_markdown
 
 EXIT_BAD_INPUT = 2
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,6 +34,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
+    _add_watch(commands)
+    _add_record(commands)
+    _add_command(commands)
+    _add_router(commands)
+    _add_keys(commands)
+    _add_tools(commands)
+    return parser
+
+
+def _add_watch(commands: Commands) -> None:
     watch = commands.add_parser("watch", help="a live table of vehicles and their targets")
     _connection(watch)
     watch.add_argument("--json", action="store_true", help="one JSON object a line: pose, health, event, vehicle, link")
@@ -38,6 +51,8 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     watch.set_defaults(act=_watch)
 
+
+def _add_record(commands: Commands) -> None:
     record = commands.add_parser("record", help="write what vehicles tell as MCAP files")
     _connection(record)
     record.add_argument("--dir", type=Path, default=Path("recordings"), help="folder (default: recordings)")
@@ -49,6 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     record.set_defaults(act=_record)
 
+
+def _add_command(commands: Commands) -> None:
     command = commands.add_parser("command", help="tell one vehicle to track, stop, record or send less")
     _endpoint(command)
     command.add_argument("uav", help="the vehicle's name")
@@ -58,10 +75,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.set_defaults(act=_command)
 
+
+def _add_router(commands: Commands) -> None:
     router = commands.add_parser("router", help="what vehicles and tools connect to; no other zenoh router is needed")
     router.add_argument("--config", type=Path, required=True, help="TOML file: listen, [tls], [access]")
     router.set_defaults(act=_router)
 
+
+def _add_keys(commands: Commands) -> None:
     keys = commands.add_parser("keys", help="certificates for TLS and QUIC").add_subparsers(
         required=True, metavar="ACTION"
     )
@@ -81,7 +102,16 @@ def _parser() -> argparse.ArgumentParser:
     issue.add_argument("--days", type=int, default=825, help="validity (default: 825)")
     init.set_defaults(act=_keys_init)
     issue.set_defaults(act=_keys_issue)
-    return parser
+
+
+def _add_tools(commands: Commands) -> None:
+    bench = commands.add_parser("bench", help="time encoding and decoding a pose, beside rosbags if it is installed")
+    bench.add_argument("--calls", type=int, default=2000, help="calls in each of seven rounds (default 2000)")
+    bench.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
+    bench.set_defaults(act=_bench)
+
+    topics = commands.add_parser("topics", help="print the table of topics as Markdown")
+    topics.set_defaults(act=_topics)
 
 
 def _positive(text: str) -> float:
@@ -163,6 +193,21 @@ def _command(options: argparse.Namespace) -> int:
 
     uav, stop = _uav(options.uav), _stop_on_signal(10.0)
     return command(options.connect, _tls(options), uav, options.name, options.words, stop, _say_aside)
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from msgs.ground.bench import bench, table, to_json
+
+    if options.calls < 1:
+        raise InputError("--calls takes a whole number from 1 on")
+    timings = bench(options.calls)
+    print(to_json(timings) if options.json else table(timings))
+    return 0
+
+
+def _topics(_: argparse.Namespace) -> int:
+    print(table_markdown(), end="")
+    return 0
 
 
 def _say_aside(text: str) -> None:

@@ -1,0 +1,28 @@
+"""Print each pose as it comes: target, age, place in the camera's frame, range and how sure it is."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from msgs.client import connect, subscribe
+from msgs.examples.arguments import parse
+
+
+def main() -> None:
+    options = parse("Print each pose of a vehicle's targets.")
+    with connect(options.endpoint) as session, subscribe(session, options.uav) as poses:
+        for one in itertools.islice(poses, options.count):
+            x, y, z = one.pose.t_cam_target_m
+            range_m = np.linalg.norm(one.pose.t_cam_target_m)
+            sigma_m = np.sqrt(one.pose.covariance[2, 2])
+            print(
+                f"{one.target}  {1e3 * one.age_s:5.0f} ms old  right {x:+7.1f}  down {y:+7.1f}  ahead {z:7.1f} m  "
+                f"range {range_m:6.1f} ± {sigma_m:.1f} m",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""Gather poses into arrays and write them as .npz: stamps, positions, rotation matrices, covariances."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from msgs.client import connect, subscribe
+from msgs.examples.arguments import parse
+from msgs.geometry import R_from_q_wxyz
+
+OUT = "poses.npz"
+
+
+def main() -> None:
+    options = parse(f"Gather the poses of a vehicle's targets into {OUT}.")
+    with connect(options.endpoint) as session, subscribe(session, options.uav, depth=256) as poses:
+        taken = list(itertools.islice(poses, options.count or 100))
+    np.savez(
+        OUT,
+        target=np.array([one.target for one in taken]),
+        stamp_ns=np.array([one.stamp_ns for one in taken]),
+        t_cam_target_m=np.array([one.pose.t_cam_target_m for one in taken]),
+        R_cam_target=R_from_q_wxyz(np.roll([one.pose.q_cam_target_xyzw for one in taken], 1, axis=-1)),
+        covariance=np.array([one.pose.covariance for one in taken]),
+    )
+    print(f"{len(taken)} poses in {OUT}")
+
+
+if __name__ == "__main__":
+    main()

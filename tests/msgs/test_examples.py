@@ -1,0 +1,66 @@
+"""Each example as a process, on a bare installation: zenoh, numpy and xxhash alone can be imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import msgs.examples
+from msgs import topics
+from msgs.publish import Node
+
+from .conftest import Network, pose_now, until
+
+EXAMPLES = sorted(path.stem for path in Path(msgs.examples.__file__).parent.glob("*.py"))
+RUN = """
+import runpy, sys
+class OnlyWhatIsDeclared:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] not in sys.stdlib_module_names | {"msgs", "zenoh", "numpy", "xxhash"}:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, OnlyWhatIsDeclared())
+runpy.run_module("msgs.examples." + sys.argv.pop(1), run_name="__main__")
+"""
+
+
+def run(network: Network, folder: Path, example: str) -> str:
+    """What it prints on five poses, 250 m ahead, of target t3."""
+    command = [sys.executable, "-c", RUN, example, "-e", network.endpoint, "-u", "uav1", "-n", "5"]
+    with Node(network.daemon, "uav1") as node:
+        publisher = node.publisher(topics.POSE, "t3")
+        process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            until(lambda: process.poll() is not None, lambda: publisher.put(pose_now(250.0).encode()))
+            out, err = process.communicate()
+        finally:
+            process.kill()
+    assert process.returncode == 0, err
+    return out
+
+
+def test_poses_are_printed(network: Network, tmp_path: Path) -> None:
+    lines = run(network, tmp_path, "print_poses").splitlines()
+    assert len(lines) == 5
+    assert all(line.startswith("t3 ") and "ahead   250.0 m" in line and "± 1.0 m" in line for line in lines)
+
+
+def test_ranges_are_plotted(network: Network, tmp_path: Path) -> None:
+    lines = run(network, tmp_path, "plot_range").splitlines()
+    assert len(lines) == 5
+    assert {line.index("o") - line.index("|") - 1 for line in lines} == {int(250 / 600 * 59)}
+
+
+def test_poses_are_gathered_as_arrays(network: Network, tmp_path: Path) -> None:
+    assert run(network, tmp_path, "to_numpy") == "5 poses in poses.npz\n"
+    with np.load(tmp_path / "poses.npz") as arrays:
+        np.testing.assert_array_equal(arrays["t_cam_target_m"], [[1.0, 2.0, 250.0]] * 5)
+        np.testing.assert_allclose(arrays["R_cam_target"], [np.eye(3)] * 5, atol=1e-12)
+        assert (np.diff(arrays["stamp_ns"]) > 0).all()
+        assert arrays["covariance"].shape == (5, 6, 6)
+
+
+def test_every_example_is_run_here() -> None:
+    assert set(EXAMPLES) - {"__init__", "arguments"} == {"print_poses", "plot_range", "to_numpy"}
