@@ -1,7 +1,8 @@
-"""The dialect: its checksum by the published algorithm, its packets read by MAVSDK, and what is never packed."""
+"""The dialect against the published checksum and MAVSDK, what is never packed, and reading frames out of bytes."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -184,3 +185,54 @@ except mavlink.MAVError:
         [sys.executable, "-c", script], env=os.environ | {"MAV_IGNORE_CRC": "0"}, capture_output=True, text=True
     )
     assert run.stdout.strip() == "refused", run.stderr
+
+
+HEARTBEAT = mavlink.dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
+JUNK = st.one_of(
+    st.binary(max_size=40), st.sampled_from([b"\xfd", b"\xfe", b"\xfd\xff\x00", b"\xfe\xff", b"\xfd\x00\x02"])
+)
+
+
+def frames_with(junk: list[bytes]) -> bytes:
+    """Numbered heartbeats, each behind some junk; what follows the last lets a claimed length run out."""
+    mav = mavlink.MAVLink(None, 1, 1)
+    return b"".join(piece + mavlink.pack(mav, HEARTBEAT) for piece in junk) + bytes(300)
+
+
+@given(junk=st.lists(JUNK, max_size=8), cuts=st.lists(st.integers(0, 700), max_size=6))
+def test_every_frame_of_a_stream_is_found_whatever_lies_between_and_wherever_it_is_cut(
+    junk: list[bytes], cuts: list[int]
+) -> None:
+    stream, reader = frames_with(junk), mavlink.FrameReader(datagram=False)
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    found = [m for a, b in itertools.pairwise(edges) for m in reader.feed(stream[a:b])]
+    assert [m.get_seq() for m in found] == list(range(len(junk)))
+
+
+@given(junk=st.lists(JUNK, max_size=8), tail=st.integers(0, 299))
+def test_every_frame_of_a_datagram_is_found_and_nothing_is_kept_for_the_next(junk: list[bytes], tail: int) -> None:
+    reader = mavlink.FrameReader(datagram=True)
+    datagram = frames_with(junk)[: -300 + tail]
+    for _ in range(2):
+        assert [m.get_seq() for m in reader.feed(datagram)] == list(range(len(junk)))
+
+
+def test_fourteen_heartbeats_behind_a_truncated_header_are_all_read() -> None:
+    mav = mavlink.MAVLink(None, 1, 1)
+    datagram = b"\xfd\xff\x00\x00" + b"".join(mavlink.pack(mav, HEARTBEAT) for _ in range(14))
+    assert len(mavlink.FrameReader(datagram=True).feed(datagram)) == 14
+
+
+@given(position=st.integers(0, 20), bit=st.integers(0, 7))
+def test_a_frame_with_one_bit_wrong_is_no_message(position: int, bit: int) -> None:
+    frame = bytearray(mavlink.pack(mavlink.MAVLink(None, 1, 1), HEARTBEAT))
+    frame[position] ^= 1 << bit
+    reader = mavlink.FrameReader(datagram=True)
+    assert reader.feed(bytes(frame)) == []
+    assert reader.bad_runs + reader.unknown_ids >= 1
+
+
+def test_a_flood_of_magic_bytes_is_given_up_and_the_next_frame_read() -> None:
+    reader = mavlink.FrameReader(datagram=False)
+    assert reader.feed(b"\xfe" * 8192) == []
+    assert len(reader.feed(mavlink.pack(mavlink.MAVLink(None, 1, 1), HEARTBEAT))) == 1
