@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+SLIVER = 2e-5  # a triangle thinner than this share of its length is left out
 Parts = NDArray[np.uint8]
 
 
@@ -100,7 +101,7 @@ def built(vertices: Array, faces: NDArray[np.int64], face_part: Part | Parts) ->
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     longest = np.maximum.reduce([np.sum((p - q) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))])
-    kept = np.linalg.norm(normal, axis=1) > 1e-4 * longest
+    kept = np.linalg.norm(normal, axis=1) > SLIVER * longest
     faces, parts, normal = faces[kept], parts[kept], normal[kept]
     centre = vertices.mean(axis=0)
     if np.sum(np.einsum("ij,ij->i", a[kept] - centre, np.cross(b[kept] - centre, c[kept] - centre))) < 0:

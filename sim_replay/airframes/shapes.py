@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from sim_replay.airframes.mesh import Mesh, Part, Parts, both_sides, loft, merge, moved
 
 Array = NDArray[np.float64]
-CHORD_POINTS = 8
+CHORD_POINTS = 8  # of one side of a wing's aerofoil
+SMALL_POINTS = 4  # of one side of an aerial's or a store's fin
 DISC_POINTS = 24
 
 
@@ -119,12 +120,13 @@ def lifting_surface(
     naca: str = "0012",
     part: Part = Part.WING,
     leading_edge: Part | None = None,
+    points: int = CHORD_POINTS,
 ) -> Mesh:
     """A wing, tailplane or fin of one NACA four-digit aerofoil.
 
     Sections, root to tip: (x, y, z of the leading edge, chord[, twist in degrees, nose up]), metres; the chord runs
-    along -x. Washout is a twist that falls towards the tip. `leading_edge` paints the foremost 5 % of the
-    chord, as a de-icing boot does.
+    along -x. Washout is a twist that falls towards the tip. `leading_edge` paints the foremost 5 % of the chord, as a
+    de-icing boot does; `points` are those of one side of the aerofoil.
     """
     table = np.array([(*row, 0.0)[:5] for row in sections], dtype=np.float64)
     span = np.gradient(table[:, 1:3], axis=0)
@@ -132,7 +134,7 @@ def lifting_surface(
     up = np.stack([np.zeros(len(table)), span[:, 1], -span[:, 0]], axis=1)
     # A fin's sections stand upright; its "up" is merely one of two sides.
     up *= np.where(up[:, 2:] > 1e-9, -1.0, 1.0)
-    profile = naca_four_digit(naca)
+    profile = naca_four_digit(naca, points)
     chord, twist = table[:, 3][:, None], np.radians(table[:, 4])[:, None]
     # Twist turns about the quarter chord.
     aft, above = profile[:, 0] - 0.25, profile[:, 1]
@@ -145,11 +147,11 @@ def lifting_surface(
     )
     parts = np.full((len(table) - 1, len(profile)), part, np.uint8)
     if leading_edge is not None:
-        parts[:, CHORD_POINTS - 2 : CHORD_POINTS] = leading_edge
+        parts[:, points - 2 : points] = leading_edge
     return loft(rings, parts, (part, part))
 
 
-def ellipsoid(centre_m: ArrayLike, semi_axes_m: ArrayLike, part: Part, rings: int = 9, points: int = 12) -> Mesh:
+def ellipsoid(centre_m: ArrayLike, semi_axes_m: ArrayLike, part: Part, rings: int = 8, points: int = 10) -> Mesh:
     """An ellipsoid along the body axes: sensor balls, canopies, spinners, fairings."""
     latitude = np.linspace(-0.5 * np.pi + 0.05, 0.5 * np.pi - 0.05, rings)[:, None]
     longitude = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)[None, :]
@@ -166,8 +168,8 @@ def ellipsoid(centre_m: ArrayLike, semi_axes_m: ArrayLike, part: Part, rings: in
 
 def wheel(centre_m: ArrayLike, radius_m: float, width_m: float) -> Mesh:
     """A tyre that rolls about y."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    rim = np.stack([np.cos(angle), np.zeros(12), np.sin(angle)], axis=-1)
+    angle = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
+    rim = np.stack([np.cos(angle), np.zeros(10), np.sin(angle)], axis=-1)
     profile = [(-0.5, 0.78), (-0.3, 1.0), (0.3, 1.0), (0.5, 0.78)]
     rings = [radius_m * r * rim + np.array([0.0, width_m * y, 0.0]) for y, r in profile]
     return loft(np.asarray(centre_m) + np.stack(rings), Part.TYRE)
@@ -211,7 +213,7 @@ def propeller(
     stations = [(way * spinner_m * along, 2 * radius * r, 2 * radius * r, 0.0) for along, r in profile]
     if pusher:
         stations.reverse()
-    cone = fuselage(stations, 2.0, spinner, rings=7, points=12)
+    cone = fuselage(stations, 2.0, spinner, rings=5, points=10)
     return merge([moved(cone, hub), propeller_disc(hub, radius_m)])
 
 
@@ -241,13 +243,15 @@ def store(centre_m: ArrayLike, length_m: float, width_m: float, rack_z_m: float,
     if not fins:
         shape = [(0.5, 0.05), (0.4, 0.55), (0.2, 0.95), (-0.1, 1.0), (-0.35, 0.6), (-0.5, 0.08)]
     stations = [(x + length_m * along, width_m * r, width_m * r, z) for along, r in shape]
-    parts = [fuselage(stations, 2.0, Part.SENSOR, y, rings=9, points=10)]
+    parts = [fuselage(stations, 2.0, Part.SENSOR, y, rings=7, points=8)]
     foot = (x + 0.2 * length_m, y, z - 0.4 * width_m, 0.42 * length_m)
-    parts.append(lifting_surface([foot, (x + 0.25 * length_m, y, rack_z_m, 0.5 * length_m)], "0010"))
+    parts.append(
+        lifting_surface([foot, (x + 0.25 * length_m, y, rack_z_m, 0.5 * length_m)], "0010", points=SMALL_POINTS)
+    )
     for side, up in ((1, 1), (1, -1), (-1, 1), (-1, -1)) if fins else ():
         root = (x - 0.32 * length_m, y + 0.2 * side * width_m, z + 0.2 * up * width_m, 0.17 * length_m)
         tip = (x - 0.4 * length_m, y + 0.75 * side * width_m, z + 0.75 * up * width_m, 0.1 * length_m)
-        parts.append(lifting_surface([root, tip], "0008", Part.SENSOR))
+        parts.append(lifting_surface([root, tip], "0008", Part.SENSOR, points=SMALL_POINTS))
     return merge(parts)
 
 
@@ -263,7 +267,8 @@ def sensor_ball(centre_m: ArrayLike, radius_m: float) -> Mesh:
     x, y, z = np.asarray(centre_m, dtype=np.float64)
     ball = ellipsoid([x, y, z], [radius_m] * 3, Part.SENSOR)
     yoke = strut([x, y, z - 1.3 * radius_m], [x, y, z - 0.2 * radius_m], 1.5 * radius_m, Part.SENSOR, 1.7 * radius_m)
-    window = ellipsoid([x + 0.7 * radius_m, y, z + 0.1 * radius_m], np.array([0.4, 0.45, 0.45]) * radius_m, Part.GLASS)
+    eye_m = [x + 0.7 * radius_m, y, z + 0.1 * radius_m]
+    window = ellipsoid(eye_m, np.array([0.4, 0.45, 0.45]) * radius_m, Part.GLASS, 6, 8)
     return merge([ball, yoke, window])
 
 
@@ -272,7 +277,7 @@ def blade_antenna(foot_m: ArrayLike, height_m: float, above: bool = True) -> Mes
     x, y, z = np.asarray(foot_m, dtype=np.float64)
     tip_z = z - height_m if above else z + height_m
     sections = [(x, y, z, 0.9 * height_m), (x - 0.5 * height_m, y, tip_z, 0.45 * height_m)]
-    return lifting_surface(sections, "0012", Part.FUSELAGE)
+    return lifting_surface(sections, "0012", Part.FUSELAGE, points=SMALL_POINTS)
 
 
 def stopped_rotor(hub_m: ArrayLike, radius_m: float, turn_rad: float) -> Mesh:
