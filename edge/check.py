@@ -28,5 +28,6 @@ def check(file: ConfigFile) -> list[str]:
         f"camera   {camera.name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + ("" if opened else "; it does not answer now and will be tried again"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
+        f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",
         f"mavlink  {', '.join(config.mavlink.endpoints) if config.mavlink.enabled else 'off'}",
     ]
