@@ -74,7 +74,15 @@ class Dataset:
         A dataset without any model gets diameters from its boxes (or masks): the largest side at the target's depth
         over all its pictures. That is never above the true diameter by more than a pixel's worth.
         """
-        return read_models(self.root, self.scenes[0].models) or _diameters_from_boxes(self.scenes)
+        frames = self.scenes[0].models
+        models = read_models(self.root, frames)
+        if models:
+            return models
+        return {
+            object_id: Model(frames.common.diameter_m or looks_m)
+            for object_id, looks_m in _diameters_from_boxes(self.scenes).items()
+            if frames.common.diameter_m or looks_m
+        }
 
     def frames(self) -> Iterator[DatasetFrame]:
         """Every frame that has a picture, by scene and image id; of a test split those in test_targets_bop19.json.
@@ -220,7 +228,8 @@ def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame,
     )
 
 
-def _diameters_from_boxes(scenes: Sequence[BopScene]) -> dict[int, Model]:
+def _diameters_from_boxes(scenes: Sequence[BopScene]) -> dict[int, float]:
+    """By object id, metres; 0 for one that no box or mask is known of."""
     largest: dict[int, float] = {}
     bare: list[tuple[BopScene, BopFrame, int]] = []
     for scene in scenes:
@@ -234,7 +243,7 @@ def _diameters_from_boxes(scenes: Sequence[BopScene]) -> dict[int, Model]:
     for scene, frame, index in bare[:: max(1, len(bare) // _MASKS_LOOKED_AT)]:
         target = _with_box(scene, frame, index)
         _widen(largest, target, target.box_visible_xyxy_px, frame.K)
-    return {object_id: Model(size_m) for object_id, size_m in largest.items() if size_m > 0}
+    return largest
 
 
 def _widen(largest: dict[int, float], target: BopTarget, box_xyxy_px: Array | None, K: Array) -> None:

@@ -157,11 +157,13 @@ def _camera(index: Path, key: str, entry: object) -> tuple[Array, tuple[float, .
     for name, size in (("cam_K", 9), (DISTORTION_KEY, 5)):
         try:
             numbers = np.array(entry.get(name, ()), dtype=np.float64).reshape(-1)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             numbers = np.full(1, np.nan)
         if (name in entry and numbers.size != size) or not np.isfinite(numbers).all():
             raise InputError(f"{index}: {name!r} of {key!r} is not {size} finite numbers")
         values.append(numbers)
+    if min(values[0][0], values[0][4]) <= 0:
+        raise InputError(f"{index}: 'cam_K' of {key!r} has no positive focal lengths")
     return values[0].reshape(3, 3), tuple(float(value) for value in values[1])
 
 

@@ -35,6 +35,11 @@ def load_object(path: Path, optional: bool = False) -> dict[str, Any]:
     return value
 
 
+def by_number(path: Path, entries: dict[str, Any]) -> dict[int, Any]:
+    """The entries by the numbers that their keys are, '000003' or '3'. Raises BopError."""
+    return {number_key(path, key): entry for key, entry in entries.items()}
+
+
 def number_key(path: Path, key: str) -> int:
     """The number that a picture or model goes by. Raises BopError."""
     if not key.isdecimal():
@@ -48,7 +53,7 @@ def matrix(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) 
         raise BopError(f"{path}: {key!r} has no {name!r}")
     try:
         values = np.asarray(entry[name], dtype=np.float64).reshape(shape)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise BopError(f"{path}: {name!r} of {key!r} is not {int(np.prod(shape))} numbers") from error
     if not np.isfinite(values).all():
         raise BopError(f"{path}: {name!r} of {key!r} is not finite")
@@ -74,7 +79,8 @@ def length_m(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]
 
 
 def integer(path: Path, key: str, entry: Any, name: str) -> int:
-    """A whole number. Raises BopError."""
-    if not isinstance(entry, dict) or not isinstance(entry.get(name), int):
-        raise BopError(f"{path}: {key!r} has no integer {name!r}")
-    return int(entry[name])
+    """A whole number, also where it is written as 5.0. Raises BopError."""
+    value = entry.get(name) if isinstance(entry, dict) else None
+    if isinstance(value, int) or (isinstance(value, float) and value.is_integer()):
+        return int(value)
+    raise BopError(f"{path}: {key!r} has no integer {name!r}")

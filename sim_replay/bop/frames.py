@@ -24,6 +24,8 @@ def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, 
     """One picture's record; `poses` and `info` may be None. Targets' poses are of their body axes. Raises BopError."""
     key = str(image_id)
     K = matrix(source.camera, key, camera, "cam_K", (3, 3))
+    if min(K[0, 0], K[1, 1]) <= 0:
+        raise BopError(f"{source.camera}: 'cam_K' of {key!r} has no positive focal lengths")
     has_world = "cam_R_w2c" in camera and "cam_t_w2c" in camera
     return BopFrame(
         image_id=image_id,

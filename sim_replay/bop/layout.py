@@ -26,7 +26,10 @@ def find_scenes(path: Path) -> tuple[BopScene, ...]:
     """
     if not path.is_dir():
         raise BopError(f"{path} is not a folder")
-    scenes = [scene for folder in _walk(path, _DEEPEST) for scene in _scenes_of(folder)]
+    try:
+        scenes = [scene for folder in _walk(path, _DEEPEST) for scene in _scenes_of(folder)]
+    except OSError as error:
+        raise BopError(f"{error.filename}: cannot be listed: {error.strerror}") from error
     if not scenes:
         raise BopError(f"{path}: no BOP scene (scene_camera.json or KEY.camera.json) in it or below")
     return _numbered(scenes)

@@ -96,7 +96,7 @@ def _frame(path: Path, prefix: str, table: dict[str, Any], default: ModelFrame) 
         if name in table:
             try:
                 value = np.array(table[name], dtype=np.float64)
-            except (ValueError, TypeError):
+            except (ValueError, TypeError, OverflowError):
                 value = np.zeros(0)
             if value.shape != shape or not np.isfinite(value).all():
                 what = " by ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"

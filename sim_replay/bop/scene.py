@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.bop.fields import load_json, load_object, matrix, number_key
+from sim_replay.bop.fields import by_number, load_json, load_object, matrix
 from sim_replay.bop.frames import Source, frame_of
 from sim_replay.bop.model_frame import ModelFrames
 from sim_replay.bop.records import DISTORTION_KEY, BopError, BopFrame
@@ -40,14 +40,13 @@ class BopScene:
     @cached_property
     def frames(self) -> tuple[BopFrame, ...]:
         """By growing image id. Raises BopError, naming file and key."""
-        poses = load_object(self.folder / "scene_gt.json", optional=True)
-        info = load_object(self.folder / "scene_gt_info.json", optional=True)
+        gt, gt_info = self.folder / "scene_gt.json", self.folder / "scene_gt_info.json"
+        poses, info = (by_number(path, load_object(path, optional=True)) for path in (gt, gt_info))
         camera_file, cameras = self._cameras(poses)
-        source = Source(camera_file, self.folder / "scene_gt.json", self.folder / "scene_gt_info.json")
-        numbered = sorted((number_key(source.camera, key), key) for key in cameras)
+        source = Source(camera_file, gt, gt_info)
         return tuple(
-            frame_of(source, image_id, cameras[key], poses.get(key), info.get(key), self.models)
-            for image_id, key in numbered
+            frame_of(source, image_id, cameras[image_id], poses.get(image_id), info.get(image_id), self.models)
+            for image_id in sorted(cameras)
         )
 
     @property
@@ -77,11 +76,11 @@ class BopScene:
         """The mask [H, W] of a target's whole silhouette inside the picture, or None. Raises BopError."""
         return self._mask("mask", frame, target_index)
 
-    def _cameras(self, poses: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+    def _cameras(self, poses: dict[int, Any]) -> tuple[Path, dict[int, Any]]:
         path = self.folder / "scene_camera.json"
         shared = None if self.root is None else self.root / "camera.json"
         if path.is_file() or shared is None or not shared.is_file() or not poses:
-            return path, load_object(path)
+            return path, by_number(path, load_object(path))
         entry = load_object(shared)
         fx, fy, cx, cy = (float(matrix(shared, "camera", entry, name, ())) for name in ("fx", "fy", "cx", "cy"))
         camera = {"cam_K": [fx, 0, cx, 0, fy, cy, 0, 0, 1]} | {k: entry[k] for k in (DISTORTION_KEY,) if k in entry}

@@ -158,8 +158,9 @@ def test_without_any_model_the_diameter_comes_from_how_large_targets_look(tmp_pa
     assert dataset.split == "train"
     assert dataset.models[1].diameter_m == pytest.approx(30 * 200.0 / 1200.0)  # 30 px at 200 m
     assert read_scene_truth(scene).truths[0].diameter_m == pytest.approx(5.0)
-    (tmp_path / "model_frame.toml").write_text("[objects.1]\ndiameter_m = 6.5\n")
-    assert open_dataset(tmp_path, "train").models[1].diameter_m == 6.5
+    for text in ("diameter_m = 6.5\n", "[objects.1]\ndiameter_m = 6.5\n"):
+        (tmp_path / "model_frame.toml").write_text(text)
+        assert open_dataset(tmp_path, "train").models[1].diameter_m == 6.5
 
 
 def test_a_scene_without_its_own_cameras_takes_the_datasets(root: Path) -> None:
@@ -201,6 +202,13 @@ def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> 
     write_json(root / "test_targets_bop19.json", [{"scene_id": 2, "obj_id": 1}])
     with pytest.raises(BopError, match=r"test_targets_bop19\.json: 'entry 0' has no integer 'im_id'"):
         list(open_dataset(root).frames())
+
+
+def test_indices_may_write_the_same_number_in_different_ways(root: Path) -> None:
+    pose = {"obj_id": 1.0, "cam_R_m2c": UNIT, "cam_t_m2c": T_MM}
+    write_json(root / "test" / "000048" / "scene_gt.json", {"000005": [pose]})
+    (frame,) = open_dataset(root / "test" / "000048").frames()
+    assert [target.object_id for target in frame.targets] == [1]
 
 
 def test_scenes_named_by_words_are_counted(tmp_path: Path) -> None:
