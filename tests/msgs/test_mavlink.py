@@ -188,9 +188,8 @@ except mavlink.MAVError:
 
 
 HEARTBEAT = mavlink.dialect.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
-JUNK = st.one_of(
-    st.binary(max_size=40), st.sampled_from([b"\xfd", b"\xfe", b"\xfd\xff\x00", b"\xfe\xff", b"\xfd\x00\x02"])
-)
+TRUNCATED = (b"\xfd", b"\xfe", b"\xfd\xff\x00", b"\xfe\xff", b"\xfd\x00\x02")
+JUNK = st.one_of(st.binary(max_size=40), st.sampled_from(TRUNCATED))
 
 
 def frames_with(junk: list[bytes]) -> bytes:
