@@ -39,7 +39,14 @@ def register(commands: argparse._SubParsersAction) -> None:
         "--dataset", type=Path, metavar="DIR", help="BOP dataset, split or scene; default: the bundled scene 'crossing'"
     )
     evaluate.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
-    evaluate.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th picture (default: all)")
+    evaluate.add_argument("--every", type=int, default=1, metavar="N", help="score every N-th picture (default: all)")
+    evaluate.add_argument(
+        "--mode",
+        choices=("frames", "track"),
+        default="frames",
+        help="frames: each picture by itself; track: whole sequences through the daemon's tracker, which knows the "
+        "camera's attitude where the scene has it (default %(default)s)",
+    )
     evaluate.add_argument(
         "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="folder to write to (default %(default)s)"
     )
@@ -67,7 +74,9 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from sim_replay.evaluation.table import score_table
     from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
-    request = DatasetRequest(arguments.model, arguments.results, arguments.dataset, arguments.split, arguments.every)
+    request = DatasetRequest(
+        arguments.model, arguments.results, arguments.dataset, arguments.split, arguments.every, arguments.mode
+    )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     errors = Console(stderr=True)
     with Progress(*columns, console=errors, transient=True, disable=not sys.stderr.isatty()) as progress:

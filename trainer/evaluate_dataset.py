@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from msgs.contract import CONTRACT_VERSION, ModelContract
 from sim_replay.bop import Model as TargetModel
@@ -17,6 +17,7 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation.bop_results import file_answers
 from sim_replay.evaluation.files import write_files
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
+from sim_replay.evaluation.tracked import tracker_answers
 from sim_replay.offline import (
     DEFAULT_THREADS,
     SHIPPED_MODEL,
@@ -35,7 +36,8 @@ class DatasetRequest(NamedTuple):
     results: Path | None = None  # BOP results file of any method
     dataset: Path | None = None  # None: the bundled scene
     split: str | None = None
-    every: int = 1  # take every n-th picture
+    every: int = 1  # score every n-th picture
+    mode: Literal["frames", "track"] = "frames"  # each picture alone, or sequences through the tracker
 
 
 class Evaluation(NamedTuple):
@@ -71,29 +73,37 @@ def evaluate_dataset(
         raise ConfigError(f"--every {request.every}: must be at least 1")
     try:
         dataset = open_dataset(request.dataset or BUNDLED_SEQUENCE, request.split)
-        pictures = list(dataset.frames())[:: request.every]
+        pictures = list(dataset.frames())
+        if request.mode == "frames":  # a tracker must see them all
+            pictures = pictures[:: request.every]
         if not pictures:
             raise ConfigError(f"{request.dataset}: holds no picture to evaluate on")
         method, answer = _subject(request, dataset)
         on_start(len(pictures))
         judged = judge_frames(pictures, dataset.models, answer, on_frame)
+        if request.mode == "track":
+            judged = judged[:: request.every]
     except InputError as error:
         raise ConfigError(str(error)) from error
     name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
-    return Evaluation(score_of(dataset, method, judged), name, dataset, judged, dataset.models)
+    score = {"mode": request.mode, **score_of(dataset, method, judged)}
+    return Evaluation(score, name, dataset, judged, dataset.models)
 
 
 def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any], Answerer]:
     """How the score names what is judged, and what answers for it."""
     if request.results is not None:
+        if request.mode == "track":
+            raise ConfigError("--mode track: runs a model; a results file has its poses already")
         return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
+    answers = tracker_answers if request.mode == "track" else estimator_answers
     path = request.model or SHIPPED_MODEL
     if path.suffix == ".onnx":
         model = load_model(path, DEFAULT_THREADS)
-        return method_of(model), estimator_answers(model)
+        return method_of(model), answers(model)
     with tempfile.TemporaryDirectory() as folder:
         model = load_model(export_for_now(path, Path(folder)), DEFAULT_THREADS)
-    return method_of(model) | {"file": path.name}, estimator_answers(model)
+    return method_of(model) | {"file": path.name}, answers(model)
 
 
 def export_for_now(checkpoint: Path, folder: Path) -> Path:

@@ -23,7 +23,14 @@ _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "ADD-0.5d": lambda group: _text(group["add_0_5d"], "{:.1%}"),
     "ADD-0.1d": lambda group: _text(group["add_0_1d"], "{:.1%}"),
 }
-_AIRFRAME_COLUMNS = ("targets", "found", "E_r mean", "E_t mean", "Pose@10°/5 %", "ADD-0.1d")
+_AIRFRAME_COLUMNS = {
+    "targets": "targets",
+    "found": "found",
+    "E_r mean": "E_r",
+    "E_t mean": "E_t",
+    "Pose@10°/5 %": "Pose",
+    "ADD-0.1d": "ADD-0.1d",
+}
 
 
 def score_table(score: dict[str, Any]) -> Group:
@@ -41,8 +48,8 @@ def score_table(score: dict[str, Any]) -> Group:
         table.add_row(name, *(cell(group) for group in groups.values()))
     airframes = Table()
     airframes.add_column("airframe", no_wrap=True)
-    for name in _AIRFRAME_COLUMNS:
-        airframes.add_column(name, justify="right")
+    for header in _AIRFRAME_COLUMNS.values():
+        airframes.add_column(header, justify="right", no_wrap=True)
     for name, group in score["by_airframe"].items():
         airframes.add_row(name, *(_ROWS[column](group) for column in _AIRFRAME_COLUMNS))
     return Group(table, airframes)

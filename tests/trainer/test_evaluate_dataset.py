@@ -189,6 +189,7 @@ def test_a_checkpoint_scores_as_its_exported_file_does(dataset: Path, tmp_path: 
         (["--model", "nowhere.pt", "--dataset", "DATASET"], ["nowhere.pt"]),
         (["--results", "nowhere.csv", "--dataset", "DATASET"], ["nowhere.csv"]),
         (["--dataset", "DATASET", "--split", "val"], ["'val'"]),
+        (["--results", "nowhere.csv", "--mode", "track", "--dataset", "DATASET"], ["--mode track"]),
         (["--windows", "64", "--dataset", "DATASET"], ["--dataset", "--windows"]),
     ],
 )

@@ -1,0 +1,118 @@
+"""A model on whole sequences: the daemon's estimator and tracker over the pictures in their order, without its clock.
+
+A scene with sequence.toml is of this project's making: its fps counts, and its world is local NED, so the tracker
+knows the camera's attitude and place from cam_R_w2c, as exactly as the files have it. Any other scene is taken at
+DEFAULT_FPS, with nothing known of the own ship.
+"""
+
+from __future__ import annotations
+
+import time
+import tomllib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edge.config import EstimatorSettings, MavlinkSettings
+from edge.errors import InputError
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import Model
+from edge.links.outgoing import sendable
+from edge.tracking.tracker import Tracker
+from edge.types import Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track, TrackState
+from sim_replay.bop import BopFrame, BopScene
+from sim_replay.datasets import DatasetFrame
+from sim_replay.evaluation.judge import Answer, Answerer
+from sim_replay.score import TargetPose
+
+DEFAULT_FPS = 30.0
+FIRST_FRAME_NS = 1_000_000_000
+_SETTINGS = EstimatorSettings()
+_MAX_AGE_MS = MavlinkSettings().max_age_ms
+_CAMERA_ITSELF = Mount(np.eye(3), np.zeros(3))  # the own ship that cam_R_w2c tells of
+
+
+@dataclass
+class _Sequence:
+    """One scene as it is flown through."""
+
+    scene: BopScene
+    fps: float
+    in_ned: bool
+    places: dict[int, tuple[int, BopFrame]]  # by image id: its place in the sequence
+    tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
+    since_acquire: int = 0
+
+    @classmethod
+    def of(cls, scene: BopScene) -> _Sequence:
+        """Raises InputError on a sequence.toml without a usable fps."""
+        places = {frame.image_id: (k, frame) for k, frame in enumerate(scene.frames)}
+        path = scene.folder / "sequence.toml"
+        if not path.is_file():
+            return cls(scene, DEFAULT_FPS, False, places)
+        try:
+            fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: 'fps' is not a number that can be read") from error
+        if not (np.isfinite(fps) and fps > 0):
+            raise InputError(f"{path}: 'fps' is not above zero")
+        return cls(scene, fps, True, places)
+
+    def capture_ns(self, image_id: int) -> int:
+        return FIRST_FRAME_NS + round(self.places[image_id][0] * 1e9 / self.fps)
+
+    def own_ship(self, image_id: int) -> OwnShip | None:
+        """The camera as a vehicle of its own: nose along the optical axes, mount nil."""
+        frame = self.places[image_id][1]
+        if not self.in_ned or frame.R_cam_world is None or frame.t_cam_world_m is None:
+            return None
+        R_ned_cam = frame.R_cam_world.T
+        return OwnShip(self.capture_ns(image_id), R_ned_cam, -R_ned_cam @ frame.t_cam_world_m, None, None)
+
+
+def tracker_answers(model: Model) -> Answerer:
+    """What the daemon would send of each picture if it flew through its scene; pictures must come in their order.
+
+    Raises InputError if the model does not run.
+    """
+    estimator = Estimator(model, _SETTINGS.max_targets)
+    model.warm_up()
+    current: list[_Sequence] = []
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        if not current or current[-1].scene is not picture.scene:
+            current[:] = [_Sequence.of(picture.scene)]
+        sequence = current[-1]
+        image_bgr = picture.undistorted_bgr()
+        capture_ns = sequence.capture_ns(picture.image_id)
+        frame = Frame(FrameMeta(index, capture_ns, capture_ns), image_bgr, picture.K)
+        size_wh = (image_bgr.shape[1], image_bgr.shape[0])
+        own_ship = sequence.own_ship(picture.image_id)
+        started_ns = time.monotonic_ns()
+        expected = sequence.tracker.predict(capture_ns, own_ship, picture.K, size_wh)
+        estimates = _estimate(estimator, sequence, frame, expected)
+        tracks = sequence.tracker.update(capture_ns, estimates, own_ship, picture.K, size_wh)
+        time_ms = (time.monotonic_ns() - started_ns) * 1e-6
+        report = Report(frame.meta, picture.K, size_wh, tracks, own_ship, model.sha256)
+        told = sendable(report, capture_ns, _MAX_AGE_MS)
+        poses = (
+            TargetPose(index, t.R_cam_target, t.t_cam_target_m, score=t.score, covariance=t.covariance) for t in told
+        )
+        return Answer(tuple(poses), time_ms)
+
+    return answer
+
+
+def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
+    """Windows around what is expected; the whole frame where nothing is held, and now and then for more."""
+    found: list[Estimate] = []
+    if expected and estimator.has_track_stage:
+        seen = estimator.track(frame, [track.box_xyxy_px for track in expected])
+        found = [estimate for estimate in seen if estimate is not None]
+    sequence.since_acquire += 1
+    nothing_held = all(track.state is TrackState.COASTING for track in expected)
+    due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
+    if nothing_held or due or not estimator.has_track_stage:
+        found += estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found])
+        sequence.since_acquire = 0
+    return found

@@ -1,0 +1,101 @@
+"""Sequences through the daemon's tracker: what is withheld, what is held, and what own attitude is good for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edge.errors import InputError
+from sim_replay import metrics
+from sim_replay.datasets import open_dataset
+from sim_replay.evaluation.judge import JudgedFrame, judge_frames
+from sim_replay.evaluation.tracked import tracker_answers
+from sim_replay.offline import load_model
+
+FRAMES = 14
+FOCAL_PX, CX_PX, CY_PX = 2400.0, 959.5, 539.5
+SPOT_Z_M, SPOT_SIZE_M = 200.0, 12.0  # as the network of the dark_spot_model fixture says of every spot
+K = np.array([[FOCAL_PX, 0, CX_PX], [0, FOCAL_PX, CY_PX], [0, 0, 1]])
+
+
+def write_scene(folder: Path, yaws_deg: list[float]) -> None:
+    """A spot that stands still before a camera that stands at (10, 20, -30) in ned and turns about the vertical."""
+    (folder / "rgb").mkdir(parents=True)
+    t_ned_cam_m = np.array([10.0, 20.0, -30.0])
+    t_ned_spot_m = t_ned_cam_m + np.array([SPOT_Z_M, 0.0, 0.0])
+    cameras, poses = {}, {}
+    for image, yaw_deg in enumerate(yaws_deg):
+        R_ned_cam = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix() @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+        t_m = R_ned_cam.T @ (t_ned_spot_m - t_ned_cam_m)
+        u, v, _ = K @ t_m / t_m[2]
+        picture = np.full((1080, 1920, 3), 240, np.uint8)
+        cv2.ellipse(picture, (round(u), round(v)), (70, 14), 0, 0, 360, (90, 90, 90), -1, cv2.LINE_AA)
+        cv2.circle(picture, (round(u), round(v)), 2, (5, 5, 5), -1, cv2.LINE_AA)
+        cv2.imwrite(str(folder / "rgb" / f"{image:06d}.png"), picture)
+        cameras[str(image)] = {
+            "cam_K": K.ravel().tolist(),
+            "cam_R_w2c": R_ned_cam.T.ravel().tolist(),
+            "cam_t_w2c": (-1e3 * R_ned_cam.T @ t_ned_cam_m).tolist(),
+        }
+        poses[str(image)] = [{"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": (1e3 * t_m).tolist()}]
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    (folder / "scene_gt.json").write_text(json.dumps(poses))
+    models = folder.parents[1] / "models"
+    models.mkdir(exist_ok=True)
+    (models / "models_info.json").write_text(json.dumps({"1": {"diameter": SPOT_SIZE_M * 1e3}}))
+
+
+def flown(dataset_folder: Path, model: Path) -> list[JudgedFrame]:
+    dataset = open_dataset(dataset_folder)
+    answers = tracker_answers(load_model(model, threads=1))
+    return judge_frames(list(dataset.frames()), dataset.models, answers)
+
+
+def told(results: list[JudgedFrame]) -> list[bool]:
+    return [frame.matches[0].estimate is not None for frame in results]
+
+
+def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, dark_spot_model: Path) -> None:
+    for scene in ("000000", "000001"):
+        write_scene(tmp_path / "data" / "test" / scene, [0.5] * 5)
+    assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, True, True, True] * 2
+
+
+def test_own_attitude_takes_the_cameras_shaking_out_of_the_track(tmp_path: Path, dark_spot_model: Path) -> None:
+    """The camera swings by 4 degrees between frames; a sequence.toml says that the scene's world is ned."""
+    scene = tmp_path / "data" / "test" / "000000"
+    write_scene(scene, [2.0 * (-1) ** k for k in range(FRAMES)])
+
+    def worst_deg() -> float:
+        matches = [frame.matches[0] for frame in flown(tmp_path / "data", dark_spot_model)[2:]]
+        assert all(match.estimate is not None for match in matches)
+        return max(
+            float(metrics.bearing_error_deg(match.estimate.t_cam_target_m, match.truth.t_cam_target_m))
+            for match in matches
+            if match.estimate is not None
+        )
+
+    (scene / "sequence.toml").write_text("fps = 30.0\n")
+    assert worst_deg() < 0.1
+    (scene / "sequence.toml").unlink()
+    blind = flown(tmp_path / "data", dark_spot_model)
+    errors_deg = [
+        float(metrics.bearing_error_deg(pose.t_cam_target_m, frame.matches[0].truth.t_cam_target_m))
+        for frame in blind
+        for pose in (*frame.false_poses, *(m.estimate for m in frame.matches if m.estimate is not None))
+    ]
+    assert not all(told(blind)[2:]) or max(errors_deg) > 0.1
+
+
+@pytest.mark.parametrize("text", ["", "fps = 0\n", "fps = 'fast'\n", "fps = "])
+def test_a_sequence_without_a_frame_rate_is_named(tmp_path: Path, dark_spot_model: Path, text: str) -> None:
+    scene = tmp_path / "data" / "test" / "000000"
+    write_scene(scene, [0.0])
+    (scene / "sequence.toml").write_text(text)
+    with pytest.raises(InputError, match=r"sequence\.toml: 'fps'"):
+        flown(tmp_path / "data", dark_spot_model)
