@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 ASPECTS = 96  # attitudes that stand for all, where the mean size of an airframe is wanted
 PRINCIPAL_SIGMA_PX = 12.0
-LENS_LIMIT = 1.7  # of the scatter, in sigmas
+LENS_LIMITS = (-2.5, 1.7)  # of the scatter, in sigmas
 LONGEST_SCATTER = 0.25  # of the logarithm of the longest lens on board
 
 
@@ -241,7 +241,7 @@ def _lenses(
     low, high = preset.lens.focal_px
     # Not every aircraft carries the longest lens there is; one limit for all would pile sequences up on it.
     longest = np.maximum(high * np.exp(-LONGEST_SCATTER * rng.random(len(frames))), low)
-    scatter = np.exp(preset.lens.spread * np.clip(rng.normal(size=len(frames)), -LENS_LIMIT, LENS_LIMIT))
+    scatter = np.exp(preset.lens.spread * np.clip(rng.normal(size=len(frames)), *LENS_LIMITS))
     area = np.array([mean_box_area_m2(name) for name in airframes]) / np.square(ranges_m)  # at focal length 1
     picture = float(preset.size_wh_px[0] * preset.size_wh_px[1])
     weight = np.asarray(frames) / sum(frames)

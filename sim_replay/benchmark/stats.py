@@ -196,8 +196,12 @@ def _rows(s: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     if v := s["visible_fraction"]:
         hidden = f"{100 * s['partly_hidden_share']:.1f} % of targets below 0.98"
         yield "visible fraction", f"mean {v['mean']:.3f}; {hidden}", "not given"
-    for split, names in s["airframes"].items():
-        yield f"airframes, {split}", f"{len(names)}: " + ", ".join(names), "not given"
+    yield (
+        "airframes by split",
+        ", ".join(f"{split} {len(names)}" for split, names in s["airframes"].items()),
+        "not given",
+    )
+    yield "airframes", ", ".join(sorted({name for names in s["airframes"].values() for name in names})), "not given"
     yield "airframe-flights in two splits", str(s["airframe_flights_in_two_splits"]), "not given"
 
 

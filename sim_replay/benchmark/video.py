@@ -45,7 +45,8 @@ def _encode(images_bgr: Iterator[Image], target: io.BytesIO, fps: float, kbps: i
             if count == 0:
                 stream.height, stream.width = image.shape[:2]
             # OpenCV's conversion both ways: libswscale's quick one tints every colour by a few levels.
-            frame = av.VideoFrame.from_ndarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420), format="yuv420p")
+            planes = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420), np.uint8)
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
             frame.pts, frame.time_base = count, 1 / rate
             container.mux(stream.encode(frame))
             count += 1
