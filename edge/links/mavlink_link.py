@@ -26,7 +26,7 @@ from edge.types import CameraInfo, Report
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
-RECEIVED_A_TURN = 256  # so that a flood cannot keep reports from going out
+HEARING_A_TURN_NS = 10_000_000  # for each endpoint, so that a flood cannot keep reports from going out
 EVENTS_WAITING = 64
 STOP_TIMEOUT_S = 5.0
 
@@ -187,10 +187,9 @@ class MavlinkLink:
             log.warning("mavlink: not sent: %s", error)
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
-        for _ in range(RECEIVED_A_TURN):
-            received = endpoint.transport.receive()
-            if received is None:
-                return
+        now_ns = time.monotonic_ns()
+        until_ns = now_ns + HEARING_A_TURN_NS
+        while now_ns < until_ns and (received := endpoint.transport.receive()) is not None:
             now_ns = time.monotonic_ns()
             messages = endpoint.believed(received, now_ns)
             for reply in self._station.take(messages, number, now_ns):

@@ -169,6 +169,8 @@ def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], 
     by_gimbal = message.get_msgId() == GIMBAL_ATTITUDE and component in GIMBAL_COMPONENTS
     if component != AUTOPILOT_COMPONENT and not by_gimbal:
         return "not_our_autopilot"
-    if message.get_msgId() == COMMAND_ACK and message.target_system not in (0, vehicle_id):
-        return "not_for_us"
+    if message.get_msgId() == COMMAND_ACK:
+        # To another of the vehicle's components, it answers a question that was not ours; zeros leave it open.
+        elsewhere = message.target_component != 0 and not our_components(message.target_component)
+        return "not_for_us" if message.target_system not in (0, vehicle_id) or elsewhere else None
     return None

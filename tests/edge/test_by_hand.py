@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,7 +72,7 @@ def test_stopping_drops_the_target_and_drawing_a_box_takes_it_up_again(tmp_path:
     np.testing.assert_allclose(np.array(center) * SIZE_WH, np.array(CENTER_PX) + 0.5, atol=10.0)
 
 
-def status_in(peer: Peer, tracking_status: int):  # type: ignore[no-untyped-def]
+def status_in(peer: Peer, tracking_status: int) -> Any:
     return peer.until(
         lambda m: m.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and m.tracking_status == tracking_status,
         f"tracking status {tracking_status}",

@@ -171,3 +171,12 @@ def test_hosts_that_are_not_allowed_are_not_heard() -> None:
         link.set_health(HealthState.TRACKING)
         peer.settle(lambda: link.counters().get("refused_host", 0) > 0, "refusal")
         assert alone(peer.wire)
+
+
+def test_an_answer_to_another_component_is_not_taken_for_ours() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for system, component in ((SYSTEM_ID, 195), (255, 190)):
+            peer.send(dialect.MAVLink_command_ack_message(511, dialect.MAV_RESULT_DENIED, 0, 0, system, component))
+        peer.settle(lambda: link.counters().get("refused_not_for_us") == 2, "refusal")
+        assert link.counters()["rates_refused"] == 0

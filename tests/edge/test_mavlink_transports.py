@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import select
@@ -26,7 +27,7 @@ from edge.links.transports.medium import PENDING_MAX
 from edge.links.transports.tcp import CALLERS_MAX, TcpClient
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
-from msgs.mavlink import FrameReader, dialect
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import CAMERA, DEADLINE_S, Peer, Pty, Tcp, Udp, alone, linked, meet
 from .reports import make_report as report
@@ -257,3 +258,24 @@ def test_an_idle_link_sleeps(tmp_path: Path) -> None:
         used_s, began = time.process_time(), time.monotonic()
         select.select([], [], [], 1.0)
         assert time.process_time() - used_s < 0.5 * (time.monotonic() - began)
+
+
+def test_a_caller_that_floods_does_not_keep_poses_from_the_autopilot() -> None:
+    with linked("tcpin:127.0.0.1:0") as (link, own_ship):
+        address = ("127.0.0.1", link.ports[0])
+        flooder = socket.create_connection(address)
+        flooder.setblocking(False)
+        beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+        flood = beat.pack(MAVLink(None, 255, 190)) * 3000
+        with Peer(Tcp(socket.create_connection(address))) as peer:
+
+            def flood_on() -> None:
+                with contextlib.suppress(BlockingIOError):
+                    flooder.send(flood)
+
+            flood_on()
+            exchanges(link, own_ship, peer)
+            for _ in range(5):
+                flood_on()
+                peer.named("TARGET_RELATIVE", lambda: link.publish(report(track(time.monotonic_ns()))))
+        flooder.close()

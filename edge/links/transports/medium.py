@@ -12,7 +12,8 @@ from msgs.mavlink import FrameReader
 
 Address = tuple[Any, ...]  # as the socket family writes it; of a serial port its device
 
-RECEIVE_MAX = 65_536  # bytes at once
+DATAGRAM_MAX = 65_536  # bytes
+CHUNK_MAX = 4096  # bytes of a stream at once
 PENDING_MAX = 32_768  # bytes a byte stream may fall behind by, before whole messages are left out
 
 

@@ -13,7 +13,7 @@ import serial
 
 from edge.links.mavlink_endpoints import SerialEndpoint
 from edge.links.transports.backoff import Backoff
-from edge.links.transports.medium import RECEIVE_MAX, Address, Outbox, Received
+from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received
 from msgs.mavlink import FrameReader
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class SerialPort:
         if self._port is None:
             return None
         try:
-            data = os.read(self._port.fileno(), RECEIVE_MAX)
+            data = os.read(self._port.fileno(), CHUNK_MAX)
         except BlockingIOError:
             return None
         except OSError as error:

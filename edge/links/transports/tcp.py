@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.transports.backoff import Backoff
-from edge.links.transports.medium import RECEIVE_MAX, Address, Outbox, Received, resolve
+from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received, resolve
 from msgs.mavlink import FrameReader
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class Connection:
 
     def receive(self) -> Received | None:
         try:
-            data = self._socket.recv(RECEIVE_MAX)
+            data = self._socket.recv(CHUNK_MAX)
         except BlockingIOError:
             return None
         except OSError:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
-from edge.links.transports.medium import RECEIVE_MAX, Address, Received, resolve
+from edge.links.transports.medium import DATAGRAM_MAX, Address, Received, resolve
 from msgs.mavlink import FrameReader
 
 RECEIVE_BUFFER = 1 << 20
@@ -44,7 +44,7 @@ class Udp:
 
     def receive(self) -> Received | None:
         try:
-            data, sender = self._socket.recvfrom(RECEIVE_MAX)
+            data, sender = self._socket.recvfrom(DATAGRAM_MAX)
         except OSError:
             # Nothing waits, or a peer's port is closed (ICMP): both mean no datagram.
             return None
