@@ -119,12 +119,12 @@ def encounter_plan(plan: SequencePlan, preset: Preset) -> EncounterPlan:
     )
 
 
-def mean_box_area(plan: SequencePlan, encounter: Encounter) -> float:
+def mean_box_area(encounter: Encounter) -> float:
     """Area of the main target's box at focal length 1, averaged over the frames, as if the picture had no edge."""
-    vertices = solid_vertices_m(airframe_id(plan.airframes[0]))
+    vertices = solid_vertices_m(airframe_id(encounter.plan.airframes[0]))
     track = encounter.targets[0].at(encounter.frame_t_s)
     areas = []
-    for k in range(plan.frames):
+    for k in range(len(encounter.frame_t_s)):
         R_cam_ned = encounter.R_ned_cam[k].T
         t_cam = R_cam_ned @ (track.t_ned_body_m[k] - encounter.t_ned_cam_m[k])
         # A target that has left the picture may be far off axis: its box is taken where it would be looked at.

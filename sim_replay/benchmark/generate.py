@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
         claim(args.out, recipe, place_and_text[1], args.resume)
         job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
         write_manifest(job, recipe, plans)
-        names = preset.airframe_names()
-        write_models(args.out / "models", {airframe_id(n) + 1: AIRFRAMES[airframe_id(n)].mesh() for n in names})
+        names = {airframe_id(name) + 1: name for name in preset.airframe_names()}
+        write_models(args.out / "models", {number: AIRFRAMES[number - 1].mesh() for number in names}, names)
         try:
             _make(job, plans, chosen, workers)
         except CrewError as error:

@@ -51,7 +51,7 @@ def settle_lenses(preset: Preset, plans: Sequence[SequencePlan], areas: Sequence
 
 def box_area(preset: Preset, plan: SequencePlan, tell: Tell, stopped: Stopped) -> float:
     """A crew's task: fly a sequence, measure its main target's box at focal length 1. Raises FlightError."""
-    return mean_box_area(plan, fly_encounter(encounter_plan(plan, preset)))
+    return mean_box_area(fly_encounter(encounter_plan(plan, preset)))
 
 
 def lenses_of(
