@@ -55,8 +55,9 @@ def load_backdrop(path: Path) -> Backdrop:
         # Files hold sRGB; the renderer works with gamma 2.
         linear = (linear / 255.0) ** 2.2
     else:
-        # Exposed so that all but the sun and its like fit.
-        linear *= 0.9 / max(float(np.percentile(linear, 98.0)), 1e-9)
+        # Exposed for the middle, but so that all fits save the sun and its like.
+        middle, bright = np.percentile(linear, [50.0, 98.0])
+        linear *= min(0.25 / max(float(middle), 1e-9), 0.9 / max(float(bright), 1e-9))
     pixels = np.sqrt(np.clip(linear, 0.0, 1.0)) * 255.0
     rgb = cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_BGR2RGB)
     height, width = rgb.shape[:2]

@@ -52,6 +52,7 @@ class Environment:
     glow: float
     relief_m: float = 0.0  # height of the hills that stand on the horizon
     veil: float = 0.0  # light that the lens scatters over the picture when the sun is in or near it
+    horizon_away: Array | None = None  # [3], the horizon opposite the sun; None: the same all round
     near_cloud: float = 0.0  # share of the view that shreds of cloud nearer than any target cover, 0 none
 
 
@@ -69,27 +70,28 @@ class _Light:
     glow: tuple[float, float]
     veil: tuple[float, float] = (0.0, 0.0)
     cloud: tuple[float, float, float] = (0.78, 0.79, 0.81)
+    horizon_away: tuple[float, float, float] | None = None
 
 
 _DAY = ((20.0, 70.0), (1.05, 1.0, 0.92), (0.15, 0.28, 0.53), (0.55, 0.64, 0.74))
-_GREY = ((20.0, 60.0), (0.12, 0.12, 0.13), (0.42, 0.45, 0.49), (0.58, 0.60, 0.62))
-_WARM_CLOUD = (0.62, 0.46, 0.38)
+_GREY = ((20.0, 60.0), (0.12, 0.12, 0.13), (0.44, 0.46, 0.49), (0.58, 0.60, 0.62))
+_WARM_CLOUD = (0.66, 0.53, 0.46)
 _LIGHTS: dict[Weather, _Light] = {
     "clear": _Light(*_DAY, (0.9, 1.05), (0.6, 1.05), (1.5e4, 6e4), (0.1, 0.5)),
     "haze": _Light(*_DAY, (0.8, 1.0), (0.5, 1.05), (2.5e3, 9e3), (0.2, 0.6), (0.0, 0.06)),
     "overcast": _Light(*_GREY, (0.55, 0.95), (0.12, 0.4), (4e3, 3e4), (0.0, 0.15)),
     "low_sun": _Light(
-        (4.0, 15.0), (0.95, 0.62, 0.36), (0.08, 0.13, 0.27), (0.75, 0.50, 0.33), (0.5, 0.9), (0.45, 1.0), (6e3, 5e4),
-        (0.2, 0.6), (0.0, 0.05), _WARM_CLOUD,
+        (4.0, 15.0), (0.95, 0.62, 0.36), (0.13, 0.21, 0.40), (0.85, 0.60, 0.40), (0.6, 0.95), (0.45, 1.0), (8e3, 5e4),
+        (0.2, 0.6), (0.0, 0.05), _WARM_CLOUD, (0.42, 0.45, 0.53),
     ),
     "dusk": _Light(
-        (0.5, 3.0), (0.42, 0.20, 0.11), (0.05, 0.07, 0.14), (0.46, 0.27, 0.20), (0.3, 0.55), (0.4, 1.0), (6e3, 4e4),
-        (0.15, 0.4), (0.0, 0.02), (0.30, 0.22, 0.23),
+        (0.5, 3.0), (0.42, 0.20, 0.11), (0.08, 0.12, 0.23), (0.70, 0.40, 0.26), (0.25, 0.5), (0.4, 1.0), (8e3, 4e4),
+        (0.15, 0.4), (0.0, 0.02), (0.34, 0.28, 0.30), (0.19, 0.21, 0.29),
     ),
     "fog": _Light(*_GREY, (0.6, 1.0), (0.0, 0.2), (5e2, 2.2e3), (0.0, 0.1)),
     "glare": _Light(
-        (6.0, 35.0), (1.15, 1.0, 0.82), (0.14, 0.26, 0.50), (0.70, 0.70, 0.70), (0.9, 1.05), (0.55, 1.05), (5e3, 4e4),
-        (0.5, 0.8), (0.12, 0.4),
+        (6.0, 35.0), (1.15, 1.0, 0.82), (0.12, 0.23, 0.44), (0.50, 0.53, 0.57), (0.7, 0.95), (0.55, 1.05), (5e3, 4e4),
+        (0.4, 0.7), (0.08, 0.28),
     ),
     "broken_cloud": _Light(*_DAY, (0.8, 1.05), (0.38, 0.5), (1e4, 6e4), (0.1, 0.4)),
 }  # fmt: skip
@@ -117,13 +119,15 @@ def environment_from_seed(seed: int, weather: Weather | None = None, sight_ned: 
     brightness = rng.uniform(*light.brightness)
     sun_ned = _sun_ned(rng, np.radians(rng.uniform(*light.sun_elevation_deg)), kind, sight_ned)
     ground_kind = int(rng.choice(len(GROUND_KINDS), p=GROUND_SHARES))
-    near_cloud = rng.uniform(0.15, 0.6) if rng.random() < (0.3 if kind == "broken_cloud" else 0.03) else 0.0
+    near_cloud = rng.uniform(0.3, 0.65) if rng.random() < (0.3 if kind == "broken_cloud" else 0.03) else 0.0
+    warmth = rng.normal(0.0, 0.035)
+    horizon_tint = rng.uniform(0.75, 1.15) * brightness * np.array([1.0 + warmth, 1.0, 1.0 - warmth])
     hills = rng.random() < 0.5 and GROUND_KINDS[ground_kind] != "sea"
     return Environment(
         sun_ned=sun_ned,
         sun_colour=np.array(light.sun_colour) * rng.uniform(0.8, 1.2) * brightness,
-        zenith=np.array(light.zenith) * rng.uniform([0.6, 0.75, 0.85], [1.45, 1.3, 1.15]) * brightness,
-        horizon=np.array(light.horizon) * rng.uniform(0.75, 1.15) * rng.uniform(0.93, 1.07, 3) * brightness,
+        zenith=np.array(light.zenith) * np.array([1.3, 1.12, 1.0]) ** rng.uniform(-1.5, 1.2) * brightness,
+        horizon=np.array(light.horizon) * horizon_tint,
         haze_per_m=3.9 / float(np.exp(rng.uniform(*np.log(light.visibility_m)))),
         cloud=np.array(light.cloud) * rng.uniform(0.75, 1.1) * brightness,
         cloud_threshold=float(rng.uniform(*light.cloud_threshold)),
@@ -140,4 +144,5 @@ def environment_from_seed(seed: int, weather: Weather | None = None, sight_ned: 
         relief_m=float(rng.uniform(150.0, 900.0)) if hills else 0.0,
         veil=float(rng.uniform(*light.veil)),
         near_cloud=float(near_cloud),
+        horizon_away=np.array(light.horizon_away or light.horizon) * horizon_tint,
     )

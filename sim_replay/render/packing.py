@@ -21,16 +21,17 @@ def noise_texture(side: int = 512, seed: int = 20) -> NDArray[np.float16]:
     fy, fx = np.fft.fftfreq(side)[:, None] * side, np.fft.rfftfreq(side)[None, :] * side
     radius = np.maximum(np.hypot(fx, fy), 1.0)
     channels = []
-    for exponent in (1.75, 1.75, 0.9, 0.0):
+    # Slow waves of the rough channel would show its period where it repeats many times across a landscape.
+    for exponent, slowest in ((1.75, 1.0), (1.75, 1.0), (0.9, 9.0), (0.0, 1.0)):
         spectrum = np.fft.rfft2(rng.standard_normal((side, side))) / radius**exponent
-        spectrum[0, 0] = 0.0
+        spectrum[np.hypot(fx, fy) < slowest] = 0.0
         field = np.fft.irfft2(spectrum, s=(side, side))
         channels.append(np.clip(0.5 + 0.18 * field / field.std(), 0.0, 1.0))
     return np.stack(channels, axis=-1).astype(np.float16)
 
 
 def packed_environment(e: Environment) -> NDArray[np.float32]:
-    """[10, 4], the rows that world.glsl and aircraft.frag name by number."""
+    """[11, 4], the rows that world.glsl and aircraft.frag name by number."""
     rows = [
         [*e.sun_ned, e.cloud_threshold],
         [*e.sun_colour, e.cloud_softness],
@@ -42,6 +43,7 @@ def packed_environment(e: Environment) -> NDArray[np.float32]:
         [*e.ground[2], e.ground_turn_rad],
         [*e.noise_offset, e.cloud_scale_m, e.glow],
         [e.veil, e.relief_m, e.near_cloud, 0.0],
+        [*(e.horizon if e.horizon_away is None else e.horizon_away), 0.0],
     ]
     return np.asarray(rows, dtype=np.float32)
 

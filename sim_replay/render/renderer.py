@@ -29,14 +29,12 @@ from sim_replay.render.packing import (
     write_lens,
     write_rows,
 )
-from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, fine_mesh, project_px
-from sim_replay.render.scene import Camera, Scene, Target, rays_ned
+from sim_replay.render.projection import fine_mesh
+from sim_replay.render.scene import Scene, Target
+from sim_replay.render.view import Crop, Parts, crop_of, depth_projection, is_ahead, parts_of
 
 Array = NDArray[np.float64]
-Crop = tuple[int, int, int, int]  # x0, y0, x1, y1, pixels
-Parts = tuple[str, ...]
 SUN_THAT_CASTS_SHADOW = 0.2
-HILLS_M = 14_000.0  # as in world.glsl
 PIECES = (8, 6)  # of a whole frame, across and down
 _NOISE_UNIT, _COLOUR_UNIT, _COORDINATE_UNIT, _SHADOW_UNIT, _SKY_UNIT, _BACKDROP_UNIT = range(6)
 
@@ -200,7 +198,7 @@ class Renderer:
         corner = (tile % self.columns * self._fine_px, tile // self.columns * self._fine_px)
         self._fine.viewport = (*corner, width * samples, height * samples)
         # One depth range for all targets, so that the nearer hides the farther.
-        projection = _projection(drawn, scene.camera, crop)
+        projection = depth_projection(drawn, scene.camera, crop)
         for number, target in enumerate(scene.targets, start=1):
             if is_ahead(target, scene.camera):
                 self._draw_target(target, scene, projection, number, slots.get((order, number)), corner)
@@ -297,7 +295,7 @@ class Renderer:
             self._fine.viewport = (0, 0, width * samples, height * samples)
             self._fine.clear(viewport=self._fine.viewport)
             self._context.enable_only(moderngl.DEPTH_TEST)
-            projection = _projection([target], camera, crop)
+            projection = depth_projection([target], camera, crop)
             self._draw_target(target, scene, projection, 1, slots.get((0, 1)), (0, 0))
             self._context.enable_only(moderngl.NOTHING)
             program, screen = self._screen("layer")
@@ -393,50 +391,3 @@ def _write_world(program: Any, scene: Scene) -> None:
         write_rows(program["environment"], packed_environment(scene.environment))
     if "lens" in used:
         write_lens(program, camera)
-
-
-def parts_of(scene: Scene, crop: Crop) -> Parts:
-    """The parts of world.glsl that a crop of the scene's picture can show."""
-    camera, environment = scene.camera, scene.environment
-    count = 2 if camera.distortion is None else 5
-    u, v = np.meshgrid(np.linspace(crop[0] - 1, crop[2], count), np.linspace(crop[1] - 1, crop[3], count))
-    down = rays_ned(np.stack([u.ravel(), v.ravel()], axis=1), camera)[:, 2]
-    # A lens bends the horizon between the points looked at.
-    margin = 0.0 if camera.distortion is None else 0.02
-    parts = []
-    if down.min() <= margin:
-        parts.append("SKY")
-        if environment.relief_m > 0.0 and -down.max() < 1.01 * environment.relief_m / HILLS_M + margin:
-            parts.append("HILLS")
-    if down.max() >= -margin:
-        parts.append(f"GROUND {environment.ground_kind}")
-    present = {"VEIL": environment.veil > 0, "NEAR_CLOUD": environment.near_cloud > 0, "LENS": bool(camera.distortion)}
-    return (*parts, *(name for name, shown in present.items() if shown))
-
-
-def is_ahead(target: Target, camera: Camera) -> bool:
-    """Whether the whole aircraft lies in front of the camera."""
-    depth_m = target.pose_in(camera)[1][2]
-    return bool(depth_m - AIRFRAMES[target.airframe_id].diameter_m() >= NEAREST_VERTEX_M)
-
-
-def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
-    """Pixels that the targets may touch, clipped to the image; zeros if there are none."""
-    x0, y0, x1, y1 = camera.width_px, camera.height_px, 0, 0
-    for target in targets:
-        mesh = AIRFRAMES[target.airframe_id].mesh()
-        points = mesh.vertices_m.astype(np.float64)
-        box = extents_px(project_px(points, *target.pose_in(camera), camera.K, camera.distortion))
-        if box is not None:
-            # Under distortion an edge may bow out beyond its ends.
-            margin = 1 if camera.distortion is None else 6
-            low, high = np.floor(box[:2]).astype(int) - margin, np.ceil(box[2:]).astype(int) + 1 + margin
-            x0, y0, x1, y1 = min(x0, low[0]), min(y0, low[1]), max(x1, high[0]), max(y1, high[1])
-    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, camera.width_px), min(y1, camera.height_px)
-    return (int(x0), int(y0), int(x1), int(y1)) if x1 > x0 and y1 > y0 else (0, 0, 0, 0)
-
-
-def _projection(targets: Sequence[Target], camera: Camera, crop: Crop) -> Array:
-    reach = [(t.pose_in(camera)[1][2], AIRFRAMES[t.airframe_id].diameter_m()) for t in targets]
-    near_m, far_m = min(z - size for z, size in reach), max(z + size for z, size in reach)
-    return clip_from_cam(camera.K, crop[0], crop[1], crop[2] - crop[0], crop[3] - crop[1], near_m, far_m)

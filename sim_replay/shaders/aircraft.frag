@@ -2,7 +2,7 @@
 // Sun with its shadows, sky and ground light on paint, glass and metal, then haze. Gamma 2 in eight bits.
 uniform sampler2D noise;
 uniform sampler2DShadow shadows;
-uniform vec4 environment[10];
+uniform vec4 environment[11];
 uniform vec4 livery[19];       // 0-15 palette and gloss; 16 camouflage, share; 17 marking, tip; 18 band x, width, offset
 uniform mat3 ned_from_body;
 uniform vec3 camera_body_m;
@@ -61,7 +61,9 @@ void main() {
     vec3 around = mix(above, ground, smoothstep(-0.15, 0.15, mirrored.z));
     float sheen = 0.04 + max(0.96 - rough, 0.0) * pow(1.0 - facing, 5.0);
     vec3 shaded = paint() * light * (1.0 - sheen) + sheen * around + environment[1].rgb * highlight;
-    shaded = mix(environment[3].rgb, shaded, exp(-range_m * environment[3].a));
+    float towards = 0.5 - 0.5 * dot(view.xy, sun.xy) / (length(view.xy) * length(sun.xy) + 1e-3);
+    vec3 haze = mix(environment[10].rgb, environment[3].rgb, towards * towards);
+    shaded = mix(haze, shaded, exp(-range_m * environment[3].a));
     float s = max(dot(-view, sun), 0.0);
     shaded += environment[1].rgb * environment[9].x * (0.25 + 0.5 * pow(s, 8.0) + 1.2 * pow(s, 120.0));
     colour = vec4(sqrt(clamp(shaded, 0.0, 1.0)), 1.0);

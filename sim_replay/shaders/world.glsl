@@ -2,7 +2,7 @@
 // A software driver runs both sides of every branch, so what a picture lacks is left out by SKY, GROUND (its kind),
 // HILLS, VEIL, NEAR_CLOUD and LENS.
 uniform sampler2D noise;
-uniform vec4 environment[10];
+uniform vec4 environment[11];
 uniform vec4 K;                // fx, fy, cx, cy
 uniform vec4 lens;             // k1, k2, p1, p2
 uniform vec2 lens_end;         // k3, squared radius where the model would fold
@@ -35,9 +35,17 @@ vec3 veil(vec3 d) {
 #endif
 }
 
+// What haze tends to: warmer on the sun's side of a low sun.
+vec3 horizon(vec3 d) {
+    vec2 sun = environment[0].xy;
+    float towards = 0.5 + 0.5 * dot(d.xy, sun) / (length(d.xy) * length(sun) + 1e-3);
+    return mix(environment[10].rgb, environment[3].rgb, towards * towards);
+}
+
 vec3 sky(vec3 d) {
     float up = max(-d.z, 0.0);
-    vec3 c = mix(environment[2].rgb, environment[3].rgb, pow(1.0 - up, 4.0));
+    vec3 low = horizon(d);
+    vec3 c = mix(environment[2].rgb, low, pow(1.0 - up, 4.0));
     float s = max(dot(d, environment[0].xyz), 0.0);
     c += environment[1].rgb * environment[8].w * (0.35 * pow(s, 6.0) + 0.5 * pow(s, 60.0));
     float fade = smoothstep(0.015, 0.12, up);
@@ -54,8 +62,8 @@ vec3 sky(vec3 d) {
     float shade = 0.6 * (n - 0.30 * swell - 0.32 * texture(noise, p + 0.02 * environment[0].xy).r - 0.18);
     float a = smoothstep(environment[0].a, environment[0].a + environment[1].a, n) * fade;
     vec3 cloud = environment[4].rgb * clamp(1.0 + 1.6 * shade - 0.35 * a * (n - environment[0].a), 0.45, 1.3);
-    c = mix(c, mix(cloud, environment[3].rgb, 0.6 * (1.0 - smoothstep(0.0, 0.4, up))), a);
-    c = mix(environment[3].rgb, c, exp(-HAZE_LAYER_M * environment[3].a / (up + 0.03)));
+    c = mix(c, mix(cloud, low, 0.6 * (1.0 - smoothstep(0.0, 0.4, up))), a);
+    c = mix(low, c, exp(-HAZE_LAYER_M * environment[3].a / (up + 0.03)));
     return c + environment[1].rgb * environment[8].w * (1.0 - 0.9 * a) * 4.0 * pow(s, 20000.0);
 }
 
@@ -72,7 +80,8 @@ vec3 hills(vec3 d, vec3 behind) {
         float ridge = steepest * (k == 1 ? 1.0 : 0.6) * smoothstep(0.2, 0.9, n);
         float away = HILLS_M * (k == 1 ? 2.0 : 1.0);
         vec3 slope = environment[6].rgb * (0.55 + 0.5 * texture(noise, vec2(40.0 * at, up * 60.0)).b);
-        vec3 hazed = mix(environment[3].rgb, slope, exp(-0.6 * away * environment[3].a));
+        float clear = exp(-0.6 * away * environment[3].a) * mix(0.4, 1.0, clamp(up / max(ridge, 1e-4), 0.0, 1.0));
+        vec3 hazed = mix(horizon(d), slope, clear);
         c = mix(c, hazed, smoothstep(-0.7, 0.7, (ridge - up) * K.y));
     }
     return c;
@@ -112,7 +121,7 @@ vec3 sea(vec3 d, float near, float fine) {
     vec3 normal = normalize(vec3(0.25 * (near - 0.5), 0.25 * (fine - 0.5), -1.0));
     vec3 mirrored = reflect(d, normal);
     float fresnel = 0.03 + 0.97 * pow(1.0 - clamp(dot(-d, normal), 0.0, 1.0), 5.0);
-    vec3 above = mix(environment[3].rgb, environment[2].rgb, clamp(-mirrored.z, 0.0, 1.0));
+    vec3 above = mix(horizon(mirrored), environment[2].rgb, clamp(-mirrored.z, 0.0, 1.0));
     float glint = pow(max(dot(mirrored, environment[0].xyz), 0.0), 180.0);
     vec3 c = mix(environment[5].rgb, above, fresnel) + environment[1].rgb * glint * 1.5;
     return mix(c, environment[7].rgb, 0.4 * smoothstep(0.68, 0.8, fine));
@@ -127,7 +136,9 @@ vec3 ground(vec3 d) {
     g = mat2(cos(a), sin(a), -sin(a), cos(a)) * g;
     float wide = texture(noise, g / 9000.0 + environment[8].xy).r;
     float near = 0.5 + 0.7 * (texture(noise, g / 700.0).r + texture(noise, turn * g / 1130.0).g - 1.0);
-    float fine = texture(noise, g / 110.0).b;
+    // Sharper than the hardware would have it: seen aslant, it would blur along both axes.
+    vec2 bent = g + 160.0 * vec2(wide, near);
+    float fine = texture(noise, bent / 290.0, -1.0).b, grain = texture(noise, turn * bent / 71.0, -1.0).b;
 #if GROUND == 0
     vec3 c = fields(g, wide, near, pixel_m);
 #elif GROUND == 3
@@ -138,15 +149,24 @@ vec3 ground(vec3 d) {
     vec3 c = mix(environment[5].rgb, environment[6].rgb, smoothstep(0.3, 0.7, near));
     c = mix(c, environment[7].rgb, smoothstep(0.55, 0.7, GROUND == 5 ? 0.5 * (wide + near) : wide));
 #endif
-    c *= 0.7 + 0.6 * mix(fine, near, 0.4);
-    return mix(environment[3].rgb, c, exp(-range_m * environment[3].a));
+#if GROUND != 3
+    // Trees stand dark and in clumps; what lies between them is worn and mown.
+    float wooded = smoothstep(0.56, 0.62, mix(grain, near, GROUND == 1 ? 0.15 : 0.6));
+    c *= GROUND == 2 ? 1.0 : 1.0 - 0.45 * wooded;
+    float rough = GROUND == 1 ? 1.8 : 0.9;
+    c *= max(1.0 + rough * (0.35 * fine + 0.35 * grain + 0.3 * near - 0.5), 0.2);
+#else
+    c *= 0.75 + 0.5 * fine;
+#endif
+    return mix(horizon(d), c, exp(-range_m * environment[3].a));
 }
 #endif
 
 // Share of the light that shreds of cloud just ahead of the camera take; they drift past as it flies.
 float near_cloud(vec3 d) {
 #ifdef NEAR_CLOUD
-    vec2 at = vec2(atan(d.y, d.x), -d.z) * 1.9 + (camera_ned_m.xy + camera_ned_m.z) / 900.0 + environment[8].yx;
+    // Shreds about as large in the picture as what they hide, whatever the lens.
+    vec2 at = vec2(atan(d.y, d.x), -d.z) * (K.x / 900.0) + (camera_ned_m.xy + camera_ned_m.z) / 900.0 + environment[8].yx;
     float n = 0.55 * texture(noise, at).r + 0.3 * texture(noise, turn * at * 3.1).g + 0.15 * texture(noise, at * 9.7).b;
     float open = 0.75 - 0.5 * environment[9].z;
     return 0.95 * smoothstep(open, open + 0.22, n);

@@ -106,7 +106,8 @@ def test_the_horizon_tilts_with_the_camera(renderer: Renderer) -> None:
     black, white = np.zeros(3), np.full(3, 0.9)
     env = replace(
         env, zenith=white, horizon=white, cloud=white, ground=np.zeros((3, 3)), ground_kind=2, haze_per_m=1e-9,
-        sun_colour=black, glow=0.0, cirrus=0.0, cloud_threshold=2.0,
+        horizon_away=white, relief_m=0.0, veil=0.0, near_cloud=0.0, sun_colour=black, glow=0.0, cirrus=0.0,
+        cloud_threshold=2.0,
     )  # fmt: skip
     K = np.array([[150.0, 0, 79.5], [0, 150.0, 79.5], [0, 0, 1]])
     cameras = [
