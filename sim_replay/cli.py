@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     score.add_argument("--dataset", type=Path, required=True, metavar="DIR", help="BOP scene, split or dataset folder")
     score.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
     score.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
+    score.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th picture (default: all)")
     score.add_argument("--json", action="store_true", help="print the score as JSON")
     return parser
 
@@ -74,9 +75,11 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _score(args: argparse.Namespace, console: Console) -> int:
+    if args.every < 1:
+        raise InputError(f"--every {args.every}: must be at least 1")
     model = load_model(args.model, DEFAULT_THREADS)
     dataset = open_dataset(args.dataset, args.split)
-    pictures = list(dataset.frames())
+    pictures = list(dataset.frames())[:: args.every]
     with Progress(console=console, disable=args.json or not console.is_terminal) as progress:
         task = progress.add_task("scoring", total=len(pictures))
         judged = judge_frames(pictures, dataset.models, estimator_answers(model), lambda _: progress.advance(task))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,7 @@ class Match:
             return None
         return float(metrics.translation_error_m(self.estimate.t_cam_target_m, self.truth.t_cam_target_m))
 
-    @property
+    @cached_property
     def add_m(self) -> float | None:
         """ADD; None where nothing was found or the target's model is not known."""
         if self.estimate is None or self.truth.points_body_m is None:
