@@ -136,6 +136,8 @@ class Pipeline:
         estimates = self._estimate(frame, expected, pointed_at, clock.lap)
         tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh)
         self._by_hand.settle(tracks)
+        for text in self._by_hand.news():
+            self._outlets.event(logging.INFO, text)
         clock.lap("filter")
         self._publish(frame, size_wh, tracks, own_ship)
         clock.lap("publish")

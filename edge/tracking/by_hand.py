@@ -24,6 +24,7 @@ class ByHand:
         self._look_until_ns = 0
         self._rest_until_ns = 0
         self._found: Array | None = None  # [4] box_xyxy_px of the estimate that is to become the chosen track
+        self._news: list[str] = []
 
     def take(self, request: Request, now_ns: int) -> None:
         """Take a request that came before the frame of `now_ns`."""
@@ -36,13 +37,16 @@ class ByHand:
 
     def box_xyxy_px(self, now_ns: int, image_size_wh: tuple[int, int], expected: Iterable[Track]) -> Array | None:
         """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
-        if self._box_share is None or now_ns > self._look_until_ns:
+        if self._box_share is not None and now_ns > self._look_until_ns:
             self._box_share = None
+            self._news.append("no target found where pointed")
+        if self._box_share is None:
             return None
         box = self._box_share * np.tile(image_size_wh, 2) - 0.5
         for track in expected:
             if _holds(box, _center(track.box_xyxy_px)) or _holds(track.box_xyxy_px, _center(box)):
-                self.chosen_id, self._box_share = track.track_id, None
+                self._box_share = None
+                self._choose(track)
                 return None
         return box
 
@@ -61,10 +65,19 @@ class ByHand:
         if self._found is not None and tracks:
             center = 0.5 * (self._found[:2] + self._found[2:])
             nearest = min(tracks, key=lambda t: float(np.linalg.norm(_center(t.box_xyxy_px) - center)))
-            self.chosen_id = nearest.track_id
+            self._choose(nearest)
         self._found = None
         if all(track.track_id != self.chosen_id for track in tracks):
             self.chosen_id = None
+
+    def news(self) -> list[str]:
+        """What the person should hear of it since the last call."""
+        told, self._news = self._news, []
+        return told
+
+    def _choose(self, track: Track) -> None:
+        self.chosen_id = track.track_id
+        self._news.append(f"target {track.track_id} chosen")
 
 
 def _holds(box_xyxy_px: Array, point_px: Array) -> bool:

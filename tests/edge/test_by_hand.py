@@ -14,6 +14,8 @@ import numpy as np
 
 from edge.requests import StopTracking, TrackBox
 from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
+from edge.tracking.tracker import Tracker
+from edge.types import Estimate, Mount
 from msgs.mavlink import dialect
 
 from . import toy_scene
@@ -66,6 +68,9 @@ def test_stopping_drops_the_target_and_drawing_a_box_takes_it_up_again(tmp_path:
             peer.command(2005, left, top, right, bottom)
             assert peer.named("COMMAND_ACK").result == dialect.MAV_RESULT_ACCEPTED
             status = status_in(peer, ACTIVE)
+            assert {"target 0 lost", "target 0 chosen"} <= {
+                m.text for m in peer.received if m.get_type() == "STATUSTEXT"
+            }
         finally:
             daemon.kill()
     center = [0.5 * (status.rec_top_x + status.rec_bottom_x), 0.5 * (status.rec_top_y + status.rec_bottom_y)]
@@ -84,6 +89,9 @@ def test_a_box_is_looked_into_for_a_second() -> None:
     by_hand.take(TrackBox((0.25, 0.5, 0.75, 1.0)), 0)
     np.testing.assert_allclose(by_hand.box_xyxy_px(LOOK_NS, SIZE_WH, []), [479.5, 539.5, 1439.5, 1079.5])
     assert by_hand.box_xyxy_px(LOOK_NS + 1, SIZE_WH, []) is None
+    assert by_hand.news() == ["no target found where pointed"]
+    assert by_hand.box_xyxy_px(LOOK_NS + 2, SIZE_WH, []) is None
+    assert by_hand.news() == []
 
 
 def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends() -> None:
@@ -105,3 +113,28 @@ def test_the_search_rests_after_stopping_until_the_next_box_or_ten_seconds() -> 
     assert by_hand.searches(REST_NS)
     by_hand.take(TrackBox((0.0, 0.0, 0.1, 0.1)), 5)
     assert by_hand.searches(5)
+
+
+def seen_at(x_m: float) -> Estimate:
+    t_m = np.array([x_m, 0.0, 200.0])
+    center_px = (toy_scene.K @ t_m / t_m[2])[:2]
+    box = np.concatenate([center_px - 20.0, center_px + 20.0])
+    return Estimate(0.9, box, np.eye(3), t_m, np.diag([0.1, 0.1, 4.0, 0.01, 0.01, 0.01]), "track")
+
+
+def test_a_target_pointed_at_takes_the_place_of_the_one_not_seen_for_longest() -> None:
+    mount = Mount(np.eye(3), np.zeros(3))
+    tracker = Tracker(2, mount)
+
+    def see(frame: int, *x_m: float) -> list[float]:
+        tracks = tracker.update(frame * 33_000_000, [seen_at(x) for x in x_m], None, toy_scene.K, SIZE_WH)
+        return sorted(round(float(t.t_cam_target_m[0])) for t in tracks)
+
+    for frame in range(5):
+        see(frame, -40.0, 0.0)
+    assert see(5, 0.0) == [-40, 0]
+    assert see(6, 0.0, 40.0) == [-40, 0], "no room"
+    tracker.make_room()
+    assert see(7, 0.0, 40.0) == [0, 40]
+    tracker.drop_all()
+    assert see(8) == []

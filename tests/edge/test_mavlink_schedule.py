@@ -1,0 +1,42 @@
+"""How often messages go, for any rhythm of frames."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.links.mavlink_schedule import Schedule
+
+MESSAGE = 275
+GAPS_NS = st.lists(st.integers(1_000_000, 400_000_000), min_size=1, max_size=200)
+
+
+@given(hz=st.floats(0.5, 50.0), gaps_ns=GAPS_NS)
+def test_a_rate_is_never_exceeded_and_kept_where_frames_are_quicker(hz: float, gaps_ns: list[int]) -> None:
+    schedule, now_ns, sent_ns = Schedule({MESSAGE: hz}), 0, []
+    for gap_ns in gaps_ns:
+        now_ns += gap_ns
+        if schedule.due(MESSAGE, 0, now_ns):
+            sent_ns.append(now_ns)
+    interval_ns = 1e9 / hz
+    span_ns = now_ns - gaps_ns[0]
+    assert len(sent_ns) <= span_ns / interval_ns + 2.2
+    # Each waits for its time, and then for the next frame.
+    slowest_ns = interval_ns + max(gaps_ns)
+    assert len(sent_ns) >= span_ns / slowest_ns - 1
+    assert sent_ns[0] == gaps_ns[0], "the first is due at once"
+
+
+@given(gaps_ns=GAPS_NS)
+def test_targets_have_a_rhythm_each_and_off_is_off(gaps_ns: list[int]) -> None:
+    schedule, now_ns = Schedule({MESSAGE: 10.0}), 0
+    for gap_ns in gaps_ns:
+        now_ns += gap_ns
+        assert schedule.due(MESSAGE, 0, now_ns) == schedule.due(MESSAGE, 1, now_ns)
+        assert not schedule.due(MESSAGE + 1, 0, now_ns), "what is not scheduled never goes"
+    schedule.set_rate(MESSAGE, 0.0)
+    assert not schedule.due(MESSAGE, 0, now_ns + 10**12)
+    schedule.ask_once(MESSAGE)
+    assert [schedule.due(MESSAGE, 0, now_ns + 10**12) for _ in range(2)] == [True, False]
+    schedule.set_rate(MESSAGE, None)
+    assert schedule.due(MESSAGE, 0, now_ns + 2 * 10**12)
