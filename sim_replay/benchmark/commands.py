@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from edge.errors import InputError
+
+RENDER_PACKAGES = ("moderngl", "jsbsim", "av")
 
 
 def register(commands: Any) -> None:
@@ -37,9 +43,23 @@ def _generate(commands: Any) -> None:
 
 
 def _run_generate(args: argparse.Namespace) -> int:
-    from sim_replay.benchmark.generate import run
+    with _extra_packages():
+        from sim_replay.benchmark.generate import run
 
     return run(args)
+
+
+@contextmanager
+def _extra_packages() -> Iterator[None]:
+    """Tell of a missing package of the render extra in a sentence. Raises InputError."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name not in RENDER_PACKAGES:
+            raise
+        raise InputError(
+            f"the package {error.name} is missing; install the render extra: pip install 'mf-uavpose6d-edge[render]'"
+        ) from error
 
 
 def _stats(commands: Any) -> None:
@@ -73,7 +93,8 @@ def _bench(commands: Any) -> None:
 
 
 def _run_bench(args: argparse.Namespace) -> int:
-    from sim_replay.benchmark.bench import run
+    with _extra_packages():
+        from sim_replay.benchmark.bench import run
 
     return run(args.seconds, args.workers, args.json)
 
@@ -97,6 +118,7 @@ def _run_sheet(args: argparse.Namespace) -> int:
         from sim_replay.benchmark.contact_sheet import run as run_contact_sheet
 
         return run_contact_sheet(args.dataset, args.out)
-    from sim_replay.sheet import run
+    with _extra_packages():
+        from sim_replay.sheet import run
 
     return run(args)

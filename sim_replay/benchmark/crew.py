@@ -20,6 +20,7 @@ from typing import Any, Literal, TypeVar
 
 from edge.errors import InputError
 from sim_replay.flight import FlightError
+from sim_replay.render.backdrop import BackdropError
 
 STOP_TIMEOUT_S = 60.0  # for the frame in hand, on a slow machine
 
@@ -127,7 +128,7 @@ def _work(pipe: Connection, do: Callable[..., Any], threads: int) -> None:
 def _done(pipe: Connection, do: Callable[..., Any], number: int, task: Any) -> Said:
     try:
         value = do(task, lambda news: _tell(pipe, Said(number, "news", news)), lambda: pipe.closed or pipe.poll())
-    except (OSError, InputError, FlightError) as error:
+    except (OSError, InputError, FlightError, BackdropError) as error:
         return Said(number, "failed", str(error))
     return Said(number, "done", value)
 
