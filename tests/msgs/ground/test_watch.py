@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from msgs import cdr, topics
 from msgs.ground.router import load_settings, open_router
 from msgs.publish import Node, TopicPublisher
-from msgs.session import TlsFiles, peer_config
+from msgs.session import TlsFiles, peer_config, router_config
 
 from ..conftest import Network, free_endpoint, until
 from .conftest import write_router_config
@@ -84,6 +84,10 @@ class Lines:
         for line in process.stdout:
             self.all.append(line)
 
+    def ended(self) -> None:
+        """Wait for the last word, before the pipe is closed."""
+        self._thread.join(20.0)
+
     def objects(self, kind: str) -> list[dict[str, object]]:
         return [one for one in map(json.loads, list(self.all)) if one["type"] == kind]
 
@@ -93,10 +97,12 @@ def ground(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], Lines]]:
     """`uavpose-ground` as a process."""
     command = [sys.executable, "-m", "msgs.ground.cli", *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        lines = Lines(process)
         try:
-            yield process, Lines(process)
+            yield process, lines
         finally:
             process.kill()
+            lines.ended()
 
 
 def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Network) -> None:
@@ -155,18 +161,20 @@ def test_the_table_shows_vehicles_and_targets_and_junk_is_refused(network: Netwo
     assert f"{network.endpoint}: up" in text
 
 
-def test_the_router_may_come_later_and_come_again(tmp_path: Path) -> None:
-    from msgs.session import router_config
-
+def test_the_router_may_come_later_and_come_again() -> None:
     endpoint = free_endpoint()
     with ExitStack() as stack, ground("watch", "--json", "-e", endpoint) as (_, lines):
         daemon = stack.enter_context(zenoh.open(peer_config([], [endpoint])))
         uav1 = Vehicle(daemon, "uav1", stack)
-        for turn in range(2):
+        links: list[object] = []
+        for _ in range(2):
             before = len(lines.objects("pose"))
+            links.append(True)
             with zenoh.open(router_config([endpoint])):
                 until(lambda before=before: len(lines.objects("pose")) > before + 3, uav1.tell)  # type: ignore[misc]
-            until(lambda turn=turn: [one["up"] for one in lines.objects("link")] == [True, False] * (turn + 1))  # type: ignore[misc]
+                until(lambda: [one["up"] for one in lines.objects("link")] == links)
+            links.append(False)
+            until(lambda: [one["up"] for one in lines.objects("link")] == links)
 
 
 def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_path: Path) -> None:
