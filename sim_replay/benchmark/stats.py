@@ -45,6 +45,7 @@ class _Counts:
     focal_px: list[float] = field(default_factory=list)  # one a scene
     box_share: list[float] = field(default_factory=list)
     visible_fraction: list[float] = field(default_factory=list)
+    below_camera: list[bool] = field(default_factory=list)
     distorted: int = 0  # scenes
 
 
@@ -92,6 +93,9 @@ def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int) -> N
             counts.box_share.append(float(np.prod(box[2:] - box[:2])) / area_px)
         if target.whole_px:
             counts.visible_fraction.append((target.visible_px or 0) / target.whole_px)
+        if frame.R_cam_world is not None:
+            # World is local NED where this project wrote it: further down than the camera is before the ground.
+            counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
         counts.airframes[split][_airframe(target.object_id)] += 1
 
 
@@ -154,6 +158,7 @@ def _summary(counts: _Counts) -> dict[str, Any]:
         "partly_hidden_share": float(np.mean(np.array(counts.visible_fraction) < 0.98))
         if counts.visible_fraction
         else None,
+        "below_camera_share": float(np.mean(counts.below_camera)) if counts.below_camera else None,
         "airframes": {split: dict(sorted(names.items())) for split, names in counts.airframes.items()},
         "airframe_flights_in_two_splits": _shared(counts.flights),
     }

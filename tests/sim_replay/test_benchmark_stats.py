@@ -34,7 +34,13 @@ def dataset(tmp_path: Path) -> Path:
             for _, _, (x, y, w, h), _, _ in targets:
                 image[y : y + h, x : x + w] = 30
             cv2.imwrite(str(folder / "rgb" / f"{k:06d}.jpg"), image)
-            cameras[str(k)] = {"cam_K": [focal, 0, 159.5, 0, focal, 89.5, 0, 0, 1], "depth_scale": 1.0}
+            # Level, looking north, NED: in scene 2 down as far as up in the others.
+            tilt = -0.1 if name.startswith("test") else 0.1
+            c, s = np.cos(tilt), np.sin(tilt)
+            cameras[str(k)] = {
+                "cam_K": [focal, 0, 159.5, 0, focal, 89.5, 0, 0, 1], "depth_scale": 1.0,
+                "cam_R_w2c": [0, 1, 0, s, 0, c, c, 0, -s], "cam_t_w2c": [0, 0, 5e5],
+            }  # fmt: skip
             poses[str(k)] = [
                 {"obj_id": i, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 1e3 * z]}
                 for i, z, *_ in targets
@@ -65,6 +71,7 @@ def test_every_figure_is_that_of_the_files(dataset: Path, capsys: pytest.Capture
     assert s["targets_per_frame"] == {"0": 1, "1": 2, "2": 1}
     assert s["target_free_share"] == pytest.approx(0.25)
     assert s["visible_fraction"]["min"] == pytest.approx(0.5)
+    assert s["below_camera_share"] == pytest.approx(0.5)  # both of scene 2
     assert s["partly_hidden_share"] == pytest.approx(0.25)
     assert s["airframes"]["train"] == {"light_aircraft": 1, "male_v_tail": 1}
     assert s["airframe_flights_in_two_splits"] == 1  # flight 11, on purpose
