@@ -166,8 +166,9 @@ class Station:
         if self._schedule.due(IMAGE_STATUS, 0, now_ns):
             status = words.image_status(report, first)
             out.append(self._packed(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN))
-        place = None if first is None else words.geo_status(report, first)
-        if place is not None and self._schedule.due(GEO_STATUS, 0, now_ns):
+        geo_due = first is not None and self._schedule.due(GEO_STATUS, 0, now_ns)
+        place = words.geo_status(report, first) if first is not None and geo_due else None
+        if place is not None:
             out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
         out += self._traffic(report, tracks, first, now_ns)
         for severity, text in self._announcer.words(report.tracks):

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge.types import Array, Report, Track, TrackState
+from edge.types import Report, Track, TrackState
+from msgs.wire import is_covariance
 
 UNSURE_RANGE_SHARE = 0.5  # range known worse than this is not told as a pose
 ROTATION_TOLERANCE = 1e-3
@@ -30,22 +31,15 @@ def _whole(track: Track) -> bool:
     in_cam = [track.box_xyxy_px, track.R_cam_target, track.t_cam_target_m, track.covariance]
     in_ned = [track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned]
     values = in_cam + [value for value in in_ned if value is not None]
-    if not all(np.all(np.isfinite(value)) for value in values):
+    if not np.isfinite(np.concatenate([np.ravel(value) for value in values])).all():
         return False
     range_m = float(np.linalg.norm(track.t_cam_target_m))
     if track.t_cam_target_m[2] <= 0.0 or not is_covariance(track.covariance):
         return False
     along = track.t_cam_target_m / range_m
     range_std_m = math.sqrt(max(float(along @ track.covariance[:3, :3] @ along), 0.0))
-    orthonormal = np.allclose(track.R_cam_target @ track.R_cam_target.T, np.eye(3), atol=ROTATION_TOLERANCE)
-    return bool(orthonormal and range_std_m <= UNSURE_RANGE_SHARE * range_m)
-
-
-def is_covariance(P: Array) -> bool:
-    """Whether [n, n] is symmetric and positive semi-definite, up to rounding."""
-    if not np.allclose(P, P.T, rtol=1e-6, atol=1e-9 * max(1.0, float(np.max(np.abs(P))))):
-        return False
-    return bool(np.linalg.eigvalsh(P)[0] >= -1e-9 * float(np.trace(P)))
+    skewness = np.abs(track.R_cam_target @ track.R_cam_target.T - np.eye(3)).max()
+    return bool(skewness <= ROTATION_TOLERANCE and range_std_m <= UNSURE_RANGE_SHARE * range_m)
 
 
 @dataclass
