@@ -14,7 +14,16 @@ from sim_replay.datasets import DatasetFrame
 from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.score import TargetPose
 
-__all__ = ["DEFAULT_THREADS", "SHIPPED_MODEL", "InputError", "Model", "estimator_answers", "load_model", "method_of"]
+__all__ = [
+    "DEFAULT_THREADS",
+    "SHIPPED_MODEL",
+    "InputError",
+    "Model",
+    "estimator_answers",
+    "load_model",
+    "method_of",
+    "with_score_min",
+]
 
 DEFAULT_THREADS = 2
 
@@ -40,6 +49,26 @@ def estimator_answers(model: Model) -> Answerer:
     return answer
 
 
+def with_score_min(model: Model, score_min: float | None) -> Model:
+    """The model with another score below which a peak is no target, in both stages; None: as it is.
+
+    Raises InputError outside 0..1.
+    """
+    if score_min is None:
+        return model
+    if not 0.0 <= score_min <= 1.0:
+        raise InputError(f"a least score of {score_min} is not between 0 and 1")
+    model.contract = model.contract.model_copy(update={"acquire_score_min": score_min, "track_score_min": score_min})
+    return model
+
+
 def method_of(model: Model) -> dict[str, Any]:
     """How a score names the model that was judged."""
-    return {"file": model.path.name, "sha256": model.sha256, "precision": model.contract.precision}
+    contract = model.contract
+    return {
+        "file": model.path.name,
+        "sha256": model.sha256,
+        "precision": contract.precision,
+        "acquire_score_min": contract.acquire_score_min,
+        "track_score_min": contract.track_score_min,
+    }

@@ -48,6 +48,12 @@ def register(commands: argparse._SubParsersAction) -> None:
         "camera's attitude where the scene has it (default %(default)s)",
     )
     evaluate.add_argument(
+        "--score-min",
+        type=float,
+        metavar="P",
+        help="below this score a peak is no target (default: what the ONNX file says; a checkpoint: 0.3)",
+    )
+    evaluate.add_argument(
         "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="folder to write to (default %(default)s)"
     )
     windows = evaluate.add_argument_group("rendered windows instead of a dataset")
@@ -74,8 +80,9 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from sim_replay.evaluation.table import score_table
     from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
+    asked = arguments
     request = DatasetRequest(
-        arguments.model, arguments.results, arguments.dataset, arguments.split, arguments.every, arguments.mode
+        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.score_min
     )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     errors = Console(stderr=True)

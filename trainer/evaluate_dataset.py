@@ -25,6 +25,7 @@ from sim_replay.offline import (
     estimator_answers,
     load_model,
     method_of,
+    with_score_min,
 )
 from trainer.config import ConfigError
 
@@ -38,6 +39,7 @@ class DatasetRequest(NamedTuple):
     split: str | None = None
     every: int = 1  # score every n-th picture
     mode: Literal["frames", "track"] = "frames"  # each picture alone, or sequences through the tracker
+    score_min: float | None = None  # below it a peak is no target; None: the model file's own
 
 
 class Evaluation(NamedTuple):
@@ -95,14 +97,16 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
     if request.results is not None:
         if request.mode == "track":
             raise ConfigError("--mode track: runs a model; a results file has its poses already")
+        if request.score_min is not None:
+            raise ConfigError("--score-min: is for a model; a results file has its poses already")
         return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
     answers = tracker_answers if request.mode == "track" else estimator_answers
     path = request.model or SHIPPED_MODEL
     if path.suffix == ".onnx":
-        model = load_model(path, DEFAULT_THREADS)
+        model = with_score_min(load_model(path, DEFAULT_THREADS), request.score_min)
         return method_of(model), answers(model)
     with tempfile.TemporaryDirectory() as folder:
-        model = load_model(export_for_now(path, Path(folder)), DEFAULT_THREADS)
+        model = with_score_min(load_model(export_for_now(path, Path(folder)), DEFAULT_THREADS), request.score_min)
     return method_of(model) | {"file": path.name}, answers(model)
 
 

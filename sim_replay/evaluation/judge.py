@@ -28,15 +28,20 @@ class JudgedFrame:
     """One picture, judged by itself."""
 
     picture: DatasetFrame
-    matches: tuple[Match, ...]  # in the order of picture.targets
+    matches: tuple[Match, ...]  # of the targets of which something is seen, in the order of picture.targets
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
 
 
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
-    """The picture's targets with size, name and model points. Raises InputError for an object without a model."""
+    """The picture's targets of which something is seen, with size, name and model points.
+
+    Raises InputError for an object without a model.
+    """
     truths = []
     for target in picture.targets:
+        if target.visible_px == 0:
+            continue
         model = models.get(target.object_id)
         if model is None:
             raise InputError(f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -120,6 +121,16 @@ def test_an_object_without_a_model_is_named(dark_spot_scene: Path) -> None:
     dataset = open_dataset(dark_spot_scene.parents[1])
     with pytest.raises(InputError, match="obj_id 1"):
         judge_frames(list(dataset.frames()), {2: Model(1.0)}, lambda *_: Answer((), None))
+
+
+def test_a_target_that_is_wholly_hidden_is_not_missed(dark_spot_scene: Path) -> None:
+    seen = {"bbox_visib": [1, 1, 5, 5], "bbox_obj": [1, 1, 5, 5], "px_count_visib": 25, "px_count_all": 25}
+    hidden = seen | {"bbox_visib": [-1, -1, -1, -1], "px_count_visib": 0}
+    info = {str(k): [hidden if k == 2 else seen] for k in range(4)}
+    (dark_spot_scene / "scene_gt_info.json").write_text(json.dumps(info | {"4": []}))
+    dataset = open_dataset(dark_spot_scene.parents[1])
+    results = judge_frames(list(dataset.frames()), dataset.models, lambda *_: Answer((), None))
+    assert [len(frame.matches) for frame in results] == [1, 1, 0, 1, 0]
 
 
 def test_angles_over_a_sequence_are_those_of_scipy_against_the_camera() -> None:

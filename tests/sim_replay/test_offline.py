@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from edge.errors import InputError
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import judge_frames
-from sim_replay.offline import estimator_answers, load_model
+from sim_replay.offline import estimator_answers, load_model, with_score_min
 
 
 def score_command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -35,6 +36,20 @@ def test_every_frame_is_judged_by_itself(dark_spot_scene: Path, dark_spot_model:
         assert match.estimate.score == pytest.approx(250 / 255, abs=0.05)
         assert match.estimate.covariance is not None
         assert match.estimate.covariance[3, 3] == pytest.approx(0.01)
+
+
+def test_a_higher_least_score_lets_less_through(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    """The network's score of a spot is its darkness, 250 of 255, and of an empty sky 15."""
+    dataset = open_dataset(dark_spot_scene)
+    pictures = list(dataset.frames())
+    found = []
+    for score_min in (0.01, None, 0.99):
+        answers = estimator_answers(with_score_min(load_model(dark_spot_model, threads=1), score_min))
+        results = judge_frames(pictures, dataset.models, answers)
+        found.append((sum(m.estimate is not None for r in results for m in r.matches), len(results[-1].false_poses)))
+    assert found == [(4, 1), (4, 0), (0, 0)]
+    with pytest.raises(InputError, match="between 0 and 1"):
+        with_score_min(load_model(dark_spot_model, threads=1), 1.5)
 
 
 def test_the_command_scores_a_dataset_folder_as_json(dark_spot_scene: Path, dark_spot_model: Path) -> None:
