@@ -23,11 +23,12 @@ class FrameMeta:
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture and the intrinsics of exactly its pixels."""
+    """One picture as the camera gave it and the intrinsics of exactly its pixels, its lens's distortion among them."""
 
     meta: FrameMeta
     image_bgr: NDArray[np.uint8]  # [H, W, 3]
     K: Array  # [3, 3], pixel centres at integers
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] (plumb bob); empty: a pinhole camera
 
 
 @dataclass(frozen=True)

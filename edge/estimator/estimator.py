@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge.estimator.decode import decode, distinct, nearest_expected
+from edge.estimator.lens import lens_of
 from edge.estimator.model import Model
 from edge.estimator.window import cut, fit_frame, window_around
 from edge.types import Array, Estimate, Frame
@@ -39,7 +40,8 @@ class Estimator:
         Each is refined in a track window of the same frame; one the window does not confirm is no target.
         """
         contract = self.model.contract
-        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit)
+        lens = lens_of(frame.K, frame.distortion)
+        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
         K = pixel_map.intrinsics(frame.K)
         peaks = self.model.run(image[None], K[None])
         found = decode(peaks, 0, pixel_map, K, contract, "acquire", self.refused)
@@ -59,10 +61,11 @@ class Estimator:
             return []
         size_wh = contract.track_size_wh
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
-        windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh) for box in boxes_xyxy_px]
-        maps = [window.pixel_map(size_wh) for window in windows]
+        lens = lens_of(frame.K, frame.distortion)
+        windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh, lens) for box in boxes_xyxy_px]
+        maps = [window.pixel_map(size_wh, lens) for window in windows]
         K = np.stack([pixel_map.intrinsics(frame.K) for pixel_map in maps])
-        peaks = self.model.run(np.stack([cut(frame.image_bgr, window, size_wh) for window in windows]), K)
+        peaks = self.model.run(np.stack([cut(frame.image_bgr, window, size_wh, lens) for window in windows]), K)
         found = [
             nearest_expected(decode(peaks, i, pixel_map, K[i], contract, "track", self.refused), boxes_xyxy_px[i])
             for i, pixel_map in enumerate(maps)

@@ -1,4 +1,8 @@
-"""Between the frame's pixels and the network's: whole frames fitted, windows cut, K following exactly. Pure."""
+"""Between the frame's pixels and the network's: whole frames fitted, windows cut, K following exactly. Pure.
+
+The network always sees a pinhole camera. A lens's distortion is taken out of the pixels that it is shown and of no
+others, and put back into the boxes it finds.
+"""
 
 from __future__ import annotations
 
@@ -9,31 +13,48 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edge.estimator.lens import Lens
 from edge.types import Array
 
 Image = NDArray[np.uint8]
 
+_GRID_POINTS = 9  # each way, to find what part of the frame a window sees through a lens
+_MARGIN_PX = 4.0  # and how much that may miss between them, with what bilinear sampling takes beside a point
+_NOWHERE = -1000.0  # a pixel outside every frame
+
 
 @dataclass(frozen=True)
 class PixelMap:
-    """Frame pixels c to network pixels c' = (c + 0.5) * scale - 0.5 + offset, each axis; pixel centres at integers."""
+    """Pinhole pixels c to network pixels c' = (c + 0.5) * scale - 0.5 + offset, each axis; pixel centres at integers.
+
+    Without a lens the frame's pixels are the pinhole's.
+    """
 
     scale_xy: tuple[float, float]
     offset_xy: tuple[float, float]
+    lens: Lens | None = None
 
     def to_network(self, points_px: ArrayLike) -> Array:
         """[..., 2] frame pixels to network pixels."""
-        return (np.asarray(points_px, dtype=np.float64) + 0.5) * self.scale_xy - 0.5 + self.offset_xy
+        points = np.asarray(points_px, dtype=np.float64)
+        pinhole = points if self.lens is None else self.lens.to_pinhole(points)
+        return (pinhole + 0.5) * self.scale_xy - 0.5 + self.offset_xy
 
     def to_frame(self, points_px: ArrayLike) -> Array:
         """[..., 2] network pixels to frame pixels."""
+        pinhole = self.to_pinhole(points_px)
+        return pinhole if self.lens is None else self.lens.to_frame(pinhole)
+
+    def to_pinhole(self, points_px: ArrayLike) -> Array:
+        """[..., 2] network pixels to pinhole pixels."""
         return (np.asarray(points_px, dtype=np.float64) + 0.5 - self.offset_xy) / self.scale_xy - 0.5
 
     def box_to_frame(self, center_px: ArrayLike, size_px: ArrayLike) -> Array:
         """Centre and size [..., 2] in network pixels to box_xyxy_px [..., 4] on the frame."""
-        center = self.to_frame(center_px)
+        center = self.to_pinhole(center_px)
         half = 0.5 * np.asarray(size_px, dtype=np.float64) / self.scale_xy
-        return np.concatenate([center - half, center + half], axis=-1)
+        box = np.concatenate([center - half, center + half], axis=-1)
+        return box if self.lens is None else self.lens.box_to_frame(box)
 
     def intrinsics(self, K: ArrayLike) -> Array:
         """K [3, 3] of the frame to K of the network's pixels: the same camera, other pixels."""
@@ -44,53 +65,78 @@ class PixelMap:
 
 @dataclass(frozen=True)
 class Window:
-    """Frame pixels left .. left + width - 1, top .. top + height - 1; it may reach beyond the frame."""
+    """Pinhole pixels left .. left + width - 1, top .. top + height - 1; it may reach beyond the frame."""
 
     left: int
     top: int
     width: int
     height: int
 
-    def pixel_map(self, size_wh: tuple[int, int]) -> PixelMap:
+    def pixel_map(self, size_wh: tuple[int, int], lens: Lens | None = None) -> PixelMap:
         sx, sy = size_wh[0] / self.width, size_wh[1] / self.height
-        return PixelMap((sx, sy), (-self.left * sx, -self.top * sy))
+        return PixelMap((sx, sy), (-self.left * sx, -self.top * sy), lens)
+
+
+def whole_frame(frame_wh: tuple[int, int], lens: Lens | None = None) -> Window:
+    """The window that holds all that the frame shows."""
+    if lens is None:
+        return Window(0, 0, *frame_wh)
+    x0, y0, x1, y1 = lens.extent_xyxy_px(frame_wh)
+    left, top = int(np.floor(x0 + 0.5)), int(np.floor(y0 + 0.5))
+    return Window(left, top, max(int(np.ceil(x1 + 0.5)) - left, 2), max(int(np.ceil(y1 + 0.5)) - top, 2))
 
 
 def fit_frame(
-    image_bgr: Image, size_wh: tuple[int, int], fit: Literal["letterbox", "squash"]
+    image_bgr: Image, size_wh: tuple[int, int], fit: Literal["letterbox", "squash"], lens: Lens | None = None
 ) -> tuple[Image, PixelMap]:
     """The whole frame [H, W, 3] on the network's [h, w, 3]: aspect kept and centred on black, or squashed."""
-    height, width = image_bgr.shape[:2]
+    seen = whole_frame((image_bgr.shape[1], image_bgr.shape[0]), lens)
     inner_wh = size_wh
     if fit == "letterbox":
-        scale = min(size_wh[0] / width, size_wh[1] / height)
-        inner_wh = (max(round(width * scale), 1), max(round(height * scale), 1))
+        scale = min(size_wh[0] / seen.width, size_wh[1] / seen.height)
+        inner_wh = (max(round(seen.width * scale), 1), max(round(seen.height * scale), 1))
+    inner_map = seen.pixel_map(inner_wh, lens)
+    if lens is None:
+        inner = _resize(image_bgr, inner_wh)
+    else:
+        inner = _straightened(image_bgr, lens, inner_map, inner_wh, cv2.BORDER_CONSTANT)
     left, top = (size_wh[0] - inner_wh[0]) // 2, (size_wh[1] - inner_wh[1]) // 2
     out = np.zeros((size_wh[1], size_wh[0], 3), dtype=np.uint8)
-    out[top : top + inner_wh[1], left : left + inner_wh[0]] = _resize(image_bgr, inner_wh)
-    return out, PixelMap((inner_wh[0] / width, inner_wh[1] / height), (float(left), float(top)))
+    out[top : top + inner_wh[1], left : left + inner_wh[0]] = inner
+    offset_xy = (inner_map.offset_xy[0] + left, inner_map.offset_xy[1] + top)
+    return out, PixelMap(inner_map.scale_xy, offset_xy, lens)
 
 
 def window_around(
-    box_xyxy_px: ArrayLike, window_scale: float, size_wh: tuple[int, int], image_size_wh: tuple[int, int]
+    box_xyxy_px: ArrayLike,
+    window_scale: float,
+    size_wh: tuple[int, int],
+    image_size_wh: tuple[int, int],
+    lens: Lens | None = None,
 ) -> Window:
-    """The window of the network's aspect around a box, its shorter side window_scale times the box's longer.
+    """The window of the network's aspect around a box on the frame, its shorter side window_scale times the longer.
 
     It is moved into the frame where it fits there: real pixels say more than a border. It never outgrows the frame's
     longer side: the box of a target predicted at arm's length has no bounds, and the memory for its window has.
     """
-    x0, y0, x1, y1 = np.asarray(box_xyxy_px, dtype=np.float64)
-    side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(image_size_wh)))
+    seen = whole_frame(image_size_wh, lens)
+    box = np.asarray(box_xyxy_px, dtype=np.float64)
+    x0, y0, x1, y1 = box if lens is None else lens.box_to_pinhole(_clipped(box, image_size_wh))
+    side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(seen.width, seen.height)))
     shorter = min(size_wh)
     width, height = max(round(side * size_wh[0] / shorter), 2), max(round(side * size_wh[1] / shorter), 2)
     # Outermost pixel centres lie half a pixel inside the box's edges.
     left = round(0.5 * (x0 + x1) - 0.5 * (width - 1))
     top = round(0.5 * (y0 + y1) - 0.5 * (height - 1))
-    return Window(_inside(left, width, image_size_wh[0]), _inside(top, height, image_size_wh[1]), width, height)
+    return Window(
+        _inside(left, width, seen.left, seen.width), _inside(top, height, seen.top, seen.height), width, height
+    )
 
 
-def cut(image_bgr: Image, window: Window, size_wh: tuple[int, int]) -> Image:
+def cut(image_bgr: Image, window: Window, size_wh: tuple[int, int], lens: Lens | None = None) -> Image:
     """The window's pixels at the network's size [h, w, 3]; beyond the frame its border is repeated."""
+    if lens is not None:
+        return _straightened(image_bgr, lens, window.pixel_map(size_wh, lens), size_wh, cv2.BORDER_REPLICATE)
     height, width = image_bgr.shape[:2]
     rows = slice(max(window.top, 0), min(window.top + window.height, height))
     columns = slice(max(window.left, 0), min(window.left + window.width, width))
@@ -106,10 +152,56 @@ def cut(image_bgr: Image, window: Window, size_wh: tuple[int, int]) -> Image:
     return _resize(pixels, size_wh)
 
 
-def _inside(start: int, length: int, limit: int) -> int:
+def _straightened(image_bgr: Image, lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int], border: int) -> Image:
+    """What the map's pinhole camera sees [h, w, 3]: the part of the frame it looks at, reduced, then bent straight.
+
+    Reducing first keeps the averages that a remap, which samples points, would skip.
+    """
+    grid = np.stack(np.meshgrid(*(np.linspace(-0.5, side - 0.5, _GRID_POINTS) for side in size_wh)), axis=-1)
+    pinhole = pixel_map.to_pinhole(grid).reshape(-1, 2)
+    folded = np.linalg.norm(lens.rays(pinhole)[:, :2], axis=1) > lens.radius_max
+    points = lens.to_frame(pinhole[~folded] if not folded.all() else pinhole[:1])
+    shrink = min(*pixel_map.scale_xy, 1.0)
+    margin_px = _MARGIN_PX / shrink
+    left, right = _span(points[:, 0], margin_px, image_bgr.shape[1])
+    top, bottom = _span(points[:, 1], margin_px, image_bgr.shape[0])
+    part = Window(left, top, right - left, bottom - top)
+    pixels: Image = image_bgr[top:bottom, left:right]
+    part_wh = (max(round(part.width * shrink), 1), max(round(part.height * shrink), 1))
+    if shrink < 1.0:
+        pixels = _resize(pixels, part_wh)
+    else:
+        part_wh = (part.width, part.height)
+    K_part, K_network = part.pixel_map(part_wh).intrinsics(lens.K), pixel_map.intrinsics(lens.K)
+    maps = cv2.initUndistortRectifyMap(K_part, np.array(lens.distortion), None, K_network, size_wh, cv2.CV_32FC1)
+    if folded.any():
+        maps[0][_folded(lens, pixel_map, size_wh)] = _NOWHERE
+    straight = cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(straight, dtype=np.uint8)
+
+
+def _folded(lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int]) -> NDArray[np.bool_]:
+    """[h, w] of the network's pixels whose rays the lens lets through nowhere."""
+    columns, rows = np.meshgrid(np.arange(size_wh[0]), np.arange(size_wh[1]))
+    rays = lens.rays(pixel_map.to_pinhole(np.stack([columns, rows], axis=-1)))
+    return np.asarray(np.hypot(rays[..., 0], rays[..., 1]) > lens.radius_max)
+
+
+def _span(coordinates: Array, margin_px: float, limit: int) -> tuple[int, int]:
+    """First and one past the last pixel, inside 0 .. limit and never empty, that hold the coordinates."""
+    first = int(np.clip(np.floor(coordinates.min() - margin_px), 0, limit - 1))
+    return first, int(np.clip(np.ceil(coordinates.max() + margin_px) + 1, first + 1, limit))
+
+
+def _clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:
+    """The box's part on the frame: only there is a lens known. A box beside it becomes the nearest edge."""
+    return np.clip(box_xyxy_px, -0.5, np.tile(image_size_wh, 2) - 0.5)
+
+
+def _inside(start: int, length: int, low: int, limit: int) -> int:
     if length >= limit:
-        return -((length - limit) // 2)
-    return min(max(start, 0), limit - length)
+        return low - ((length - limit) // 2)
+    return min(max(start, low), low + limit - length)
 
 
 def _resize(image_bgr: Image, size_wh: tuple[int, int]) -> Image:

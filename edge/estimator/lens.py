@@ -1,0 +1,114 @@
+"""A lens that bends rays: from the frame's pixels to those of the pinhole camera of the same K, and back. Pure.
+
+The model is OpenCV's and ROS's plumb bob: k1 k2 p1 p2 [k3 [k4 k5 k6]].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edge.types import Array
+
+# Beyond this tangent (76 degrees off the axis) no pinhole camera is asked for a picture.
+RADIUS_MAX = 4.0
+# How far, in sides of the frame, the pinhole's picture may reach beyond the frame's own pixels.
+EXTENT_EXCESS = 0.5
+_EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+_BORDER_POINTS = 17
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """K [3, 3] (pixel centres at integers) and the distortion that `pinhole` pixels lack and `frame` pixels have."""
+
+    K: Array
+    distortion: tuple[float, ...]  # k1 k2 p1 p2 [k3 [k4 k5 k6]]
+
+    def to_pinhole(self, points_px: ArrayLike) -> Array:
+        """[..., 2] frame pixels to pinhole pixels; of use inside the frame, where the lens can be inverted."""
+        points = np.asarray(points_px, dtype=np.float64)
+        straight = cv2.undistortPoints(
+            points.reshape(-1, 1, 2), self.K, np.array(self.distortion), P=self.K, criteria=_EXACT
+        )
+        return np.asarray(straight, dtype=np.float64).reshape(points.shape)
+
+    def to_frame(self, points_px: ArrayLike) -> Array:
+        """[..., 2] pinhole pixels to frame pixels."""
+        points = np.asarray(points_px, dtype=np.float64)
+        rays = self.rays(points).reshape(-1, 1, 3)
+        bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), self.K, np.array(self.distortion))
+        return np.asarray(bent, dtype=np.float64).reshape(points.shape)
+
+    def rays(self, points_px: ArrayLike) -> Array:
+        """[..., 2] pinhole pixels to rays [..., 3] in `cam` with z = 1."""
+        points = np.asarray(points_px, dtype=np.float64)
+        homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+        return np.asarray(homogeneous @ np.linalg.inv(self.K).T)
+
+    def box_to_pinhole(self, box_xyxy_px: ArrayLike) -> Array:
+        """Box [..., 4] on the frame to the box on the pinhole's picture that its sides' middles bound."""
+        return _through(self.to_pinhole, box_xyxy_px)
+
+    def box_to_frame(self, box_xyxy_px: ArrayLike) -> Array:
+        """Box [..., 4] on the pinhole's picture to the box on the frame that its sides' middles bound."""
+        return _through(self.to_frame, box_xyxy_px)
+
+    def extent_xyxy_px(self, frame_wh: tuple[int, int]) -> Array:
+        """The box [4] of pinhole pixels that holds all of the frame that the lens lets through, within bounds."""
+        return _extent(self.K.tobytes(), self.distortion, frame_wh).copy()
+
+    @property
+    def radius_max(self) -> float:
+        """Tangent of the angle off the axis up to which the lens maps rays one to one."""
+        return _radius_max(self.distortion)
+
+
+def lens_of(K: ArrayLike, distortion: tuple[float, ...]) -> Lens | None:
+    """The lens, or None where there is nothing to bend."""
+    return Lens(np.asarray(K, dtype=np.float64), distortion) if any(distortion) else None
+
+
+def _through(convert: Callable[[Array], Array], box_xyxy_px: ArrayLike) -> Array:
+    x0, y0, x1, y1 = np.moveaxis(np.asarray(box_xyxy_px, dtype=np.float64), -1, 0)
+    x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    middles = np.stack([np.stack(p, axis=-1) for p in ((x0, y), (x, y0), (x1, y), (x, y1))], axis=-2)
+    left, top, right, bottom = np.moveaxis(convert(middles), -2, 0)
+    return np.stack([left[..., 0], top[..., 1], right[..., 0], bottom[..., 1]], axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _radius_max(distortion: tuple[float, ...]) -> float:
+    """Where the radial part stops growing: beyond, the polynomial folds the picture over itself."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
+    r = np.linspace(0.0, RADIUS_MAX, 4001)
+    r2 = r * r
+    bent = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    folds = np.flatnonzero(~(np.diff(bent) > 0))
+    return float(r[folds[0]]) if folds.size else RADIUS_MAX
+
+
+@lru_cache(maxsize=16)
+def _extent(K_bytes: bytes, distortion: tuple[float, ...], frame_wh: tuple[int, int]) -> Array:
+    lens = Lens(np.frombuffer(K_bytes).reshape(3, 3), distortion)
+    right, bottom = frame_wh[0] - 0.5, frame_wh[1] - 0.5
+    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
+    xs, ys = -0.5 + along * (right + 0.5), -0.5 + along * (bottom + 0.5)
+    border = np.concatenate(
+        [np.column_stack([xs, np.full_like(xs, y)]) for y in (-0.5, bottom)]
+        + [np.column_stack([np.full_like(ys, x), ys]) for x in (-0.5, right)]
+    )
+    straight = lens.to_pinhole(border)
+    radius = np.linalg.norm(lens.rays(straight)[:, :2], axis=1)
+    returned = np.abs(lens.to_frame(straight) - border).max(axis=1)
+    straight = straight[(radius < lens.radius_max) & (returned < 0.5)]  # NaN compares false
+    if not len(straight):
+        return np.array([-0.5, -0.5, right, bottom])
+    low, high = straight.min(axis=0), straight.max(axis=0)
+    excess = EXTENT_EXCESS * np.array(frame_wh)
+    return np.concatenate([np.maximum(low, -0.5 - excess), np.minimum(high, np.array([right, bottom]) + excess)])

@@ -1,0 +1,197 @@
+"""Windows cut through lenses that bend: the network must see the pinhole camera that its K tells of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from edge.estimator.estimator import Estimator
+from edge.estimator.lens import Lens
+from edge.estimator.model import load_model
+from edge.estimator.window import cut, fit_frame, whole_frame, window_around
+from edge.types import Frame, FrameMeta
+
+from .toy_scene import SIZE_WH, TARGET_WH, K, true_t_cam_target_m
+
+NETWORK_WH = (160, 160)
+BARREL = (-0.32, 0.12, 0.001, -0.0008, -0.02)
+
+
+@dataclass(frozen=True)
+class Camera:
+    K: np.ndarray
+    size_wh: tuple[int, int]
+    distortion: tuple[float, ...]
+
+    @property
+    def lens(self) -> Lens:
+        return Lens(self.K, self.distortion)
+
+    def bend(self, rays_xy: np.ndarray) -> np.ndarray:
+        """Rays (x / z, y / z) [..., 2] to frame pixels: the plumb-bob model as its authors write it."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = rays_xy[..., 0], rays_xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        (fx, fy), (cx, cy) = np.diag(self.K)[:2], self.K[:2, 2]
+        return np.stack([fx * bent_x + cx, fy * bent_y + cy], axis=-1)
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> Camera:
+    """Any focal length and centre; distortion by up to a fifth of the radius at the corner, growing to there."""
+    width, height = draw(st.sampled_from([(1920, 1080), (1280, 1024), (640, 480)]))
+    focal = draw(st.floats(0.6, 8.0)) * width
+    fy = focal * draw(st.floats(0.97, 1.03))
+    cx = width * draw(st.floats(0.45, 0.55))
+    cy = height * draw(st.floats(0.45, 0.55))
+    corner = np.hypot(width, height) / 2 / focal
+    shares = [draw(st.floats(-0.2, 0.2)), draw(st.floats(-0.05, 0.05)), draw(st.floats(-0.02, 0.02))]
+    decentred = [draw(st.floats(-0.01, 0.01)) / corner for _ in range(2)]
+    k1, k2, k3 = (share / corner ** (2 * n) for n, share in enumerate(shares, start=1))
+    return Camera(np.array([[focal, 0, cx], [0, fy, cy], [0, 0, 1]]), (width, height), (k1, k2, *decentred, k3))
+
+
+shares = st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)).map(np.array)
+sizes = st.floats(8.0, 500.0)
+
+
+@given(cameras(), shares, shares, sizes, st.floats(60, 500))
+def test_a_point_goes_through_any_window_and_back_within_a_hundredth_of_a_pixel(
+    camera: Camera, at: np.ndarray, beside: np.ndarray, size_px: float, z_m: float
+) -> None:
+    lens, K_frame = camera.lens, camera.K
+    on_frame = at * (np.array(camera.size_wh) - 1)
+    rays = np.linalg.inv(K_frame) @ [*lens.to_pinhole(on_frame), 1.0]
+    assume(np.linalg.norm(rays[:2]) < lens.radius_max)
+    point_m = z_m * rays
+    np.testing.assert_allclose(camera.bend(rays[:2]), on_frame, atol=0.01)
+    center = beside * np.array(camera.size_wh)  # a window around something else: partly off the frame at its edges
+    box = np.array([*(center - size_px / 2), *(center + size_px / 2)])
+    windows = [window_around(box, 1.8, NETWORK_WH, camera.size_wh, lens), whole_frame(camera.size_wh, lens)]
+    for window in windows:
+        pixel_map = window.pixel_map(NETWORK_WH, lens)
+        on_network = pixel_map.intrinsics(K_frame) @ point_m / point_m[2]
+        np.testing.assert_allclose(pixel_map.to_frame(on_network[:2]), camera.bend(rays[:2]), atol=0.01)
+        np.testing.assert_allclose(pixel_map.to_network(camera.bend(rays[:2])), on_network[:2], atol=0.01)
+
+
+def dot(size_wh: tuple[int, int], at_px: np.ndarray, sigma_px: float = 3.0) -> np.ndarray:
+    """A picture with one soft dot, exact below the pixel."""
+    x = np.exp(-((np.arange(size_wh[0]) - at_px[0]) ** 2) / (2 * sigma_px**2))
+    y = np.exp(-((np.arange(size_wh[1]) - at_px[1]) ** 2) / (2 * sigma_px**2))
+    return np.repeat((250 * y[:, None] * x[None, :]).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    weights = image[..., 0].astype(float)
+    rows, columns = np.indices(weights.shape)
+    return np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
+
+
+@settings(max_examples=30, deadline=None)
+@given(cameras(), shares, sizes)
+def test_a_window_shows_a_point_where_its_pinhole_sees_it(camera: Camera, at: np.ndarray, size_px: float) -> None:
+    width, height = camera.size_wh
+    on_frame = 30 + at * (np.array([width, height]) - 60)
+    lens = camera.lens
+    rays = np.linalg.inv(camera.K) @ [*lens.to_pinhole(on_frame), 1.0]
+    assume(np.linalg.norm(rays[:2]) < 0.9 * lens.radius_max)
+    box = np.array([*(on_frame - size_px / 2), *(on_frame + size_px / 2)])
+    window = window_around(box, 1.8, NETWORK_WH, camera.size_wh, lens)
+    assume(window.width >= 40)
+    image = cut(dot(camera.size_wh, on_frame), window, NETWORK_WH, lens)
+    expected = (window.pixel_map(NETWORK_WH, lens).intrinsics(camera.K) @ rays)[:2]
+    np.testing.assert_allclose(centroid(image), expected, atol=0.2)
+
+
+@pytest.mark.parametrize("fit", ["letterbox", "squash"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("corner", [(20, 20), (1899, 20), (20, 1059), (1899, 1059)])
+def test_the_whole_frame_is_seen_to_its_corners_through_barrel_and_pincushion(
+    fit: str, sign: float, corner: tuple[int, int]
+) -> None:
+    camera = Camera(K, SIZE_WH, (sign * 0.25, 0.0, 0.0, 0.0, 0.0))
+    image, pixel_map = fit_frame(dot(SIZE_WH, np.array(corner), 5.0), (640, 384), fit, camera.lens)  # type: ignore[arg-type]
+    expected = pixel_map.to_network(np.array(corner))
+    assert np.all(expected > 0)
+    assert np.all(expected < (639, 383))
+    np.testing.assert_allclose(centroid(image), expected, atol=0.25)
+
+
+def test_a_window_has_the_pixels_of_the_straightened_frame() -> None:
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, (1080, 1920, 3), dtype=np.uint8), (0, 0), 4.0)
+    camera = Camera(K, SIZE_WH, BARREL)
+    whole = cv2.undistort(texture, K, np.array(BARREL))
+    for box in ([900, 500, 960, 540], [300, 200, 700, 500], [1500, 800, 1700, 900]):
+        window = window_around(np.array(box), 1.8, NETWORK_WH, SIZE_WH, camera.lens)
+        own = cut(texture, window, NETWORK_WH, camera.lens).astype(float)
+        reference = cut(np.asarray(whole, dtype=np.uint8), window, NETWORK_WH).astype(float)
+        assert np.abs(own - reference).mean() < 0.02 * reference.std() + 1.0
+        shifted = np.roll(reference, 1, axis=1)
+        assert np.abs(own - reference).mean() < 0.5 * np.abs(shifted - reference).mean()
+
+
+def test_a_lens_that_folds_the_picture_shows_nothing_twice() -> None:
+    camera = Camera(np.array([[300.0, 0, 319.5], [0, 300.0, 239.5], [0, 0, 1]]), (640, 480), (-0.3, 0, 0, 0, 0))
+    on_frame = np.array([319.5 + 180.0, 239.5])
+    image, pixel_map = fit_frame(dot((640, 480), on_frame), (640, 480), "squash", camera.lens)
+    bright = (image[..., 0] > 100).astype(np.uint8)
+    count, _ = cv2.connectedComponents(bright)
+    assert count - 1 == 1
+    np.testing.assert_allclose(centroid(image), pixel_map.to_network(on_frame), atol=0.5)
+
+
+def test_windows_off_the_frame_and_beyond_the_lens_are_still_pictures() -> None:
+    folding = Lens(np.array([[300.0, 0, 319.5], [0, 300.0, 239.5], [0, 0, 1]]), (-0.3, 0, 0, 0))
+    image = np.full((480, 640, 3), 90, np.uint8)
+    for box in ([-300, -200, -250, -150], [630, 470, 900, 800], [-1e4, -1e4, 1e4, 1e4], [0, 0, 1, 1]):
+        window = window_around(np.array(box, dtype=float), 1.8, NETWORK_WH, (640, 480), folding)
+        seen = cut(image, window, NETWORK_WH, folding)
+        assert seen.shape == (160, 160, 3)
+        assert np.all(seen == 90)  # no black, no noise: the frame's border is repeated
+
+
+def bent_rectangle(camera: Camera, center_px: tuple[float, float]) -> np.ndarray:
+    """The toy target at a place of the pinhole's picture, as the lens throws it on the frame."""
+    half = np.array(TARGET_WH) / 2
+    columns, rows = np.meshgrid(np.arange(SIZE_WH[0]), np.arange(SIZE_WH[1]))
+    left, top = np.array(center_px) - 150
+    near = (np.abs(columns - left - 150) < 250) & (np.abs(rows - top - 150) < 250)
+    image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+    points = np.stack([columns[near], rows[near]], axis=-1).astype(float)
+    inside = np.all(np.abs(camera.lens.to_pinhole(points) - center_px) <= half, axis=-1)
+    image[rows[near][inside], columns[near][inside]] = 255
+    return image
+
+
+@pytest.mark.parametrize("center", [(960.5, 540.5), (200.5, 150.5), (1750.5, 950.5)])
+def test_a_target_seen_through_a_lens_is_where_it_is_and_its_box_where_the_frame_shows_it(
+    toy_model: Path, center: tuple[float, float]
+) -> None:
+    camera = Camera(K, SIZE_WH, BARREL)
+    image = bent_rectangle(camera, center)
+    frame = Frame(FrameMeta(0, 0, 0), image, K, BARREL)
+    estimator = Estimator(load_model(toy_model, 1))
+    (found,) = estimator.acquire(frame)
+    (tracked,) = estimator.track(frame, [found.box_xyxy_px + 10.0])
+    rows, columns = np.nonzero(image[..., 0])
+    seen = np.array([columns.min() - 0.5, rows.min() - 0.5, columns.max() + 0.5, rows.max() + 0.5])
+    for estimate in (found, tracked):
+        assert estimate is not None
+        np.testing.assert_allclose(estimate.t_cam_target_m, true_t_cam_target_m(center), rtol=0.02, atol=0.3)
+        np.testing.assert_allclose(estimate.box_xyxy_px, seen, atol=3.0)
+    # What the lens does is more than what is tolerated: ignoring it must fail.
+    naive = Estimator(load_model(toy_model, 1)).acquire(Frame(FrameMeta(0, 0, 0), image, K))
+    away_m = [float(np.linalg.norm(e.t_cam_target_m - true_t_cam_target_m(center))) for e in naive]
+    if center != (960.5, 540.5):
+        assert min(away_m) > 3.0
