@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,8 +44,10 @@ class RecordingLimits:
     when_full: WhenFull = "oldest"  # remove the oldest recordings, or stop
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sample:
+    """What is to be written."""
+
     topic: Topic
     name: str  # with vehicle and target
     payload: bytes
@@ -65,6 +67,7 @@ class Recorder:
         self._tell = tell
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
+        self._standing: dict[str, Sample] = {}
         self._counters: Counter[str] = Counter()
         self._wanted = on
         self._stopping = False
@@ -89,6 +92,8 @@ class Recorder:
         """Take a sample to be written, if it is switched on; never waits. Lost, and counted, when the disk fails."""
         sample = Sample(topic, topics.topic_name(topic, uav, target), payload, time.time_ns(), publish_ns)
         with self._changed:
+            if topic.cache == 1:
+                self._standing[sample.name] = sample
             if not self._wanted or self._stopping:
                 return
             if self._failure is not None or len(self._waiting) >= WAITING_MAX:
@@ -136,7 +141,7 @@ class Recorder:
     def _turn(self, samples: deque[Sample], go_on: bool) -> None:
         """One second's work: write, put it on the disk, and begin another file where the limits say."""
         if samples or (self._failure is not None and go_on):
-            self._open()
+            self._open(samples)
         if self._file is None:
             return
         for sample in samples:
@@ -149,7 +154,7 @@ class Recorder:
         elif samples:
             self._store.make_room(self._file)
 
-    def _open(self) -> None:
+    def _open(self, samples: Collection[Sample]) -> None:
         now_s = time.monotonic()
         if self._file is not None or (self._failure is not None and now_s < self._retry_s):
             return
@@ -157,6 +162,13 @@ class Recorder:
         self._store.make_room(None)
         self._file = self._store.new_file()
         self._opened_s = now_s
+        with self._changed:
+            standing = list(self._standing.values())
+        # What is told on change alone is repeated, so that each file can be read without those before it.
+        began_ns = min((one.log_ns for one in samples), default=time.time_ns())
+        for one in standing:
+            if one not in samples:
+                self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns)
         if self._failure is not None:
             self._set_failure(None)
             self._tell(logging.INFO, "recording again")

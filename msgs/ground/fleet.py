@@ -27,6 +27,7 @@ ATTITUDE_AGE_NS = 1_000_000_000
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
 _RANGES_KEPT = 256
+VEHICLES_MAX = 64  # so that made-up names cannot grow this without bound
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,16 @@ class Fleet:
 
     def alive(self, uav: str, alive: bool) -> None:
         with self._lock:
-            self._vehicle(uav).alive = alive
+            vehicle = self._vehicle(uav)
+            if vehicle is not None:
+                vehicle.alive = alive
 
     def take(self, incoming: Incoming, now_ns: int) -> TargetRow | Log | DiagnosticArray | None:
         """Note a sample at `now_ns` (UTC); what is new in it for a person, or None. Malformed ones are counted."""
         with self._lock:
             vehicle = self._vehicle(incoming.uav)
+            if vehicle is None:
+                return None
             if incoming.topic is topics.POSE:
                 pose = vehicle.receiver.receive(incoming.key, incoming.payload, incoming.attachment, now_ns)
                 return None if pose is None else self._take_pose(vehicle, pose)
@@ -119,10 +124,10 @@ class Fleet:
         with self._lock:
             return [self._row(uav, vehicle, now_ns) for uav, vehicle in sorted(self._vehicles.items())]
 
-    def _vehicle(self, uav: str) -> _Vehicle:
-        if uav not in self._vehicles:
+    def _vehicle(self, uav: str) -> _Vehicle | None:
+        if uav not in self._vehicles and len(self._vehicles) < VEHICLES_MAX:
             self._vehicles[uav] = _Vehicle(PoseReceiver(uav, domain=self._domain, max_age_s=self._max_age_s))
-        return self._vehicles[uav]
+        return self._vehicles.get(uav)
 
     def _take_pose(self, vehicle: _Vehicle, pose: TargetPose) -> TargetRow:
         known = vehicle.targets.get(pose.target)

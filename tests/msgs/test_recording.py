@@ -31,6 +31,11 @@ def read(path: Path) -> list[tuple[str, str, bytes, int]]:
         return [(c.topic, s.name if s else "", m.data, m.log_time) for s, c, m in make_reader(file).iter_messages()]
 
 
+def is_whole(path: Path) -> bool:
+    """Whether its end has been written."""
+    return path.stat().st_size > 500 and path.read_bytes().endswith(MCAP0_MAGIC)
+
+
 def test_definitions_are_those_of_the_interfaces() -> None:
     assert make_definitions.PATH.read_text() == make_definitions.definitions()
     assert {topic.ros_type for topic in topics.TOPICS} == set(DEFINITIONS)
@@ -174,13 +179,30 @@ def test_switching_off_ends_the_file_and_on_begins_another(tmp_path: Path, monke
     until(lambda: recorder.counters()["recorded"] == 1)
     recorder.switch(False)
     (path,) = tmp_path.iterdir()
-    until(lambda: path.stat().st_size > 500 and path.read_bytes().endswith(MCAP0_MAGIC))
+    until(lambda: is_whole(path))
     record_some(recorder, [b"unheard"])
     recorder.switch(True)
     record_some(recorder, [b"second"])
     recorder.stop()
     assert [data for path in sorted(tmp_path.iterdir()) for *_, data, _ in read(path)] == [b"first", b"second"]
     assert recorder.counters() == {"recorded": 2}
+
+
+def test_each_file_holds_what_is_told_on_change_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    recorder = Recorder(tmp_path, "uav1", ROOM, print, on=False)
+    recorder.start()
+    for intrinsics in (b"wide", b"narrow"):
+        recorder.record(topics.CAMERA_INFO, "uav1", None, intrinsics, 1)
+    for turn in (1, 2):
+        recorder.switch(True)
+        record_some(recorder, [b"pose"])
+        until(lambda turn=turn: recorder.counters()["recorded"] == turn)  # type: ignore[misc]
+        recorder.switch(False)
+        until(lambda turn=turn: sum(map(is_whole, tmp_path.iterdir())) == turn)  # type: ignore[misc]
+    recorder.stop()
+    told = [("/uav1/camera_info", b"narrow"), ("/uav1/target/t0/pose", b"pose")]
+    assert [[(topic, data) for topic, _, data, _ in read(path)] for path in sorted(tmp_path.iterdir())] == [told, told]
 
 
 def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(

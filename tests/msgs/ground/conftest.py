@@ -31,7 +31,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TlsFiles]:
     folder, other = tmp_path_factory.mktemp("keys"), tmp_path_factory.mktemp("other")
     made = {}
     init_authority(folder)
-    for name in ("ground", "uav1", "uav2", "alice", "screen"):
+    for name in ("ground", "uav1", "uav2", "alice", "screen", "unlisted"):
         made[name] = issue(folder, name, ["127.0.0.1", "localhost"])
     init_authority(other)
     forged = issue(other, "uav1", ["127.0.0.1"])

@@ -113,6 +113,23 @@ def test_without_a_certificate_of_ours_nobody_gets_in_and_loopback_reads(ground:
         until(lambda: poses.poll() is not None, lambda: publisher.put(pose_now().encode()))
 
 
+def test_a_vehicle_hears_no_other_and_who_is_in_no_list_neither_hears_nor_is_heard(ground: Ground) -> None:
+    with ExitStack() as stack:
+        uav1, uav2 = vehicle(stack, ground, "uav1"), vehicle(stack, ground, "uav2")
+        unlisted = stack.enter_context(client.connect(ground.secure, tls=ground.keys["unlisted"]))
+        on_ground, *others = (watch(session, "0/uav1/target/**") for session in (ground.router, uav2, unlisted))
+        own = stack.enter_context(Node(uav1, "uav1")).publisher(topics.POSE, "t0")
+
+        def put() -> None:
+            unlisted.put(own.key.replace("t0", "t9"), b"forged")
+            own.put(pose_now().encode())
+
+        until(lambda: on_ground[own.key] >= 20, put)
+        assert set(on_ground) == {own.key}
+        # A session delivers to itself what it puts.
+        assert [own.key in other for other in others] == [False, False]
+
+
 def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
     tmp_path: Path, keys: dict[str, TlsFiles]
 ) -> None:
