@@ -1,0 +1,41 @@
+"""A target seen through a gimbal that pans while the aircraft banks is where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edge.tracking.tracker import Tracker
+from edge.types import Estimate, Mount, OwnShip, TrackState
+
+from .reports import SIZE_WH, K
+
+# On its gimbal the camera looks along the gimbal's x axis, upright.
+MOUNT = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
+T_NED_TARGET_M = np.array([260.0, 40.0, -100.0])
+V_NED_OWN_MPS = np.array([20.0, 0.0, 0.0])
+FRAME_S = 1 / 30
+
+
+def test_a_still_target_stands_still_while_gimbal_and_body_turn() -> None:
+    tracker, tracks = Tracker(1, MOUNT), ()
+    rng = np.random.default_rng(3)
+    for frame in range(90):
+        t_s = frame * FRAME_S
+        t_ned_own_m = V_NED_OWN_MPS * t_s + np.array([0.0, 0.0, -120.0])
+        R_ned_body = Rotation.from_euler("ZYX", [0.3 * t_s, 0.05, 0.5 * np.sin(t_s)]).as_matrix()
+        R_ned_gimbal = Rotation.from_euler("ZYX", [0.15 + 0.1 * np.sin(2 * t_s), -0.07, 0.0]).as_matrix()
+        own = OwnShip(round(t_s * 1e9), R_ned_body, t_ned_own_m, V_NED_OWN_MPS, None, R_ned_body.T @ R_ned_gimbal)
+        R_cam_ned = (R_ned_gimbal @ MOUNT.R_body_cam).T
+        t_cam_m = R_cam_ned @ (T_NED_TARGET_M - t_ned_own_m) * (1.0 + rng.normal(0.0, 0.005))
+        center_px = (K @ t_cam_m / t_cam_m[2])[:2]
+        box = np.concatenate([center_px - 20.0, center_px + 20.0])
+        covariance = np.diag([0.05, 0.05, 4.0, 0.01, 0.01, 0.01])
+        seen = Estimate(0.9, box, R_cam_ned, t_cam_m, covariance, "track")
+        tracks = tracker.update(own.time_ns, [seen], own, K, SIZE_WH)
+    (track,) = tracks
+    assert track.state is TrackState.CONFIRMED
+    assert track.t_ned_target_m is not None
+    assert track.v_ned_target_mps is not None
+    np.testing.assert_allclose(track.t_ned_target_m, T_NED_TARGET_M, atol=4.0)
+    assert np.linalg.norm(track.v_ned_target_mps) < 4.0
