@@ -25,6 +25,7 @@ from msgs.topics import Topic
 log = logging.getLogger(__name__)
 
 WAITING_MAX = 4096  # samples, for a disk that stalls
+STANDING_MAX = 256  # so that made-up names cannot grow it without bound
 FLUSH_S = 1.0
 RETRY_S = 10.0
 STOP_TIMEOUT_S = 10.0
@@ -92,7 +93,7 @@ class Recorder:
         """Take a sample to be written, if it is switched on; never waits. Lost, and counted, when the disk fails."""
         sample = Sample(topic, topics.topic_name(topic, uav, target), payload, time.time_ns(), publish_ns)
         with self._changed:
-            if topic.cache == 1:
+            if topic.cache == 1 and (sample.name in self._standing or len(self._standing) < STANDING_MAX):
                 self._standing[sample.name] = sample
             if not self._wanted or self._stopping:
                 return
@@ -133,7 +134,8 @@ class Recorder:
                 self._turn(samples, go_on)
                 with self._changed:
                     self._counters["recorded"] += len(samples)
-            except OSError as error:
+            except Exception as error:
+                # A full disk as a rule; but whatever it is, it must not silently end the recorder.
                 self._fail(error, len(samples))
             if stopping:
                 return
@@ -173,14 +175,15 @@ class Recorder:
             self._set_failure(None)
             self._tell(logging.INFO, "recording again")
 
-    def _fail(self, error: OSError, lost: int) -> None:
+    def _fail(self, error: Exception, lost: int) -> None:
         """Leave what is whole on the disk, say so once, and try again later."""
         if self._file is not None:
             file, self._file = self._file, None
             file.abandon()
         self._retry_s = time.monotonic() + RETRY_S
         first = self._failure is None
-        self._set_failure(error.strerror or str(error), lost)
+        reason = error.strerror if isinstance(error, OSError) else repr(error)
+        self._set_failure(reason or str(error), lost)
         if first:
             log.warning("recording stopped: %s", error)
             self._tell(logging.ERROR, f"recording stopped: {self._failure}")

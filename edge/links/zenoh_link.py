@@ -70,6 +70,7 @@ class ZenohLink:
         self._waiting = threading.Condition()
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
+        self._links = 0  # routers and peers connected just now
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
 
@@ -129,7 +130,7 @@ class ZenohLink:
 
     def counters(self) -> dict[str, int]:
         with self._waiting:
-            return dict(self._counters)
+            return {**self._counters, "links": self._links}
 
     def _take(self) -> Mailbox:
         with self._waiting:
@@ -153,7 +154,9 @@ class ZenohLink:
             while True:
                 mail = self._take()
                 counted = self._deliver(desk, mail)
+                links = 0 if session is None else len([*session.info.routers_zid(), *session.info.peers_zid()])
                 with self._waiting:
+                    self._links = links
                     self._counters.update(counted)
                     if mail.stopping and self._mailbox.empty():
                         return

@@ -274,7 +274,10 @@ def test_the_ground_may_come_later_than_the_daemon_and_come_again() -> None:
                 handler = zenoh.handlers.Callback(lambda _, came=came: came.set(), indirect=False)
                 subscriber = router.declare_subscriber("0/uav1/target/**", handler)
                 wait_until(came.is_set, "a sample", lambda: link.publish(report(track(time.monotonic_ns()))))
+                wait_until(lambda: link.counters()["links"] == 1, "the count of links")
                 subscriber.undeclare()
+            gone = lambda: link.publish(report(track(time.monotonic_ns())))  # noqa: E731
+            wait_until(lambda: link.counters()["links"] == 0, "its going", gone)
 
 
 def test_publishing_never_waits_and_the_newest_wins() -> None:
