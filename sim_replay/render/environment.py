@@ -8,8 +8,6 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.geometry import R_from_euler
-
 Array = NDArray[np.float64]
 Weather = Literal["clear", "haze", "overcast", "low_sun", "dusk", "fog", "glare", "broken_cloud"]
 WEATHERS: tuple[Weather, ...] = get_args(Weather)
@@ -97,6 +95,12 @@ _LIGHTS: dict[Weather, _Light] = {
 }  # fmt: skip
 
 
+def direction_ned(elevation_rad: float, azimuth_rad: float) -> Array:
+    """Unit vector [3] that points so far above the horizon and east of north."""
+    level = np.cos(elevation_rad)
+    return np.array([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), -np.sin(elevation_rad)])
+
+
 def _sun_ned(rng: np.random.Generator, elevation_rad: float, weather: Weather, sight_ned: Array | None) -> Array:
     azimuth = rng.uniform(0.0, 2.0 * np.pi)
     aside, above = rng.normal(0.0, np.radians(9.0)), rng.uniform(np.radians(1.0), np.radians(14.0))
@@ -104,7 +108,7 @@ def _sun_ned(rng: np.random.Generator, elevation_rad: float, weather: Weather, s
         azimuth = float(np.arctan2(sight_ned[1], sight_ned[0])) + aside
         sight_up = np.arctan2(-sight_ned[2], np.hypot(sight_ned[0], sight_ned[1]))
         elevation_rad = float(np.clip(sight_up + above, np.radians(3.0), np.radians(75.0)))
-    return R_from_euler(0.0, elevation_rad, azimuth) @ np.array([1.0, 0.0, 0.0])
+    return direction_ned(elevation_rad, azimuth)
 
 
 def environment_from_seed(seed: int, weather: Weather | None = None, sight_ned: Array | None = None) -> Environment:

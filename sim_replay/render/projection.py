@@ -20,6 +20,14 @@ FARTHEST_RADIUS2 = 25.0  # squared tangent of 79 degrees: no lens here sees furt
 
 
 @cache
+def vertices_m(airframe_id: int) -> Array:
+    """All vertices [V, 3] of the airframe; read-only."""
+    vertices = AIRFRAMES[airframe_id].mesh().vertices_m.astype(np.float64)
+    vertices.setflags(write=False)
+    return vertices
+
+
+@cache
 def solid_vertices_m(airframe_id: int) -> Array:
     """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds; read-only."""
     return _without_disc(AIRFRAMES[airframe_id].mesh())

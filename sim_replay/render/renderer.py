@@ -31,10 +31,11 @@ from sim_replay.render.packing import (
 )
 from sim_replay.render.projection import fine_mesh
 from sim_replay.render.scene import Scene, Target
-from sim_replay.render.view import Crop, Parts, crop_of, depth_projection, is_ahead, parts_of
+from sim_replay.render.view import Crop, Parts, crop_of, depth_projection, diameter_px, is_ahead, parts_of
 
 Array = NDArray[np.float64]
 SUN_THAT_CASTS_SHADOW = 0.2
+SHADOWED_FROM_PX = 40.0  # of diameter: what a smaller aircraft casts on itself is finer than the picture
 PIECES = (8, 6)  # of a whole frame, across and down
 _NOISE_UNIT, _COLOUR_UNIT, _COORDINATE_UNIT, _SHADOW_UNIT, _SKY_UNIT, _BACKDROP_UNIT = range(6)
 
@@ -318,6 +319,7 @@ class Renderer:
             for order, scene in enumerate(scenes)
             if scene.environment.sun_colour.max() > SUN_THAT_CASTS_SHADOW
             for number, target in enumerate(scene.targets, start=1)
+            if is_ahead(target, scene.camera) and diameter_px(target, scene.camera) >= SHADOWED_FROM_PX
         ]
         if not casting:
             return {}

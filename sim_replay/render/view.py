@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES
-from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, project_px
+from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, project_px, vertices_m
 from sim_replay.render.scene import Camera, Scene, Target, rays_ned
 
 Array = NDArray[np.float64]
@@ -42,12 +42,17 @@ def is_ahead(target: Target, camera: Camera) -> bool:
     return bool(depth_m - AIRFRAMES[target.airframe_id].diameter_m() >= NEAREST_VERTEX_M)
 
 
+def diameter_px(target: Target, camera: Camera) -> float:
+    """Pixels that the target's diameter takes at its range, seen broadside."""
+    range_m = np.linalg.norm(target.t_ned_body_m - camera.t_ned_cam_m)
+    return float(camera.K[0, 0] * AIRFRAMES[target.airframe_id].diameter_m() / range_m)
+
+
 def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
     """Pixels that the targets may touch, clipped to the image; zeros if there are none."""
     x0, y0, x1, y1 = camera.width_px, camera.height_px, 0, 0
     for target in targets:
-        mesh = AIRFRAMES[target.airframe_id].mesh()
-        points = mesh.vertices_m.astype(np.float64)
+        points = vertices_m(target.airframe_id)
         box = extents_px(project_px(points, *target.pose_in(camera), camera.K, camera.distortion))
         if box is not None:
             # Under distortion an edge may bow out beyond its ends.
