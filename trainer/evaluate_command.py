@@ -99,7 +99,9 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
         print(json.dumps(evaluation.score, indent=2, allow_nan=False))
     else:
         Console().print(score_table(evaluation.score))
-    errors.print(f"written to {arguments.out}: {', '.join(path.name for path in files)}", highlight=False)
+    names = [path.name for path in files if not path.name.startswith("sequence_")]
+    drawn = f"{len(files) - len(names)} sequence_*.png"
+    errors.print(f"written to {arguments.out}: {', '.join([*names, drawn])}", highlight=False, soft_wrap=True)
 
 
 def _on_windows(arguments: argparse.Namespace) -> None:

@@ -76,11 +76,15 @@ def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
 def file_answers(path: Path, dataset: Dataset) -> Answerer:
     """Answers from a results file; poses of pictures that are not asked for stay unused.
 
-    Raises InputError if the file is not as it should be, or none of its rows is of the dataset's pictures.
+    Raises InputError if the file is not as it should be, none of its rows is of the dataset's pictures, or two splits
+    of the dataset share a scene's number.
     """
     by_picture: dict[tuple[int, int], list[ResultRow]] = {}
     for row in read_results(path):
         by_picture.setdefault((row.scene_id, row.image_id), []).append(row)
+    numbers = [scene.scene_id for scene in dataset.scenes]
+    if len(set(numbers)) < len(numbers):
+        raise InputError(f"{dataset.root}: two of its splits have a scene of one number; give --split")
     known = {(scene.scene_id, frame.image_id) for scene in dataset.scenes for frame in scene.frames}
     if by_picture and not known & by_picture.keys():
         raise InputError(f"{path}: none of its scene_id and im_id is a picture of {dataset.name}")

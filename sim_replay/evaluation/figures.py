@@ -43,15 +43,22 @@ def write_figures(
     files = [out / "error_by_range.png", out / "cumulative_error.png"]
     _save(error_by_range(score), files[0])
     _save(cumulative_error(matches), files[1])
-    scenes: dict[int, list[JudgedFrame]] = {}
+    scenes: dict[str, list[JudgedFrame]] = {}
     for frame in judged:
-        scenes.setdefault(frame.picture.scene_id, []).append(frame)
+        scenes.setdefault(_scene_name(frame, score["split"]), []).append(frame)
     chosen = np.linspace(0, len(scenes) - 1, min(SEQUENCES_MAX, len(scenes))).round().astype(int)
-    for scene_id in np.array(list(scenes))[chosen]:
-        files.append(out / f"sequence_{scene_id:06d}.png")
-        _save(sequence(f"{score['dataset']}, scene {scene_id}", scenes[int(scene_id)]), files[-1])
+    for name in np.array(list(scenes))[chosen]:
+        files.append(out / f"sequence_{name}.png")
+        _save(sequence(f"{score['dataset']}, scene {name}", scenes[name]), files[-1])
     worst = write_worst(out / "worst_frames.jpg", judged, models)
     return files if worst is None else [*files, worst]
+
+
+def _scene_name(frame: JudgedFrame, split: str | None) -> str:
+    """The scene's number, with its split where the dataset was opened with several."""
+    own = frame.picture.scene.split
+    prefix = f"{own}_" if split is None and own is not None else ""
+    return f"{prefix}{frame.picture.scene_id:06d}"
 
 
 def error_by_range(score: dict[str, Any]) -> Figure:

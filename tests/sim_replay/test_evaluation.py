@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -110,6 +111,17 @@ def test_results_of_another_dataset_are_refused(dark_spot_scene: Path, tmp_path:
     path.write_text(HEADER + f"4,1,1,0.9,{EYE},0 0 1000,-1\n")
     with pytest.raises(InputError, match="is a picture of dataset"):
         file_answers(path, open_dataset(dark_spot_scene.parents[1]))
+
+
+def test_two_splits_with_one_scene_number_need_a_choice(dark_spot_scene: Path, tmp_path: Path) -> None:
+    shutil.copytree(dark_spot_scene, dark_spot_scene.parents[1] / "val" / "000000")
+    path = tmp_path / "m_dataset-test.csv"
+    path.write_text(HEADER + f"0,1,1,0.9,{EYE},-15000 0 200000,-1\n")
+    with pytest.raises(InputError, match="give --split"):
+        file_answers(path, open_dataset(dark_spot_scene.parents[1]))
+    dataset = open_dataset(dark_spot_scene.parents[1], "val")
+    results = judge_frames(list(dataset.frames()), dataset.models, file_answers(path, dataset))
+    assert sum(match.estimate is not None for frame in results for match in frame.matches) == 1
 
 
 def test_the_results_name_parts_at_one_underscore() -> None:
