@@ -96,7 +96,9 @@ def _add_keys(commands: Commands) -> None:
         metavar="HOST",
         help="DNS name or IP address it is reached at; repeatable",
     )
-    for action in (init, issue):
+    show = keys.add_parser("list", help="say until when each certificate in the folder is valid")
+    show.set_defaults(act=_keys_list)
+    for action in (init, issue, show):
         action.add_argument("--dir", type=Path, default=Path("keys"), help="folder of the keys (default: keys)")
     init.add_argument("--days", type=int, default=3650, help="validity (default: ten years)")
     issue.add_argument("--days", type=int, default=825, help="validity (default: 825)")
@@ -237,6 +239,13 @@ def _keys_init(options: argparse.Namespace) -> int:
 
     for path in keys.init_authority(options.dir, options.days):
         print(path)
+    return 0
+
+
+def _keys_list(options: argparse.Namespace) -> int:
+    from msgs.ground.keys import listing
+
+    print("\n".join(listing(options.dir)))
     return 0
 
 

@@ -83,6 +83,27 @@ def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 82
     return files
 
 
+def listing(folder: Path) -> list[str]:
+    """A line for each certificate in `folder`: identity, last day, hosts. Raises InputError if there are none."""
+    lines = []
+    for path in sorted(folder.glob("*.pem")):
+        try:
+            certificate = x509.load_pem_x509_certificate(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read as a certificate: {error}") from error
+        until = certificate.not_valid_after_utc
+        state = "valid until" if until > datetime.now(UTC) else "EXPIRED on"
+        try:
+            names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            hosts = ", ".join(str(one.value) for one in names)
+        except x509.ExtensionNotFound:
+            hosts = ""
+        lines.append(f"{path.stem:16} {state} {until:%Y-%m-%d}  {hosts}".rstrip())
+    if not lines:
+        raise InputError(f"{folder}: no certificates there; `keys init` makes the authority")
+    return lines
+
+
 def _builder(
     subject: x509.Name, issuer: x509.Name, public_key: ec.EllipticCurvePublicKey, days: int
 ) -> x509.CertificateBuilder:

@@ -1,0 +1,84 @@
+"""Certificates as openssl, an independent reader, judges them, and files that only their owner can read."""
+
+from __future__ import annotations
+
+import shutil
+import ssl
+import stat
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from msgs.ground import cli
+from msgs.ground.errors import InputError
+from msgs.ground.keys import init_authority, issue, listing
+from msgs.session import TlsFiles
+
+
+def test_openssl_verifies_what_was_issued_and_nothing_of_another_authority(tmp_path: Path) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    for name in ("ours", "theirs"):
+        init_authority(tmp_path / name)
+    files = issue(tmp_path / "ours", "uav1", ["10.0.0.7", "uav1.local", "fd00::7"])
+
+    def verified(authority: str, *arguments: str) -> bool:
+        command = ["openssl", "verify", "-x509_strict", "-CAfile", str(tmp_path / authority / "ca.pem"), *arguments]
+        return subprocess.run([*command, str(files.certificate)], capture_output=True, check=False).returncode == 0
+
+    assert verified("ours", "-purpose", "sslserver", "-verify_ip", "10.0.0.7")
+    assert verified("ours", "-purpose", "sslclient", "-verify_hostname", "uav1.local")
+    assert verified("ours", "-verify_ip", "fd00::7")
+    assert not verified("ours", "-verify_ip", "10.0.0.8")
+    assert not verified("theirs")
+    text = subprocess.run(
+        ["openssl", "x509", "-in", str(files.certificate), "-noout", "-subject"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert text.replace(" ", "").strip() == "subject=CN=uav1"
+
+
+def test_private_keys_are_their_owner_s_alone_and_match(tmp_path: Path) -> None:
+    init_authority(tmp_path)
+    files = issue(tmp_path, "uav1")
+    for path in (files.private_key, tmp_path / "ca.key"):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    files.check()
+    ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(files.certificate, files.private_key)
+    with pytest.raises(ValueError, match=r"ca\.key is not the PEM key of"):
+        TlsFiles(files.root_ca, files.certificate, tmp_path / "ca.key").check()
+
+
+def test_nothing_is_overwritten_and_bad_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="`keys init` makes it"):
+        issue(tmp_path, "uav1")
+    init_authority(tmp_path)
+    before = (tmp_path / "ca.key").read_bytes()
+    with pytest.raises(InputError, match="is there already"):
+        init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    with pytest.raises(InputError, match="is there already"):
+        issue(tmp_path, "uav1")
+    assert (tmp_path / "ca.key").read_bytes() == before
+    for name in ("../uav1", "ca", "", "a" * 80, "uav 1"):
+        with pytest.raises(InputError, match="is no identity"):
+            issue(tmp_path, name)
+    with pytest.raises(InputError, match="neither an IP address nor a host name"):
+        issue(tmp_path, "uav2", ["10.0.0.7:7447"])
+    with pytest.raises(InputError, match="valid for 1 to"):
+        issue(tmp_path, "uav2", days=0)
+    assert not (tmp_path / "uav2.key").exists()
+
+
+def test_the_list_says_until_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["keys", "list", "--dir", str(tmp_path)]) == 2
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1", ["10.0.0.7"], days=30)
+    last = datetime.now(UTC) + timedelta(days=30)
+    assert listing(tmp_path)[1] == f"uav1             valid until {last:%Y-%m-%d}  uav1, 10.0.0.7"
+    assert cli.main(["keys", "list", "--dir", str(tmp_path)]) == 0
+    assert "no certificates there" in capsys.readouterr().err
