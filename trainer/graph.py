@@ -20,6 +20,7 @@ from trainer.backbones import fuse_branches
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch
 from trainer.evaluate import Predictions, Predictor
+from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
 
 OPSET = 17
@@ -78,9 +79,7 @@ def fold_pads(graph: onnx.GraphProto) -> None:
         attribute.ints[:] = [int(old + new) for old, new in zip(attribute.ints, added, strict=True)]
         conv.input[0] = pad.input[0]
         graph.node.remove(pad)
-    still_read = {name for node in graph.node for name in node.input}
-    for tensor in [tensor for tensor in graph.initializer if tensor.name not in still_read]:
-        graph.initializer.remove(tensor)
+    drop_unread(graph)
 
 
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
@@ -90,6 +89,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         prepared_model = onnx.load(str(prepared))
         fold_pads(prepared_model.graph)
+        stem_input = fold_normalisation(prepared_model.graph, INPUT_NAMES[0])
         onnx.save(prepared_model, str(prepared))
         ours = [node for node in prepared_model.graph.node if node.name.startswith(QUANTISED_PARTS)]
         nodes = [node.name for node in ours if node.op_type in QUANTISED_OPS]
@@ -104,8 +104,14 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
             calibrate_method=CalibrationMethod.MinMax,
-            extra_options={"QDQKeepRemovableActivations": False},
+            extra_options={
+                "QDQKeepRemovableActivations": False,
+                "TensorQuantOverrides": quantised_as_pixels(stem_input),
+            },
         )
+    quantised = onnx.load(str(destination))
+    feed_pixels(quantised.graph, INPUT_NAMES[0])
+    onnx.save(quantised, str(destination))
 
 
 def write_contract(path: Path, contract: ModelContract) -> None:
