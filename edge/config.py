@@ -11,11 +11,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
+from edge.config_camera import CameraSettings
+from edge.config_camera import SequenceCamera as SequenceCamera
+from edge.config_camera import camera_key as camera_key
 from edge.config_ground import RecorderSettings, ZenohSettings
 from edge.config_section import ConfigPath, Section
 from edge.errors import InputError
@@ -44,7 +47,6 @@ def _endpoint(text: str) -> str:
 
 
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
-PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -52,88 +54,6 @@ class VehicleSettings(Section):
     name: str = Field(
         default="uav1", pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$", description="ROS-legal name, first part of every topic"
     )
-
-
-class IntrinsicsSettings(Section):
-    """Either `file`, or the numbers themselves."""
-
-    file: ConfigPath | None = Field(default=None, description="calibration YAML as ROS camera_info or OpenCV write it")
-    fx: PositivePx | None = Field(default=None, description="focal length along x, pixels")
-    fy: PositivePx | None = Field(default=None, description="focal length along y, pixels")
-    cx: Finite | None = Field(default=None, description="principal point x, pixels; pixel centres at integers")
-    cy: Finite | None = Field(default=None, description="principal point y, pixels; pixel centres at integers")
-    width: int | None = Field(default=None, gt=0, description="width of the calibrated picture, pixels")
-    height: int | None = Field(default=None, gt=0, description="height of the calibrated picture, pixels")
-    distortion: list[Finite] = Field(
-        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: the picture has none"
-    )
-
-    @model_validator(mode="after")
-    def _one_way(self) -> IntrinsicsSettings:
-        numbers = (self.fx, self.fy, self.cx, self.cy, self.width, self.height)
-        if self.file is not None and (self.distortion or any(n is not None for n in numbers)):
-            raise ValueError("give either file or fx fy cx cy width height, not both")
-        if self.file is None and any(n is None for n in numbers):
-            raise ValueError("needs file, or all of fx fy cx cy width height")
-        if len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError("distortion takes 4, 5 or 8 coefficients, or none")
-        return self
-
-
-class Camera(Section):
-    mount: Literal["fixed", "gimbal"] = Field(
-        default="fixed", description="gimbal: [mount] says how the camera sits on it, MAVLink how it is turned"
-    )
-
-
-class SequenceCamera(Camera):
-    type: Literal["sequence"]
-    path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
-    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
-    start_at_ns: int | None = Field(
-        default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
-    )
-    loop: bool = Field(default=False, description="begin again after the last frame")
-    intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
-
-
-class FileCamera(Camera):
-    type: Literal["file"]
-    path: ConfigPath = Field(description="video file, played at its own rate")
-    intrinsics: IntrinsicsSettings
-
-
-class DeviceCamera(Camera):
-    type: Literal["device"]
-    device: str = Field(default="/dev/video0", description="V4L2 device")
-    width: int = Field(default=1920, gt=0, description="pixels asked of the device")
-    height: int = Field(default=1080, gt=0, description="pixels asked of the device")
-    fps: float = Field(default=30.0, gt=0, description="rate asked of the device")
-    fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
-    latency_ms: float = Field(
-        default=0.0, ge=0, le=1000, description="measured time from exposure to arrival, milliseconds"
-    )
-    intrinsics: IntrinsicsSettings
-
-
-class StreamCamera(Camera):
-    type: Literal["stream"]
-    url: str = Field(min_length=1, description="RTSP, HTTP or UDP address, as ffmpeg takes it")
-    latency_ms: float = Field(
-        default=0.0, ge=0, le=5000, description="measured time from exposure to arrival, milliseconds"
-    )
-    intrinsics: IntrinsicsSettings
-
-
-CameraSettings = Annotated[
-    SequenceCamera | FileCamera | DeviceCamera | StreamCamera,
-    Field(discriminator="type", description="where frames are from"),
-]
-
-
-def camera_key(camera: CameraSettings) -> tuple[str, str]:
-    """The key that names where a camera's frames are from."""
-    return "camera", {"stream": "url", "device": "device"}.get(camera.type, "path")
 
 
 class MountSettings(Section):
@@ -320,7 +240,7 @@ def _reason(item: Any) -> str:
     if item["type"] == "missing":
         return "is missing"
     if item["type"] == "union_tag_not_found":
-        return "needs type = one of 'sequence', 'file', 'device', 'stream'"
+        return "needs type = one of 'sequence', 'folder', 'file', 'device', 'stream', 'zenoh'"
     if item["type"] == "union_tag_invalid":
         return f"type must be one of {item['ctx']['expected_tags']}"
     return str(item["msg"]).removeprefix("Value error, ")

@@ -9,9 +9,12 @@ from collections import Counter
 
 from edge.cameras.reconnect import LinkState, Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
+from edge.cameras.watch import FrameWatch
 from edge.types import Frame
 
 log = logging.getLogger(__name__)
+
+FROZEN_TOLD_NS = 1_000_000_000
 
 
 class Capture:
@@ -25,7 +28,11 @@ class Capture:
         self._newest: Frame | None = None
         self._end: Exception | None = None
         self._last_sequence: int | None = None
-        self._counts: Counter[str] = Counter(captured=0, dropped=0, reconnects=0)
+        self._counts: Counter[str] = Counter(
+            captured=0, dropped=0, dropped_at_source=0, dropped_overtaken=0, frozen=0, time_jumps=0, reconnects=0
+        )
+        self._watch = FrameWatch()
+        self._frozen_since_ns: int | None = None
         self._link = Reconnect()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
@@ -50,9 +57,11 @@ class Capture:
         return self._link.state is LinkState.STREAMING
 
     def counters(self) -> dict[str, int]:
-        """captured; dropped (missed at the source or overtaken before they were taken); reconnects."""
+        """captured; dropped, at the source (known where it numbers its frames) or overtaken before they were taken;
+        frozen (the same picture again); time_jumps; reconnects; what the source itself counts, as camera_NAME.
+        """
         with self._fresh:
-            return dict(self._counts)
+            return {**self._counts, **{f"camera_{name}": n for name, n in self._source.counts.items()}}
 
     def stop(self) -> None:
         """Stop the thread and close the source; a driver stuck in a read keeps nobody waiting for long."""
@@ -79,7 +88,8 @@ class Capture:
                 return
             else:
                 self._link = self._link.delivered()
-                self._offer(frame)
+                if self._lives(frame):
+                    self._offer(frame)
 
     def _lose(self, error: SourceLost) -> None:
         if self._opened:
@@ -91,6 +101,26 @@ class Capture:
         with self._fresh:
             self._counts["reconnects"] += 1
 
+    def _lives(self, frame: Frame) -> bool:
+        """Whether the frame shows something new; of a live camera, a picture sent again is stale whatever its stamp."""
+        jumps, repeats = self._watch.jumps(frame), self._watch.repeats(frame)
+        with self._fresh:
+            self._counts["time_jumps"] += jumps
+            self._counts["frozen"] += repeats
+        if jumps and self._counts["time_jumps"] == 1:
+            log.warning("the camera's timestamps jump; the first time at frame %d", frame.meta.sequence)
+        if not (repeats and self._source.live):
+            self._frozen_since_ns = None
+            return True
+        if self._frozen_since_ns is None:
+            self._frozen_since_ns = frame.meta.arrival_ns
+        elif 0 <= self._frozen_since_ns <= frame.meta.arrival_ns - FROZEN_TOLD_NS:
+            log.warning("the camera has sent the same picture for a second: it is frozen")
+            self._frozen_since_ns = -1  # told
+        with self._fresh:
+            self._last_sequence = frame.meta.sequence
+        return False
+
     def _offer(self, frame: Frame) -> None:
         with self._fresh:
             last = self._last_sequence
@@ -98,6 +128,8 @@ class Capture:
             overtaken = 1 if self._newest is not None else 0
             self._counts["captured"] += 1
             self._counts["dropped"] += max(missed, 0) + overtaken
+            self._counts["dropped_at_source"] += max(missed, 0)
+            self._counts["dropped_overtaken"] += overtaken
             self._last_sequence = frame.meta.sequence
             self._newest = frame
             self._fresh.notify_all()

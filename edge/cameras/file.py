@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 
 import cv2
 import numpy as np
 
-from edge.cameras.intrinsics import Undistorter, load_intrinsics
+from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
-from edge.config import FileCamera
+from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
@@ -19,11 +20,14 @@ from edge.types import CameraInfo, Frame, FrameMeta
 class FileSource:
     """Frame k is taken as exposed at start + k / fps; frames a late reader missed are skipped, as with a camera."""
 
+    live = False
+
     def __init__(self, settings: FileCamera) -> None:
         self._settings = settings
         self._capture: cv2.VideoCapture | None = None
         self._start_ns: int | None = None
         self._next = 0
+        self.counts: Counter[str] = Counter()
 
     def open(self) -> CameraInfo:
         """Raises InputError: no video, no frame rate, or intrinsics that do not fit."""
@@ -40,11 +44,9 @@ class FileSource:
             int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
         )
-        intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(size_wh)
-        self._K = intrinsics.K
-        self._undistort = Undistorter(intrinsics)
+        self._intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(size_wh)
         self._start_ns, self._next = None, 0
-        return CameraInfo(path.name, size_wh, self._K, self._fps)
+        return CameraInfo(path.name, size_wh, self._intrinsics.K, self._fps)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame, not before its time. Raises EndOfStream after the last, InputError if none can be read."""
@@ -62,7 +64,8 @@ class FileSource:
             raise EndOfStream
         meta = FrameMeta(self._next, capture_ns, time.monotonic_ns())
         self._next += 1
-        return Frame(meta, self._undistort(np.asarray(image_bgr, dtype=np.uint8)), self._K)
+        image = np.asarray(image_bgr, dtype=np.uint8)
+        return Frame(meta, image, self._intrinsics.K, self._intrinsics.distortion)
 
     def close(self) -> None:
         if self._capture is not None:

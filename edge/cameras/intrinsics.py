@@ -1,20 +1,19 @@
-"""Calibrations: read, fitted to the picture's size, distortion taken out."""
+"""Calibrations: read, and fitted to the picture's size."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from edge.config import IntrinsicsSettings
+from edge.config_camera import IntrinsicsSettings
 from edge.errors import InputError
 from edge.types import Array
 
 INTRINSICS_KEY = ("camera", "intrinsics")
+DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own files name none
 
 
 @dataclass(frozen=True)
@@ -39,28 +38,6 @@ class Intrinsics:
         K[:2, :2] *= scale
         K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
         return Intrinsics(K, image_size_wh, self.distortion)
-
-
-class Undistorter:
-    """Takes a lens's distortion out of pictures; the pinhole K stays the same."""
-
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        self._maps: tuple[NDArray[Any], NDArray[Any]] | None = None
-        if any(intrinsics.distortion):
-            self._maps = cv2.initUndistortRectifyMap(
-                intrinsics.K,
-                np.array(intrinsics.distortion),
-                np.eye(3),
-                intrinsics.K,
-                intrinsics.image_size_wh,
-                cv2.CV_16SC2,
-            )
-
-    def __call__(self, image_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """[H, W, 3] to [H, W, 3]; the very same array when the lens has no distortion."""
-        if self._maps is None:
-            return image_bgr
-        return np.asarray(cv2.remap(image_bgr, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def load_intrinsics(settings: IntrinsicsSettings) -> Intrinsics:
@@ -91,8 +68,13 @@ def read_calibration(path: Path) -> Intrinsics:
         size_wh = (int(storage.getNode("image_width").real()), int(storage.getNode("image_height").real()))
         K = _matrix(storage.getNode("camera_matrix"))
         distortion = _matrix(storage.getNode("distortion_coefficients"))
+        model = storage.getNode("distortion_model").string()
     except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
         raise InputError(f"calibration {path} is not valid YAML", INTRINSICS_KEY) from error
+    if model not in DISTORTION_MODELS:
+        raise InputError(
+            f"calibration {path}: distortion_model {model} is not one of plumb_bob, rational_polynomial", INTRINSICS_KEY
+        )
     if min(size_wh) <= 0:
         raise InputError(f"calibration {path} has no image_width and image_height", INTRINSICS_KEY)
     if K.size != 9 or not np.all(np.isfinite(K)) or K[0] <= 0 or K[4] <= 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.cameras.intrinsics import Intrinsics, Undistorter, load_intrinsics
+from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
-from edge.config import SequenceCamera
+from edge.config_camera import FolderCamera, SequenceCamera
 from edge.errors import InputError
 from edge.types import Array, CameraInfo, Frame, FrameMeta
 
 DECODED_AHEAD = 2
 DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself knows pinhole cameras alone
-_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,12 @@ class ScenePicture:
 class SequenceSource:
     """Hands no frame over before its exposure; a reader that is late finds the newest exposed, as with a camera."""
 
-    def __init__(self, settings: SequenceCamera) -> None:
+    live = False
+
+    def __init__(self, settings: SequenceCamera | FolderCamera) -> None:
         self._settings = settings
+        self.counts: Counter[str] = Counter()
         self._pictures: list[ScenePicture] = []
-        self._undistort: Undistorter | None = None
-        self._undistorted: ScenePicture | None = None  # the one whose lens `_undistort` is for
         self._image_size_wh = (0, 0)
         self._start_ns: int | None = None
         self._next = 0
@@ -51,7 +52,7 @@ class SequenceSource:
     def open(self) -> CameraInfo:
         """Read the scene's index and first picture. Raises InputError."""
         folder = self._settings.path
-        self._pictures = read_scene(folder)
+        self._pictures = self._list(folder)
         first = _decode(self._pictures[0].path)
         self._image_size_wh = (first.shape[1], first.shape[0])
         if self._settings.intrinsics is not None:
@@ -83,12 +84,17 @@ class SequenceSource:
         self._next = index + 1
         self._decode_ahead(self._next)
         meta = FrameMeta(index, capture_ns, time.monotonic_ns())
-        return Frame(meta, image_bgr, self._at(index).K)
+        picture = self._at(index)
+        return Frame(meta, image_bgr, picture.K, picture.distortion)
 
     def close(self) -> None:
         if self._decoder is not None:
             self._decoder.shutdown(wait=True, cancel_futures=True)
             self._decoder = None
+
+    def _list(self, folder: Path) -> list[ScenePicture]:
+        """Raises InputError if the folder holds none."""
+        return read_scene(folder)
 
     def _exists(self, index: int) -> bool:
         return self._settings.loop or index < len(self._pictures)
@@ -104,22 +110,8 @@ class SequenceSource:
         assert self._decoder is not None
         wanted = self._ahead[-1][0] + 1 if self._ahead else index
         while len(self._ahead) < DECODED_AHEAD and self._exists(wanted):
-            self._ahead.append((wanted, self._decoder.submit(self._pixels, self._at(wanted))))
+            self._ahead.append((wanted, self._decoder.submit(_decode, self._at(wanted).path)))
             wanted += 1
-
-    def _pixels(self, picture: ScenePicture) -> NDArray[np.uint8]:
-        """The picture as a pinhole camera sees it; on the decoder's one thread, which keeps the last lens's maps."""
-        image_bgr = _decode(picture.path)
-        if not any(picture.distortion):
-            return image_bgr
-        if self._undistort is None or not _same_lens(picture, self._undistorted):
-            lens = Intrinsics(picture.K, (image_bgr.shape[1], image_bgr.shape[0]), picture.distortion)
-            self._undistort, self._undistorted = Undistorter(lens), picture
-        return self._undistort(image_bgr)
-
-
-def _same_lens(picture: ScenePicture, other: ScenePicture | None) -> bool:
-    return other is not None and picture.distortion == other.distortion and np.array_equal(picture.K, other.K)
 
 
 def read_scene(folder: Path) -> list[ScenePicture]:
@@ -139,7 +131,7 @@ def read_scene(folder: Path) -> list[ScenePicture]:
         int(path.stem): path
         for name in ("gray", "rgb")  # the later wins where a frame has both
         for path in sorted((folder / name).glob("*"), reverse=True)
-        if path.stem.isdecimal() and path.suffix.lower() in _SUFFIXES
+        if path.stem.isdecimal() and path.suffix.lower() in PICTURE_SUFFIXES
     }
     if not paths:
         raise InputError(f"{folder} has no pictures in rgb/ or gray/")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from typing import Protocol
 
 from edge.types import CameraInfo, Frame
@@ -19,6 +20,9 @@ class SourceLost(Exception):
 
 class Source(Protocol):
     """A source of frames, driven by one thread at a time."""
+
+    live: bool  # what it shows is happening now: a picture that repeats is a fault, not a recording's
+    counts: Counter[str]  # what it met that should not be, by reason, with every reason in it from the start
 
     def open(self) -> CameraInfo:
         """Make ready for `read`. Raises SourceLost when a later try may do, InputError when none will."""

@@ -13,7 +13,7 @@ import pytest
 
 from edge.cameras.sequence import DISTORTION_KEY, SequenceSource
 from edge.cameras.source import EndOfStream
-from edge.config import IntrinsicsSettings, SequenceCamera
+from edge.config_camera import IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
 from edge.types import Frame
 
@@ -69,12 +69,13 @@ def scene(tmp_path: Path) -> Path:
     return folder
 
 
-def test_every_frame_is_as_its_pinhole_camera_would_see_it(scene: Path) -> None:
+def test_every_frame_is_as_on_disk_and_says_what_its_lens_does(scene: Path) -> None:
     frames = play(scene)
     assert [frame.K[0, 0] for frame in frames] == [300.0, 300.0, 320.0]
     for frame in frames:
-        seen = POINTS_CAM_M @ frame.K.T
-        for expected in seen[:, :2] / seen[:, 2:]:
+        lens = np.array(frame.distortion or (0.0,) * 5)
+        seen, _ = cv2.projectPoints(POINTS_CAM_M, np.zeros(3), np.zeros(3), frame.K, lens)
+        for expected in seen.reshape(-1, 2):
             np.testing.assert_allclose(centroid(frame.image_bgr, expected), expected, atol=0.25)
 
 

@@ -1,0 +1,78 @@
+"""A V4L2 device: USB and CSI cameras, capture cards."""
+
+from __future__ import annotations
+
+import logging
+
+import cv2
+
+from edge.cameras.intrinsics import load_intrinsics
+from edge.cameras.live import LiveSource
+from edge.config_camera import DeviceCamera
+
+log = logging.getLogger(__name__)
+
+STAMP_AGE_MAX_NS = 1_000_000_000
+# V4L2's own: its menu of V4L2_CID_EXPOSURE_AUTO, and the unit of V4L2_CID_EXPOSURE_ABSOLUTE.
+EXPOSURE_MANUAL = 1
+EXPOSURE_UNITS_PER_MS = 10
+FPS_TOLERANCE = 0.05
+
+
+class DeviceSource(LiveSource):
+    """Stamped by the driver, on the monotonic clock, where it does so."""
+
+    def __init__(self, settings: DeviceCamera) -> None:
+        super().__init__(settings.device, load_intrinsics(settings.intrinsics))
+        self._settings = settings
+        self._latency_ns = round(settings.latency_ms * 1e6)
+
+    def _connect(self) -> cv2.VideoCapture:
+        settings = self._settings
+        capture = cv2.VideoCapture(settings.device, cv2.CAP_V4L2)
+        if not capture.isOpened():
+            return capture
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*settings.fourcc))
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
+        capture.set(cv2.CAP_PROP_FPS, settings.fps)
+        # One buffer deep, so that no stale frame waits in the driver.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        if settings.exposure_ms is not None:
+            manual = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, EXPOSURE_MANUAL)
+            if not (capture.set(cv2.CAP_PROP_EXPOSURE, settings.exposure_ms * EXPOSURE_UNITS_PER_MS) and manual):
+                log.warning("%s does not let its exposure be set", settings.device)
+        for complaint in complaints(settings, _fourcc(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)):
+            log.warning("%s %s", settings.device, complaint)
+        return capture
+
+    def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
+        stamped_ns = driver_stamp_ns(arrival_ns, position_ms)
+        if stamped_ns is None:
+            self.counts["unstamped"] += 1
+        return (arrival_ns if stamped_ns is None else stamped_ns) - self._latency_ns
+
+
+def driver_stamp_ns(arrival_ns: int, position_ms: float) -> int | None:
+    """The driver's stamp on the monotonic clock, ns, or None if it gives none that can be.
+
+    OpenCV hands the V4L2 buffer's timestamp over as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC where the driver sets
+    V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not tell; a driver without stamps gives 0, one with another
+    clock a time far from now.
+    """
+    stamp_ns = round(position_ms * 1e6)
+    return stamp_ns if 0 <= arrival_ns - stamp_ns <= STAMP_AGE_MAX_NS else None
+
+
+def complaints(settings: DeviceCamera, fourcc: str, fps: float) -> list[str]:
+    """What the device does other than asked; the size is judged with the intrinsics."""
+    found = []
+    if fourcc != settings.fourcc:
+        found.append(f"gives {fourcc or 'an unnamed format'}, not {settings.fourcc}")
+    if fps > 0 and abs(fps - settings.fps) > FPS_TOLERANCE * settings.fps:
+        found.append(f"gives {fps:g} frames a second, not {settings.fps:g}")
+    return found
+
+
+def _fourcc(code: float) -> str:
+    return int(code).to_bytes(4, "little", signed=False).decode("ascii", "replace").strip("\0 ") if code > 0 else ""

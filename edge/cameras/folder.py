@@ -1,0 +1,33 @@
+"""A folder of pictures by one camera, played in the order of their names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from edge.cameras.intrinsics import load_intrinsics
+from edge.cameras.sequence import PICTURE_SUFFIXES, ScenePicture, SequenceSource
+from edge.config_camera import FolderCamera
+from edge.errors import InputError
+
+
+class FolderSource(SequenceSource):
+    """Picture k is taken as exposed at start + k / fps; those a late reader missed are skipped, as with a camera."""
+
+    def __init__(self, settings: FolderCamera) -> None:
+        super().__init__(settings)
+        self._intrinsics = load_intrinsics(settings.intrinsics)
+
+    def _list(self, folder: Path) -> list[ScenePicture]:
+        return [ScenePicture(path, self._intrinsics.K, self._intrinsics.distortion) for path in list_pictures(folder)]
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """The folder's pictures, `2.png` before `10.png`. Raises InputError when there are none."""
+    try:
+        paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+    except OSError as error:
+        raise InputError(f"{folder} cannot be read: {error.strerror}") from error
+    if not paths:
+        raise InputError(f"{folder} has no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})")
+    return sorted(paths, key=lambda path: [(int(n or 0), text) for n, text in re.findall(r"(\d*)(\D*)", path.name)])

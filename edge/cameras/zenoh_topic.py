@@ -1,0 +1,132 @@
+"""A camera on zenoh: sensor_msgs/CompressedImage, as a ROS 2 driver over rmw_zenoh publishes it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+
+import cv2
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from zenoh import handlers
+
+from edge.cameras.intrinsics import Intrinsics, load_intrinsics
+from edge.cameras.source import EndOfStream, SourceLost
+from edge.config_camera import ZenohCamera
+from edge.types import CameraInfo, Frame, FrameMeta
+from msgs.cdr import CompressedImage
+from msgs.session import client_config
+from msgs.topics import parse_attachment
+from msgs.wire import PayloadError
+
+SILENCE_S = 3.0
+LOOK_S = 0.1
+STAMP_AGE_MAX_NS = 2_000_000_000
+
+
+class ZenohSource:
+    """The newest picture of a topic, stamped by its header as far as the sender's UTC agrees with ours.
+
+    A picture that cannot be decoded or is of another size than the calibration's is counted and dropped.
+    """
+
+    live = True
+
+    def __init__(self, settings: ZenohCamera) -> None:
+        self._settings = settings
+        self._intrinsics = load_intrinsics(settings.intrinsics)
+        self._latency_ns = round(settings.latency_ms * 1e6)
+        self._session: zenoh.Session | None = None
+        self._arrived = threading.Condition()
+        self._sample: tuple[int, bytes, bytes] | None = None  # arrival_ns, payload, attachment
+        self._sequence = 0
+        self._sent: tuple[bytes, int] | None = None  # the publisher and its number of the last picture
+        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0)
+
+    def nominal(self) -> CameraInfo:
+        return CameraInfo(self._settings.topic, self._intrinsics.image_size_wh, self._intrinsics.K, None)
+
+    def open(self) -> CameraInfo:
+        """Raises SourceLost while nothing answers at the endpoint. The publisher may come later."""
+        tls = self._settings.tls.files() if self._settings.tls is not None else None
+        try:
+            self._session = zenoh.open(client_config([self._settings.connect], tls=tls))
+            key = f"{self._settings.domain}/{self._settings.topic}/**"
+            self._session.declare_subscriber(key, handlers.Callback(self._take, indirect=False))
+        except zenoh.ZError as error:
+            self.close()
+            raise SourceLost(f"no zenoh session with {self._settings.connect}: {error}") from error
+        return self.nominal()
+
+    def read(self, stop: threading.Event) -> Frame:
+        """The next picture. Raises SourceLost when none came for three seconds."""
+        silent_ns = time.monotonic_ns() + round(SILENCE_S * 1e9)
+        while time.monotonic_ns() < silent_ns:
+            if stop.is_set():
+                raise EndOfStream
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._sample is not None, LOOK_S)
+                sample, self._sample = self._sample, None
+            if sample is not None and (frame := self._frame(*sample)) is not None:
+                return frame
+        raise SourceLost(f"no picture on {self._settings.topic} for {SILENCE_S:.0f} s")
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        """On zenoh's thread: keep the newest; what it replaces shows as a gap in the numbers."""
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        with self._arrived:
+            self._sample = (time.monotonic_ns(), sample.payload.to_bytes(), attachment)
+            self._arrived.notify()
+
+    def _frame(self, arrival_ns: int, payload: bytes, attachment: bytes) -> Frame | None:
+        try:
+            message = CompressedImage.decode(payload)
+        except PayloadError:
+            self.counts["undecodable"] += 1
+            return None
+        image_bgr = decode_picture(message.data)
+        if image_bgr is None:
+            self.counts["undecodable"] += 1
+            return None
+        fitted = self._fit((image_bgr.shape[1], image_bgr.shape[0]))
+        if fitted is None:
+            self.counts["misfit"] += 1
+            return None
+        stamp_ns = message.stamp_ns - (time.time_ns() - time.monotonic_ns())
+        if not 0 <= arrival_ns - stamp_ns <= STAMP_AGE_MAX_NS:
+            self.counts["unstamped"] += 1
+            stamp_ns = arrival_ns
+        meta = FrameMeta(self._number(attachment), stamp_ns - self._latency_ns, arrival_ns)
+        return Frame(meta, image_bgr, fitted.K, fitted.distortion)
+
+    def _fit(self, size_wh: tuple[int, int]) -> Intrinsics | None:
+        (w, h), (new_w, new_h) = self._intrinsics.image_size_wh, size_wh
+        return self._intrinsics.scaled_to(size_wh) if w * new_h == h * new_w else None
+
+    def _number(self, attachment: bytes) -> int:
+        """Counts up with the publisher's own numbers while one publisher sends, so that what is lost shows as a gap."""
+        parsed = parse_attachment(attachment)
+        step = 1
+        if parsed is not None:
+            sent, _, publisher = parsed
+            if self._sent is not None and self._sent[0] == publisher and sent > self._sent[1]:
+                step = sent - self._sent[1]
+            self._sent = (publisher, sent)
+        self._sequence += step
+        return self._sequence - 1
+
+
+def decode_picture(data: bytes) -> NDArray[np.uint8] | None:
+    """JPEG or PNG to [H, W, 3] BGR, or None."""
+    try:
+        image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
+    return None if image_bgr is None else np.asarray(image_bgr, dtype=np.uint8)

@@ -1,0 +1,131 @@
+"""The section of where frames are from: [camera], one type of it for each kind, and its intrinsics."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from edge.config_ground import ZenohTlsSettings
+from edge.config_section import ConfigPath, Section
+from msgs.session import check_endpoint
+
+PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class IntrinsicsSettings(Section):
+    """Either `file`, or the numbers themselves."""
+
+    file: ConfigPath | None = Field(default=None, description="calibration YAML as ROS camera_info or OpenCV write it")
+    fx: PositivePx | None = Field(default=None, description="focal length along x, pixels")
+    fy: PositivePx | None = Field(default=None, description="focal length along y, pixels")
+    cx: Finite | None = Field(default=None, description="principal point x, pixels; pixel centres at integers")
+    cy: Finite | None = Field(default=None, description="principal point y, pixels; pixel centres at integers")
+    width: int | None = Field(default=None, gt=0, description="width of the calibrated picture, pixels")
+    height: int | None = Field(default=None, gt=0, description="height of the calibrated picture, pixels")
+    distortion: list[Finite] = Field(
+        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: the picture has none"
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> IntrinsicsSettings:
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+        if self.file is not None and (self.distortion or any(n is not None for n in numbers)):
+            raise ValueError("give either file or fx fy cx cy width height, not both")
+        if self.file is None and any(n is None for n in numbers):
+            raise ValueError("needs file, or all of fx fy cx cy width height")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError("distortion takes 4, 5 or 8 coefficients, or none")
+        return self
+
+
+class Camera(Section):
+    mount: Literal["fixed", "gimbal"] = Field(
+        default="fixed", description="gimbal: [mount] says how the camera sits on it, MAVLink how it is turned"
+    )
+
+
+class SequenceCamera(Camera):
+    type: Literal["sequence"]
+    path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
+    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
+    start_at_ns: int | None = Field(
+        default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
+    )
+    loop: bool = Field(default=False, description="begin again after the last frame")
+    intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
+
+
+class FolderCamera(Camera):
+    type: Literal["folder"]
+    path: ConfigPath = Field(description="folder of pictures, played in the order of their names")
+    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
+    start_at_ns: int | None = Field(
+        default=None, description="monotonic ns of the first picture's exposure; default: when all is ready"
+    )
+    loop: bool = Field(default=False, description="begin again after the last picture")
+    intrinsics: IntrinsicsSettings
+
+
+class FileCamera(Camera):
+    type: Literal["file"]
+    path: ConfigPath = Field(description="video file, played at its own rate")
+    intrinsics: IntrinsicsSettings
+
+
+class DeviceCamera(Camera):
+    type: Literal["device"]
+    device: str = Field(default="/dev/video0", description="V4L2 device")
+    width: int = Field(default=1920, gt=0, description="pixels asked of the device")
+    height: int = Field(default=1080, gt=0, description="pixels asked of the device")
+    fps: float = Field(default=30.0, gt=0, description="rate asked of the device")
+    fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
+    exposure_ms: float | None = Field(
+        default=None, gt=0, le=1000, description="fixed exposure, where the driver has it; default: left as it is"
+    )
+    latency_ms: float = Field(
+        default=0.0, ge=0, le=1000, description="measured time from exposure to the driver's stamp, milliseconds"
+    )
+    intrinsics: IntrinsicsSettings
+
+
+class StreamCamera(Camera):
+    type: Literal["stream"]
+    url: str = Field(min_length=1, description="RTSP, HTTP or UDP address, as ffmpeg takes it")
+    rtsp_transport: Literal["tcp", "udp"] = Field(default="tcp", description="what RTSP's pictures come by")
+    latency_ms: float = Field(
+        default=0.0, ge=0, le=5000, description="measured time from exposure to the fastest arrival, milliseconds"
+    )
+    intrinsics: IntrinsicsSettings
+
+
+class ZenohCamera(Camera):
+    type: Literal["zenoh"]
+    topic: str = Field(
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$",
+        description="sensor_msgs/CompressedImage, as ROS names it, without the first slash",
+    )
+    connect: str = Field(default="tcp/127.0.0.1:7447", description="endpoint of the router or publisher")
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of the key")
+    tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
+    latency_ms: float = Field(
+        default=0.0, ge=0, le=5000, description="measured time from exposure to the header's stamp, milliseconds"
+    )
+    intrinsics: IntrinsicsSettings
+
+    @model_validator(mode="after")
+    def _endpoint_does(self) -> ZenohCamera:
+        check_endpoint(self.connect, tls=self.tls is not None)
+        return self
+
+
+CameraSettings = Annotated[
+    SequenceCamera | FolderCamera | FileCamera | DeviceCamera | StreamCamera | ZenohCamera,
+    Field(discriminator="type", description="where frames are from"),
+]
+
+
+def camera_key(camera: CameraSettings) -> tuple[str, str]:
+    """The key that names where a camera's frames are from."""
+    return "camera", {"stream": "url", "device": "device", "zenoh": "topic"}.get(camera.type, "path")
