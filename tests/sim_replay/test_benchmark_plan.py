@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import trainer
 from edge.errors import InputError
+from sim_replay.airframes import AIRFRAMES
 from sim_replay.benchmark.plan import SequencePlan, allotted, cut_frames, plan_dataset, spread_ranges
 from sim_replay.benchmark.preset import held_out_airframes, load_preset, parse_preset
 
@@ -80,6 +83,12 @@ def test_held_out_airframes_are_in_no_training_preset(paper_plan: tuple[Sequence
     assert not held_out & {name for plan in paper_plan for name in plan.airframes}
     unseen = plan_dataset(load_preset("unseen"), 0)
     assert {name for plan in unseen for name in plan.airframes} == held_out
+
+
+def test_the_shipped_training_leaves_out_what_is_held_out() -> None:
+    config = Path(trainer.__file__).parent / "configs" / "edge.toml"
+    trained_on = tomllib.loads(config.read_text())["data"]["airframe_ids"]
+    assert {AIRFRAMES[k].name for k in trained_on} == {a.name for a in AIRFRAMES} - set(held_out_airframes())
 
 
 def test_stress_has_empty_skies_company_and_every_hardship() -> None:
