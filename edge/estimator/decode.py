@@ -19,6 +19,13 @@ RANGE_EXCESS_MAX = 2.0
 # Two boxes of which the smaller lies this much inside the larger are one aircraft.
 SAME_TARGET_OVERLAP = 0.5
 ROTATION_TOLERANCE = 0.05
+# A longer side below this many pixels of the frame shows no shape to tell a pose from.
+BOX_MIN_PX = 8.0
+# A box this near to the frame's edge, in its longer sides and in pixels, may be cut by it.
+EDGE_SHARE, EDGE_PX = 0.05, 1.5
+# What is cut off is not known, so neither is how large the whole is nor where its middle: 1-sigma of log Z, and of the
+# origin's pixels in longer sides of the box. They cover the errors of targets cut by up to half (docs/cameras.md).
+CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
 
 
 def decode(
@@ -29,8 +36,13 @@ def decode(
     contract: ModelContract,
     stage: Literal["acquire", "track"],
     refused: Counter[str],
+    frame_wh: tuple[int, int],
 ) -> list[Estimate]:
-    """Accepted, distinct targets of one image of the batch, best score first; refusals are counted by reason."""
+    """Accepted, distinct targets of one image of the batch, best score first; refusals are counted by reason.
+
+    A target cut by the frame's edge or of a size that was not trained is told with a covariance that says so; one
+    whose origin lies off the frame, or too small to show a shape, is not told.
+    """
     score_min = contract.acquire_score_min if stage == "acquire" else contract.track_score_min
     found = []
     for peak in range(peaks.score.shape[1]):
@@ -41,11 +53,16 @@ def decode(
         t_m = peaks.t_cam_target_m[image, peak].astype(np.float64)
         sigma = peaks.sigma[image, peak].astype(np.float64)
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
-        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m)
+        origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
+        cut = _is_cut(box, frame_wh)
+        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, frame_wh)
         if reason is not None:
             refused[reason] += 1
             continue
+        longer_px = float(peaks.size_px[image, peak].max())
+        sigma = _widened(sigma, longer_px, cut, contract.trained_box_px)
         covariance = pose_covariance(t_m, sigma, K_network, contract.trained_range_m)
+        box = np.clip(box, -0.5, np.tile(frame_wh, 2) - 0.5)
         found.append(Estimate(score, box, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
 
@@ -60,7 +77,7 @@ def pose_covariance(
     """
     t_m, sigma = np.asarray(t_cam_target_m, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
     K_inverse = np.linalg.inv(np.asarray(K, dtype=np.float64))
-    sigma_log_z = np.hypot(sigma[2], np.log(_range_excess(t_m[2], trained_range_m)))
+    sigma_log_z = np.hypot(sigma[2], np.log(_excess(t_m[2], trained_range_m)))
     J = np.column_stack([t_m[2] * K_inverse[:, 0], t_m[2] * K_inverse[:, 1], t_m])
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = J @ np.diag([sigma[0] ** 2, sigma[1] ** 2, sigma_log_z**2]) @ J.T
@@ -107,15 +124,44 @@ def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tu
         return "no_rotation"
     if np.any(sigma <= 0) or np.any(box[2:] <= box[:2]):
         return "no_size"
-    if t_m[2] <= 0 or _range_excess(t_m[2], trained_range_m) > RANGE_EXCESS_MAX:
+    if t_m[2] <= 0 or _excess(t_m[2], trained_range_m) > RANGE_EXCESS_MAX:
         return "out_of_range"
     return None
 
 
-def _range_excess(z_m: float, trained_range_m: tuple[float, float]) -> float:
-    """Factor by which a depth lies outside the trained range; 1 inside."""
-    near_m, far_m = trained_range_m
-    return float(max(near_m / z_m, z_m / far_m, 1.0))
+def _is_cut(box_xyxy_px: Array, frame_wh: tuple[int, int]) -> bool:
+    """Whether the frame's edge may hide a part of what the box holds."""
+    margin_px = EDGE_SHARE * float(np.max(box_xyxy_px[2:] - box_xyxy_px[:2])) + EDGE_PX
+    return bool(
+        np.any(box_xyxy_px[:2] < margin_px - 0.5) or np.any(box_xyxy_px[2:] > np.array(frame_wh) - 0.5 - margin_px)
+    )
+
+
+def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int, int]) -> str | None:
+    """Why too little of a target is on the frame to tell its pose, or None."""
+    limit = np.array(frame_wh) - 0.5
+    visible = np.minimum(box_xyxy_px[2:], limit) - np.maximum(box_xyxy_px[:2], -0.5)
+    if np.max(visible) < BOX_MIN_PX or np.min(visible) <= 0:
+        return "too_small"
+    if cut and (not np.all(np.isfinite(origin_px)) or np.any(origin_px < -0.5) or np.any(origin_px > limit)):
+        return "cut_off"
+    return None
+
+
+def _widened(sigma: Array, longer_px: float, cut: bool, trained_box_px: tuple[float, float]) -> Array:
+    """Sigma [6] of (u, v, log Z, rotation), wider by what the network was not taught: cut targets, other sizes."""
+    wider = sigma.copy()
+    wider[2] = np.hypot(wider[2], np.log(_excess(longer_px, trained_box_px)))
+    if cut:
+        wider[:2] = np.hypot(wider[:2], CUT_SIGMA_ORIGIN * longer_px)
+        wider[2] = np.hypot(wider[2], CUT_SIGMA_LOG_Z)
+    return wider
+
+
+def _excess(value: float, trained: tuple[float, float]) -> float:
+    """Factor by which a depth or a size lies outside what was trained; 1 inside."""
+    low, high = trained
+    return float(max(low / value, value / high, 1.0))
 
 
 def _nearest_rotation(R: Array) -> Array:

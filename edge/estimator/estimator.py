@@ -41,10 +41,11 @@ class Estimator:
         """
         contract = self.model.contract
         lens = lens_of(frame.K, frame.distortion)
+        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
         K = pixel_map.intrinsics(frame.K)
         peaks = self.model.run(image[None], K[None])
-        found = decode(peaks, 0, pixel_map, K, contract, "acquire", self.refused)
+        found = decode(peaks, 0, pixel_map, K, contract, "acquire", self.refused, frame_wh)
         found = distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
         if not self.has_track_stage:
             return found
@@ -67,7 +68,9 @@ class Estimator:
         K = np.stack([pixel_map.intrinsics(frame.K) for pixel_map in maps])
         peaks = self.model.run(np.stack([cut(frame.image_bgr, window, size_wh, lens) for window in windows]), K)
         found = [
-            nearest_expected(decode(peaks, i, pixel_map, K[i], contract, "track", self.refused), boxes_xyxy_px[i])
+            nearest_expected(
+                decode(peaks, i, pixel_map, K[i], contract, "track", self.refused, frame_wh), boxes_xyxy_px[i]
+            )
             for i, pixel_map in enumerate(maps)
         ]
         # Two windows may see the same aircraft; the stronger sight of it counts.

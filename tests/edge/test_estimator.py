@@ -13,7 +13,7 @@ from edge.estimator.decode import decode, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, window_around
-from edge.types import Frame, FrameMeta
+from edge.types import Estimate, Frame, FrameMeta
 from msgs.contract import ModelContract
 
 from .toy_model import CONTRACT, GRAPH, write_toy_model
@@ -120,7 +120,7 @@ def peaks_of(*, score: float = 0.9, z_m: float = 300.0, n: int = 1, apart_px: fl
 def accepted(peaks: Peaks) -> tuple[int, Counter[str]]:
     refused: Counter[str] = Counter()
     contract = ModelContract(**CONTRACT)
-    return len(decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused)), refused
+    return len(decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused, SIZE_WH)), refused
 
 
 def test_what_is_no_pose_is_refused_and_counted() -> None:
@@ -142,6 +142,48 @@ def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
     inside, outside = (pose_covariance([0, 0, z], sigma, K, (50, 600))[2, 2] ** 0.5 / z for z in (599.0, 900.0))
     assert inside == pytest.approx(0.05, rel=1e-6)
     assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
+
+
+def seen_at(
+    left_px: float, width_px: float, *, origin_x_px: float | None = None
+) -> tuple[list[Estimate], Counter[str]]:
+    """What is made of a target 40 px high in the middle rows, whose box begins at `left_px`."""
+    peaks = peaks_of()
+    peaks.center_px[0, 0] = [left_px + width_px / 2, 500.0]
+    peaks.size_px[0, 0] = [width_px, min(40.0, width_px)]
+    peaks.origin_px[0, 0] = [left_px + width_px / 2 if origin_x_px is None else origin_x_px, 500.0]
+    refused: Counter[str] = Counter()
+    contract = ModelContract(**CONTRACT)
+    return decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused, SIZE_WH), refused
+
+
+def test_a_target_below_eight_pixels_is_not_told() -> None:
+    assert seen_at(700.0, 7.9) == ([], Counter(too_small=1))
+    assert len(seen_at(700.0, 8.1)[0]) == 1
+
+
+@pytest.mark.parametrize("left_px", [-30.0, 0.0, 1880.0, 1860.0])
+def test_a_target_cut_by_the_edge_is_told_with_doubt_in_place_and_range(left_px: float) -> None:
+    ((whole,), (cut,)) = seen_at(900.0, 60.0)[0], seen_at(left_px, 60.0)[0]
+    depth_sigma, whole_sigma = (e.covariance[2, 2] ** 0.5 / e.t_cam_target_m[2] for e in (cut, whole))
+    assert whole_sigma == pytest.approx(0.05, rel=1e-6)
+    assert depth_sigma > 0.35
+    across_px = cut.covariance[1, 1] ** 0.5 * K[1, 1] / cut.t_cam_target_m[2]
+    assert across_px > 0.2 * 60
+    assert cut.box_xyxy_px[0] >= -0.5
+    assert cut.box_xyxy_px[2] <= SIZE_WH[0] - 0.5
+
+
+def test_a_target_whose_middle_is_off_the_frame_is_not_told() -> None:
+    assert seen_at(-40.0, 60.0, origin_x_px=-10.0) == ([], Counter(cut_off=1))
+    assert seen_at(-90.0, 60.0) == ([], Counter(too_small=1))
+
+
+def test_a_size_that_was_not_trained_is_less_sure() -> None:
+    (trained,), (larger,) = seen_at(700.0, 200.0)[0], seen_at(700.0, 300.0)[0]
+    sigma = [e.covariance[2, 2] ** 0.5 / e.t_cam_target_m[2] for e in (trained, larger)]
+    assert sigma[0] == pytest.approx(0.05, rel=1e-6)
+    assert sigma[1] == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
 
 
 def test_two_peaks_on_one_aircraft_are_one_target_and_two_apart_are_two() -> None:
