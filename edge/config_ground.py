@@ -54,8 +54,12 @@ class ZenohSettings(Section):
 
     @model_validator(mode="after")
     def _endpoints_do(self) -> ZenohSettings:
-        for endpoint in (*self.listen, *self.connect):
-            check_endpoint(endpoint, tls=self.tls is not None)
+        for key in ("listen", "connect"):
+            for endpoint in getattr(self, key):
+                try:
+                    check_endpoint(endpoint, tls=self.tls is not None)
+                except ValueError as error:
+                    raise ValueError(f"{key}: {error}") from error
         return self
 
 

@@ -60,7 +60,10 @@ class RouterSettings(_Section):
     @model_validator(mode="after")
     def _endpoints_do(self) -> RouterSettings:
         for endpoint in self.listen:
-            check_endpoint(endpoint, tls=self.tls is not None)
+            try:
+                check_endpoint(endpoint, tls=self.tls is not None)
+            except ValueError as error:
+                raise ValueError(f"listen: {error}") from error
         if self.access is not None and self.tls is None:
             raise ValueError("[access] tells identities by their certificates and needs [tls]")
         return self

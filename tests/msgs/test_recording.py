@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
+from rosbags.rosbag2 import Reader
 
 from msgs import recording, topics
 from msgs.definitions import DEFINITIONS
@@ -139,6 +140,22 @@ def test_a_file_cut_anywhere_is_readable_once_finished(tmp_path: Path, whole: by
             assert not finish_unfinished(path)
     assert lengths == sorted(lengths)
     assert set(lengths) == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("torn", [False, True], ids=["closed", "torn and finished"])
+def test_rosbags_reads_it_as_a_ros_2_bag(tmp_path: Path, torn: bool) -> None:
+    file = McapFile(tmp_path / "one.mcap")
+    payloads = [pose_now(z).encode() for z in (250.0, 251.0)]
+    for n, payload in enumerate(payloads):
+        file.write("uav1/target/t0/pose", topics.POSE.ros_type, payload, n, n)
+        file.flush()
+    if torn:
+        file.abandon()
+    else:
+        file.close()
+    with Reader(file.path) as bag:
+        came = [(one.topic, one.msgtype, stamp_ns, bytes(raw)) for one, stamp_ns, raw in bag.messages()]
+    assert came == [("/uav1/target/t0/pose", topics.POSE.ros_type, n, payload) for n, payload in enumerate(payloads)]
 
 
 def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:

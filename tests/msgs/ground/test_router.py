@@ -157,7 +157,7 @@ def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
         ('listen = ["tcp/0.0.0.0:7447"]\nlisten_on = 3', "listen_on: unknown key"),
         ("[access]\n", "listen: is missing"),
         ('listen = ["udp/0.0.0.0:7447"]', "'udp/0.0.0.0:7447' is not tcp/HOST:PORT, tls/HOST:PORT or quic/HOST:PORT"),
-        ('listen = ["quic/0.0.0.0:7447"]', "'quic/0.0.0.0:7447' needs tls"),
+        ('listen = ["quic/0.0.0.0:7447"]', "router.toml: listen: 'quic/0.0.0.0:7447' needs tls"),
         ('listen = ["tcp/0.0.0.0:7447"]\n[access]\nvehicles = ["uav1"]', "[access] tells identities by their"),
         ('listen = ["tcp/0.0.0.0:7447"]\n[access]\nvehicles = ["uav/1"]', "access.vehicles.0: "),
         (
