@@ -1,0 +1,324 @@
+"""Cameras that others run: a zenoh topic, a stream over UDP, pictures that freeze, stamps that jump."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.cameras.capture import Capture
+from edge.cameras.device import STAMP_AGE_MAX_NS, complaints, driver_stamp_ns
+from edge.cameras.folder import FolderSource, list_pictures
+from edge.cameras.intrinsics import read_calibration
+from edge.cameras.source import EndOfStream, SourceLost
+from edge.cameras.stream import StreamClock, StreamSource
+from edge.cameras.watch import FrameWatch
+from edge.cameras.zenoh_topic import ZenohSource
+from edge.config_camera import DeviceCamera, FolderCamera, IntrinsicsSettings, StreamCamera, ZenohCamera
+from edge.errors import InputError
+from edge.types import Frame, FrameMeta
+from msgs import topics
+from msgs.cdr import CompressedImage
+from msgs.publish import Node, TopicPublisher
+from msgs.session import client_config, router_config
+
+SIZE_WH = (320, 180)
+LENS = [-0.2, 0.05, 0.001, -0.001, 0.0]
+INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=320, height=180, distortion=LENS)
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    with socket.socket(type=kind) as bound:
+        bound.bind(("127.0.0.1", 0))
+        return int(bound.getsockname()[1])
+
+
+def picture(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
+    """Tells its number, modulo 25, by its brightness."""
+    return np.full((size_wh[1], size_wh[0], 3), 10 * (index % 25), np.uint8)
+
+
+def number_of(frame: Frame) -> int:
+    return round(float(frame.image_bgr.mean()) / 10)
+
+
+def message(index: int, size_wh: tuple[int, int] = SIZE_WH, stamp_ns: int | None = None) -> bytes:
+    _, png = cv2.imencode(".png", picture(index, size_wh))
+    now_ns = time.time_ns() if stamp_ns is None else stamp_ns
+    return CompressedImage(now_ns, "camera_optical_frame", "png", png.tobytes()).encode()
+
+
+@contextmanager
+def router(port: int) -> Iterator[TopicPublisher]:
+    """A router with a ROS 2 node behind it that publishes `nose/image/compressed`."""
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with zenoh.open(router_config([endpoint])), zenoh.open(client_config([endpoint])) as session:
+        yield Node(session, "nose", name="driver").publisher(topics.IMAGE)
+
+
+def zenoh_camera(port: int) -> ZenohCamera:
+    return ZenohCamera(
+        type="zenoh", topic="nose/image/compressed", connect=f"tcp/127.0.0.1:{port}", intrinsics=INTRINSICS
+    )
+
+
+def put_until_read(source: ZenohSource, publisher: TopicPublisher, payload: bytes) -> Frame:
+    """The first pictures may be lost while the subscription spreads."""
+    frames: list[Frame] = []
+    reader = threading.Thread(target=lambda: frames.append(source.read(threading.Event())))
+    reader.start()
+    while reader.is_alive():
+        publisher.put(payload)
+        reader.join(0.05)
+    return frames[0]
+
+
+def test_a_zenoh_topic_is_a_camera_stamped_by_its_publisher() -> None:
+    port = free_port()
+    with router(port) as publisher, closing(ZenohSource(zenoh_camera(port))) as source:
+        info = source.open()
+        assert info.image_size_wh == SIZE_WH
+        put_until_read(source, publisher, message(1))
+        exposed_ns = time.monotonic_ns() - 80_000_000
+        frame = put_until_read(source, publisher, message(7, stamp_ns=time.time_ns() - 80_000_000))
+        while number_of(frame) != 7:
+            frame = put_until_read(source, publisher, message(7, stamp_ns=time.time_ns() - 80_000_000))
+        assert frame.meta.capture_ns >= exposed_ns - 1_000_000
+        assert frame.meta.arrival_ns - frame.meta.capture_ns >= 79_000_000
+        assert frame.distortion == tuple(LENS)
+        assert frame.K[0, 0] == 300
+
+
+def reading(source: ZenohSource, stop: threading.Event) -> Frame | None:
+    try:
+        return source.read(stop)
+    except EndOfStream:
+        return None
+
+
+def test_what_is_no_picture_on_the_topic_is_counted_and_what_is_lost_shows_as_a_gap() -> None:
+    port = free_port()
+    with router(port) as publisher, closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        first = put_until_read(source, publisher, message(1))
+        stop, read = threading.Event(), []
+        reader = threading.Thread(target=lambda: read.append(reading(source, stop)))
+        reader.start()
+        for reason, payload in (
+            ("undecodable", message(2)[:40]),
+            ("undecodable", CompressedImage(1, "", "jpeg", b"no jpeg").encode()),
+            ("misfit", message(3, (300, 200))),
+        ):
+            before = source.counts[reason]
+            while source.counts[reason] == before:
+                publisher.put(payload)
+                stop.wait(0.02)
+        stop.set()
+        reader.join()
+        assert read == [None]
+        later = put_until_read(source, publisher, message(4, stamp_ns=5))  # a clock from 1970
+        assert later.meta.sequence - first.meta.sequence >= 4
+        assert source.counts["unstamped"] >= 1
+        assert later.meta.capture_ns == later.meta.arrival_ns
+
+
+def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None:
+    port = free_port()
+    source = ZenohSource(zenoh_camera(port))
+    with pytest.raises(SourceLost, match="no zenoh session"):
+        source.open()
+    capture = Capture(source, False)
+    capture.start()
+    try:
+        assert capture.newest(0.3) is None
+        with router(port) as publisher:
+            index, frame = 0, None
+            while frame is None:
+                publisher.put(message(index := index + 1))
+                frame = capture.newest(0.1)
+        assert capture.streaming
+    finally:
+        capture.stop()
+    assert capture.counters()["reconnects"] >= 1
+
+
+class UdpCamera(threading.Thread):
+    """An encoder that sends MPEG-TS over UDP in real time until told to stop."""
+
+    def __init__(self, port: int, fps: int) -> None:
+        super().__init__()
+        self._url, self._fps, self.stop = f"udp://127.0.0.1:{port}?pkt_size=1316", fps, threading.Event()
+
+    def run(self) -> None:
+        with av.open(self._url, "w", format="mpegts") as out:
+            stream = out.add_stream("mpeg2video", rate=self._fps)
+            stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
+            stream.codec_context.gop_size, stream.codec_context.max_b_frames = 5, 0
+            start_s, index = time.monotonic(), 0
+            while not self.stop.wait(max(start_s + index / self._fps - time.monotonic(), 0)):
+                frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
+                frame.pts, frame.time_base = index, Fraction(1, self._fps)
+                out.mux(stream.encode(frame))
+                index += 1
+
+
+def test_a_udp_stream_is_stamped_by_its_own_clock() -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    encoder = UdpCamera(port, fps=20)
+    settings = StreamCamera(type="stream", url=f"udp://127.0.0.1:{port}", intrinsics=INTRINSICS, latency_ms=30)
+    encoder.start()
+    try:
+        source = StreamSource(settings)
+        with closing(source):
+            source.open()
+            frames = [source.read(threading.Event()) for _ in range(30)]
+    finally:
+        encoder.stop.set()
+        encoder.join()
+    stamps_ns = np.array([frame.meta.capture_ns for frame in frames])
+    late_ns = np.array([frame.meta.arrival_ns for frame in frames]) - stamps_ns
+    assert np.all(late_ns >= 30_000_000 - 1)
+    # However the frames bunched on their way, most steps are the camera's own to the microsecond.
+    assert np.median(np.abs(np.diff(stamps_ns) - 50_000_000)) < 100_000
+    assert all(frame.distortion == tuple(LENS) for frame in frames)
+
+
+@given(
+    st.lists(st.integers(0, 400_000_000), min_size=2, max_size=80),
+    st.integers(0, 10**15),
+    st.integers(-(10**12), 10**12),
+)
+def test_a_streams_stamps_are_its_exposures_and_the_least_delay(
+    delays_ns: list[int], boot_ns: int, origin_ns: int
+) -> None:
+    clock = StreamClock()
+    exposed = [boot_ns + 33_000_000 * k for k in range(len(delays_ns))]
+    for k, (exposed_ns, delay_ns) in enumerate(zip(exposed, delays_ns, strict=True)):
+        stamp_ns = clock.monotonic_ns(exposed_ns - boot_ns + origin_ns, exposed_ns + delay_ns)
+        assert stamp_ns is not None
+        assert stamp_ns == exposed_ns + min(delays_ns[: k + 1])
+
+
+def test_a_stream_that_starts_over_is_laid_on_our_clock_anew() -> None:
+    clock, step_ns = StreamClock(), 40_000_000
+    assert clock.monotonic_ns(0, 10**12) == 10**12
+    assert clock.monotonic_ns(step_ns, 10**12 + step_ns + 7_000_000) == 10**12 + step_ns
+    assert clock.monotonic_ns(0, 2 * 10**12) is None  # back to its beginning
+    assert clock.monotonic_ns(step_ns, 2 * 10**12 + step_ns) == 2 * 10**12 + step_ns
+    ahead_ns = 3 * 10**12  # a gap in its clock that ours does not have
+    assert clock.monotonic_ns(ahead_ns, 2 * 10**12 + 2 * step_ns) == 2 * 10**12 + 2 * step_ns
+
+
+def test_a_drivers_stamp_is_used_only_where_it_can_be() -> None:
+    now_ns = 5_000_000_000_000
+    assert driver_stamp_ns(now_ns, now_ns / 1e6 - 20.0) == now_ns - 20_000_000
+    assert driver_stamp_ns(now_ns, 0.0) is None  # no stamp
+    assert driver_stamp_ns(now_ns, 1.7e12) is None  # another clock's
+    assert driver_stamp_ns(now_ns, (now_ns - STAMP_AGE_MAX_NS) / 1e6 - 1) is None
+
+
+def test_a_device_that_does_other_than_asked_is_told() -> None:
+    asked = DeviceCamera(type="device", fps=30, fourcc="MJPG", intrinsics=INTRINSICS)
+    assert complaints(asked, "MJPG", 30.0) == []
+    assert complaints(asked, "MJPG", 29.97) == []
+    assert complaints(asked, "YUYV", 5.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
+
+
+class Playing(FolderSource):
+    """A folder that is a live camera: what repeats there is frozen."""
+
+    live = True
+
+
+def write_pictures(folder: Path, numbers: list[int]) -> Path:
+    folder.mkdir()
+    for index, number in enumerate(numbers):
+        cv2.imwrite(str(folder / f"frame{index}.png"), picture(number))
+    return folder
+
+
+def all_of(source: FolderSource) -> tuple[list[int], dict[str, int]]:
+    """Brightness of every frame handed out to a reader that is always in time, and the counters."""
+    capture = Capture(source, False)
+    capture.start()
+    numbers = []
+    try:
+        while True:
+            if (frame := capture.newest(5.0)) is not None:
+                numbers.append(number_of(frame))
+    except EndOfStream:
+        return numbers, capture.counters()
+    finally:
+        capture.stop()
+
+
+def test_a_live_picture_that_repeats_is_withheld_and_a_recordings_is_not(tmp_path: Path) -> None:
+    shown = [1, 2, 3, 3, 3, 4, 5, 5, 6, 7, 8]  # ten in eleven: names are sorted as numbers
+    folder = write_pictures(tmp_path / "pictures", shown)
+    settings = FolderCamera(type="folder", path=folder, fps=8, intrinsics=INTRINSICS)
+    numbers, counters = all_of(FolderSource(settings))
+    assert numbers == shown
+    assert (counters["frozen"], counters["dropped"]) == (3, 0)
+    numbers, counters = all_of(Playing(settings))
+    assert numbers == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert (counters["frozen"], counters["dropped"]) == (3, 0)
+
+
+def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("none here")
+    with pytest.raises(InputError, match=rf"{tmp_path} has no pictures"):
+        list_pictures(tmp_path)
+    with pytest.raises(InputError, match=r"nowhere cannot be read"):
+        list_pictures(tmp_path / "nowhere")
+
+
+def frame_at(capture_ms: float, arrival_ms: float, shade: int = 0) -> Frame:
+    meta = FrameMeta(0, round(capture_ms * 1e6), round(arrival_ms * 1e6))
+    return Frame(meta, np.full((16, 16, 3), shade, np.uint8), np.eye(3))
+
+
+def test_stamps_that_jump_are_noticed_and_those_that_jitter_are_not() -> None:
+    watch = FrameWatch()
+
+    def jumps(capture_ms: float, arrival_ms: float) -> bool:
+        frame = frame_at(capture_ms, arrival_ms)
+        jumped = watch.jumps(frame)
+        watch.repeats(frame)
+        return jumped
+
+    assert [jumps(1000 + 33 * k, 1050 + 33 * k + (k % 3) * 20) for k in range(6)] == [False] * 6
+    assert jumps(1100, 1300)  # back
+    assert jumps(1000 + 600, 1550)  # in the future
+    assert jumps(2000, 2900)  # much older than those before
+    assert not jumps(2033, 2933)
+
+
+def test_one_pixel_that_changed_is_another_picture() -> None:
+    watch = FrameWatch()
+    still = frame_at(0, 1)
+    moved = frame_at(33, 34)
+    moved.image_bgr[3, 5, 1] = 1
+    assert [watch.repeats(frame) for frame in (still, still, moved, moved, still)] == [False, True, False, True, False]
+
+
+def test_a_calibration_of_another_lens_model_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fisheye.yaml"
+    path.write_text(
+        "image_width: 640\nimage_height: 480\ndistortion_model: equidistant\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [300, 0, 320, 0, 300, 240, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 4, data: [0.1, 0, 0, 0]}\n"
+    )
+    with pytest.raises(InputError, match="distortion_model equidistant"):
+        read_calibration(path)
