@@ -11,6 +11,7 @@ import numpy as np
 
 from msgs.geometry import Array
 from sim_replay.benchmark.crew import Stopped, Tell
+from sim_replay.benchmark.exposure import metered
 from sim_replay.benchmark.filming import Film, bop_frame, fly, outline_labels
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import Preset
@@ -66,7 +67,7 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
         shutil.rmtree(folder / ".part", ignore_errors=True)
         tell(FrameNews(plan.index, kept=len(job.frames(plan))))
         return True
-    film = job.film(plan)
+    film = job.film(plan) if job.labels_only else metered(job.film(plan))
     squeezed = plan.h264_kbps is not None and not job.labels_only
     with SceneStore(folder, plan.jpeg_quality, pictures=not job.labels_only, keep_raw=squeezed) as store:
         tell(FrameNews(plan.index, kept=len(store.done)))
