@@ -40,6 +40,7 @@ class FileSource:
         self._fps = self._capture.get(cv2.CAP_PROP_FPS)
         if not math.isfinite(self._fps) or not 0 < self._fps <= 1000:
             raise InputError(f"{path} does not say its frame rate")
+        self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # not above 0: not known
         size_wh = (
             int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
@@ -53,7 +54,9 @@ class FileSource:
         assert self._capture is not None
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
-        while self._exposure_ns(self._next + 1) <= time.monotonic_ns() and self._capture.grab():
+        while self._follows(self._next) and self._exposure_ns(self._next + 1) <= time.monotonic_ns():
+            if not self._capture.grab():
+                break
             self._next += 1
         capture_ns = self._exposure_ns(self._next)
         wait_until(capture_ns, stop)
@@ -71,6 +74,10 @@ class FileSource:
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _follows(self, index: int) -> bool:
+        """Whether another frame comes after this one: the last is not skipped, however late the reader."""
+        return self._frames <= 0 or index + 1 < self._frames
 
     def _exposure_ns(self, index: int) -> int:
         assert self._start_ns is not None

@@ -139,12 +139,25 @@ def test_a_damaged_scene_names_the_file(tmp_path: Path, damage: object, named: s
 
 
 def test_a_video_plays_at_its_own_rate(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "flight.mp4", frames=8, fps=20)
+    path = write_video(tmp_path / "flight.mp4", frames=8, fps=8)
     frames = play(FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS)))
     steps_ns = np.diff([frame.meta.capture_ns for frame in frames])
     assert [frame.meta.sequence for frame in frames] == list(range(8))
-    np.testing.assert_allclose(steps_ns, 50e6, atol=1)
+    np.testing.assert_allclose(steps_ns, 125e6, atol=1)
     assert [round(float(frame.image_bgr.mean()) / 10) for frame in frames] == list(range(8))
+
+
+def test_however_late_its_reader_a_video_ends_with_its_last_frame(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "flight.mp4", frames=8, fps=20)
+    with closing(FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS))) as source:
+        source.open()
+        assert source.read(threading.Event()).meta.sequence == 0
+        threading.Event().wait(0.6)  # longer than the rest of it
+        last = source.read(threading.Event())
+        assert last.meta.sequence == 7
+        assert round(float(last.image_bgr.mean()) / 10) == 7
+        with pytest.raises(EndOfStream):
+            source.read(threading.Event())
 
 
 @contextmanager
