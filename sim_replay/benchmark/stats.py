@@ -201,6 +201,8 @@ def _rows(s: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     if v := s["visible_fraction"]:
         hidden = f"{100 * s['partly_hidden_share']:.1f} % of targets below 0.98"
         yield "visible fraction", f"mean {v['mean']:.3f}; {hidden}", "not given"
+    if s["below_camera_share"] is not None:
+        yield "targets lower than camera", f"{100 * s['below_camera_share']:.1f} %", "not given"
     yield (
         "airframes by split",
         ", ".join(f"{split} {len(names)}" for split, names in s["airframes"].items()),
