@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
-from edge.estimator.model import load_model
+from edge.reload import load_configured
+from edge.status_board import no_password
 
 
 def check(file: ConfigFile) -> list[str]:
     """Lines for a person on what the configuration holds. Raises InputError on the first thing that does not do."""
     config = file.config
-    with file.blame("model", "path"):
-        model = load_model(config.model.path, config.model.threads)
-        model.warm_up()
+    model = load_configured(file)
     with file.blame(*camera_key(config.camera)):
         source, camera, opened = open_source(config.camera)
         source.close()
     contract = model.contract
-    width, height = camera.image_size_wh
+    name, (width, height) = no_password(camera.name), camera.image_size_wh
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
     if contract.track_size_wh is not None:
         stages += f", track {contract.track_size_wh[0]}x{contract.track_size_wh[1]}"
@@ -25,7 +24,8 @@ def check(file: ConfigFile) -> list[str]:
         f"{file.path}: valid",
         f"vehicle  {config.vehicle.name}",
         f"model    {model.path.name}: {contract.name} {contract.precision}, {stages}, sha256 {model.sha256[:12]}",
-        f"camera   {camera.name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
+        f"runs on  {model.provider}" + (f": {model.fallback_reason}" if model.fallback_reason else ""),
+        f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + ("" if opened else "; it does not answer now and will be tried again"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
         f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",

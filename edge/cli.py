@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import signal
 import sys
 import threading
 from pathlib import Path
 
 from edge.errors import InputError
+from edge.logs import set_up_logging
 
 EXIT_BAD_INPUT = 2
 
@@ -17,7 +17,7 @@ EXIT_BAD_INPUT = 2
 def main(arguments: list[str] | None = None) -> int:
     """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key."""
     options = _parser().parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    set_up_logging()
     try:
         return int(options.act(options))
     except InputError as error:
@@ -42,6 +42,13 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--config", type=Path, required=True, help="TOML file")
     check.set_defaults(act=_check)
 
+    status = commands.add_parser("status", help="ask the running daemon how it is")
+    status.add_argument("--config", type=Path, help="its TOML file, for its address and name")
+    status.add_argument("--connect", metavar="ENDPOINT", help="its zenoh endpoint (default tcp/127.0.0.1:7448)")
+    status.add_argument("--vehicle", default=None, help="its name (default: whoever answers there)")
+    status.add_argument("--json", action="store_true", help="print one JSON object: info, config, model")
+    status.set_defaults(act=_status)
+
     bench = commands.add_parser("bench", help="time acquire and track inference on this machine")
     bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
     bench.add_argument("--threads", type=int, default=2, help="CPU threads of one inference (default 2)")
@@ -59,11 +66,13 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace) -> int:
     from edge.config import load_config
     from edge.daemon import run
+    from edge.reload import Reloader
 
-    stop = threading.Event()
+    stop, reloader = threading.Event(), Reloader()
+    signal.signal(signal.SIGHUP, lambda *_: reloader.ask())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    return run(load_config(options.config), stop)
+    return run(load_config(options.config), stop, reloader)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -72,6 +81,12 @@ def _check(options: argparse.Namespace) -> int:
 
     print("\n".join(check(load_config(options.config))))
     return 0
+
+
+def _status(options: argparse.Namespace) -> int:
+    from edge.status import status
+
+    return status(options.config, options.connect, options.vehicle, options.json)
 
 
 def _bench(options: argparse.Namespace) -> int:

@@ -22,6 +22,7 @@ from edge.config_camera import camera_key as camera_key
 from edge.config_ground import RecorderSettings, ZenohSettings
 from edge.config_section import ConfigPath, Section
 from edge.errors import InputError
+from edge.estimator.providers import Provider
 from edge.links.mavlink_endpoints import parse_endpoint
 from edge.links.signing_key import load_key
 from edge.types import Array, Mount
@@ -93,6 +94,9 @@ class MountSettings(Section):
 
 class ModelSettings(Section):
     path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file that carries its contract")
+    provider: Provider = Field(
+        default="cpu", description="what it runs on; the CPU, with a warning, where the machine does not have it"
+    )
     threads: int = Field(default=2, ge=1, le=64, description="CPU threads of one inference")
     spinning: bool = Field(
         default=False, description="threads spin between inferences: faster alone, slower beside others"
@@ -173,6 +177,19 @@ class MavlinkSettings(Section):
         return self
 
 
+class HealthSettings(Section):
+    no_frame_s: float = Field(default=2.0, ge=0.2, le=60, description="without a frame for so long: fault")
+    latency_max_ms: float | None = Field(
+        default=None, gt=0, le=10_000, description="degraded when p95 from exposure to the links is above"
+    )
+    loop_stuck_s: float = Field(
+        default=5.0, ge=1, le=60, description="the process ends when its loop stands still for so long"
+    )
+    prometheus_port: int | None = Field(
+        default=None, ge=1, le=65535, description="serve metrics to Prometheus on this port of 127.0.0.1"
+    )
+
+
 class Config(Section):
     vehicle: VehicleSettings = VehicleSettings()
     camera: CameraSettings
@@ -183,6 +200,7 @@ class Config(Section):
     # Checked though it is the default, so that its folder is taken from the file's.
     recorder: RecorderSettings = Field(default_factory=dict, validate_default=True)
     mavlink: MavlinkSettings = MavlinkSettings()
+    health: HealthSettings = HealthSettings()
 
     @model_validator(mode="after")
     def _gimbal_is_heard(self) -> Config:

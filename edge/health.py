@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from edge.types import Track, TrackState
 
 WINDOW_FRAMES = 900  # half a minute at 30 frames a second
+RATE_OVER_NS = 2_000_000_000
 NO_FRAME_NS = 2_000_000_000
 DROPS_TOLERATED = 0.1
 ANNOUNCE_NS = 1_000_000_000
@@ -55,7 +56,8 @@ class HealthSnapshot:
     tracks: int  # confirmed or coasting
     frame_rate_hz: float
     counters: Mapping[str, int]
-    latency_ms: Mapping[str, Percentiles]  # by stage; `total` is exposure to handed to the links
+    latency_ms: Mapping[str, Percentiles]  # by stage (edge.stages.STAGES)
+    facts: Mapping[str, str] = field(default_factory=dict)  # what the daemon flies with, e.g. the model's hash
 
     def brief(self) -> str:
         """For the log each second: state, tracks, rate, latency from exposure to the links, frames dropped."""
@@ -102,14 +104,21 @@ class Announcer:
 
 
 def judge(
-    tracks: Iterable[Track], frame_age_ns: int | None, drops_share: float, has_attitude: bool, wants_attitude: bool
+    tracks: Iterable[Track],
+    frame_age_ns: int | None,
+    drops_share: float,
+    has_attitude: bool,
+    wants_attitude: bool,
+    no_frame_ns: int = NO_FRAME_NS,
+    faults: Sequence[str] = (),
 ) -> tuple[HealthState, tuple[str, ...]]:
-    """The state and its reasons. `frame_age_ns` is None before the first frame. Pure."""
+    """The state and its reasons. `frame_age_ns` is None before the first frame; `faults` are what else is less well
+    than it should be. Pure."""
     if frame_age_ns is None:
-        return HealthState.INIT, ("waiting for the camera",)
-    if frame_age_ns > NO_FRAME_NS:
-        return HealthState.FAULT, (f"no frame for {frame_age_ns / 1e9:.0f} s",)
-    reasons = []
+        return HealthState.INIT, ("waiting for the camera", *faults)
+    if frame_age_ns > no_frame_ns:
+        return HealthState.FAULT, (f"no frame for {frame_age_ns / 1e9:.0f} s", *faults)
+    reasons = list(faults)
     if wants_attitude and not has_attitude:
         reasons.append("no own attitude: poses in the camera frame only")
     if drops_share > DROPS_TOLERATED:
@@ -125,8 +134,10 @@ def judge(
 class Health:
     """Collects what the loop saw; `assess` and `snapshot` say what it means."""
 
-    def __init__(self, wants_attitude: bool) -> None:
+    def __init__(self, wants_attitude: bool, no_frame_ns: int = NO_FRAME_NS) -> None:
         self._wants_attitude = wants_attitude
+        self.no_frame_ns = no_frame_ns
+        self.faults: tuple[str, ...] = ()  # what others noticed, told as reasons while it is there
         self._stages_ns: dict[str, deque[int]] = {}
         self._done_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
         self._sequence: deque[int] = deque(maxlen=WINDOW_FRAMES)
@@ -152,14 +163,25 @@ class Health:
 
     def assess(self, now_ns: int) -> tuple[HealthState, tuple[str, ...]]:
         frame_age_ns = now_ns - self._done_ns[-1] if self._done_ns else None
-        return judge(self._tracks, frame_age_ns, self._drops_share(), self._has_attitude, self._wants_attitude)
+        return judge(
+            self._tracks,
+            frame_age_ns,
+            self._drops_share(),
+            self._has_attitude,
+            self._wants_attitude,
+            self.no_frame_ns,
+            self.faults,
+        )
 
-    def snapshot(self, now_ns: int, counters: Mapping[str, int]) -> HealthSnapshot:
+    def snapshot(
+        self, now_ns: int, counters: Mapping[str, int], facts: Mapping[str, str] | None = None
+    ) -> HealthSnapshot:
         state, reasons = self.assess(now_ns)
         latency_ms = {stage: percentiles_ms(values) for stage, values in self._stages_ns.items()}
         sure = sum(track.state is not TrackState.TENTATIVE for track in self._tracks)
         counted = {"poses": self._poses, **counters}
-        return HealthSnapshot(now_ns, state, reasons, sure, self._frame_rate_hz(now_ns), counted, latency_ms)
+        rate_hz = self._frame_rate_hz(now_ns)
+        return HealthSnapshot(now_ns, state, reasons, sure, rate_hz, counted, latency_ms, facts or {})
 
     def _drops_share(self) -> float:
         if len(self._sequence) < 2:
@@ -168,7 +190,7 @@ class Health:
         return 1.0 - (len(self._sequence) - 1) / produced if produced > 0 else 0.0
 
     def _frame_rate_hz(self, now_ns: int) -> float:
-        recent = [done_ns for done_ns in self._done_ns if now_ns - done_ns <= NO_FRAME_NS]
+        recent = [done_ns for done_ns in self._done_ns if now_ns - done_ns <= RATE_OVER_NS]
         return (len(recent) - 1) / ((recent[-1] - recent[0]) / 1e9) if len(recent) > 1 else 0.0
 
 

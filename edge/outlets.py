@@ -6,15 +6,15 @@ import logging
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from edge.config import ConfigFile
 from edge.health import HealthSnapshot, HealthState
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import CameraInfo, Report
+from edge.types import Report
 
 if TYPE_CHECKING:
     from edge.links.mavlink_link import MavlinkLink
     from edge.links.zenoh_link import ZenohLink
+    from edge.status_board import StatusBoard
     from msgs.recording import Recorder
 
 # Python's logging levels are those of rcl_interfaces/Log; MAVLink counts the other way (MAV_SEVERITY).
@@ -61,14 +61,14 @@ class Outlets:
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
 
 
-def start_outlets(
-    file: ConfigFile, own_ship: OwnShipBuffer, camera: CameraInfo, requests: RequestQueue, cleanup: ExitStack
-) -> Outlets:
+def start_outlets(board: StatusBoard, own_ship: OwnShipBuffer, requests: RequestQueue, cleanup: ExitStack) -> Outlets:
     """Start the enabled links, to be stopped by `cleanup`. A link that is off is not even imported.
+
+    Over zenoh the board answers who asks.
 
     Raises InputError (LinkError) when an endpoint of our own cannot be opened.
     """
-    config = file.config
+    file, config = board.file, board.file.config
     zenoh: ZenohLink | None = None
     mavlink: MavlinkLink | None = None
     recorder: Recorder | None = None
@@ -88,16 +88,25 @@ def start_outlets(
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests)
             cleanup.callback(zenoh.stop)
             zenoh.start()
+        if zenoh.session is not None:
+            from edge.status_board import declare_status
+
+            cleanup.callback(declare_status(zenoh.session, board))
     if config.mavlink.enabled:
         from edge.links.mavlink_link import MavlinkLink, signing_of
 
         with file.blame("mavlink", "signing_key"):
             signing = signing_of(config.mavlink)
         with file.blame("mavlink", "endpoints"):
-            mavlink = MavlinkLink(config.mavlink, own_ship, camera, requests, signing)
+            mavlink = MavlinkLink(config.mavlink, own_ship, board.camera, requests, signing)
             cleanup.callback(mavlink.stop)
             mavlink.start()
     outlets = Outlets(zenoh, mavlink, recorder)
     if recorder is not None:
         recorder.start()
+    if config.health.prometheus_port is not None:
+        from edge.prometheus import MetricsServer
+
+        with file.blame("health", "prometheus_port"):
+            cleanup.callback(MetricsServer(board, config.health.prometheus_port).stop)
     return outlets

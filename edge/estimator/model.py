@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from edge.errors import InputError
+from edge.estimator.providers import Provider, choose_provider
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
 
 INPUT_TYPES = {"image": ("tensor(uint8)", 4), "K": ("tensor(float)", 3)}
@@ -27,6 +30,7 @@ OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
     "sigma": (6,),
 }
 SIZE_STEP_PX = 32
+RUNS_REMEMBERED = 16
 _LOG_FATAL = 4
 
 
@@ -46,16 +50,36 @@ class Peaks:
 class Model:
     """A loaded session. One thread at a time calls `run`."""
 
-    def __init__(self, session: ort.InferenceSession, contract: ModelContract, path: Path, sha256: str) -> None:
+    def __init__(
+        self,
+        session: ort.InferenceSession,
+        contract: ModelContract,
+        path: Path,
+        sha256: str,
+        provider: Provider = "cpu",
+        fallback_reason: str | None = None,
+    ) -> None:
         self._session = session
+        self._runs_ns: deque[tuple[int, int]] = deque(maxlen=RUNS_REMEMBERED)
         self.contract = contract
         self.path = path
         self.sha256 = sha256
+        self.provider = provider  # what it runs on
+        self.fallback_reason = fallback_reason  # a sentence; None: that is what was asked for
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
         feeds = {"image": images_bgr, "K": K.astype(np.float32)}
-        return Peaks(*self._session.run(list(OUTPUT_NAMES), feeds))
+        begin_ns = time.monotonic_ns()
+        peaks = Peaks(*self._session.run(list(OUTPUT_NAMES), feeds))
+        self._runs_ns.append((begin_ns, time.monotonic_ns()))
+        return peaks
+
+    def take_runs_ns(self) -> list[tuple[int, int]]:
+        """Begin and end (monotonic) of the inferences since the last call, oldest first."""
+        taken = list(self._runs_ns)
+        self._runs_ns.clear()
+        return taken
 
     def warm_up(self) -> None:
         """One inference at each size. Raises InputError if the graph does not run or its outputs' shapes are wrong."""
@@ -73,8 +97,12 @@ class Model:
                     raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
 
 
-def load_model(path: Path, threads: int, spinning: bool = False) -> Model:
-    """Open an ONNX file on the CPU and check it against the contract. Raises InputError: which, and what is wrong."""
+def load_model(path: Path, threads: int, spinning: bool = False, provider: Provider = "cpu") -> Model:
+    """Open an ONNX file and check it against the contract. Raises InputError: which, and what is wrong.
+
+    A `provider` that this machine does not have is no error: the model then runs on the CPU and says why in
+    `fallback_reason`.
+    """
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -85,14 +113,17 @@ def load_model(path: Path, threads: int, spinning: bool = False) -> Model:
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "1" if spinning else "0")
     options.log_severity_level = _LOG_FATAL
+    chosen = choose_provider(provider, ort.get_available_providers())
     try:
-        session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        session = ort.InferenceSession(content, options, providers=list(chosen.names))
     except Exception as error:  # ONNX Runtime's errors have no common base of their own
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"model {path} is not a loadable ONNX file: {reason}") from error
+    chosen = chosen.confirmed(session.get_providers())
     contract = _contract(session.get_modelmeta().custom_metadata_map, path)
     _check_graph(session, contract, path)
-    return Model(session, contract, path, hashlib.sha256(content).hexdigest())
+    sha256 = hashlib.sha256(content).hexdigest()
+    return Model(session, contract, path, sha256, chosen.provider, chosen.fallback_reason)
 
 
 def _contract(metadata: dict[str, str], path: Path) -> ModelContract:

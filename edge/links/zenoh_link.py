@@ -128,6 +128,11 @@ class ZenohLink:
             self._session.close()
             self._session = None
 
+    @property
+    def session(self) -> zenoh.Session | None:
+        """Open between start and stop, if zenoh is on."""
+        return self._session
+
     def counters(self) -> dict[str, int]:
         with self._waiting:
             return {**self._counters, "links": self._links}

@@ -91,6 +91,7 @@ def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> c
     values = {
         "tracks": str(snapshot.tracks),
         "frame_rate_hz": f"{snapshot.frame_rate_hz:.1f}",
+        **snapshot.facts,
         **{name: str(count) for name, count in snapshot.counters.items()},
         **{
             f"latency_ms/{stage}/{name}": f"{value:.2f}"

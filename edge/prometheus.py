@@ -1,0 +1,94 @@
+"""Metrics for Prometheus in its text format, served on loopback alone by a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from edge.errors import InputError
+from edge.health import HealthState
+from edge.stages import STAGES
+from edge.status_board import StatusBoard
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
+
+
+def metrics(board: StatusBoard) -> str:
+    """Everything in seconds and counts; without state before the first second is over."""
+    return "\n".join(_lines(board)) + "\n"
+
+
+def _lines(board: StatusBoard) -> Iterator[str]:
+    info = board.info()
+    labels = ",".join(f"{name}={_quoted(info[name])}" for name in ("vehicle", "version", "model_sha256"))
+    yield from _metric("uavpose_info", "gauge", "what flies")
+    yield f"uavpose_info{{{labels}}} 1"
+    yield from _metric("uavpose_uptime_seconds", "gauge", "since the start")
+    yield f"uavpose_uptime_seconds {info['uptime_s']}"
+    if "state" not in info:
+        return
+    yield from _metric("uavpose_state", "gauge", "1 for the state that holds")
+    for state in HealthState:
+        yield f"uavpose_state{{state={_quoted(state.value)}}} {int(state.value == info['state'])}"
+    for name, key, text in (
+        ("uavpose_tracks", "tracks", "targets confirmed or coasting"),
+        ("uavpose_frame_rate_hertz", "frame_rate_hz", "frames a second, done"),
+        ("uavpose_snapshot_age_seconds", "age_s", "age of these figures; grows when the loop stands still"),
+    ):
+        yield from _metric(name, "gauge", text)
+        yield f"{name} {info[key]}"
+    yield from _metric("uavpose_count", "untyped", "by name: frames, poses, drops, messages, refusals since the start")
+    for name, count in info["counters"].items():
+        yield f"uavpose_count{{name={_quoted(name)}}} {count}"
+    yield from _metric("uavpose_stage_seconds", "gauge", f"by stage over the last frames: {', '.join(STAGES)}")
+    for stage, percentiles in info["latency_ms"].items():
+        for name, quantile in QUANTILES.items():
+            label = f"stage={_quoted(stage)},quantile={_quoted(quantile)}"
+            yield f"uavpose_stage_seconds{{{label}}} {percentiles[name] / 1e3:.6f}"
+
+
+def _metric(name: str, kind: str, text: str) -> Iterator[str]:
+    yield f"# HELP {name} {text}"
+    yield f"# TYPE {name} {kind}"
+
+
+def _quoted(value: object) -> str:
+    text = str(value).replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+    return f'"{text}"'
+
+
+class MetricsServer:
+    """Serves `/metrics` on 127.0.0.1. Raises InputError if the port is taken."""
+
+    def __init__(self, board: StatusBoard, port: int) -> None:
+        class Handler(BaseHTTPRequestHandler):
+            timeout = 5.0  # a client that says nothing holds its thread no longer
+
+            def do_GET(self) -> None:
+                if self.path != "/metrics":
+                    self.send_error(404)
+                    return
+                body = metrics(board).encode()
+                self.send_response(200)
+                self.send_header("Content-Type", CONTENT_TYPE)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            def log_message(self, format: str, *args: object) -> None:
+                """A scrape is no news."""
+
+        try:
+            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        except OSError as error:
+            raise InputError(f"port {port} of 127.0.0.1 cannot be served: {error.strerror}") from error
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, name="prometheus", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()

@@ -1,0 +1,174 @@
+"""SIGHUP: the configuration read again, and a new model put in between two frames; what is wrong changes nothing.
+
+| key                             | when it is changed                    |
+|---------------------------------|---------------------------------------|
+| [model], the file's content too | from the next frame on                |
+| [estimator] acquire_every_n     | from the next frame on                |
+| [health] no_frame_s, latency_max_ms | from the next frame on            |
+| all others                      | named; they need a restart            |
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from edge.config import Config, ConfigFile, load_config
+from edge.errors import InputError
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import Model, load_model
+from edge.types import CameraInfo, Frame, FrameMeta
+
+log = logging.getLogger(__name__)
+
+LIVE_KEYS = frozenset({("estimator", "acquire_every_n"), ("health", "no_frame_s"), ("health", "latency_max_ms")})
+LIVE_SECTIONS = frozenset({"model"})
+
+
+@dataclass(frozen=True)
+class Reloaded:
+    """What the loop takes over."""
+
+    file: ConfigFile  # what flies from now on: the old, but for what can be changed in flight
+    estimator: Estimator  # warm
+    said: str  # a sentence for the operator
+
+
+def load_configured(file: ConfigFile) -> Model:
+    """The configured model, run once at each size. Raises InputError that names the key."""
+    settings = file.config.model
+    with file.blame("model", "path"):
+        model = load_model(settings.path, settings.threads, settings.spinning, settings.provider)
+        model.warm_up()
+    return model
+
+
+def warm_estimator(model: Model, max_targets: int, camera: CameraInfo) -> Estimator:
+    """Both stages, gone through once with a black picture of the camera's size: first calls allocate, and should not
+    cost a frame."""
+    estimator = Estimator(model, max_targets)
+    width, height = camera.image_size_wh
+    estimator.warm_up(Frame(FrameMeta(0, 0, 0), np.zeros((height, width, 3), dtype=np.uint8), camera.K))
+    model.take_runs_ns()
+    return estimator
+
+
+def needs_restart(old: Config, new: Config) -> list[str]:
+    """Keys that differ and cannot be changed in flight, as `[section] key`."""
+    named = []
+    for section in Config.model_fields:
+        if section in LIVE_SECTIONS:
+            continue
+        was, now = _keys(getattr(old, section)), _keys(getattr(new, section))
+        named += [
+            f"[{section}] {key}"
+            for key in dict.fromkeys((*was, *now))
+            if (section, key) not in LIVE_KEYS and was.get(key) != now.get(key)
+        ]
+    return named
+
+
+def with_live_keys(old: Config, new: Config) -> Config:
+    """`old` with what can be changed in flight taken from `new`."""
+    changes: dict[str, Any] = {section: getattr(new, section) for section in LIVE_SECTIONS}
+    for section in {section for section, _ in LIVE_KEYS}:
+        keys = {key: getattr(getattr(new, section), key) for name, key in LIVE_KEYS if name == section}
+        changes[section] = getattr(old, section).model_copy(update=keys)
+    return old.model_copy(update=changes)
+
+
+def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Reloaded:
+    """Read the configuration again and make ready what it asks for. Raises InputError; `flying` then goes on."""
+    new = load_config(flying.path)
+    config = with_live_keys(flying.config, new.config)
+    file = replace(new, config=config)
+    said = []
+    if config.model != flying.config.model or _sha256(file) != estimator.model.sha256:
+        old = estimator.model
+        estimator = warm_estimator(load_configured(file), config.estimator.max_targets, camera)
+        said.append(f"model {old.sha256[:12]} replaced by {_name(estimator.model)}")
+    changed = needs_restart(config, new.config)
+    live = [f"[{s}] {k}" for s, k in sorted(LIVE_KEYS) if _key(config, s, k) != _key(flying.config, s, k)]
+    if live:
+        said.append(f"taken over: {', '.join(live)}")
+    if changed:
+        said.append(f"needs a restart: {', '.join(changed)}")
+    return Reloaded(file, estimator, f"reloaded: {'; '.join(said) or 'nothing has changed'}")
+
+
+class Reloader:
+    """Asked by a signal, works in a thread of its own, delivers to the loop; one reload at a time."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._ready: Reloaded | None = None
+        self._taken = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def ask(self) -> None:
+        """From a signal handler, so without a lock: the loop sees it at its next turn."""
+        self._asked = True
+
+    def take(
+        self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
+    ) -> Reloaded | None:
+        """At every turn of the loop: begin what was asked for, hand over what is ready. Never waits."""
+        ready, self._ready = self._ready, None
+        if ready is not None:
+            self._taken.set()
+            return ready
+        if self._asked and (self._thread is None or not self._thread.is_alive()):
+            self._asked = False
+            self._taken.clear()
+            arguments = (flying, estimator, camera, event)
+            self._thread = threading.Thread(target=self._work, args=arguments, name="reload", daemon=True)
+            self._thread.start()
+        return None
+
+    def _work(
+        self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
+    ) -> None:
+        log.info("reload: reading %s", flying.path)
+        try:
+            self._ready = reload(flying, estimator, camera)
+        except InputError as error:
+            _refuse(str(error), event)
+        except Exception as error:  # whatever is wrong with a new model, the old one flies on
+            _refuse(repr(error), event)
+        else:
+            # `estimator` is let go of here, when the loop has the new one: freeing its memory takes time.
+            self._taken.wait()
+
+
+def _refuse(reason: str, event: Callable[[int, str], None]) -> None:
+    text = f"reload refused, flying on as before: {reason}"
+    log.error("%s", text)
+    event(logging.ERROR, text)
+
+
+def _keys(section: Any) -> dict[str, Any]:
+    return {name: getattr(section, name) for name in type(section).model_fields}
+
+
+def _key(config: Config, section: str, key: str) -> Any:
+    return getattr(getattr(config, section), key)
+
+
+def _sha256(file: ConfigFile) -> str:
+    path = file.config.model.path
+    with file.blame("model", "path"):
+        try:
+            return hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise InputError(f"model {path} cannot be read: {error.strerror}") from error
+
+
+def _name(model: Model) -> str:
+    fallback = f"; {model.fallback_reason}" if model.fallback_reason else ""
+    return f"{model.contract.name} {model.sha256[:12]} on {model.provider}{fallback}"

@@ -1,0 +1,50 @@
+"""How long one frame is in each stage, from its exposure to the links."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from edge.types import FrameMeta
+
+STAGES = {
+    "capture": "exposure to pixels in memory",
+    "wait": "pixels in memory to taken by the loop",
+    "preprocess": "windows cut and scaled for the network",
+    "inference": "the network itself, all its runs",
+    "decode": "the network's answer to poses; between two runs also the next one's windows",
+    "track": "association and filters",
+    "publish": "handed to the links",
+    "total": "exposure to handed to the links",
+}
+
+
+class StageClock:
+    """Laps of one frame; each belongs to a row of STAGES."""
+
+    def __init__(self, meta: FrameMeta, now_ns: int) -> None:
+        self._begin_ns = meta.capture_ns
+        self._last_ns = now_ns
+        self._stages_ns = Counter(capture=meta.arrival_ns - meta.capture_ns, wait=now_ns - meta.arrival_ns)
+
+    def lap(self, stage: str) -> None:
+        """All since the lap before was `stage`."""
+        self._until(time.monotonic_ns(), stage)
+
+    def estimated(self, runs_ns: Sequence[tuple[int, int]]) -> None:
+        """All since the lap before was the estimator's, and `runs_ns` (begin, end) its inferences."""
+        before = "preprocess"
+        for begin_ns, end_ns in runs_ns:
+            self._until(begin_ns, before)
+            self._until(end_ns, "inference")
+            before = "decode"
+        self._until(time.monotonic_ns(), before)
+
+    def stages_ns(self) -> dict[str, int]:
+        """Nanoseconds by stage, and from exposure to the last lap as `total`."""
+        return {**self._stages_ns, "total": self._last_ns - self._begin_ns}
+
+    def _until(self, now_ns: int, stage: str) -> None:
+        self._stages_ns[stage] += now_ns - self._last_ns
+        self._last_ns = now_ns

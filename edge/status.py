@@ -1,0 +1,115 @@
+"""`uavpose-edge status`: ask the running daemon over zenoh on loopback, and print its answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from edge.config import load_config
+from edge.config_ground import ZenohSettings
+from edge.errors import InputError
+from edge.health import HealthState
+from edge.status_board import key_of
+from msgs.session import TlsFiles, check_endpoint, client_config
+
+ANSWER_S = 5.0
+STALE_S = 3.0
+EXIT_NOT_WELL = 1
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+
+
+def status(config: Path | None, connect: str | None, vehicle: str | None, as_json: bool) -> int:
+    """Print how the daemon is; 0 if it works, 1 if it does not answer, stands still or is in FAULT.
+
+    Raises InputError for an address or name that is none, or a configuration that keeps zenoh off.
+    """
+    endpoint, uav, tls = _address(config, connect, vehicle)
+    answer = ask(endpoint, uav, tls)
+    if answer is None:
+        sentence = f"no daemon answers at {endpoint}: it is not running, or its [zenoh] listen is elsewhere"
+        print(json.dumps({"error": sentence}) if as_json else sentence)
+        return EXIT_NOT_WELL
+    print(json.dumps(answer) if as_json else for_a_person(answer))
+    return 0 if works(answer["info"]) else EXIT_NOT_WELL
+
+
+def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] | None:
+    """`info`, `config` and `model` of the daemon that listens at `endpoint`; None if none answers."""
+    try:
+        with zenoh.open(client_config([endpoint], tls=tls)) as session:
+            answers = {what: _ask_one(session, uav, what) for what in ("info", "config", "model")}
+    except zenoh.ZError:
+        return None
+    return answers if all(answer is not None for answer in answers.values()) else None
+
+
+def works(info: dict[str, Any]) -> bool:
+    """Whether the daemon's loop turns and gives what it is for."""
+    return info.get("state") not in (None, HealthState.FAULT.value) and info.get("age_s", 0.0) < STALE_S
+
+
+def for_a_person(answer: dict[str, Any]) -> str:
+    info, model = answer["info"], answer["model"]
+    reasons = f": {'; '.join(info['reasons'])}" if info.get("reasons") else ""
+    contract, fallback = model["contract"], model["fallback_reason"]
+    lines = [
+        f"{info['vehicle']}  {info.get('state', 'starting')}{reasons}",
+        f"  up        {info['uptime_s']:.0f} s, process {info['pid']}, version {info['version']}",
+        f"  camera    {info['camera']}",
+        f"  model     {contract['name']} {contract['precision']} {model['sha256'][:12]} on {model['provider']}"
+        + (f" ({fallback})" if fallback else ""),
+        f"  config    {answer['config']['file']}",
+    ]
+    if "state" not in info:
+        return "\n".join(lines)
+    stale = f"; {info['age_s']:.0f} s OLD: the loop stands still" if info["age_s"] >= STALE_S else ""
+    lines += [f"  targets   {info['tracks']}", f"  frames    {info['frame_rate_hz']:.1f} a second{stale}", ""]
+    lines.append(f"  {'stage':12} {'p50 ms':>8} {'p95 ms':>8} {'p99 ms':>8}")
+    lines += [
+        f"  {stage:12} {p['p50']:8.2f} {p['p95']:8.2f} {p['p99']:8.2f}" for stage, p in info["latency_ms"].items()
+    ]
+    lines += ["", *(f"  {name:40} {count:>12}" for name, count in info["counters"].items() if count)]
+    return "\n".join(lines)
+
+
+def _ask_one(session: zenoh.Session, uav: str, what: str) -> dict[str, Any] | None:
+    for reply in session.get(key_of(uav, what), timeout=ANSWER_S):
+        if reply.ok is None:
+            continue
+        try:
+            tree = json.loads(reply.ok.payload.to_bytes())
+        except ValueError:
+            continue
+        if isinstance(tree, dict):
+            return tree
+    return None
+
+
+def _address(config: Path | None, connect: str | None, vehicle: str | None) -> tuple[str, str, TlsFiles | None]:
+    """Endpoint, vehicle (`*`: any) and certificates to ask with."""
+    settings, uav, tls = ZenohSettings(), vehicle or "*", None
+    if config is not None:
+        loaded = load_config(config).config
+        settings, uav = loaded.zenoh, vehicle or loaded.vehicle.name
+        tls = settings.tls.files() if settings.tls is not None else None
+        if not settings.enabled:
+            raise InputError(f"{config}: [zenoh] enabled is false: the daemon answers nobody; look at its log")
+    try:
+        key_of(uav, "info")
+        if connect is not None:
+            return check_endpoint(connect, tls=tls is not None), uav, tls
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    own = [_reachable(endpoint) for endpoint in settings.listen]
+    here = [endpoint for endpoint in own if any(f"/{host}:" in endpoint for host in LOOPBACK)]
+    if not here:
+        raise InputError(f"{config}: [zenoh] listen names no loopback address to ask at; give --connect")
+    return here[0], uav, tls
+
+
+def _reachable(endpoint: str) -> str:
+    """An endpoint that listens everywhere is asked on loopback."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

@@ -1,0 +1,107 @@
+"""What the loop tells of itself: its state at every turn, changes as events, and once a second how all goes."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+
+from edge import threads
+from edge.config import HealthSettings
+from edge.health import Announcer, Health, HealthSnapshot
+from edge.outlets import LEVELS, Outlets
+from edge.status_board import StatusBoard
+from edge.systemd import Notifier
+from edge.types import FrameMeta, Track
+from edge.watchdog import Watchdog
+
+log = logging.getLogger(__name__)
+
+SNAPSHOT_PERIOD_NS = 1_000_000_000
+LOG_EVERY_N_SNAPSHOTS = 10
+
+
+class Supervisor:
+    """Called by the loop alone, at every turn; feeds the watchdogs, the links, the status board and the log."""
+
+    def __init__(
+        self,
+        settings: HealthSettings,
+        wants_attitude: bool,
+        outlets: Outlets,
+        board: StatusBoard,
+        count: Callable[[], Mapping[str, int]],
+    ) -> None:
+        self._outlets = outlets
+        self._board = board
+        self._count = count
+        self._health = Health(wants_attitude)
+        self._announcer = Announcer()
+        self._notifier = Notifier()
+        self.watchdog = Watchdog(settings.loop_stuck_s, self._last_words)
+        self._threads_wanted: frozenset[str] = frozenset()
+        self._snapshot_due_ns = 0
+        self._snapshots = 0
+        self._flew = False
+        self.apply(settings)
+
+    def apply(self, settings: HealthSettings) -> None:
+        """Judge by these limits from now on."""
+        self._health.no_frame_ns = round(settings.no_frame_s * 1e9)
+        self._latency_max_ms = settings.latency_max_ms
+
+    def ready(self) -> None:
+        """Warmed up: what runs now is expected to go on running."""
+        self._threads_wanted = threads.running()
+        self._notifier.ready()
+
+    def stopping(self) -> None:
+        self._notifier.stopping()
+        self._notifier.close()
+
+    def frame_done(
+        self, meta: FrameMeta, stages_ns: Mapping[str, int], tracks: tuple[Track, ...], has_attitude: bool
+    ) -> None:
+        if not self._flew:
+            self._flew = True
+            log.info("first frame done, %.0f ms after its exposure", stages_ns["total"] / 1e6)
+        self._health.frame_done(meta.sequence, stages_ns, tracks, has_attitude, time.monotonic_ns())
+
+    def turn(self) -> None:
+        """Once each time round the loop, whether or not a frame came."""
+        now_ns = time.monotonic_ns()
+        self.watchdog.beat(now_ns)
+        self._notifier.feed(now_ns)
+        state, reasons = self._health.assess(now_ns)
+        self._outlets.set_health(state)
+        if self._announcer.due(state, now_ns):
+            text = f"{state.value}: {'; '.join(reasons)}" if reasons else state.value
+            log.log(LEVELS.get(state, logging.INFO), "%s", text)
+            self._outlets.tell(state, text)
+        if now_ns >= self._snapshot_due_ns:
+            self._snapshot_due_ns = now_ns + SNAPSHOT_PERIOD_NS
+            self._tell_snapshot()
+
+    def snapshot(self) -> HealthSnapshot:
+        return self._health.snapshot(time.monotonic_ns(), self._count(), self._board.facts())
+
+    def _tell_snapshot(self) -> None:
+        snapshot = self.snapshot()
+        self._health.faults = self._faults(snapshot)
+        self._board.snapshot = snapshot
+        self._outlets.publish_diagnostics(snapshot)
+        self._notifier.status(snapshot.brief())
+        if self._snapshots % LOG_EVERY_N_SNAPSHOTS == 0:
+            log.info("%s", snapshot.brief())
+        self._snapshots += 1
+
+    def _faults(self, snapshot: HealthSnapshot) -> tuple[str, ...]:
+        found = [f"the {name} thread has ended" for name in sorted(self._threads_wanted - threads.running())]
+        total = snapshot.latency_ms.get("total")
+        if self._latency_max_ms is not None and total is not None and total.p95 > self._latency_max_ms:
+            found.append(f"slow: p95 {total.p95:.0f} ms from exposure to the links")
+        return tuple(found)
+
+    def _last_words(self, sentence: str) -> None:
+        self._notifier.status(sentence)
+        self._outlets.event(logging.ERROR, sentence)

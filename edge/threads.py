@@ -1,0 +1,40 @@
+"""The table of threads: who does what, and whom nobody waits for."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ThreadRow:
+    name: str  # of the threading.Thread
+    does: str
+    never_waits_for: str
+    watched: bool = False  # once it runs it runs to the end: its absence is a fault
+
+
+THREADS = (
+    ThreadRow("main", "the loop of `edge/daemon.py`", "links, camera"),
+    ThreadRow("capture", "reads the camera, keeps the newest frame", "the loop"),
+    ThreadRow("decode", "reads a sequence's pictures ahead", "the loop"),
+    ThreadRow("zenoh", "sends the newest report, events, diagnostics", "the loop", watched=True),
+    ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),
+    ThreadRow("mavlink", "owns the sockets: sends, answers, hears the autopilot", "the loop", watched=True),
+    ThreadRow("watchdog", "ends the process when the loop stands still", "anybody"),
+    ThreadRow("reload", "while SIGHUP is obeyed: reads the configuration, loads and warms the model", "the loop"),
+    ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
+)
+
+
+def running() -> frozenset[str]:
+    """Names of the watched threads that run now."""
+    alive = {thread.name for thread in threading.enumerate()}
+    return frozenset(row.name for row in THREADS if row.watched and row.name in alive)
+
+
+def table_markdown() -> str:
+    """The table as the documents show it."""
+    lines = ["| thread | does | never waits for |", "|---|---|---|"]
+    lines += [f"| {row.name} | {row.does} | {row.never_waits_for} |" for row in THREADS]
+    return "\n".join(lines) + "\n"

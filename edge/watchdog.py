@@ -1,0 +1,65 @@
+"""Ends the process when its main loop stands still: a dead daemon is restarted, a stuck one would fly on silent."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+log = logging.getLogger(__name__)
+
+LOOKS_PER_LIMIT = 10
+LAST_WORDS_S = 0.5
+EXIT_STUCK = 70
+
+
+class Watchdog:
+    """Armed after warm-up, on the monotonic clock. Code that holds the interpreter's lock for ever stops this thread
+    too; then systemd's own watchdog, fed by the loop alone, ends the process."""
+
+    def __init__(self, limit_s: float, last_words: Callable[[str], None]) -> None:
+        self._limit_ns = round(limit_s * 1e9)
+        self._last_words = last_words
+        self._beat_ns = 0
+
+    def beat(self, now_ns: int) -> None:
+        """The loop has come round. Costs an assignment."""
+        self._beat_ns = now_ns
+
+    @contextmanager
+    def armed(self) -> Iterator[None]:
+        """Watch the calling thread until the block ends."""
+        self._beat_ns = time.monotonic_ns()
+        disarmed = threading.Event()
+        watched = threading.get_ident()
+        thread = threading.Thread(target=self._watch, args=(watched, disarmed), name="watchdog", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            disarmed.set()
+            thread.join()
+
+    def _watch(self, watched: int, disarmed: threading.Event) -> None:
+        while not disarmed.wait(self._limit_ns / 1e9 / LOOKS_PER_LIMIT):
+            still_ns = time.monotonic_ns() - self._beat_ns
+            if still_ns > self._limit_ns:
+                self._end(f"the main loop has stood still for {still_ns / 1e9:.1f} s {_place(watched)}: ending")
+
+    def _end(self, sentence: str) -> None:
+        log.critical("%s", sentence)
+        # A link that hangs with the loop must not keep the process from its end.
+        threading.Thread(target=self._last_words, args=(sentence,), daemon=True).start()
+        time.sleep(LAST_WORDS_S)
+        os._exit(EXIT_STUCK)
+
+
+def _place(thread: int) -> str:
+    frame = sys._current_frames().get(thread)
+    if frame is None:
+        return "somewhere"
+    return f"in {frame.f_code.co_name} ({os.path.basename(frame.f_code.co_filename)}:{frame.f_lineno})"
