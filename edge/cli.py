@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+from edge.bench import command as bench
 from edge.errors import InputError
 from edge.logs import set_up_logging
 
@@ -49,13 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     status.add_argument("--json", action="store_true", help="print one JSON object: info, config, model")
     status.set_defaults(act=_status)
 
-    bench = commands.add_parser("bench", help="time acquire and track inference on this machine")
-    bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
-    bench.add_argument("--threads", type=int, default=2, help="CPU threads of one inference (default 2)")
-    bench.add_argument("--runs", type=int, default=100, help="timed inferences of each stage (default 100)")
-    bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
-    bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
-    bench.set_defaults(act=_bench)
+    bench.register(commands)
 
     keygen = commands.add_parser("keygen", help="write a new key that signs MAVLink, for [mavlink] signing_key")
     keygen.add_argument("--out", type=Path, required=True, help="file to write; one that exists is left alone")
@@ -87,16 +82,6 @@ def _status(options: argparse.Namespace) -> int:
     from edge.status import status
 
     return status(options.config, options.connect, options.vehicle, options.json)
-
-
-def _bench(options: argparse.Namespace) -> int:
-    from edge.bench import bench, table, to_json
-
-    if options.runs < 1 or options.threads < 1:
-        raise InputError("--runs and --threads take whole numbers from 1 on")
-    timings = bench(options.models, options.threads, options.spinning, options.runs)
-    print(to_json(timings) if options.json else table(timings))
-    return 0
 
 
 def _keygen(options: argparse.Namespace) -> int:

@@ -1,0 +1,81 @@
+"""The `bench` sub-command of `uavpose-edge`: what a person gives, what is printed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from edge.errors import InputError
+
+PIPELINE = "uavpose-replay"
+
+
+def register(commands: argparse._SubParsersAction) -> None:
+    bench = commands.add_parser(
+        "bench",
+        help="time inference on this machine, or with --pipeline the whole daemon",
+        description="Time every given model by stage and number of threads, in turns, beside what this machine "
+        "multiplies at most. Ratios are of 10th percentiles: a busy machine adds to a call's time and never takes "
+        "from it. With --pipeline: fly a replayed sequence through the daemon instead and hold it to its budgets.",
+    )
+    bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
+    bench.add_argument("--threads", default="1,2", metavar="N,N", help="CPU threads of one inference (default 1,2)")
+    bench.add_argument("--runs", type=int, default=50, help="timed inferences of each row (default %(default)s)")
+    bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
+    bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    bench.add_argument("--pipeline", action="store_true", help=f"run `{PIPELINE} bench-pipeline`")
+    bench.add_argument("--sequence", type=Path, metavar="DIR", help="with --pipeline: scene folder that is replayed")
+    bench.add_argument("--minutes", type=float, help="with --pipeline: how long")
+    bench.set_defaults(act=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """0, or what the pipeline's command returns. Raises InputError."""
+    if options.pipeline:
+        return _pipeline(options)
+    for name in ("sequence", "minutes"):
+        if getattr(options, name) is not None:
+            raise InputError(f"--{name} needs --pipeline")
+    threads = _threads(options.threads)
+    if options.runs < 1:
+        raise InputError(f"--runs {options.runs}: must be at least 1")
+    from edge.bench.measure import measure
+    from edge.bench.report import table, to_tree
+    from edge.bench.timing import UNTIMED_ROUNDS
+    from edge.config import SHIPPED_MODEL
+
+    def on_round(done: int) -> None:
+        if sys.stderr.isatty():
+            end = "\n" if done == options.runs + UNTIMED_ROUNDS else ""
+            print(f"\rround {done} of {options.runs + UNTIMED_ROUNDS}", end=end, file=sys.stderr, flush=True)
+
+    measured = measure(options.models or [SHIPPED_MODEL], threads, options.spinning, options.runs, on_round)
+    print(json.dumps(to_tree(measured)) if options.json else table(measured))
+    return 0
+
+
+def _threads(text: str) -> list[int]:
+    numbers = text.split(",")
+    if not all(number.isdecimal() and int(number) >= 1 for number in numbers):
+        raise InputError(f"--threads {text}: give whole numbers from 1 on, such as 1,2")
+    return sorted({int(number) for number in numbers})
+
+
+def _pipeline(options: argparse.Namespace) -> int:
+    """The replay harness is a program of its own, beside this one; the daemon's package does not import it."""
+    command = Path(sys.executable).parent / PIPELINE
+    if not command.exists():
+        raise InputError(f"--pipeline needs {PIPELINE}, which is not installed beside {sys.executable}")
+    arguments = ["bench-pipeline"]
+    if options.sequence is not None:
+        arguments += ["--sequence", str(options.sequence)]
+    if options.minutes is not None:
+        arguments += ["--minutes", str(options.minutes)]
+    if options.models:
+        arguments += ["--model", str(options.models[0])]
+    if options.json:
+        arguments.append("--json")
+    return subprocess.run([str(command), *arguments], check=False).returncode

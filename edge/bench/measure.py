@@ -1,0 +1,136 @@
+"""Everything that is timed: model files by stage, number of threads and engine, and the machine's own peak."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+
+from edge.bench import openvino, peak
+from edge.bench.macs import Macs, count_macs
+from edge.bench.peak import Peak
+from edge.bench.timing import Milliseconds, time_in_turns
+from edge.estimator.model import Model, load_model
+from msgs.contract import ModelContract
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row: a file's stage on so many threads of an engine (`onnxruntime`, `openvino`)."""
+
+    file: str
+    stage: str
+    threads: int
+    engine: str
+
+
+@dataclass(frozen=True)
+class Row:
+    case: Case
+    configuration: str
+    precision: str
+    size_wh: tuple[int, int]
+    macs: Macs
+    ms: Milliseconds
+    limit_ms: float  # at the machine's peak on these threads
+
+
+@dataclass(frozen=True)
+class Machine:
+    cpu: str
+    cores: int  # that this process may use
+    onnxruntime: str
+    openvino: str | None  # None: not installed
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One run on one machine."""
+
+    machine: Machine
+    rounds: int
+    models: dict[str, Model]  # by file
+    peaks: tuple[Peak, ...]
+    rows: tuple[Row, ...]
+
+
+def measure(
+    models: Sequence[Path], threads: Sequence[int], spinning: bool, rounds: int, on_round: Callable[[int], None]
+) -> Measured:
+    """Time all of it in turns, on noise. Raises InputError on a file that is no model."""
+    calls: dict[Case, Callable[[], object]] = {}
+    loaded: dict[str, Model] = {}
+    for path in models:
+        for count in threads:
+            loaded[str(path)] = model = load_model(path, count, spinning)
+            model.warm_up()
+            calls |= _cases(model, count)
+    peaks: dict[Case, Callable[[], object]] = {
+        Case("", precision, count, "peak"): peak.product(precision, _options(count, spinning))
+        for count in threads
+        for precision in ("int8", "fp32")
+    }
+    ms = time_in_turns({**calls, **peaks}, rounds, on_round)
+    rate = {case: peak.MACS / ms[case].p10 / 1e6 for case in peaks}
+    by_threads = {n: Peak(n, rate[Case("", "int8", n, "peak")], rate[Case("", "fp32", n, "peak")]) for n in threads}
+    macs = {
+        (file, stage): count_macs(model.path.read_bytes(), size_wh)
+        for file, model in loaded.items()
+        for stage, size_wh in stages(model.contract).items()
+    }
+    rows = tuple(_row(case, loaded[case.file], macs[case.file, case.stage], ms[case], by_threads) for case in calls)
+    return Measured(_machine(), rounds, loaded, tuple(by_threads.values()), rows)
+
+
+def stages(contract: ModelContract) -> dict[str, tuple[int, int]]:
+    """The network's input sizes (width, height) by stage."""
+    track = {"track": contract.track_size_wh} if contract.track_size_wh is not None else {}
+    return {"acquire": contract.acquire_size_wh, **track}
+
+
+def _cases(model: Model, threads: int) -> dict[Case, Callable[[], object]]:
+    calls: dict[Case, Callable[[], object]] = {}
+    for stage, (width, height) in stages(model.contract).items():
+        image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), dtype=np.uint8)
+        K = np.array([[[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]])
+        calls[Case(str(model.path), stage, threads, "onnxruntime")] = partial(model.run, image, K)
+        if openvino.version() is not None:
+            by_openvino = openvino.inference(model.path, image, K.astype(np.float32), threads)
+            calls[Case(str(model.path), stage, threads, "openvino")] = by_openvino
+    return calls
+
+
+def _row(case: Case, model: Model, macs: Macs, ms: Milliseconds, peaks: dict[int, Peak]) -> Row:
+    contract = model.contract
+    limit_ms = peaks[case.threads].limit_ms(macs.int8, macs.float32)
+    return Row(case, contract.configuration, contract.precision, stages(contract)[case.stage], macs, ms, limit_ms)
+
+
+def _options(threads: int, spinning: bool) -> ort.SessionOptions:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.intra_op.allow_spinning", "1" if spinning else "0")
+    return options
+
+
+def _machine() -> Machine:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Machine(_cpu_name(), cores, ort.__version__, openvino.version())
+
+
+def _cpu_name() -> str:
+    """As the kernel tells it; Arm kernels tell none, there it is the architecture."""
+    try:
+        lines = CPU_INFO.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

@@ -1,0 +1,29 @@
+"""The same file in OpenVINO, where the package `openvino` is installed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+PACKAGE = "openvino"
+
+
+def version() -> str | None:
+    """None: not installed."""
+    return importlib.metadata.version(PACKAGE) if importlib.util.find_spec(PACKAGE) is not None else None
+
+
+def inference(path: Path, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int) -> Callable[[], object]:
+    """One inference a call on the CPU, at this size alone."""
+    core = importlib.import_module(PACKAGE).Core()
+    network = core.read_model(str(path))
+    network.reshape({"image": list(image.shape), "K": list(K.shape)})
+    settings = {"INFERENCE_NUM_THREADS": threads, "NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
+    request = core.compile_model(network, "CPU", settings).create_infer_request()
+    return lambda: request.infer({"image": image, "K": K})

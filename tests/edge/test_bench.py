@@ -1,0 +1,160 @@
+"""`uavpose-edge bench` as a process, and its count of work against onnx's own reading of the files."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnx.parser
+import onnxruntime as ort
+import pytest
+from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
+
+from edge.bench import peak
+from edge.bench.macs import Macs, count_macs
+from edge.bench.timing import UNTIMED_ROUNDS, time_in_turns
+
+from .conftest import Cli
+from .toy_model import write_toy_model
+
+# 3 -> 8 channels with stride 2, 8 in 4 groups, then a product over the mean of each channel.
+NETWORK = """
+<ir_version: 8, opset_import: ["" : 17]>
+work (uint8[N, H, W, 3] image, float[N, 3, 3] K) => (float[N, 5] y, float[N, 3, 3] kept)
+<float[8, 3, 3, 3] w1 = {W1}, float[8, 2, 3, 3] w2 = {W2}, float[8, 5] w3 = {W3}>
+{
+    kept = Identity(K)
+    pixels = Cast<to = 1>(image)
+    planes = Transpose<perm = [0, 3, 1, 2]>(pixels)
+    a = Conv<pads = [1, 1, 1, 1], strides = [2, 2]>(planes, w1)
+    b = Conv<pads = [1, 1, 1, 1], group = 4>(a, w2)
+    mean = ReduceMean<axes = [2, 3], keepdims = 0>(b)
+    y = MatMul(mean, w3)
+}
+"""
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    text = NETWORK
+    rng = np.random.default_rng(0)
+    for name, count in (("W1", 216), ("W2", 144), ("W3", 40)):
+        values = ", ".join(f"{value:.4f}" for value in rng.standard_normal(count))
+        text = text.replace("{" + name + "}", "{" + values + "}")
+    path = tmp_path / "work.onnx"
+    onnx.save(onnx.parser.parse_model(text), str(path))
+    return path
+
+
+def by_hand(width: int, height: int) -> tuple[int, int]:
+    """Multiply-accumulates of the convolutions and of the product."""
+    cells = (width // 2) * (height // 2)
+    return cells * 8 * 3 * 9 + cells * 8 * 2 * 9, 8 * 5
+
+
+@pytest.mark.parametrize("size_wh", [(64, 64), (96, 32)])
+def test_work_is_counted_at_the_input_size(network: Path, size_wh: tuple[int, int]) -> None:
+    assert count_macs(network.read_bytes(), size_wh) == Macs(0, sum(by_hand(*size_wh)))
+
+
+def test_quantised_work_is_counted_apart(network: Path, tmp_path: Path) -> None:
+    class Noise(CalibrationDataReader):
+        def __init__(self) -> None:
+            image = np.random.default_rng(1).integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
+            self.left = [{"image": image, "K": np.eye(3, dtype=np.float32)[None]}]
+
+        def get_next(self) -> dict[str, np.ndarray] | None:
+            return self.left.pop() if self.left else None
+
+    quantised = tmp_path / "int8.onnx"
+    quantize_static(
+        str(network),
+        str(quantised),
+        Noise(),
+        op_types_to_quantize=["Conv"],
+        per_channel=True,
+        activation_type=QuantType.QUInt8,
+        weight_type=QuantType.QInt8,
+    )
+    convolutions, product = by_hand(64, 96)
+    assert count_macs(quantised.read_bytes(), (64, 96)) == Macs(convolutions, product)
+
+
+@pytest.mark.parametrize(("op", "types"), [("MatMul", (1, 1, 1)), ("MatMulInteger", (2, 3, 6))])
+def test_the_peak_is_of_a_valid_graph_that_multiplies(op: str, types: tuple[int, int, int]) -> None:
+    kind = onnx.helper.tensor_dtype_to_np_dtype(types[1])
+    weight = np.random.default_rng(2).integers(-127, 128, (300, 7)).astype(kind)
+    content = peak.matmul_model(op, *types, weight)
+    model = onnx.load_from_string(content)
+    onnx.checker.check_model(model, full_check=True)
+    left = (
+        np.random.default_rng(3)
+        .integers(0, 256, (peak.ROWS, 300))
+        .astype(onnx.helper.tensor_dtype_to_np_dtype(types[0]))
+    )
+    (product,) = ort.InferenceSession(content, providers=["CPUExecutionProvider"]).run(None, {"left": left})
+    np.testing.assert_allclose(product, left.astype(np.int64) @ weight.astype(np.int64), rtol=1e-5, atol=1.0)
+
+
+def test_cases_take_turns() -> None:
+    order: list[str] = []
+    ms = time_in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, lambda _: None)
+    assert order == ["a", "b"] * (3 + UNTIMED_ROUNDS)
+    assert all(0 <= one.p10 <= one.p50 <= one.p99 for one in ms.values())
+
+
+def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8")
+    paper = write_toy_model(tmp_path / "paper.onnx", configuration="paper", track_size_wh=None)
+    done = cli("bench", toy_model, int8, paper, "--runs", "5", "--threads", "1,2", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    rows = {(Path(r["file"]).stem, r["stage"], r["threads"]): r for r in result["rows"]}
+    assert len(rows) == 2 * (2 + 2 + 1)
+    p10 = {key: row["ms"]["p10"] for key, row in rows.items()}
+    ratios = result["ratios"]
+    assert ratios["int8_over_fp32"] == pytest.approx(p10["int8", "track", 2] / p10["toy", "track", 2])
+    assert ratios["edge_over_paper_fp32"] == pytest.approx(p10["toy", "acquire", 2] / p10["paper", "acquire", 2])
+    assert ratios["over_vnni_limit"] is None, "a network without convolutions and products has no limit"
+    assert result["track_ms"] == rows["int8", "track", 2]["ms"]["p50"]
+    assert result["acquire_ms"] == rows["int8", "acquire", 2]["ms"]["p50"]
+    assert {model["precision"]: len(model["sha256"]) for model in result["models"]} == {"fp32": 64, "int8": 64}
+    assert all(peak["int8_gmac_per_s"] > 0 and peak["fp32_gmac_per_s"] > 0 for peak in result["peaks"])
+
+
+def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
+    done = cli("bench", "--runs", "2", "--threads", "1", "--json", timeout_s=200.0)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    for row in result["rows"]:
+        assert row["macs"]["int8"] > 10 * row["macs"]["float32"], "the network's work is quantised"
+        peaks = result["peaks"][0]
+        limit_ms = (
+            row["macs"]["int8"] / peaks["int8_gmac_per_s"] + row["macs"]["float32"] / peaks["fp32_gmac_per_s"]
+        ) / 1e6
+        assert row["limit_ms"] == pytest.approx(limit_ms)
+    track = next(row for row in result["rows"] if row["stage"] == "track")
+    assert result["ratios"]["over_vnni_limit"] == pytest.approx(track["ms"]["p10"] / track["limit_ms"])
+    assert result["ratios"]["int8_over_fp32"] is None
+    area = math.prod(result["rows"][0]["size_wh"]) / math.prod(track["size_wh"])
+    assert result["rows"][0]["macs"]["int8"] / track["macs"]["int8"] == pytest.approx(area, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--threads", "two"], "--threads two"),
+        (["--threads", "0"], "--threads 0"),
+        (["--runs", "0"], "--runs 0"),
+        (["none.onnx"], "none.onnx"),
+        (["--minutes", "1"], "--minutes needs --pipeline"),
+    ],
+)
+def test_what_cannot_be_timed_is_named(cli: Cli, arguments: list[str], named: str) -> None:
+    done = cli("bench", *arguments)
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
