@@ -52,6 +52,21 @@ def _parser() -> argparse.ArgumentParser:
 
     bench.register(commands)
 
+    calibrate = commands.add_parser("calibrate", help="make a camera's intrinsics file from pictures of a board")
+    calibrate.add_argument("source", type=Path, nargs="?", help="video, or folder of pictures, of a board held still")
+    calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file to write (default camera.yaml)")
+    calibrate.add_argument("--name", default="camera", help="the camera's name in the file (default camera)")
+    calibrate.add_argument("--pattern", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
+    calibrate.add_argument("--squares", default="9x6", help="squares across and down, black and white (default 9x6)")
+    calibrate.add_argument("--dictionary", default="5X5_100", help="a ChArUco board's markers (default 5X5_100)")
+    calibrate.add_argument("--marker-share", type=float, default=0.75, help="marker's side / square's (default 0.75)")
+    calibrate.add_argument(
+        "--coefficients", type=int, choices=(4, 5, 8), default=4, help="of distortion: k1 k2 p1 p2, k3, k4 k5 k6"
+    )
+    calibrate.add_argument("--json", action="store_true", help="print one JSON object instead of sentences")
+    calibrate.add_argument("--draw", type=Path, metavar="PICTURE", help="write the board to print, and no more")
+    calibrate.set_defaults(act=_calibrate)
+
     keygen = commands.add_parser("keygen", help="write a new key that signs MAVLink, for [mavlink] signing_key")
     keygen.add_argument("--out", type=Path, required=True, help="file to write; one that exists is left alone")
     keygen.set_defaults(act=_keygen)
@@ -82,6 +97,22 @@ def _status(options: argparse.Namespace) -> int:
     from edge.status import status
 
     return status(options.config, options.connect, options.vehicle, options.json)
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from edge.calibrate import BoardSettings, board_squares, calibrate, report, to_json, write_board, write_calibration
+
+    squares = board_squares(options.squares)
+    board = BoardSettings(options.pattern, squares, options.dictionary, options.marker_share)
+    if options.draw is not None:
+        write_board(board, options.draw)
+        return 0
+    if options.source is None:
+        raise InputError("calibrate needs a video or a folder of pictures, or --draw")
+    found = calibrate(options.source, board, options.coefficients)
+    write_calibration(found, options.name, options.out)
+    print(to_json(found) if options.json else "\n".join(report(found, options.out)))
+    return 0
 
 
 def _keygen(options: argparse.Namespace) -> int:

@@ -1,0 +1,140 @@
+"""`uavpose-edge calibrate` on boards rendered through cameras that are known exactly."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edge.calibrate import DRAWN_SQUARE_PX, BoardSettings, draw_board
+from edge.cameras.intrinsics import load_intrinsics
+from edge.config_camera import IntrinsicsSettings
+
+from .conftest import Cli
+
+SIZE_WH = (960, 600)
+K = np.array([[820.0, 0, 471.3], [0, 826.0, 309.8], [0, 0, 1]])
+DISTORTION = np.array([-0.21, 0.06, 0.0012, -0.0009, 0.0])
+SQUARES = (9, 6)
+FINE = 2
+
+
+@cache
+def rays_xy() -> np.ndarray:
+    """Of FINE x FINE points in every pixel [H, W, 2], through the lens."""
+    columns, rows = np.meshgrid(np.arange(SIZE_WH[0] * FINE), np.arange(SIZE_WH[1] * FINE))
+    pixels = (np.stack([columns, rows], axis=-1).reshape(-1, 1, 2) + 0.5) / FINE - 0.5
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 12, 1e-7)
+    straight = cv2.undistortPoints(pixels.astype(np.float64), K, DISTORTION, criteria=criteria)
+    return np.asarray(straight).reshape(*columns.shape, 2)
+
+
+def rendered(board: np.ndarray, rvec_rad: np.ndarray, t_cam_board: np.ndarray) -> np.ndarray:
+    """The picture [H, W] of a drawn board, one square a unit, its middle at t: a homography of straight rays."""
+    R, _ = cv2.Rodrigues(rvec_rad)
+    px_per_square = DRAWN_SQUARE_PX
+    from_drawn = np.diag([1 / px_per_square, 1 / px_per_square, 1.0])
+    from_drawn[:2, 2] = [0.5 / px_per_square - side / 2 / px_per_square for side in (board.shape[1], board.shape[0])]
+    to_drawn = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t_cam_board]) @ from_drawn).astype(np.float32)
+    at = cv2.perspectiveTransform(rays_xy().astype(np.float32), to_drawn)
+    picture = cv2.remap(board, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
+    return np.asarray(cv2.resize(picture, SIZE_WH, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def poses(tilt_rad: float, moved: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Twelve: the board tilted to all sides and held to all places."""
+    found = []
+    for k in range(12):
+        angle = 2 * np.pi * k / 12
+        axis = np.array([np.cos(angle), np.sin(angle), 0.2])
+        place = moved * np.array([3.2 * np.cos(2.3 * angle), 2.0 * np.sin(2.3 * angle), 0.0])
+        found.append((tilt_rad * axis, place + np.array([0.0, 0.0, 11.0 + moved * (k % 3)])))
+    return found
+
+
+def film(folder: Path, pattern: str, views: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    board = draw_board(BoardSettings(pattern, SQUARES, "5X5_100", 0.75))  # type: ignore[arg-type]
+    blurred = cv2.GaussianBlur(board, (0, 0), 1.2)
+    folder.mkdir()
+    noise = np.random.default_rng(1)
+    for index, (rvec, t) in enumerate(views):
+        picture = rendered(np.asarray(blurred, dtype=np.uint8), rvec, t)
+        noisy = np.clip(picture + noise.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{index}.png"), noisy)
+    return folder
+
+
+@pytest.mark.parametrize("pattern", ["charuco", "chessboard"])
+def test_a_known_camera_is_found_again_and_its_file_flies(cli: Cli, tmp_path: Path, pattern: str) -> None:
+    pictures = film(tmp_path / "board", pattern, poses(0.55, 1.0))
+    done = cli("calibrate", pictures, "--pattern", pattern, "--out", "nose.yaml", "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["rms_px"] < 0.3
+    assert said["views"] >= 8
+    found = load_intrinsics(IntrinsicsSettings(file=tmp_path / "nose.yaml"))
+    assert found.image_size_wh == SIZE_WH
+    np.testing.assert_allclose(np.diag(found.K)[:2], np.diag(K)[:2], rtol=0.005)
+    np.testing.assert_allclose(found.K[:2, 2], K[:2, 2], atol=3.0)
+    # What counts of a distortion is where it puts the rays, not its numbers.
+    rays = np.array([[x, y, 1.0] for x in (-0.5, -0.2, 0.2, 0.5) for y in (-0.3, 0.1, 0.3)])
+    true_px, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, DISTORTION)
+    found_px, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), found.K, np.array(found.distortion))
+    assert np.abs(found_px - true_px).max() < 1.0
+
+
+def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:
+    still = film(tmp_path / "still", "charuco", poses(0.5, 1.0)[:2] * 3)
+    done = cli("calibrate", still)
+    assert done.returncode == 2
+    assert "6 of 6 pictures show the board, but only 2 views of it differ" in done.stderr
+    assert not (tmp_path / "camera.yaml").exists()
+
+
+def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:
+    flat = film(tmp_path / "flat", "charuco", poses(0.0, 1.0))
+    done = cli("calibrate", flat)
+    assert done.returncode == 2
+    assert "too alike" in done.stderr or "folds" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "calibrate needs a video or a folder"),
+        (["nowhere"], "nowhere does not exist"),
+        (["notes.txt"], "neither a folder of pictures nor a readable video"),
+        (["grey"], "no picture shows the whole board"),
+        (["grey", "--squares", "9 by 6"], "--squares: '9 by 6' is not ACROSSxDOWN"),
+        (["grey", "--dictionary", "3X3_7"], "--dictionary: OpenCV has no 3X3_7"),
+        (["grey", "--squares", "30x30", "--dictionary", "4X4_50"], "fewer markers than the 450"),
+        (["mixed"], "is 320x240, those before 640x480"),
+    ],
+)
+def test_what_is_wrong_is_said(cli: Cli, tmp_path: Path, arguments: list[str], sentence: str) -> None:
+    (tmp_path / "notes.txt").write_text("no video")
+    for name, sizes in (("grey", [(640, 480)]), ("mixed", [(640, 480), (320, 240)])):
+        (tmp_path / name).mkdir()
+        for index, (width, height) in enumerate(sizes):
+            cv2.imwrite(str(tmp_path / name / f"{index}.png"), np.full((height, width), 90, np.uint8))
+    done = cli("calibrate", *arguments)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_drawn_board_is_one_that_is_found(cli: Cli, tmp_path: Path) -> None:
+    assert cli("calibrate", "--draw", "board.png", "--squares", "7x5").returncode == 0
+    picture = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    small = cv2.resize(picture, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(tmp_path / "board.png"), small)
+    (tmp_path / "one").mkdir()
+    (tmp_path / "board.png").rename(tmp_path / "one" / "board.png")
+    done = cli("calibrate", "one", "--squares", "7x5")
+    assert "1 of 1 pictures show the board" in done.stderr
