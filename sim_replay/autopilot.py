@@ -52,11 +52,12 @@ class Autopilot:
     `received` counts valid messages by name, `refused` everything else by reason.
     """
 
-    def __init__(self, telemetry: Telemetry, start_at_ns: int, boot_at_ns: int) -> None:
+    def __init__(self, telemetry: Telemetry, start_at_ns: int, boot_at_ns: int, system_id: int = SYSTEM_ID) -> None:
         self._telemetry = telemetry
         self._start_at_ns = start_at_ns
         self._boot_at_ns = boot_at_ns
-        self._mav = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
+        self._system_id = system_id
+        self._mav = MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
         self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in DEFAULT_RATES_HZ.items()}
         self._next_ns = dict.fromkeys(DEFAULT_RATES_HZ, boot_at_ns)
         self._last_target_us: dict[int, int] = {}
@@ -136,7 +137,7 @@ class Autopilot:
             return "not MAVLink"
         if kind.startswith("UNKNOWN"):
             return "unknown message"
-        if message.get_srcSystem() != SYSTEM_ID or message.get_srcComponent() == COMPONENT_ID:
+        if message.get_srcSystem() != self._system_id or message.get_srcComponent() == COMPONENT_ID:
             return "not from a component of this vehicle"
         if message.get_msgId() != TARGET_RELATIVE_ID:
             return None
@@ -154,7 +155,7 @@ class Autopilot:
         if message.get_msgId() == dialect.MAVLINK_MSG_ID_TIMESYNC and message.tc1 == 0:
             return dialect.MAVLink_timesync_message(now_ns - self._boot_at_ns, message.ts1)
         if message.get_msgId() == dialect.MAVLINK_MSG_ID_COMMAND_LONG:
-            if message.target_system != SYSTEM_ID or message.target_component not in (0, COMPONENT_ID):
+            if message.target_system != self._system_id or message.target_component not in (0, COMPONENT_ID):
                 return None
             result = self._command(message, now_ns)
             asker = (message.get_srcSystem(), message.get_srcComponent())
@@ -234,6 +235,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--start-at-ns", type=int, required=True, help="monotonic ns at which the telemetry's t_ns is 0"
     )
+    parser.add_argument("--boot-at-ns", type=int, help="monotonic ns of its boot (default: long before)")
+    parser.add_argument(
+        "--system-id", type=int, choices=range(1, 256), metavar="ID", default=SYSTEM_ID, help="its own (1)"
+    )
     args = parser.parse_args(argv)
     try:
         telemetry = read_telemetry(args.telemetry)
@@ -243,7 +248,8 @@ def main(argv: list[str] | None = None) -> int:
     stop: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, _: stop.append(received))
-    autopilot = Autopilot(telemetry, args.start_at_ns, args.start_at_ns - BOOT_BEFORE_START_NS)
+    boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
+    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id)
     _fly(autopilot, args.endpoint, stop)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0

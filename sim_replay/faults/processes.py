@@ -1,0 +1,76 @@
+"""The processes of a rig: each started, heard line by line, signalled and ended by its own id."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+_END_S = 10.0
+
+Heard = Callable[[str, int], None]  # a line, and when it came (monotonic ns)
+
+
+class Process:
+    """A child process whose standard output and error are one stream of lines for `heard`, in a thread of its own."""
+
+    def __init__(self, command: Sequence[str | Path], heard: Heard) -> None:
+        self._heard = heard
+        self._popen = subprocess.Popen(
+            [str(word) for word in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # a terminal's Ctrl-C is for the rig, which then ends the others
+        )
+        self._reader = threading.Thread(target=self._read, name=f"read {self.pid}", daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self._popen.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs; minus the signal's number if one ended it."""
+        return self._popen.poll()
+
+    def tell(self, line: str) -> None:
+        """A line for its standard input."""
+        assert self._popen.stdin is not None
+        self._popen.stdin.write(line + "\n")
+        self._popen.stdin.flush()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        self._popen.send_signal(number)
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """End it, by force if it does not heed the signal; its exit code, once its last line was heard."""
+        if self._popen.poll() is None:
+            self._popen.send_signal(number)
+            self._popen.send_signal(signal.SIGCONT)
+        try:
+            self._popen.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            self._popen.wait()
+        return self.reap()
+
+    def reap(self) -> int:
+        """Wait for its end and its last line."""
+        code = self._popen.wait()
+        self._reader.join(_END_S)
+        for stream in (self._popen.stdin, self._popen.stdout):
+            if stream is not None:
+                stream.close()
+        return code
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            self._heard(line.rstrip("\n"), time.monotonic_ns())

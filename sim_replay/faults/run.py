@@ -1,0 +1,122 @@
+"""`uavpose-replay faults`: play a timeline of faults on the real daemon and tell what followed, and when."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from edge.config import SHIPPED_MODEL
+from edge.errors import InputError
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.faults.actions import act
+from sim_replay.faults.expectations import Seen, Since, Unmet, expect
+from sim_replay.faults.judge import ages_ms, violations
+from sim_replay.faults.rig import Rig, RigSettings, can_mount
+from sim_replay.faults.timeline import ExpectPoses, Step, Timeline, load_timeline
+from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
+
+TIMELINES = Path(__file__).parent / "timelines"
+EXIT_UNMET = 1
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class Outcome:
+    """What a timeline came to: what was seen at each step, and what should not have been."""
+
+    title: str
+    seen: list[dict[str, Any]] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+
+
+def play_timeline(rig: Rig, timeline: Timeline, say: Say) -> Outcome:
+    """Carry out every step on a running rig, first waiting until both peers have poses; stops at the first unmet."""
+    outcome = Outcome(timeline.title)
+    say(timeline.title)
+    now_ns = time.time_ns()
+    since = Since(now_ns, now_ns)
+    try:
+        expect(ExpectPoses(do="expect_poses"), rig, since)
+        since = Since(now_ns, now_ns, dict(rig.witness.counters))
+        for step in timeline.step:
+            since = _take(step, rig, since, outcome, say)
+    except Unmet as error:
+        outcome.wrong.append(str(error))
+        say(f"  NOT MET: {error}")
+    return outcome
+
+
+def _take(step: Step, rig: Rig, since: Since, outcome: Outcome, say: Say) -> Since:
+    what = step.model_dump(exclude_defaults=True)
+    if step.do.startswith("expect_"):
+        seen: Seen = expect(step, rig, since)
+        outcome.seen.append({"step": what, "seen": seen.text, "took_s": round(seen.took_s, 3)})
+        say(f"  {seen.text}")
+        return since
+    say("  " + " ".join(f"{value}" if key == "do" else f"{key}={value}" for key, value in what.items()))
+    began_ns = time.time_ns()
+    act(step, rig)
+    if step.do == "hold":
+        return since
+    return Since(time.time_ns(), began_ns, since.counters)
+
+
+def register(commands: Any) -> None:
+    """Add the command to what argparse's add_subparsers() gave; it sets `run`, a function of the parsed arguments."""
+    parser = commands.add_parser(
+        "faults",
+        help="break cameras, links, disks and peers of the real daemon by a timeline, and see it recover",
+        description="Start the daemon with a camera, an autopilot, a zenoh router and a subscriber, act on them as the "
+        "timeline says, and wait for what it expects. Looks at each pose that a peer received: none may be stale. "
+        f"Timelines that come with it: {', '.join(bundled())}. Writes faults.json and daemon.log. "
+        "Exit code 0 if all was as expected, 1 if not.",
+    )
+    parser.add_argument(
+        "--timeline", required=True, action="append", metavar="FILE", help="TOML, or a bundled name; may be repeated"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out") / "faults", metavar="DIR", help="folder to write to")
+    parser.add_argument("--scene", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="BOP scene to play")
+    parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
+    parser.set_defaults(run=run)
+
+
+def bundled() -> list[str]:
+    """Names of the timelines that come with the package."""
+    return sorted(path.stem for path in TIMELINES.glob("*.toml"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the timelines one after the other on one rig. Raises InputError for a timeline that does not do."""
+    timelines = [load_timeline(_path(name)) for name in args.timeline]
+    if not args.model.is_file():
+        raise InputError(f"--model {args.model}: is no file")
+    volume = any(timeline.volume for timeline in timelines)
+    args.out.mkdir(parents=True, exist_ok=True)
+    if volume and not can_mount(args.out):
+        raise InputError(f"{args.timeline[0]}: volume = true needs a host that lets a user mount (unshare --mount)")
+    rig = Rig(RigSettings(args.out, args.scene, args.model, volume=volume))
+    with rig:
+        outcomes = [play_timeline(rig, timeline, print) for timeline in timelines]
+    wrong = [*(text for outcome in outcomes for text in outcome.wrong), *violations(rig.witness)]
+    oldest_ms = {peer: max(ages_ms(rig.witness, peer), default=None) for peer in (AUTOPILOT, SUBSCRIBER)}
+    report = {
+        "timelines": [{"title": outcome.title, "seen": outcome.seen, "wrong": outcome.wrong} for outcome in outcomes],
+        "age_max_ms": oldest_ms,
+        "poses": {peer: len(ages_ms(rig.witness, peer)) for peer in (AUTOPILOT, SUBSCRIBER)},
+        "wrong": wrong,
+    }
+    (args.out / "faults.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    for text in wrong:
+        print(f"WRONG: {text}")
+    print(f"{len(rig.witness.poses)} poses received, oldest on receipt {oldest_ms} ms; {len(wrong)} wrong")
+    return EXIT_UNMET if wrong else 0
+
+
+def _path(name: str) -> Path:
+    return TIMELINES / f"{name}.toml" if name in bundled() else Path(name)

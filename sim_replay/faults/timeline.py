@@ -1,0 +1,225 @@
+"""The schema of a timeline: steps in their order, each an act upon the rig or something that must then be seen.
+
+title = "The autopilot's link is cut for six seconds"
+
+[[step]]
+do = "link"
+which = "mavlink"
+cut = true
+
+[[step]]
+do = "hold"
+for_s = 6.0
+
+[[step]]
+do = "link"
+which = "mavlink"
+
+[[step]]
+do = "expect_poses"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from edge.errors import InputError
+from msgs.mavlink import dialect
+
+Who = Literal["camera", "daemon", "autopilot", "router", "subscriber"]
+Peer = Literal["autopilot", "subscriber", "both"]
+Seconds = Annotated[float, Field(gt=0, le=600)]
+WITHIN_S = 60.0  # a loaded machine takes its time; what was taken is reported
+
+
+class _Step(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Hold(_Step):
+    """Leave everything as it is."""
+
+    do: Literal["hold"]
+    for_s: Seconds
+
+
+class Start(_Step):
+    do: Literal["start"]
+    who: Who
+    system_id: int = Field(default=1, ge=1, le=255, description="autopilot: its MAVLink system")
+    rebooted: bool = Field(default=False, description="autopilot: its boot clock begins now")
+    clock_ahead_s: float = Field(default=0.0, ge=-60, le=60, description="autopilot: boot clock against the last one's")
+
+
+class Signal(_Step):
+    """STOP freezes a process, CONT lets it go on; after KILL and TERM it is waited for."""
+
+    do: Literal["signal"]
+    who: Who
+    name: Literal["TERM", "KILL", "HUP", "STOP", "CONT"]
+
+
+class Camera(_Step):
+    """What the camera does from now on; what is left out is as it should be."""
+
+    do: Literal["camera"]
+    frozen: bool = Field(default=False, description="the same picture, stamped anew")
+    stamp_offset_s: float = Field(default=0.0, ge=-60, le=60, description="added to each stamp")
+    stamp_jitter_s: float = Field(default=0.0, ge=0, le=60, description="added and taken off, frame by frame")
+
+
+class Link(_Step):
+    """How a link is from now on; what is left out is as it should be, so `which` alone mends it."""
+
+    do: Literal["link"]
+    which: Literal["mavlink", "zenoh"] = Field(description="daemon to autopilot, or daemon to router")
+    cut: bool = False
+    delay_ms: float = Field(default=0.0, ge=0, le=10_000)
+    corrupt: float = Field(default=0.0, ge=0, le=1, description="share of packets with a flipped bit")
+    drop: list[str] = Field(default_factory=list, description="MAVLink messages by name that do not get through")
+
+    @field_validator("drop")
+    @classmethod
+    def _known(cls, names: list[str]) -> list[str]:
+        for name in names:
+            if not hasattr(dialect, f"MAVLINK_MSG_ID_{name}"):
+                raise ValueError(f"{name} is no MAVLink message")
+        return names
+
+
+class Flood(_Step):
+    """Datagrams at the daemon's MAVLink port, as fast as they go."""
+
+    do: Literal["flood"]
+    what: Literal["random", "hostile", "replay"] = Field(
+        description="random bytes; sound frames with absurd content; what the autopilot said before, again"
+    )
+    sender: Literal["autopilot", "stranger"] = Field(description="from the address that is heeded, or another")
+    total_bytes: int = Field(gt=0, le=1_000_000_000)
+
+
+class SlowSubscriber(_Step):
+    """A second subscriber, frozen once it has subscribed, or let go of."""
+
+    do: Literal["slow_subscriber"]
+    there: bool = True
+
+
+class Disk(_Step):
+    """What the recorder's disk lets be written from now on; what is left out is as it should be."""
+
+    do: Literal["disk"]
+    full: bool = Field(default=False, description="no byte more on the volume; needs `volume = true`")
+    read_only: bool = Field(default=False, description="mounted read-only; needs `volume = true`")
+    file_max_bytes: int | None = Field(default=None, gt=0, description="no file grows beyond this (RLIMIT_FSIZE)")
+
+
+class ModelFile(_Step):
+    """The file that the configuration names; `signal daemon HUP` has it read."""
+
+    do: Literal["model_file"]
+    content: Literal["good", "noise", "cut_short"]
+
+
+class Load(_Step):
+    """Busy processes for each core."""
+
+    do: Literal["load"]
+    times: int = Field(ge=1, le=16)
+    for_s: Seconds
+
+
+class ExpectPoses(_Step):
+    """Three new poses of frames exposed after the last act."""
+
+    do: Literal["expect_poses"]
+    at: Peer = "both"
+    within_s: Seconds = WITHIN_S
+
+
+class ExpectSilence(_Step):
+    """No pose for so long."""
+
+    do: Literal["expect_silence"]
+    at: Peer = "both"
+    for_s: Seconds
+    within_s: Seconds = WITHIN_S
+
+
+class ExpectSaid(_Step):
+    """A line of the daemon's log since the last act."""
+
+    do: Literal["expect_said"]
+    pattern: str = Field(description="regular expression")
+    within_s: Seconds = WITHIN_S
+
+
+class ExpectCounter(_Step):
+    """A counter of the daemon's diagnostics, as a subscriber hears them, grown since the timeline began."""
+
+    do: Literal["expect_counter"]
+    name: str
+    by: int = Field(default=1, ge=1)
+    within_s: Seconds = WITHIN_S
+
+
+class ExpectExit(_Step):
+    do: Literal["expect_exit"]
+    code: int = Field(description="of the daemon; of a signal, minus its number")
+    within_s: Seconds = WITHIN_S
+
+
+Step = Annotated[
+    Hold
+    | Start
+    | Signal
+    | Camera
+    | Link
+    | Flood
+    | SlowSubscriber
+    | Disk
+    | ModelFile
+    | Load
+    | ExpectPoses
+    | ExpectSilence
+    | ExpectSaid
+    | ExpectCounter
+    | ExpectExit,
+    Field(discriminator="do"),
+]
+
+
+class Timeline(BaseModel):
+    """It begins once both peers have poses."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str
+    volume: bool = Field(default=False, description="recordings go to a small volume of their own (needs unshare)")
+    step: list[Step] = Field(min_length=1)
+
+
+def load_timeline(path: Path) -> Timeline:
+    """Raises InputError: one line a fault, each naming file, step and key."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"{path}: cannot be read: {reason}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    try:
+        return Timeline.model_validate(tree)
+    except ValidationError as error:
+        raise InputError("\n".join(f"{path}: {_fault(item)}" for item in error.errors())) from error
+
+
+def _fault(item: object) -> str:
+    assert isinstance(item, dict)
+    place = [f"step {part + 1}" if isinstance(part, int) else str(part) for part in item["loc"] if part != "step"]
+    known = {"extra_forbidden": "unknown key", "missing": "is missing"}
+    return f"{', '.join(place) or 'the file'}: {known.get(item['type'], item['msg'].removeprefix('Value error, '))}"

@@ -1,0 +1,104 @@
+"""What was seen of a run: frames as the camera exposed them, poses as the peers received them, words of the daemon."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from edge.links.outgoing import UtcClock
+
+AUTOPILOT, SUBSCRIBER = "autopilot", "subscriber"
+
+
+@dataclass(frozen=True)
+class ExposedFrame:
+    """Times are UTC."""
+
+    exposed_ns: int
+    stamp_ns: int  # as the camera told it
+    frozen: bool  # the picture before, once more
+
+
+@dataclass(frozen=True)
+class ReceivedPose:
+    """A pose that a peer found valid. Times are UTC."""
+
+    peer: str
+    capture_ns: int  # as it says
+    arrival_ns: int
+
+
+@dataclass
+class Witness:
+    """Written by the readers of all processes; `wait_for` is how anything waits for anything."""
+
+    frames: list[ExposedFrame] = field(default_factory=list)
+    poses: list[ReceivedPose] = field(default_factory=list)
+    said: list[tuple[int, str]] = field(default_factory=list)  # UTC ns, a line of the daemon's log
+    counters: dict[str, int] = field(default_factory=dict)  # of the newest diagnostics
+    counted_ns: int = 0  # UTC when they came
+    ready: set[str] = field(default_factory=set)
+    summaries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)  # of other processes than the daemon
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+    _clock: UtcClock = field(default_factory=UtcClock)
+
+    def wait_for(self, seen: Callable[[], bool], within_s: float) -> bool:
+        """Whether `seen` came true; it is asked with the witness held still, at each change and ten times a second."""
+        deadline_s = time.monotonic() + within_s
+        with self._changed:
+            while not seen():
+                left_s = deadline_s - time.monotonic()
+                if left_s <= 0:
+                    return False
+                self._changed.wait(min(left_s, 0.1))
+            return True
+
+    def hear_daemon(self, line: str, arrival_ns: int) -> None:
+        with self._changed:
+            self.said.append((self._clock.utc_ns(arrival_ns), line))
+            self._changed.notify_all()
+
+    def hear(self, name: str, line: str) -> None:
+        """A line of another process: a JSON object, or else a complaint."""
+        try:
+            record = json.loads(line)
+            event = record["event"]
+        except (ValueError, TypeError, KeyError):
+            record, event = {}, ""
+        with self._changed:
+            self._take(name, event, record, line)
+            self._changed.notify_all()
+
+    def forget_ready(self, name: str) -> None:
+        with self._changed:
+            self.ready.discard(name)
+
+    def poses_at(self, peer: str, since_ns: int) -> list[ReceivedPose]:
+        """Poses of frames exposed after `since_ns` (UTC), in the order of their arrival."""
+        return [pose for pose in self.poses if pose.peer == peer and pose.capture_ns > since_ns]
+
+    def _take(self, name: str, event: str, record: dict[str, Any], line: str) -> None:
+        if event == "ready":
+            self.ready.add(name)
+        elif event == "frame":
+            stamp_ns, exposed_ns = record["stamp_utc_ns"], record["exposed_utc_ns"]
+            self.frames.append(ExposedFrame(exposed_ns, stamp_ns, record["frozen"]))
+        elif event == "target_relative":
+            arrival_ns = self._clock.utc_ns(record["received_ns"])
+            self.poses.append(ReceivedPose(AUTOPILOT, record["capture_utc_us"] * 1000, arrival_ns))
+        elif event == "pose":
+            capture_ns = record["capture_utc_ns"]
+            self.poses.append(ReceivedPose(SUBSCRIBER, capture_ns, capture_ns + round(record["age_ms"] * 1e6)))
+        elif event == "diagnostics":
+            values = record["values"].items()
+            self.counters = {key: int(value) for key, value in values if value.isdecimal()}
+            self.counted_ns = time.time_ns()
+        elif event == "summary":
+            self.summaries.append((name, record))
+        else:
+            self.complaints.append(f"{name}: {line}")
