@@ -30,6 +30,8 @@ DIFFERENT_SHARE = 0.03  # of the picture's diagonal that corners must have moved
 RMS_MAX_PX = 1.5
 OUTLIER_FACTOR = 3.0
 FOCAL_SIGMA_MAX = 0.005  # relative; above it the views do not settle the focal length
+# A board that always faces the camera leaves focal length and distance undecided, whatever the fit's own sigma says.
+TILT_MIN_RAD, TILTED_MIN = np.deg2rad(15.0), 3
 COVERED_MIN = 0.5  # share of the picture's 4x4 cells with a corner in one view or another
 FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 MODEL = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
@@ -69,6 +71,7 @@ class Calibration:
     rms_px: float  # of all corners' reprojection
     focal_sigma: float  # relative 1-sigma of the focal length
     covered: float  # share of the picture that boards were seen in
+    tilted: int  # views of a board that does not face the camera
     views: int  # used
     boards: int  # pictures that showed the board
     pictures: int  # looked at
@@ -201,7 +204,7 @@ def differ(view: View, other: View, size_wh: Size) -> bool:
 def _fit(views: list[View], size_wh: Size, coefficients: int, boards: int, pictures: int) -> Calibration:
     """Twice: the second time without the views that the first did not agree with."""
     for _ in range(2):
-        rms_px, K, distortion, _, _, sigma, _, errors_px = cv2.calibrateCameraExtended(
+        rms_px, K, distortion, rvecs, _, sigma, _, errors_px = cv2.calibrateCameraExtended(
             [view.board for view in views],
             [view.pixels for view in views],
             size_wh,
@@ -215,6 +218,7 @@ def _fit(views: list[View], size_wh: Size, coefficients: int, boards: int, pictu
             break
         views = agreeing
     sigma_f = np.asarray(sigma).reshape(-1)[:2] / np.diag(K)[:2]
+    tilts_rad = [np.arccos(np.clip(abs(cv2.Rodrigues(rvec)[0][2, 2]), 0.0, 1.0)) for rvec in rvecs]
     cells = {tuple(cell) for view in views for cell in np.floor(4 * view.pixels / size_wh).astype(int)}
     return Calibration(
         image_size_wh=size_wh,
@@ -224,6 +228,7 @@ def _fit(views: list[View], size_wh: Size, coefficients: int, boards: int, pictu
         rms_px=float(rms_px),
         focal_sigma=float(np.max(np.abs(sigma_f))),
         covered=len(cells) / 16,
+        tilted=int(np.sum(np.array(tilts_rad) > TILT_MIN_RAD)),
         views=len(views),
         boards=boards,
         pictures=pictures,
@@ -239,10 +244,10 @@ def _judged(found: Calibration, source: Path) -> Calibration:
         raise InputError(
             f"{source}: the board was seen in {100 * found.covered:.0f} % of the picture; show it in the corners too"
         )
-    if not found.focal_sigma <= FOCAL_SIGMA_MAX:
+    if found.tilted < TILTED_MIN or not found.focal_sigma <= FOCAL_SIGMA_MAX:
         raise InputError(
-            f"{source}: the views are too alike: the focal length is known to {100 * found.focal_sigma:.1f} % only; "
-            "tilt the board by 30 degrees and more, to all sides"
+            f"{source}: the views are too alike to tell focal length from distance ({found.tilted} of {found.views} "
+            f"are tilted; 1 sigma {100 * found.focal_sigma:.1f} %): tilt the board by 30 degrees and more, to all sides"
         )
     width, height = found.image_size_wh
     lens = Lens(np.array(found.K), tuple(found.distortion))

@@ -99,7 +99,7 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
     flat = film(tmp_path / "flat", "charuco", poses(0.0, 1.0))
     done = cli("calibrate", flat)
     assert done.returncode == 2
-    assert "too alike" in done.stderr or "folds" in done.stderr
+    assert "too alike to tell focal length from distance (0 of" in done.stderr
     assert "Traceback" not in done.stderr
 
 
