@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-from trainer import evaluate_command
+from trainer import evaluate_command, results
 from trainer.config import ConfigError, RenderingError, load_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
@@ -72,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
     evaluate_command.register(commands)
+    results.register(commands)
     _add_ablate(commands)
     _add_export(commands)
     return parser

@@ -1,0 +1,60 @@
+"""The results page says what was measured, beside the paper, and how much training is behind it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from trainer.config import ConfigError
+from trainer.results import HISTORY, PAPER, datasets_in, draw_history, gathered, measure, page, read_history, told
+
+ROOT = Path(__file__).parents[2]
+CROSSING = ROOT / "sim_replay" / "data" / "crossing"
+
+
+def run_folder(folder: Path, samples: list[int]) -> Path:
+    folder.mkdir()
+    metrics = {"E_r_mean_deg": 30.0, "E_r_median_deg": 10.0, "depth_rel_mean": 0.1, "depth_rel_median": 0.05}
+    metrics |= {"pose_10deg_5pct": 0.3, "rot_lt_10deg": 0.5}
+    lines = [{"kind": "train", "samples": 1}]
+    lines += [{"kind": "validation", "samples": n, "size_px": 128, "windows": 256, **metrics} for n in samples]
+    (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
+    history = gathered([run_folder(tmp_path / "a", [100, 250]), run_folder(tmp_path / "b", [40])])
+    assert [line["total_samples"] for line in history] == [100, 250, 290]
+    assert "290 rendered windows in 2 runs" in told(history)
+    draw_history(history, tmp_path / "learning.png")
+    assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(ConfigError, match="no validation"):
+        gathered([run_folder(tmp_path / "c", [])])
+
+
+def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
+    from edge.config import SHIPPED_MODEL
+    from edge.estimator.model import load_model
+
+    training = load_model(SHIPPED_MODEL, 1).contract.training
+    assert read_history(HISTORY)[-1]["samples"] == training["samples"]
+
+
+def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
+    scores = measure([None], [CROSSING], lambda _: None)
+    assert [score["mode"] for score in scores] == ["frames", "track"]
+    text = page(scores, "the command", "Trained on much.")
+    rows = [line for line in text.splitlines() if line.startswith("| crossing")]
+    assert len(rows) == 2
+    found = 100 * scores[1]["overall"]["recall"]
+    assert f"| {found:.1f} |" in rows[1]
+    paper = next(line for line in text.splitlines() if "the paper, FP32" in line)
+    assert f"{100 * PAPER['pose_10deg_5pct']:.1f}" in paper
+    assert "the command" in text
+
+
+def test_a_folder_without_datasets_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=str(tmp_path)):
+        datasets_in(tmp_path)

@@ -1,0 +1,218 @@
+"""The results page: one model on the benchmark's datasets beside the paper, made again by one command."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from trainer.config import ConfigError
+from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
+
+# MF-UAVPose6D, the paper's own network on its own dataset (tables of its section on results).
+PAPER = {
+    "rotation_error_deg": {"mean": 4.96},
+    "translation_error_m": {"mean": 7.28},
+    "depth_error_m": {"mean": 6.96},
+    "rot_10deg": 0.909,
+    "depth_5pct": 0.890,
+    "pose_10deg_5pct": 0.828,
+    "add_0_5d": 0.885,
+}
+KEPT_METRICS = ("E_", "rot_", "depth_", "pose_", "bearing_", "recall", "false_alarms")
+HISTORY = Path(__file__).parent / "checkpoints" / "history.jsonl"
+Cell = Callable[[Mapping[str, Any]], float | None]
+
+
+def _at(*keys: str, scale: float = 1.0) -> Cell:
+    def cell(group: Mapping[str, Any]) -> float | None:
+        value: Any = group
+        for key in keys:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        return None if value is None else scale * float(value)
+
+    return cell
+
+
+COLUMNS: tuple[tuple[str, Cell, str], ...] = (
+    ("found %", _at("recall", scale=100), ".1f"),
+    ("false / 1,000", _at("false_positives_per_1000"), ".0f"),
+    ("E_r mean °", _at("rotation_error_deg", "mean"), ".1f"),
+    ("median °", _at("rotation_error_deg", "median"), ".1f"),
+    ("Rot<10° %", _at("rot_10deg", scale=100), ".1f"),
+    ("E_t mean m", _at("translation_error_m", "mean"), ".1f"),
+    ("E_z mean m", _at("depth_error_m", "mean"), ".1f"),
+    ("Depth<5 % %", _at("depth_5pct", scale=100), ".1f"),
+    ("Pose@10°/5 % %", _at("pose_10deg_5pct", scale=100), ".1f"),
+    ("ADD-0.5d %", _at("add_0_5d", scale=100), ".1f"),
+    ("ADD-0.1d %", _at("add_0_1d", scale=100), ".1f"),
+    ("bearing mean °", _at("bearing_error_deg", "mean"), ".3f"),
+)
+
+
+def datasets_in(benchmark: Path) -> list[Path]:
+    """Folders with a dataset.toml in `benchmark`, sorted. Raises ConfigError if there is none."""
+    found = sorted(path.parent for path in benchmark.glob("*/dataset.toml"))
+    if not found:
+        raise ConfigError(f"{benchmark}: holds no folder with a dataset.toml; make some with uavpose-replay generate")
+    return found
+
+
+def measure(
+    models: Sequence[Path | None], datasets: Sequence[Path], say: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Scores of each model on each dataset: single frames and, where its sequences are whole, through the tracker too.
+
+    A model that is None is the shipped INT8 file.
+    """
+    scores = []
+    for dataset in datasets:
+        manifest = _manifest(dataset)
+        for model in models:
+            # Only a sequence that has every frame can be followed.
+            for mode in ("frames", "track") if manifest.get("every", 1) == 1 else ("frames",):
+                request = DatasetRequest(model=model, dataset=dataset, mode=mode)
+                score = evaluate_dataset(request).score
+                scores.append({**score, "dataset": dataset.name, "recipe": manifest.get("command", "")})
+                say(f"{dataset.name}, {mode}: {score['overall']['frames']} frames, {score['method']['file']}")
+    return scores
+
+
+def _manifest(dataset: Path) -> dict[str, Any]:
+    path = dataset / "dataset.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str:
+    """Markdown: overall beside the paper, then each dataset by distance and by airframe."""
+    models = {score["method"]["file"]: score["method"] for score in scores}
+    lines = ["# Results", "", f"Made by `{command}`. Missed targets count as failures in every rate; means are over "]
+    lines[-1] += (
+        "found targets. Single frames, unless a row says *track*: then the daemon's tracker, which knows own attitude."
+    )
+    lines += ["", *(f"- `{name}`: {m['precision']}, sha256 `{m['sha256'][:16]}`" for name, m in models.items())]
+    lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]
+    lines += ["", "## Overall", "", *_header("dataset", "model", "frames")]
+    for score in scores:
+        first = [f"{score['dataset']}{', track' if score['mode'] == 'track' else ''}", score["method"]["precision"]]
+        lines.append(_row([*first, str(score["overall"]["frames"])], score["overall"]))
+    lines.append(_row(["FW-UAV6DPose (the paper's own data)", "the paper, FP32", "4,500"], PAPER))
+    for score in scores:
+        name = f"{score['dataset']}, {score['method']['precision']}, {score['mode']}"
+        lines += [
+            "",
+            f"## {name}",
+            "",
+            f"`{score['recipe']}`" if score["recipe"] else "",
+            "",
+            *_header("range m", "targets"),
+        ]
+        lines += [_row([band, str(g["targets"])], g) for band, g in score["by_range"].items() if g["targets"]]
+        lines += ["", *_header("airframe", "targets")]
+        lines += [_row([name, str(g["targets"])], g) for name, g in score["by_airframe"].items() if g["targets"]]
+    return "\n".join(lines) + "\n"
+
+
+def _header(*first: str) -> list[str]:
+    names = [*first, *(name for name, _, _ in COLUMNS)]
+    return ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+
+
+def _row(first: Sequence[str], group: Mapping[str, Any]) -> str:
+    values = [(cell(group), form) for _, cell, form in COLUMNS]
+    return "| " + " | ".join([*first, *("–" if v is None else f"{v:{form}}" for v, form in values)]) + " |"
+
+
+def read_history(path: Path) -> list[dict[str, Any]]:
+    """Validations of all training runs behind the shipped weights, in order. Raises ConfigError."""
+    try:
+        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+
+
+def gathered(runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """The validations of run folders, each begun from the one before it. Raises ConfigError."""
+    history, before = [], 0
+    for folder in runs:
+        lines = [line for line in read_history(folder / "log.jsonl") if line["kind"] == "validation"]
+        if not lines:
+            raise ConfigError(f"{folder / 'log.jsonl'}: holds no validation")
+        kept = ("samples", "size_px", "windows", *(key for key in lines[0] if key.startswith(KEPT_METRICS)))
+        for line in lines:
+            total = before + line["samples"]
+            history.append({"run": folder.name, "total_samples": total, **{key: round(line[key], 5) for key in kept}})
+        before = history[-1]["total_samples"]
+    return history
+
+
+def told(history: Sequence[Mapping[str, Any]]) -> str:
+    """How much training is behind the last line."""
+    runs = list(dict.fromkeys(line["run"] for line in history))
+    return (
+        f"Trained on {history[-1]['total_samples']:,} rendered windows in {len(runs)} runs, each begun from the last."
+    )
+
+
+def draw_history(history: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Held-out errors over training samples; a run's windows may differ from the last one's in size and airframes."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.2), constrained_layout=True)
+    panels = (
+        (("E_r_mean_deg", "E_r_median_deg"), 1.0, "rotation error, degrees"),
+        (("depth_rel_mean", "depth_rel_median"), 100.0, "depth error, %"),
+        (("pose_10deg_5pct", "rot_lt_10deg"), 100.0, "Pose@10°/5 % and Rot<10°, %"),
+    )
+    for axis, (keys, scale, title) in zip(axes, panels, strict=True):
+        for run in dict.fromkeys(line["run"] for line in history):
+            lines = [line for line in history if line["run"] == run]
+            for key, style in zip(keys, ("-", "--"), strict=True):
+                x = [line["total_samples"] / 1000 for line in lines]
+                label = key if run == history[0]["run"] else None
+                axis.plot(x, [scale * line[key] for line in lines], style, color=f"C{keys.index(key)}", label=label)
+            axis.axvline(lines[0]["total_samples"] / 1000, color="0.85", linewidth=0.8)
+        axis.set(title=title, xlabel="thousand training windows", ylim=(0, None))
+        axis.legend(fontsize=7)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def register(commands: argparse._SubParsersAction) -> None:
+    """Add the sub-command."""
+    results = commands.add_parser(
+        "results",
+        help="measure the shipped model on generated datasets and write the results page",
+        description="Evaluate the shipped INT8 file (and --model files) on every dataset in a folder and write "
+        "results.md, results.json and learning.png.",
+    )
+    results.add_argument("--benchmark", type=Path, required=True, metavar="DIR", help="folder of generated datasets")
+    results.add_argument("--model", type=Path, action="append", default=[], help="an ONNX file to stand beside it")
+    results.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
+    results.add_argument(
+        "--runs", type=Path, nargs="+", metavar="DIR", help="run folders behind the shipped weights, oldest first, anew"
+    )
+    results.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measure and write. Raises ConfigError."""
+    if arguments.runs:
+        lines = "".join(json.dumps(line) + "\n" for line in gathered(arguments.runs))
+        HISTORY.write_text(lines, encoding="utf-8")
+    history = read_history(HISTORY)
+    datasets = datasets_in(arguments.benchmark)
+    scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    extra = "".join(f" --model {path}" for path in arguments.model)
+    command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"
+    (arguments.out / "results.md").write_text(page(scores, command, told(history)), encoding="utf-8")
+    (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
+    draw_history(history, arguments.out / "learning.png")
