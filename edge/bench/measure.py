@@ -16,7 +16,7 @@ from edge.bench import openvino, peak
 from edge.bench.macs import Macs, count_macs
 from edge.bench.peak import Peak
 from edge.bench.timing import Milliseconds, time_in_turns
-from edge.estimator.model import Model, load_model
+from edge.estimator.model import Model, load_model, session_options
 from msgs.contract import ModelContract
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -74,7 +74,7 @@ def measure(
             model.warm_up()
             calls |= _cases(model, count)
     peaks: dict[Case, Callable[[], object]] = {
-        Case("", precision, count, "peak"): peak.product(precision, _options(count, spinning))
+        Case("", precision, count, "peak"): peak.product(precision, session_options(count, spinning))
         for count in threads
         for precision in ("int8", "fp32")
     }
@@ -112,13 +112,6 @@ def _row(case: Case, model: Model, macs: Macs, ms: Milliseconds, peaks: dict[int
     contract = model.contract
     limit_ms = peaks[case.threads].limit_ms(macs.int8, macs.float32)
     return Row(case, contract.configuration, contract.precision, stages(contract)[case.stage], macs, ms, limit_ms)
-
-
-def _options(threads: int, spinning: bool) -> ort.SessionOptions:
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.add_session_config_entry("session.intra_op.allow_spinning", "1" if spinning else "0")
-    return options
 
 
 def _machine() -> Machine:

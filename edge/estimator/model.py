@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from edge.errors import InputError
-from edge.estimator.providers import Provider, choose_provider
+from edge.estimator.providers import ChosenProvider, Provider, choose_provider
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
 
 INPUT_TYPES = {"image": ("tensor(uint8)", 4), "K": ("tensor(float)", 3)}
@@ -30,6 +31,7 @@ OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
     "sigma": (6,),
 }
 SIZE_STEP_PX = 32
+FREE_SIDES = ("W", "H")  # what the graph calls the sides of its input
 RUNS_REMEMBERED = 16
 _LOG_FATAL = 4
 
@@ -48,7 +50,7 @@ class Peaks:
 
 
 class Model:
-    """A loaded session. One thread at a time calls `run`."""
+    """A loaded file: a session that takes any size, and others for one size each. One thread at a time calls `run`."""
 
     def __init__(
         self,
@@ -58,8 +60,10 @@ class Model:
         sha256: str,
         provider: Provider = "cpu",
         fallback_reason: str | None = None,
+        fixed: Mapping[tuple[int, int], ort.InferenceSession] | None = None,  # by (width, height)
     ) -> None:
         self._session = session
+        self._fixed = dict(fixed or {})
         self._runs_ns: deque[tuple[int, int]] = deque(maxlen=RUNS_REMEMBERED)
         self.contract = contract
         self.path = path
@@ -70,8 +74,9 @@ class Model:
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
         feeds = {"image": images_bgr, "K": K.astype(np.float32)}
+        session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
         begin_ns = time.monotonic_ns()
-        peaks = Peaks(*self._session.run(list(OUTPUT_NAMES), feeds))
+        peaks = Peaks(*session.run(list(OUTPUT_NAMES), feeds))
         self._runs_ns.append((begin_ns, time.monotonic_ns()))
         return peaks
 
@@ -107,23 +112,40 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"model {path} cannot be read: {error.strerror}") from error
+    chosen = choose_provider(provider, ort.get_available_providers())
+    session = _open(content, path, session_options(threads, spinning), chosen)
+    chosen = chosen.confirmed(session.get_providers())
+    contract = _contract(session.get_modelmeta().custom_metadata_map, path)
+    _check_graph(session, contract, path)
+    fixed = {}
+    if contract.track_size_wh is not None:
+        # Where the size is known the arithmetic of shapes is done once, here. The whole frame's share of it is too
+        # small to be worth the memory.
+        options = session_options(threads, spinning)
+        for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
+            options.add_free_dimension_override_by_name(name, side)
+        fixed[contract.track_size_wh] = _open(content, path, options, chosen)
+    sha256 = hashlib.sha256(content).hexdigest()
+    return Model(session, contract, path, sha256, chosen.provider, chosen.fallback_reason, fixed)
+
+
+def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
+    """One inference at a time on so many threads, which sleep between inferences unless `spinning`."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "1" if spinning else "0")
     options.log_severity_level = _LOG_FATAL
-    chosen = choose_provider(provider, ort.get_available_providers())
+    return options
+
+
+def _open(content: bytes, path: Path, options: ort.SessionOptions, chosen: ChosenProvider) -> ort.InferenceSession:
     try:
-        session = ort.InferenceSession(content, options, providers=list(chosen.names))
+        return ort.InferenceSession(content, options, providers=list(chosen.names))
     except Exception as error:  # ONNX Runtime's errors have no common base of their own
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"model {path} is not a loadable ONNX file: {reason}") from error
-    chosen = chosen.confirmed(session.get_providers())
-    contract = _contract(session.get_modelmeta().custom_metadata_map, path)
-    _check_graph(session, contract, path)
-    sha256 = hashlib.sha256(content).hexdigest()
-    return Model(session, contract, path, sha256, chosen.provider, chosen.fallback_reason)
 
 
 def _contract(metadata: dict[str, str], path: Path) -> ModelContract:
