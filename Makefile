@@ -7,7 +7,7 @@ demo:
 
 test:
 	@sh deploy/bootstrap.sh dev
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest -n 3 --dist loadfile
 
 check:
 	@sh deploy/bootstrap.sh dev
