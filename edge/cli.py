@@ -50,6 +50,11 @@ def _parser() -> argparse.ArgumentParser:
     status.add_argument("--json", action="store_true", help="print one JSON object: info, config, model")
     status.set_defaults(act=_status)
 
+    doctor = commands.add_parser("doctor", help="look at all the daemon needs here, and say what to do")
+    doctor.add_argument("--config", type=Path, required=True, help="TOML file")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object: findings with their advice")
+    doctor.set_defaults(act=_doctor)
+
     bench.register(commands)
 
     calibrate = commands.add_parser("calibrate", help="make a camera's intrinsics file from pictures of a board")
@@ -97,6 +102,13 @@ def _status(options: argparse.Namespace) -> int:
     from edge.status import status
 
     return status(options.config, options.connect, options.vehicle, options.json)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from edge.config import load_config
+    from edge.doctor import doctor
+
+    return doctor(load_config(options.config), options.json)
 
 
 def _calibrate(options: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
 from dataclasses import dataclass
 from typing import TextIO
@@ -10,6 +11,7 @@ from typing import TextIO
 REPEAT_S = 60.0
 FAULTS_REMEMBERED = 64
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass
@@ -20,8 +22,8 @@ class _Fault:
 
 
 class CountingHandler(logging.StreamHandler[TextIO]):
-    """Writes a warning or an error at once, the same one (logger, level, words but for their arguments) again only as
-    a count after REPEAT_S. What is below a warning is written as it comes."""
+    """Writes a warning or an error at once, the same one (logger, level, words but for their numbers) again only as a
+    count after REPEAT_S. What is below a warning is written as it comes."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(stream)
@@ -33,7 +35,7 @@ class CountingHandler(logging.StreamHandler[TextIO]):
                 self._tell_count(fault)
                 del self._faults[key]
         if record.levelno >= logging.WARNING:
-            key = (record.name, record.levelno, str(record.msg))
+            key = (record.name, record.levelno, _NUMBER.sub("#", record.getMessage()))
             known = self._faults.get(key)
             if known is not None:
                 known.repeated, known.last = known.repeated + 1, record

@@ -1,0 +1,129 @@
+"""`uavpose-edge doctor`: look at everything the daemon needs on this machine, and say what to do about each fault."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from edge.cameras import open_source
+from edge.cameras.capture import Capture
+from edge.cameras.source import EndOfStream
+from edge.config import ConfigFile
+from edge.doctor_links import link_findings
+from edge.doctor_machine import machine_findings
+from edge.errors import InputError
+from edge.estimator.model import Model
+from edge.findings import Finding, device_fault, good, poor, wrong
+from edge.health import percentiles_ms
+from edge.reload import load_configured
+from edge.status_board import no_password
+
+FRAME_S = 8.0
+TIMED_RUNS = 10
+LIVE_FRAMES = 20
+
+
+def doctor(file: ConfigFile, as_json: bool) -> int:
+    """Print a line for each finding as it is made; 1 if something is wrong, else 0."""
+    found = []
+    for finding in findings(file):
+        found.append(finding)
+        if not as_json:
+            print(finding.line(), flush=True)
+    failed = [finding for finding in found if finding.verdict == "wrong"]
+    if as_json:
+        print(json.dumps({"well": not failed, "findings": [asdict(finding) for finding in found]}))
+    else:
+        print(f"{len(failed)} wrong" if failed else "nothing is wrong")
+    return 1 if failed else 0
+
+
+def findings(file: ConfigFile) -> Iterator[Finding]:
+    """Every look in its order; none of them raises for what it finds."""
+    yield from machine_findings(file.config)
+    frame_ms: float | None = None
+    for finding, rate_hz in _camera(file):
+        frame_ms = 1e3 / rate_hz if rate_hz else frame_ms
+        yield finding
+    yield from _model(file, frame_ms)
+    yield from link_findings(file.config)
+
+
+def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
+    """Opens it as the daemon does, and waits for pictures; with each finding the frame rate that was seen."""
+    camera = file.config.camera
+    device = getattr(camera, "device", None)
+    if device is not None and (fault := device_fault(Path(device), "video")) is not None:
+        yield wrong("camera", *fault), None
+        return
+    try:
+        source, info, opened = open_source(camera)
+    except InputError as error:
+        yield wrong("camera", str(error), "mend what is named in [camera]"), None
+        return
+    name = no_password(info.name)
+    capture = Capture(source, opened)
+    capture.start()
+    try:
+        seen_ns = _see_frames(capture)
+    except InputError as error:
+        yield wrong("camera", str(error), "mend what is named in [camera]"), None
+        return
+    finally:
+        capture.stop()
+    if not seen_ns:
+        advice = "is it on, plugged in, in no other program's hands, and reachable from here?"
+        yield wrong("camera", f"{name}: no picture within {FRAME_S:.0f} s", advice), None
+        return
+    rate_hz = (len(seen_ns) - 1) / ((seen_ns[-1] - seen_ns[0]) / 1e9) if len(seen_ns) > 2 else None
+    rate = f", {rate_hz:.0f} a second" if rate_hz else ""
+    yield good("camera", f"{name}: {info.image_size_wh[0]}x{info.image_size_wh[1]}{rate}"), rate_hz
+
+
+def _see_frames(capture: Capture) -> list[int]:
+    """Exposure times of the first frames that come. Raises InputError."""
+    until_s, seen_ns = time.monotonic() + FRAME_S, list[int]()
+    while time.monotonic() < until_s and len(seen_ns) < LIVE_FRAMES:
+        try:
+            frame = capture.newest(0.2)
+        except EndOfStream:
+            break
+        if frame is not None:
+            seen_ns.append(frame.meta.capture_ns)
+    return seen_ns
+
+
+def _model(file: ConfigFile, frame_ms: float | None) -> Iterator[Finding]:
+    try:
+        model = load_configured(file)
+    except InputError as error:
+        yield wrong("model", str(error), "give a file that `uavpose-trainer export` wrote, or leave [model] path out")
+        return
+    if model.fallback_reason is not None:
+        yield wrong("provider", model.fallback_reason, 'install what is missing, or set [model] provider = "cpu"')
+    contract = model.contract
+    sizes = {"acquire": contract.acquire_size_wh, "track": contract.track_size_wh}
+    times = {stage: _time_ms(model, size) for stage, size in sizes.items() if size is not None}
+    told = ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items())
+    text = f"{contract.name} {contract.precision} {model.sha256[:12]} on {model.provider}: {told}"
+    steady_ms = times.get("track", times["acquire"])
+    if frame_ms is not None and steady_ms > frame_ms:
+        advice = "lower [camera] fps, raise [model] threads, take the INT8 model, or stop what else runs"
+        yield poor("model", f"{text}; a frame comes every {frame_ms:.0f} ms", advice)
+    else:
+        yield good("model", text)
+
+
+def _time_ms(model: Model, size_wh: tuple[int, int]) -> float:
+    width, height = size_wh
+    image = np.zeros((1, height, width, 3), dtype=np.uint8)
+    K = np.array([[[float(width), 0.0, width / 2], [0.0, float(width), height / 2], [0.0, 0.0, 1.0]]])
+    model.take_runs_ns()
+    for _ in range(TIMED_RUNS):
+        model.run(image, K)
+    return percentiles_ms(end_ns - begin_ns for begin_ns, end_ns in model.take_runs_ns()).p50

@@ -1,0 +1,107 @@
+"""The links: is the autopilot heard, does the ground answer, are our own endpoints free?"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from edge.config import Config, MavlinkSettings
+from edge.config_ground import ZenohSettings
+from edge.errors import InputError
+from edge.findings import Finding, device_fault, good, poor, wrong
+from edge.links.mavlink_link import MavlinkLink, signing_of
+from edge.requests import RequestQueue
+from edge.status import ask
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import CameraInfo
+from msgs.session import client_config, peer_config
+
+HEARING_S = 4.0
+LOOK_S = 0.1
+
+
+def link_findings(config: Config) -> Iterator[Finding]:
+    """Where the daemon runs already, its endpoints are its own: it is asked instead."""
+    running = _running(config)
+    if running is not None:
+        yield running
+        return
+    if config.zenoh.enabled:
+        yield from _zenoh(config.zenoh)
+    if config.mavlink.enabled:
+        yield from _mavlink(config.mavlink)
+
+
+def _running(config: Config) -> Finding | None:
+    for endpoint in config.zenoh.listen if config.zenoh.enabled else []:
+        if endpoint.startswith("tcp/127.0.0.1:") and (answer := ask(endpoint, config.vehicle.name)) is not None:
+            info = answer["info"]
+            said = f"the daemon runs (process {info['pid']}) and is {info.get('state', 'starting')}"
+            return good("daemon", f"{said}; its links are not tried from here")
+    return None
+
+
+def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
+    tls = settings.tls.files() if settings.tls is not None else None
+    try:
+        zenoh.open(peer_config(settings.listen, [], tls=tls)).close()
+        yield good("zenoh", f"{', '.join(settings.listen) or 'nothing'} can be listened on")
+    except zenoh.ZError:
+        advice = "another program has one of them: `ss -ltnup` shows which; or change [zenoh] listen"
+        yield wrong("zenoh", f"{', '.join(settings.listen)} cannot be listened on", advice)
+    for endpoint in settings.connect:
+        try:
+            zenoh.open(client_config([endpoint], tls=tls)).close()
+            yield good("ground", f"{endpoint} answers")
+        except zenoh.ZError:
+            advice = (
+                "start `uavpose-ground router` there, check address, firewall, certificates"
+            )
+            yield poor("ground", f"{endpoint} does not answer", advice)
+
+
+def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
+    """Listens as the daemon does, until an attitude is heard."""
+    for endpoint in settings.endpoints:
+        kind, _, rest = endpoint.partition(":")
+        if kind == "serial" and (fault := device_fault(Path(rest.rpartition(":")[0]), "dialout")) is not None:
+            yield wrong("mavlink", *fault)
+            return
+    own_ship = OwnShipBuffer()
+    camera = CameraInfo("doctor", (640, 480), np.eye(3), None)
+    try:
+        link = MavlinkLink(settings, own_ship, camera, RequestQueue(), signing_of(settings))
+        link.start()
+    except InputError as error:
+        yield wrong(
+            "mavlink", str(error), "another program has it: `ss -lunp` shows which; or change [mavlink] endpoints"
+        )
+        return
+    try:
+        counters = _wait(link.counters, lambda counted: counted.get("received_HEARTBEAT", 0) > 0)
+    finally:
+        link.stop()
+    where = ", ".join(settings.endpoints)
+    if counters.get("received_HEARTBEAT", 0):
+        yield good("mavlink", f"{where}: a heartbeat is heard")
+        return
+    refused = ", ".join(f"{name} {count}" for name, count in counters.items() if name.startswith("refused_") and count)
+    advice = "is the autopilot on, its port set to MAVLink 2 at this speed, its stream sent to this address?"
+    yield wrong(
+        "mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{f' ({refused})' if refused else ''}", advice
+    )
+
+
+def _wait(look: Callable[[], dict[str, int]], done: Callable[[dict[str, int]], bool]) -> dict[str, int]:
+    """Look until it is done or HEARING_S are over; the last look."""
+    pause, counted = threading.Event(), look()
+    for _ in range(round(HEARING_S / LOOK_S)):
+        if done(counted):
+            break
+        pause.wait(LOOK_S)
+        counted = look()
+    return counted

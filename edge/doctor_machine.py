@@ -1,0 +1,82 @@
+"""The machine: processor, clock, memory and disk."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from edge.config import Config
+from edge.findings import Finding, good, poor, wrong
+
+CPUINFO = Path("/proc/cpuinfo")
+GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+# The instructions that make an 8-bit network faster than a float one, as /proc/cpuinfo names them.
+DOT_PRODUCT = {"x86_64": ("avx512_vnni", "avx_vnni"), "aarch64": ("asimddp", "i8mm")}
+TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
+
+
+def machine_findings(config: Config) -> Iterator[Finding]:
+    yield cpu_finding(CPUINFO.read_text(errors="replace") if CPUINFO.exists() else "", platform.machine())
+    yield from _cores(config.model.threads)
+    yield clock_finding(_clock_state())
+    if config.recorder.enabled:
+        yield disk_finding(config.recorder.folder, round(config.recorder.free_min_mb * 1e6))
+
+
+def cpu_finding(cpuinfo: str, machine: str) -> Finding:
+    """From /proc/cpuinfo's text."""
+    lines = [line.partition(":") for line in cpuinfo.splitlines()]
+    flags = {word for name, _, words in lines if name.strip() in ("flags", "Features") for word in words.split()}
+    wanted = DOT_PRODUCT.get(machine, ())
+    have = [flag for flag in wanted if flag in flags]
+    if have:
+        return good("processor", f"{machine} with {', '.join(have)}: made for the INT8 model")
+    names = " or ".join(wanted) or "8-bit dot products"
+    advice = "compare models with `uavpose-edge bench`: INT8 gains little here; a Raspberry Pi 5 or newer has them"
+    return poor("processor", f"{machine} without {names}", advice)
+
+
+def _cores(threads: int) -> Iterator[Finding]:
+    cores = len(os.sched_getaffinity(0))
+    if threads > cores:
+        advice = f"set [model] threads = {cores}"
+        yield poor("cores", f"{cores} for this process, but [model] threads is {threads}", advice)
+    else:
+        yield good("cores", f"{cores} for this process, {threads} for one inference")
+    if GOVERNOR.exists() and (governor := GOVERNOR.read_text().strip()) in ("powersave", "conservative"):
+        advice = "sudo cpupower frequency-set -g performance, or schedutil"
+        yield poor("governor", f"the processor's clock is held by '{governor}'", advice)
+
+
+def clock_finding(state: int) -> Finding:
+    """From adjtimex's return value, -1 where it cannot be asked."""
+    if state == TIME_ERROR:
+        advice = "install chrony, with GPS or the ground's time; stamps are judged by age, and poses refused without it"
+        return poor("clock", "UTC is not synchronised", advice)
+    if state < 0:
+        return poor("clock", "this system does not say whether UTC is synchronised", "compare `date -u` on both ends")
+    return good("clock", "UTC is synchronised")
+
+
+def _clock_state() -> int:
+    try:
+        return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)))  # no modes set: it only reads
+    except (OSError, AttributeError):
+        return -1
+
+
+def disk_finding(folder: Path, free_min_bytes: int) -> Finding:
+    """Where recordings go; the folder is made when the daemon starts, so its parents count."""
+    there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        advice = f"sudo install -d -o $USER {folder}, or name another in [recorder] folder"
+        return wrong("disk", f"{folder} cannot be written by this user", advice)
+    free = shutil.disk_usage(there).free
+    if free < free_min_bytes:
+        advice = "remove old recordings, or lower [recorder] free_min_mb"
+        return wrong("disk", f"{folder}: {free / 1e6:.0f} MB free, {free_min_bytes / 1e6:.0f} to be left free", advice)
+    return good("disk", f"{folder}: {free / 1e9:.1f} GB free")

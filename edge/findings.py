@@ -1,0 +1,46 @@
+"""What the doctor finds: one line each, and what to do about it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+MARKS = {"good": "ok", "poor": "poor", "wrong": "WRONG"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One look at one thing. `poor` works, but less well than it could; `wrong` does not."""
+
+    what: str
+    verdict: Literal["good", "poor", "wrong"]
+    says: str
+    advice: str = ""
+
+    def line(self) -> str:
+        """For a person."""
+        head = f"{MARKS[self.verdict]:6} {self.what:12} {self.says}"
+        return f"{head}\n{'':20}→ {self.advice}" if self.advice else head
+
+
+def good(what: str, says: str) -> Finding:
+    return Finding(what, "good", says)
+
+
+def poor(what: str, says: str, advice: str) -> Finding:
+    return Finding(what, "poor", says, advice)
+
+
+def wrong(what: str, says: str, advice: str) -> Finding:
+    return Finding(what, "wrong", says, advice)
+
+
+def device_fault(path: Path, group: str) -> tuple[str, str] | None:
+    """Why a device file cannot be used by this user, and what to do; None if it can."""
+    if not path.exists():
+        return f"{path} is not there", f"plug it in, or name another; `ls {path.parent}` shows what there is"
+    if not os.access(path, os.R_OK | os.W_OK):
+        return f"{path} may not be read and written by this user", f"sudo usermod -aG {group} $USER, then log in again"
+    return None

@@ -1,0 +1,209 @@
+"""Watchdogs, systemd, stages, the log, the provider: what a stuck or limping daemon does."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.config import Config, ConfigFile
+from edge.estimator.model import load_model
+from edge.estimator.providers import NAMES, choose_provider
+from edge.health import HealthState, judge
+from edge.logs import CountingHandler
+from edge.outlets import Outlets
+from edge.stages import STAGES, StageClock
+from edge.status_board import StatusBoard
+from edge.supervisor import Supervisor
+from edge.systemd import Notifier
+from edge.types import CameraInfo, FrameMeta
+
+from .flying import flying, free_port, toml, write_swaying_scene
+from .toy_scene import K
+
+STICKS_LATER = """
+import sys, threading
+from edge import cli
+from edge.estimator.estimator import Estimator
+seen, track = [], Estimator.track
+def stand_still(self, *arguments):
+    seen.append(1)
+    if len(seen) > 25:
+        threading.Event().wait()
+    return track(self, *arguments)
+Estimator.track = stand_still
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path: Path, toy_model: Path) -> None:
+    scene, words, over = write_swaying_scene(tmp_path / "000001"), list[str](), threading.Event()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(0.1)
+
+        def hear() -> None:
+            while not over.is_set():
+                with contextlib.suppress(TimeoutError):
+                    words.append(systemd.recv(4096).decode())
+
+        manager = threading.Thread(target=hear)
+        manager.start()
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
+        text = toml(scene, toy_model, free_port(), "[health]\nloop_stuck_s = 1.5\n")
+        try:
+            with flying(tmp_path, text, environment, program=("-c", STICKS_LATER)) as flight:
+                said = flight.until("CRITICAL")
+                assert flight.process.wait(timeout=20) == 70
+        finally:
+            over.set()
+            manager.join()
+    assert "the main loop has stood still for" in said
+    assert "in wait (threading.py:" in said
+    ready = words.index("READY=1")
+    assert "WATCHDOG=1" not in words[:ready]
+    assert "WATCHDOG=1" in words[ready:]
+    assert any(word.startswith("STATUS=the main loop has stood still") for word in words)
+    assert "STOPPING=1" not in words
+    # Fed every 0.1 s while it turned, 1.5 s before the end no more: the last word is not that it lives.
+    assert words[-1] != "WATCHDOG=1"
+
+
+def test_a_daemon_told_to_stop_tells_systemd(tmp_path: Path, toy_model: Path) -> None:
+    scene = write_swaying_scene(tmp_path / "000001")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind("\0uavpose-" + tmp_path.name)
+        systemd.settimeout(20.0)
+        environment = {"NOTIFY_SOCKET": "@uavpose-" + tmp_path.name}
+        with flying(tmp_path, toml(scene, toy_model, free_port()), environment) as flight:
+            flight.process.terminate()
+            word = ""
+            while word != "STOPPING=1":
+                word = systemd.recv(4096).decode()
+                assert word != "WATCHDOG=1"  # systemd asked for none
+            assert flight.process.wait(timeout=20) == 0
+
+
+def test_without_systemd_nothing_is_said_and_nothing_fails() -> None:
+    notifier = Notifier({"WATCHDOG_USEC": "soon"})
+    notifier.ready()
+    notifier.feed(1)
+    notifier.close()
+
+
+def test_a_watchdog_meant_for_another_process_is_not_fed(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.setblocking(False)
+        address = str(tmp_path / "notify")
+        notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"})
+        notifier.feed(10**12)
+        with pytest.raises(BlockingIOError):
+            systemd.recv(100)
+
+
+def test_a_link_whose_thread_has_ended_is_told(toy_model: Path) -> None:
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "/x"}, "mavlink": {"enabled": False}})
+    camera = CameraInfo("x", (640, 480), K, None)
+    board = StatusBoard(ConfigFile(Path("x.toml"), "", config), load_model(toy_model, 1), camera)
+    supervisor = Supervisor(config.health, False, Outlets(None, None), board, dict)
+    ends = threading.Event()
+    link = threading.Thread(target=ends.wait, name="mavlink")
+    link.start()
+    supervisor.ready()
+    supervisor.turn()
+    assert board.snapshot is not None
+    assert not any("thread" in reason for reason in supervisor.snapshot().reasons)
+    ends.set()
+    link.join()
+    deadline_s = time.monotonic() + 20
+    while "the mavlink thread has ended" not in supervisor.snapshot().reasons and time.monotonic() < deadline_s:
+        supervisor.turn()
+    assert "the mavlink thread has ended" in supervisor.snapshot().reasons
+
+
+def test_what_else_is_wrong_degrades_a_daemon_that_tracks() -> None:
+    state, reasons = judge([], 10_000_000, 0.0, True, True, faults=("slow: p95 90 ms from exposure to the links",))
+    assert state is HealthState.DEGRADED
+    assert reasons == ("slow: p95 90 ms from exposure to the links",)
+    assert judge([], 900_000_000, 0.0, True, True, no_frame_ns=500_000_000)[0] is HealthState.FAULT
+
+
+@given(st.lists(st.integers(0, 10**7), min_size=0, max_size=6), st.integers(0, 10**7), st.integers(0, 10**7))
+def test_the_stages_of_a_frame_add_up_to_its_whole(steps_ns: list[int], capture_ns: int, wait_ns: int) -> None:
+    now_ns = time.monotonic_ns()
+    edges = [now_ns - 10**9 + sum(steps_ns[:k]) for k in range(len(steps_ns) + 1)]
+    arrival_ns = edges[0] - wait_ns
+    clock = StageClock(FrameMeta(0, arrival_ns - capture_ns, arrival_ns), edges[0])
+    runs_ns = [(edges[k], edges[k + 1]) for k in range(0, len(edges) - 1, 2)]
+    clock.estimated(runs_ns)
+    clock.lap("track")
+    stages = clock.stages_ns()
+    assert set(stages) <= set(STAGES)
+    assert sum(ns for stage, ns in stages.items() if stage != "total") == stages["total"]
+    assert stages.get("inference", 0) == sum(end - begin for begin, end in runs_ns)
+    assert (stages["capture"], stages["wait"]) == (capture_ns, wait_ns)
+
+
+def logged(times_and_words: list[tuple[float, int, str]]) -> list[str]:
+    stream = io.StringIO()
+    handler = CountingHandler(stream)
+    for created_s, level, words in times_and_words:
+        record = logging.LogRecord("edge.camera", level, "", 0, words, (), None)
+        record.created = created_s
+        handler.emit(record)
+    handler.close()
+    return stream.getvalue().splitlines()
+
+
+def test_a_fault_that_repeats_is_one_line_and_a_count() -> None:
+    fault = [(k * 0.1, logging.WARNING, f"picture {k} cannot be read") for k in range(500)]
+    lines = logged([*fault, (61.0, logging.INFO, "tracking")])
+    assert lines == [
+        "picture 0 cannot be read",
+        "picture 499 cannot be read (499 more in 60 s)",
+        "tracking",
+    ]
+
+
+def test_other_faults_and_plain_news_are_all_written() -> None:
+    told = [(0.0, logging.ERROR, "a"), (0.1, logging.ERROR, "b"), (0.2, logging.WARNING, "a"), (0.3, logging.INFO, "c")]
+    assert logged([*told, (0.4, logging.INFO, "c")]) == ["a", "b", "a", "c", "c"]
+
+
+@pytest.mark.parametrize("wanted", ["cuda", "tensorrt", "openvino"])
+def test_a_provider_that_is_not_there_is_named_and_the_cpu_flies(toy_model: Path, wanted: str) -> None:
+    model = load_model(toy_model, 1, provider=wanted)  # type: ignore[arg-type]
+    model.warm_up()
+    assert model.provider == "cpu"
+    assert model.fallback_reason is not None
+    assert NAMES[wanted][0] in model.fallback_reason  # type: ignore[index]
+
+
+def test_a_provider_that_is_built_in_but_does_not_start_is_named() -> None:
+    chosen = choose_provider("tensorrt", ["TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider"])
+    assert chosen.names == NAMES["tensorrt"]
+    assert chosen.confirmed([*NAMES["tensorrt"]]).fallback_reason is None
+    on_cuda = chosen.confirmed(["CUDAExecutionProvider", "CPUExecutionProvider"])
+    assert on_cuda.provider == "cuda"
+    assert on_cuda.fallback_reason is not None
+    assert chosen.confirmed(["CPUExecutionProvider"]).provider == "cpu"
+
+
+def test_an_unknown_provider_is_refused(tmp_path: Path) -> None:
+    config = tmp_path / "config.toml"
+    config.write_text('[camera]\ntype = "sequence"\npath = "x"\n[model]\nprovider = "npu"\n')
+    command = [sys.executable, "-m", "edge.cli", "check", "--config", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"{config}:5: [model] provider: " in done.stderr

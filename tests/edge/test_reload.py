@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.config import Config
+from edge.reload import needs_restart, with_live_keys
+from edge.status import ask
+from msgs.client import connect, subscribe
+
+from .flying import Flight, flying, free_port, toml, write_swaying_scene
+from .toy_model import write_toy_model
+
+
+@pytest.fixture(scope="module")
+def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_swaying_scene(tmp_path_factory.mktemp("scenes") / "000001")
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def flight(tmp_path: Path, swaying: Path, port: int) -> Iterator[Flight]:
+    write_toy_model(tmp_path / "flown.onnx")
+    with flying(tmp_path, toml(swaying, tmp_path / "flown.onnx", port)) as flight:
+        yield flight
+
+
+def model_hash(port: int) -> str:
+    answer = ask(f"tcp/127.0.0.1:{port}", "uav1")
+    assert answer is not None
+    assert answer["model"]["sha256"] == answer["info"]["model_sha256"]
+    return str(answer["info"]["model_sha256"])
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_new_model_takes_over_between_frames_and_the_track_lives_on(
+    flight: Flight, tmp_path: Path, swaying: Path, port: int
+) -> None:
+    model, config = tmp_path / "flown.onnx", tmp_path / "config.toml"
+    before = sha256(model)
+    with connect(f"tcp/127.0.0.1:{port}") as session, subscribe(session, "uav1") as poses:
+        first = next(iter(poses))
+        assert model_hash(port) == before
+        write_toy_model(model, name="another")
+        config.write_text(toml(swaying, model, port, "[estimator]\nacquire_every_n = 50\n", fps=11))
+        flight.process.send_signal(signal.SIGHUP)
+        said = flight.until("reloaded: ")
+        last = next(iter(poses))
+    after = sha256(model)
+    assert f"model {before[:12]} replaced by another {after[:12]}" in said
+    assert "taken over: [estimator] acquire_every_n" in said
+    assert "needs a restart: [camera] fps" in said
+    assert model_hash(port) == after != before
+    assert last.target == first.target
+    assert not re.search("searching|init|coasting", "".join(flight.lines).partition("reload: reading")[2])
+
+
+def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Path, swaying: Path, port: int) -> None:
+    model, config = tmp_path / "flown.onnx", tmp_path / "config.toml"
+    before, good = sha256(model), toml(swaying, model, port)
+    torn, other = tmp_path / "torn.onnx", tmp_path / "other.onnx"
+    torn.write_bytes(model.read_bytes()[:300])
+    write_toy_model(other, metadata=json.dumps({"version": 99}))
+    for text, words in (
+        (good.replace(str(model), str(torn)), "[model] path: model"),
+        (good.replace(str(model), str(other)), "contract version 99"),
+        (good.replace(str(model), str(tmp_path / "none.onnx")), "No such file"),
+        (good + "[health]\nmood = 3\n", "[health] mood: unknown key"),
+        ("[camera", "not valid TOML"),
+    ):
+        config.write_text(text)
+        flight.process.send_signal(signal.SIGHUP)
+        said = flight.until("reload refused, flying on as before: ")
+        assert str(config) in said
+        assert words in said
+    with connect(f"tcp/127.0.0.1:{port}") as session, subscribe(session, "uav1") as poses:
+        assert next(iter(poses)).target == "t0"
+    assert model_hash(port) == before
+    config.write_text(good)
+    flight.process.send_signal(signal.SIGHUP)
+    assert "nothing has changed" in flight.until("reloaded: ")
+
+
+def config_of(**sections: dict[str, object]) -> Config:
+    return Config.model_validate({"camera": {"type": "sequence", "path": "/scene"}, **sections})
+
+
+@given(st.integers(1, 64), st.integers(1, 99), st.floats(0.5, 50), st.integers(1, 4), st.booleans())
+def test_a_change_is_either_taken_over_or_named(
+    threads: int, every_n: int, no_frame_s: float, targets: int, mavlink: bool
+) -> None:
+    old = config_of()
+    new = config_of(
+        model={"threads": threads},
+        estimator={"acquire_every_n": every_n, "max_targets": targets},
+        health={"no_frame_s": no_frame_s},
+        mavlink={"enabled": mavlink},
+    )
+    named = needs_restart(old, new)
+    flown = with_live_keys(old, new)
+    assert ("[estimator] max_targets" in named) == (targets != old.estimator.max_targets)
+    assert ("[mavlink] enabled" in named) == (mavlink != old.mavlink.enabled)
+    assert flown.model == new.model
+    assert flown.estimator.acquire_every_n == every_n
+    assert flown.health.no_frame_s == no_frame_s
+    assert flown.estimator.max_targets == old.estimator.max_targets
+    assert (flown == new) == (not named)

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edge.health import HealthState
+from edge.stages import STAGES
+from msgs import topics
+from msgs.cdr import DiagnosticArray
+from msgs.client import connect
+
+from .conftest import Cli
+from .flying import Flight, flying, free_port, toml, write_swaying_scene
+
+SAMPLE = re.compile(r'^[a-z_]+(\{[a-z0-9_]+="[^"]*"(,[a-z0-9_]+="[^"]*")*\})? [-+0-9.e]+$')
+
+
+@pytest.fixture(scope="module")
+def ports() -> tuple[int, int]:
+    return free_port(), free_port()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("daemon")
+
+
+@pytest.fixture(scope="module")
+def daemon(folder: Path, toy_model: Path, ports: tuple[int, int]) -> Iterator[Flight]:
+    scene = write_swaying_scene(folder / "000001")
+    more = f'[health]\nprometheus_port = {ports[1]}\n[vehicle]\nname = "kestrel"\n'
+    with flying(folder, toml(scene, toy_model, ports[0], more)) as flight:
+        yield flight
+
+
+def test_status_says_how_the_daemon_is(
+    cli: Cli, daemon: Flight, folder: Path, toy_model: Path, ports: tuple[int, int]
+) -> None:
+    asked = cli("status", "--config", folder / "config.toml", "--json")
+    assert asked.returncode == 0, asked.stderr
+    answer = json.loads(asked.stdout)
+    info = answer["info"]
+    assert info["vehicle"] == "kestrel"
+    assert info["pid"] == daemon.process.pid
+    assert info["state"] in {state.value for state in HealthState}
+    assert info["counters"]["captured"] > 0
+    assert set(info["latency_ms"]) == set(STAGES)
+    total, parts = info["latency_ms"]["total"], info["latency_ms"]
+    assert max(parts[stage]["p50"] for stage in STAGES if stage != "total") <= total["p99"]
+    assert answer["model"]["contract"]["name"] == "toy"
+    assert answer["model"]["file"] == str(toy_model)
+    assert answer["config"]["config"]["camera"]["fps"] == 10
+    for_a_person = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}")
+    assert for_a_person.returncode == 0
+    assert for_a_person.stdout.startswith("kestrel  ")
+    assert str(daemon.process.pid) in for_a_person.stdout
+
+
+def test_status_without_a_daemon_says_so_and_fails(cli: Cli) -> None:
+    asked = cli("status", "--connect", f"tcp/127.0.0.1:{free_port()}")
+    assert asked.returncode == 1
+    assert "no daemon answers at tcp/127.0.0.1" in asked.stdout
+    assert "Traceback" not in asked.stderr
+
+
+def test_status_refuses_what_is_no_address(cli: Cli) -> None:
+    asked = cli("status", "--connect", "127.0.0.1")
+    assert asked.returncode == 2
+    assert "'127.0.0.1' is not tcp/HOST:PORT" in asked.stderr
+
+
+@pytest.mark.usefixtures("daemon")
+def test_another_vehicle_s_name_is_not_answered(cli: Cli, ports: tuple[int, int]) -> None:
+    asked = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}", "--vehicle", "merlin")
+    assert asked.returncode == 1
+
+
+@pytest.mark.usefixtures("daemon")
+def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
+    with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/metrics", timeout=10) as answer:
+        assert answer.headers["Content-Type"].startswith("text/plain; version=0.0.4")
+        lines = answer.read().decode().splitlines()
+    samples = [line for line in lines if not line.startswith("#")]
+    assert all(SAMPLE.match(line) for line in samples)
+    families = {re.split(r"[{ ]", line)[0] for line in samples}
+    assert families == {line.split()[2] for line in lines if line.startswith("# TYPE")}
+    states = [float(line.split()[-1]) for line in samples if line.startswith("uavpose_state{")]
+    assert sorted(states) == [0.0] * (len(HealthState) - 1) + [1.0]
+    for stage in STAGES:
+        assert any(f'stage="{stage}",quantile="0.99"' in line for line in samples)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/etc/passwd", timeout=10)
+
+
+@pytest.mark.usefixtures("daemon")
+def test_diagnostics_carry_each_stage_and_the_model_s_hash(ports: tuple[int, int]) -> None:
+    key = topics.subscription_key(topics.DIAGNOSTICS, "kestrel")
+    with connect(f"tcp/127.0.0.1:{ports[0]}") as session, session.declare_subscriber(key) as subscriber:
+        (status,) = DiagnosticArray.decode(subscriber.recv().payload.to_bytes()).status
+    values = dict(status.values)
+    assert len(values["model_sha256"]) == 64
+    assert values["model_provider"] == "cpu"
+    for stage in STAGES:
+        assert float(values[f"latency_ms/{stage}/p95"]) >= 0.0
+
+
+def test_passwords_in_addresses_are_not_told() -> None:
+    from edge.status_board import no_password
+
+    assert no_password("rtsp://pilot:secret@10.0.0.2:554/main") == "rtsp://***@10.0.0.2:554/main"
+    assert no_password("rtsp://10.0.0.2/a@b") == "rtsp://10.0.0.2/a@b"
