@@ -1,43 +1,127 @@
-"""Nose or tail towards us? Outlines cannot say; that a fixed-wing aircraft flies nose first can.
+"""Towards us or away? Outlines cannot say; how fixed-wing aircraft fly can.
 
 At long range perspective is weak, so an aircraft that is symmetric left to right has the same outline as its depth
-reversal: the same turned about, heading away instead of towards. A single picture often leaves both open. Its track
-does not: the nose lies on the side of the sight line that the aircraft flies to.
+reversal: the same turned about, heading away instead of towards. A single picture leaves both open, a little in favour
+of one. Each function here weighs one kind of evidence and answers in log-odds for a rotation against its reversal:
+what the network says, where the target flies, and that it flies upright and banks into its turns. Pure.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from edge.tracking import so3
 from edge.types import Array, Estimate
 
-WIND_MPS = 5.0  # a nose may point against the ground track's sight-line component by this much
-SIGMAS = 2.0  # the component's sign must be this sure
-ACROSS = float(np.sin(np.deg2rad(10.0)))  # a nose this near to across the sight line has no side
 MIRRORED_WINGS = np.diag([1.0, -1.0, 1.0])
+NETWORK_STD_FLOOR_RAD = float(np.deg2rad(4.0))
+GRAVITY_MPS2 = 9.81
+
+# Through the air an aircraft flies along its nose, about so fast.
+AIRSPEED_MPS, AIRSPEED_STD_MPS = 28.0, 15.0
+OWN_AIRSPEED_MPS, OWN_AIRSPEED_STD_MPS = 20.0, 10.0
+WIND_STD_MPS = 5.0  # of each component, over ground
+SLIP_STD_RAD = float(np.deg2rad(5.0))  # nose against the way through the air
+
+BANK_STD_RAD = float(np.deg2rad(15.0))  # against that of a coordinated turn
+PITCH_STD_RAD = float(np.deg2rad(8.0))  # against the climb
+UNKNOWN_BANK_STD_RAD = float(np.deg2rad(30.0))  # where the turn is not known
+UNKNOWN_PITCH_STD_RAD = float(np.deg2rad(12.0))
+TAIL_DOF = 4.0  # Student's t: aircraft do loop and slip now and then
+SPEED_MIN_MPS, SPEED_MAX_MPS = 12.0, 60.0
+LOG_ODDS_MAX = 5.0  # of one kind of evidence
 
 
-def flown_nose_first(estimate: Estimate, v_cam_mps: Array, v_covariance: Array) -> Estimate:
-    """The estimate, or its depth reversal if only that flies where the track goes.
+@dataclass(frozen=True)
+class Flight:
+    """What is known of a target's way, in ned axes."""
 
-    v_cam_mps [3] is the target's velocity over ground in `cam`, v_covariance [3, 3] its covariance.
+    v_mps: Array  # [3], over ground, or relative to the own ship
+    P_v: Array  # [3, 3]
+    turn_rate_radps: float | None  # None: not known, nor is the climb
+    turn_rate_variance: float
+    own_nose_ned: Array | None  # [3] if v_mps is relative to the own ship, which flies nose first too
+
+
+def reversal(R: Array, along: Array) -> Array:
+    """The other rotation of the same outline: mirrored in depth, `along` the unit sight line [3], and left to right.
+
+    R [3, 3] turns target axes into those of `along`. Doing it twice gives R again.
     """
-    along = estimate.t_cam_target_m / np.linalg.norm(estimate.t_cam_target_m)
-    opening_mps = float(along @ v_cam_mps)
-    std_mps = float(np.sqrt(max(float(along @ v_covariance @ along), 0.0)))
-    nose = float(along @ estimate.R_cam_target[:, 0])
-    sure = abs(opening_mps) > WIND_MPS + SIGMAS * std_mps
-    if not sure or abs(nose) < ACROSS or nose * opening_mps > 0.0:
-        return estimate
-    return depth_reversed(estimate, along)
+    return (np.eye(3) - 2.0 * np.outer(along, along)) @ R @ MIRRORED_WINGS
 
 
-def depth_reversed(estimate: Estimate, along: Array) -> Estimate:
-    """The other rotation of the same outline: mirrored in depth, `along` the unit sight line [3], and left to right."""
+def reversed_covariance(P: Array, along: Array) -> Array:
+    """[3, 3] of the reversal's error: as R' = M exp(w) R B = exp(-M w) M R B, it turns with the mirror M."""
     mirror = np.eye(3) - 2.0 * np.outer(along, along)
-    R = mirror @ estimate.R_cam_target @ MIRRORED_WINGS
-    # R' = mirror exp(w) R B = exp(-mirror w) mirror R B: errors turn with the mirror.
-    turn = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), -mirror]])
-    return replace(estimate, R_cam_target=R, covariance=turn @ estimate.covariance @ turn.T)
+    return mirror @ P @ mirror.T
+
+
+def network_opinion(estimate: Estimate, along: Array) -> tuple[float, Array]:
+    """(log-odds of the estimated rotation against its reversal, covariance [3, 3] in `cam` if it is the right one).
+
+    Trained by likelihood, the network tells one sigma for both: with probability p of the reversal, w away, its
+    variances are those about the right one plus p w w^T. Here p is what fits its variances best, and at most even.
+    """
+    variances = np.diag(estimate.covariance)[3:]
+    spread = np.square(so3.log(reversal(estimate.R_cam_target, along) @ estimate.R_cam_target.T))
+    p = float(np.clip((variances @ spread) / max(float(spread @ spread), 1e-9), np.exp(-LOG_ODDS_MAX), 0.5))
+    about_it = np.maximum(variances - p * spread, NETWORK_STD_FLOOR_RAD**2)
+    return float(np.log((1.0 - p) / p)), np.diag(about_it)
+
+
+def flown_odds(R: Array, R_reversed: Array, P: Array, flight: Flight) -> float:
+    """Log-odds of R against its reversal by the way the target flies; both [3, 3] into ned axes, P [3, 3] of either."""
+    return _limited(
+        _log_along_nose(R[:, 0], P, flight) - _log_along_nose(R_reversed[:, 0], P, flight)
+        + _log_upright(R, P, flight) - _log_upright(R_reversed, P, flight)
+    )  # fmt: skip
+
+
+def _log_along_nose(nose: Array, P: Array, flight: Flight) -> float:
+    """Log density of the velocity if the target flies along its nose [3]; speed and wind are marginalised."""
+    v = flight.v_mps.copy()
+    across = np.eye(3) - np.outer(nose, nose)
+    slip = SLIP_STD_RAD**2 + float(np.trace(P)) / 3.0
+    S = flight.P_v + WIND_STD_MPS**2 * np.eye(3) + AIRSPEED_STD_MPS**2 * np.outer(nose, nose)
+    S += AIRSPEED_MPS**2 * slip * across
+    if flight.own_nose_ned is not None:
+        v += OWN_AIRSPEED_MPS * flight.own_nose_ned
+        S += OWN_AIRSPEED_STD_MPS**2 * np.outer(flight.own_nose_ned, flight.own_nose_ned)
+    residual = v - AIRSPEED_MPS * nose
+    d2 = float(residual @ np.linalg.solve(S, residual))
+    return _log_tailed(d2, 3.0) - 0.5 * float(np.log(np.linalg.det(S)))
+
+
+def _log_upright(R: Array, P: Array, flight: Flight) -> float:
+    """Log density, but for a constant, of bank and pitch of R [3, 3] in ned axes."""
+    pitch, bank = -np.arcsin(np.clip(R[2, 0], -1.0, 1.0)), np.arctan2(R[2, 1], R[2, 2])
+    rotation_variance = float(np.trace(P)) / 3.0
+    if flight.turn_rate_radps is None:
+        climb, turned = 0.0, 0.0
+        pitch_variance, bank_variance = UNKNOWN_PITCH_STD_RAD**2, UNKNOWN_BANK_STD_RAD**2
+    else:
+        known = float(flight.v_mps @ flight.v_mps)
+        # A velocity not yet known is no slow flight.
+        speed = float(np.clip(np.sqrt(known + np.trace(flight.P_v) / 3.0), SPEED_MIN_MPS, SPEED_MAX_MPS))
+        climb_variance = float(flight.P_v[2, 2]) / speed**2
+        believed = PITCH_STD_RAD**2 / (PITCH_STD_RAD**2 + climb_variance)
+        climb = -believed * float(np.clip(flight.v_mps[2] / speed, -0.5, 0.5))
+        per_rate = speed / GRAVITY_MPS2
+        turned = float(np.arctan(per_rate * flight.turn_rate_radps))
+        slope = per_rate / (1.0 + (per_rate * flight.turn_rate_radps) ** 2)
+        pitch_variance = PITCH_STD_RAD**2 + believed * climb_variance
+        bank_variance = BANK_STD_RAD**2 + slope**2 * flight.turn_rate_variance
+    d2_pitch = (pitch - climb) ** 2 / (pitch_variance + rotation_variance)
+    d2_bank = (bank - turned) ** 2 / (bank_variance + rotation_variance)
+    return _log_tailed(float(d2_pitch), 1.0) + _log_tailed(float(d2_bank), 1.0)
+
+
+def _log_tailed(d2: float, dimensions: float) -> float:
+    return -0.5 * (TAIL_DOF + dimensions) * float(np.log1p(d2 / TAIL_DOF))
+
+
+def _limited(log_odds: float) -> float:
+    return float(np.clip(log_odds, -LOG_ODDS_MAX, LOG_ODDS_MAX))

@@ -1,9 +1,8 @@
 """Estimates of single frames become tracks: association, life and death, and where each target will be next.
 
 A target is tentative until it was seen CONFIRM_HITS times, coasts on prediction when it is missed, and is lost, and
-its number free again, after COAST_MAX_S. What keeps disagreeing with the filter wins after PERSISTENT frames: a
-rotation turned over, or a position outside the gate but under the same box. Until then the covariance of what is told
-grows by the share of rotations that disagree.
+its number free again, after COAST_MAX_S. A position that stays outside the gate but under the same box wins after
+PERSISTENT frames.
 """
 
 from __future__ import annotations
@@ -13,70 +12,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge.tracking import motion as ekf
-from edge.tracking.heading import flown_nose_first
-from edge.tracking.motion import Innovation, Motion, View
+from edge.tracking import rotation
+from edge.tracking.association import associate
+from edge.tracking.boxes import RANGE_MIN_M, BoxModel, inside, iou
+from edge.tracking.heading import Flight
+from edge.tracking.motion import Innovation, Motion
+from edge.tracking.rotation import Attitude
+from edge.tracking.view import NS_PER_S, View
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
 
 CONFIRM_HITS = 3
 TENTATIVE_MISSES = 2  # in a row: gone
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
-POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as the soft gate is inside it
 SAME_BOX_IOU = 0.3
-FLIP_MEMORY = 30  # frames over which disagreeing rotations are counted
-RANGE_MIN_M = 1.0  # nearer, a projection is meaningless
 
 Size = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class BoxModel:
-    """A measured box, remembered so that it moves with the bearing and scales with the range."""
-
-    offset: Array  # [2] box centre minus projection of the target's origin, px * m / px of focal length
-    size: Array  # [2] m, as if the target were flat
-
-    @classmethod
-    def measured(cls, box_xyxy_px: Array, t_cam_target_m: Array, K: Array) -> BoxModel:
-        m_per_px = max(t_cam_target_m[2], RANGE_MIN_M) / np.array([K[0, 0], K[1, 1]])
-        center = 0.5 * (box_xyxy_px[:2] + box_xyxy_px[2:])
-        return cls((center - _project(t_cam_target_m, K)) * m_per_px, (box_xyxy_px[2:] - box_xyxy_px[:2]) * m_per_px)
-
-    def box_xyxy_px(self, t_cam_target_m: Array, K: Array) -> Array:
-        px_per_m = np.array([K[0, 0], K[1, 1]]) / max(t_cam_target_m[2], RANGE_MIN_M)
-        center = _project(t_cam_target_m, K) + self.offset * px_per_m
-        half = 0.5 * self.size * px_per_m
-        return np.concatenate([center - half, center + half])
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """How often measured rotations were lately turned over against the filter's, and how: its own P cannot tell.
-
-    If the other is true with probability p, rotations spread by p w w^T about the filter's. p follows from the share s
-    as if two frames had to agree, s^2 / (s^2 + (1 - s)^2): one odd frame says little, as many as not say all.
-    """
-
-    share: float = 0.0  # of the last FLIP_MEMORY frames, fading
-    w_target_rad: Array = field(default_factory=lambda: np.zeros(3))  # [3] from the filter's to the other, target axes
-
-    def after(self, seen: Innovation, R_cam_target: Array) -> Doubt:
-        """With one more measurement, `seen` against R_cam_target."""
-        if seen.rotation_rad <= ekf.ROTATION_GATE_RAD:
-            return Doubt(self.share * (1.0 - 1.0 / FLIP_MEMORY), self.w_target_rad)
-        return Doubt(self.share + (1.0 - self.share) / FLIP_MEMORY, R_cam_target.T @ seen.residual[3:])
-
-    def changed_sides(self) -> Doubt:
-        """When the other rotation is taken for the filter's."""
-        return Doubt(min(1.0 - self.share, 0.5), -self.w_target_rad)
-
-    def added_to(self, P: Array, R_frame_target: Array) -> Array:
-        """P [n, n], whose last three are the rotation in the frame, with this."""
-        w = R_frame_target @ self.w_target_rad
-        probability = self.share**2 / (self.share**2 + (1.0 - self.share) ** 2)
-        widened = P.copy()
-        widened[-3:, -3:] += probability * np.outer(w, w)
-        return widened
 
 
 @dataclass
@@ -85,15 +36,14 @@ class Target:
 
     track_id: int
     motion: Motion
+    attitude: Attitude
     box: BoxModel
     score: float
     measured_ns: int
     state: TrackState = TrackState.TENTATIVE
     hits: int = 1
     misses: int = 0
-    rotation_disagreements: int = 0
     position_disagreements: int = 0
-    doubt: Doubt = field(default_factory=Doubt)
 
 
 @dataclass
@@ -113,11 +63,11 @@ class Tracker:
 
         Oldest measurement first. Changes nothing. K [3, 3] px; image_size_wh px.
         """
-        view = View.of(capture_ns, own_ship, self.mount)
+        view = View.of(capture_ns, own_ship, self.mount, self._view)
         expected = []
         for target in sorted(self._targets, key=lambda t: t.measured_ns):
-            track = _track(target, self._advanced(target.motion, view), view, K)
-            if track.t_cam_target_m[2] > RANGE_MIN_M and _inside(track.box_xyxy_px, image_size_wh):
+            track = _track(target, *self._advanced(target, view), view, K)
+            if track.t_cam_target_m[2] > RANGE_MIN_M and inside(track.box_xyxy_px, image_size_wh):
                 expected.append(track)
         return expected
 
@@ -144,20 +94,16 @@ class Tracker:
         if self.is_late(capture_ns):
             self.out_of_order += 1
             return self._tracks
-        view = View.of(capture_ns, own_ship, self.mount)
+        view = View.of(capture_ns, own_ship, self.mount, self._view)
         for target in self._targets:
-            target.motion = self._advanced(target.motion, view)
+            target.motion, target.attitude = self._advanced(target, view)
         self._view = view
 
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
-        pairs = _associate(self._targets, finite, K, view)
+        pairs = associate([(target.motion, target.attitude) for target in self._targets], finite, K, view)
         for target_index, estimate_index, seen in pairs:
-            target, estimate = self._targets[target_index], finite[estimate_index]
-            turned = _nose_first(target.motion, estimate, view)
-            if turned is not estimate:
-                seen = ekf.innovation(target.motion, turned, K, view)
-            _hit(target, turned, seen, K, view)
+            _hit(self._targets[target_index], finite[estimate_index], seen, K, view)
         used = {estimate_index for _, estimate_index, _ in pairs}
         hit = {target_index for target_index, _, _ in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]
@@ -167,18 +113,25 @@ class Tracker:
         self._targets = [t for t in self._targets if _alive(t, K, view, image_size_wh)]
         self._give_birth(spare, K, view)
         self._targets.sort(key=lambda t: t.track_id)
-        self._tracks = tuple(_track(target, target.motion, view, K) for target in self._targets)
+        self._tracks = tuple(_track(target, target.motion, target.attitude, view, K) for target in self._targets)
         return self._tracks
 
-    def _advanced(self, motion: Motion, view: View) -> Motion:
-        """The motion at the view's time and in its frame."""
+    def _advanced(self, target: Target, view: View) -> tuple[Motion, Attitude]:
+        """The target's state at the view's time and in its frame."""
         assert self._view is not None, "a target exists only after a frame"
-        moved = ekf.propagate(motion, view.time_ns)
+        turn = ekf.turning(target.motion, view.time_ns)
+        motion = ekf.propagate(target.motion, view.time_ns)
+        attitude = rotation.propagate(target.attitude, turn, (view.time_ns - target.motion.time_ns) / NS_PER_S)
         if motion.kind == view.kind:
-            return moved
+            return motion, attitude
+        old = self._view.moved_to(view.time_ns)
         # Leaving ned, the attitude is the last one known; entering it, the new one belongs to this very frame.
-        stale_s = (view.time_ns - self._view.time_ns) / ekf.NS_PER_S if view.kind == "cam" else 0.0
-        return ekf.reframe(moved, self._view.moved_to(view.time_ns), view, stale_s)
+        stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if view.kind == "cam" else 0.0
+        through_cam = "cam" in (motion.kind, view.kind)
+        return (
+            ekf.reframe(motion, old, view, stale_s),
+            rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
+        )
 
     def _give_birth(self, estimates: list[Estimate], K: Array, view: View) -> None:
         for estimate in sorted(estimates, key=lambda e: -e.score):
@@ -188,55 +141,33 @@ class Tracker:
                 return
             if any(iou(estimate.box_xyxy_px, box) > SAME_BOX_IOU for box in boxes):
                 continue  # two windows saw one target
-            begun = ekf.begin(estimate, K, view)
+            motion, attitude = ekf.begin(estimate, K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, K)
-            self._targets.append(Target(free[0], begun, box, estimate.score, view.time_ns))
-
-
-def iou(a_xyxy: Array, b_xyxy: Array) -> float:
-    """Intersection over union of two boxes [4]."""
-    overlap = np.clip(np.minimum(a_xyxy[2:], b_xyxy[2:]) - np.maximum(a_xyxy[:2], b_xyxy[:2]), 0.0, None)
-    intersection = float(overlap[0] * overlap[1])
-    union = float(np.prod(a_xyxy[2:] - a_xyxy[:2]) + np.prod(b_xyxy[2:] - b_xyxy[:2])) - intersection
-    return intersection / union if union > 0.0 else 0.0
-
-
-def _associate(
-    targets: list[Target], estimates: list[Estimate], K: Array, view: View
-) -> list[tuple[int, int, Innovation]]:
-    """Pairs inside the gate, nearest first, each target and estimate once."""
-    candidates = []
-    for i, target in enumerate(targets):
-        for j, estimate in enumerate(estimates):
-            seen = ekf.innovation(target.motion, estimate, K, view)
-            if seen.position_d2 < POSITION_GATE_D2:
-                candidates.append((seen.position_d2, i, j, seen))
-    pairs: list[tuple[int, int, Innovation]] = []
-    for _, i, j, seen in sorted(candidates, key=lambda c: c[:3]):
-        if all(i != pair[0] and j != pair[1] for pair in pairs):
-            pairs.append((i, j, seen))
-    return pairs
-
-
-def _nose_first(motion: Motion, estimate: Estimate, view: View) -> Estimate:
-    """The estimate turned to fly where its track goes; in `ned` alone is the velocity that over ground."""
-    if motion.kind != "ned":
-        return estimate
-    R_cam_ned = view.R_frame_cam.T
-    P_v = R_cam_ned @ motion.P[ekf.VELOCITY, ekf.VELOCITY] @ R_cam_ned.T
-    return flown_nose_first(estimate, R_cam_ned @ motion.v_mps, P_v)
+            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns))
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:
-    target.doubt = target.doubt.after(seen, view.R_frame_cam.T @ target.motion.R_frame_target)
+    dt_s = (view.time_ns - target.measured_ns) / NS_PER_S
     target.motion = ekf.correct(target.motion, seen)
-    turned_over = seen.rotation_rad > ekf.ROTATION_GATE_RAD
-    target.rotation_disagreements = target.rotation_disagreements + 1 if turned_over else 0
-    if target.rotation_disagreements >= PERSISTENT:
-        target.motion = ekf.with_rotation_of(target.motion, estimate, K, view)
-        target.doubt = target.doubt.changed_sides()
-        target.rotation_disagreements = 0
+    attitude = rotation.correct(target.attitude, estimate, view, dt_s)
+    settled = target.state is not TrackState.TENTATIVE
+    target.attitude = rotation.weighed(
+        attitude, _along(target.motion, view), _flight(target.motion, view), dt_s, settled
+    )
     _seen(target, estimate, K, view)
+
+
+def _flight(motion: Motion, view: View) -> Flight | None:
+    """What the motion tells of how the target flies; nothing in `cam`, where the way is mostly the camera's own."""
+    P_v = motion.P[ekf.VELOCITY, ekf.VELOCITY]
+    if motion.kind == "ned":
+        return Flight(motion.v_mps, P_v, motion.turn_rate_radps, float(motion.P[ekf.TURN_RATE, ekf.TURN_RATE]), None)
+    return None if motion.kind == "cam" else Flight(motion.v_mps, P_v, None, 0.0, view.nose_frame)
+
+
+def _along(motion: Motion, view: View) -> Array:
+    """The unit sight line [3] in the frame."""
+    return rotation.unit(motion.t_m - view.t_frame_cam_m)
 
 
 def _taken_over(target: Target, spare: list[Estimate], K: Array, view: View) -> bool:
@@ -247,7 +178,7 @@ def _taken_over(target: Target, spare: list[Estimate], K: Array, view: View) -> 
     if target.position_disagreements < PERSISTENT:
         return False
     rival = max(rivals, key=lambda e: e.score)
-    target.motion = ekf.begin(rival, K, view)
+    target.motion, target.attitude = ekf.begin(rival, K, view), rotation.begin(rival, view)
     _seen(target, rival, K, view)
     spare[:] = [e for e in spare if e is not rival]
     return True
@@ -266,23 +197,27 @@ def _seen(target: Target, estimate: Estimate, K: Array, view: View) -> None:
 
 def _miss(target: Target) -> None:
     target.misses += 1
-    target.rotation_disagreements = 0
     if target.state is TrackState.CONFIRMED:
         target.state = TrackState.COASTING
 
 
 def _alive(target: Target, K: Array, view: View, image_size_wh: Size) -> bool:
     if target.state is TrackState.TENTATIVE:
-        return target.misses < TENTATIVE_MISSES and _inside(_box(target, view, K), image_size_wh)
-    return (view.time_ns - target.measured_ns) / ekf.NS_PER_S <= COAST_MAX_S
+        return target.misses < TENTATIVE_MISSES and inside(_box(target, view, K), image_size_wh)
+    return (view.time_ns - target.measured_ns) / NS_PER_S <= COAST_MAX_S
 
 
 def _box(target: Target, view: View, K: Array) -> Array:
     return target.box.box_xyxy_px(ekf.t_in_cam(target.motion, view), K)
 
 
-def _track(target: Target, motion: Motion, view: View, K: Array) -> Track:
-    t_cam, R_cam, covariance = ekf.in_cam(motion, view)
+def _track(target: Target, motion: Motion, attitude: Attitude, view: View, K: Array) -> Track:
+    t_cam = ekf.t_in_cam(motion, view)
+    R = view.R_frame_cam.T
+    spread = rotation.covariance(attitude, _along(motion, view))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = ekf.covariance_in_cam(motion, view)
+    covariance[3:, 3:] = ekf.symmetric(R @ spread @ R.T) + view.attitude_variance * np.eye(3)
     in_ned = motion.kind != "cam"
     return Track(
         track_id=target.track_id,
@@ -291,24 +226,24 @@ def _track(target: Target, motion: Motion, view: View, K: Array) -> Track:
         measured_ns=target.measured_ns,
         score=target.score,
         box_xyxy_px=target.box.box_xyxy_px(t_cam, K),
-        R_cam_target=R_cam,
+        R_cam_target=R @ attitude.R_frame_target,
         t_cam_target_m=t_cam,
-        covariance=target.doubt.added_to(covariance, R_cam),
-        R_ned_target=motion.R_frame_target if in_ned else None,
+        covariance=covariance,
+        R_ned_target=attitude.R_frame_target if in_ned else None,
         t_ned_target_m=motion.t_m if in_ned else None,
         v_ned_target_mps=motion.v_mps if in_ned else None,
-        covariance_ned=target.doubt.added_to(motion.P[:9, :9], motion.R_frame_target) if in_ned else None,
+        covariance_ned=_covariance_ned(motion, spread, view) if in_ned else None,
     )
+
+
+def _covariance_ned(motion: Motion, spread: Array, view: View) -> Array:
+    """[9, 9] (position, velocity, rotation), with the own ship's errors."""
+    covariance = view.own_ship_covariance(motion.t_m, motion.v_mps)
+    covariance[:6, :6] += motion.P[:6, :6]
+    covariance[6:, 6:] += spread
+    return ekf.symmetric(covariance)
 
 
 def _finite(estimate: Estimate) -> bool:
     parts = (estimate.box_xyxy_px, estimate.R_cam_target, estimate.t_cam_target_m, estimate.covariance)
     return bool(all(np.all(np.isfinite(part)) for part in parts) and estimate.t_cam_target_m[2] > RANGE_MIN_M)
-
-
-def _project(t_cam_m: Array, K: Array) -> Array:
-    return (K @ (t_cam_m / max(t_cam_m[2], RANGE_MIN_M)))[:2]
-
-
-def _inside(box_xyxy_px: Array, image_size_wh: Size) -> bool:
-    return bool(np.all(box_xyxy_px[2:] > 0.0) and np.all(box_xyxy_px[:2] < np.array(image_size_wh) - 1.0))

@@ -1,75 +1,106 @@
-"""Which way an aircraft heads: outlines leave two answers, the track one."""
+"""Towards or away: outlines leave two answers; the network's doubt and how aircraft fly weigh them."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edge.tracking.heading import depth_reversed, flown_nose_first
+from edge.tracking.heading import Flight, flown_odds, network_opinion, reversal, reversed_covariance
 from edge.types import Estimate
 
 # A symmetric aircraft: nose, tail, wing tips, fin.
 POINTS_M = np.array([[4.0, 0, 0], [-4, 0, 0], [0, 6, 0.2], [0, -6, 0.2], [-3.5, 0, -1.5]])
-SURE = 1e-6 * np.eye(3)
 finite = st.floats(-1.0, 1.0)
+NORTH = np.array([1.0, 0.0, 0.0])
+EXACT = 1e-4 * np.eye(3)
 
 
-def estimate(R: np.ndarray, t_m: np.ndarray, covariance: np.ndarray | None = None) -> Estimate:
-    return Estimate(0.9, np.array([0.0, 0, 1, 1]), R, t_m, np.eye(6) if covariance is None else covariance, "track")
+def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> np.ndarray:
+    return Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+
+
+def flight(v_mps: list[float], std_mps: float = 2.0, turn_rate_radps: float = 0.0) -> Flight:
+    return Flight(np.array(v_mps), std_mps**2 * np.eye(3), turn_rate_radps, 0.01**2, None)
+
+
+def odds(R: np.ndarray, along: np.ndarray, way: Flight) -> float:
+    return flown_odds(R, reversal(R, along), EXACT, way)
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.tuples(finite, finite, finite, finite), st.tuples(finite, finite))
-def test_the_depth_reversal_has_the_same_outline(q: tuple[float, ...], side: tuple[float, float]) -> None:
+def test_the_reversal_has_the_same_outline(q: tuple[float, ...], side: tuple[float, float]) -> None:
     """Far away, each point's image is that of the point mirrored left to right; doing it twice gives the first back."""
     R = Rotation.from_quat([q[0], q[1], q[2], q[3] + 3.0]).as_matrix()
     t_m = 1e6 * np.array([0.3 * side[0], 0.3 * side[1], 1.0])
     along = t_m / np.linalg.norm(t_m)
-    one = estimate(R, t_m)
-    other = depth_reversed(one, along)
-    np.testing.assert_allclose(other.R_cam_target @ other.R_cam_target.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(other.R_cam_target) > 0
+    other = reversal(R, along)
+    np.testing.assert_allclose(other @ other.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(other) > 0
     project = lambda R, points: ((p := points @ R.T + t_m)[:, :2] / p[:, 2:]) * 1e6  # noqa: E731
-    mirrored = POINTS_M * [1, -1, 1]
-    np.testing.assert_allclose(project(other.R_cam_target, mirrored), project(R, POINTS_M), atol=1e-3)
-    np.testing.assert_allclose(depth_reversed(other, along).R_cam_target, R, atol=1e-12)
-
-
-def test_a_nose_against_the_track_is_turned_about() -> None:
-    """Seen flying away with its nose told 30 degrees off towards us: the answer is 30 degrees off away from us."""
-    t_m = np.array([0.0, 0.0, 200.0])
-    # Level, cam's y down: body x forward in the cam's x-z plane.
-    towards = np.array([[np.cos(a := np.deg2rad(-60)), -np.sin(a), 0], [0, 0, 1], [np.sin(a), np.cos(a), 0]])
-    towards = np.column_stack([towards[:, 0], np.cross([0, 1.0, 0], towards[:, 0]), [0, 1.0, 0]])
-    turned = flown_nose_first(estimate(towards, t_m), np.array([20.0, 0.0, 30.0]), SURE)
-    np.testing.assert_allclose(turned.R_cam_target[:, 0], [np.cos(a), 0, -np.sin(a)], atol=1e-12)
-    np.testing.assert_allclose(turned.R_cam_target[:, 2], [0, 1, 0], atol=1e-12)
-
-
-def test_nothing_is_turned_on_an_unsure_or_slow_track() -> None:
-    t_m = np.array([0.0, 0.0, 200.0])
-    R = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])  # nose straight at us
-    told = estimate(R, t_m)
-    away = np.array([0.0, 0.0, 30.0])
-    assert flown_nose_first(told, away, SURE) is not told
-    assert flown_nose_first(told, away, 15.0**2 * np.eye(3)) is told
-    assert flown_nose_first(told, 0.1 * away, SURE) is told
-    assert flown_nose_first(told, -away, SURE) is told
+    np.testing.assert_allclose(project(other, POINTS_M * [1, -1, 1]), project(R, POINTS_M), atol=1e-3)
+    np.testing.assert_allclose(reversal(other, along), R, atol=1e-12)
 
 
 @settings(deadline=None, max_examples=30)
 @given(st.tuples(finite, finite, finite))
-def test_the_covariance_turns_with_the_rotation(w: tuple[float, float, float]) -> None:
-    """An error of the one is told as the same error of the other: checked by turning a disturbed rotation."""
-    rng = np.random.default_rng(3)
-    R, t_m = Rotation.random(random_state=7).as_matrix(), np.array([20.0, -10.0, 200.0])
-    along = t_m / np.linalg.norm(t_m)
-    error = 1e-3 * np.array([*rng.normal(size=3), *w])
-    disturbed = Rotation.from_rotvec(error[3:]).as_matrix() @ R
-    one = depth_reversed(estimate(R, t_m, np.outer(error, error)), along)
-    other = depth_reversed(estimate(disturbed, t_m), along)
-    moved = Rotation.from_matrix(other.R_cam_target @ one.R_cam_target.T).as_rotvec()
-    expected = np.concatenate([error[:3], moved])
-    np.testing.assert_allclose(one.covariance, np.outer(expected, expected), atol=1e-12)
+def test_a_covariance_turns_with_the_reversal(w: tuple[float, float, float]) -> None:
+    """A small error of a rotation becomes, in the reversal, the error that its covariance tells of."""
+    R, along = Rotation.from_rotvec([0.3, -1.0, 0.7]).as_matrix(), np.array([0.6, 0.0, 0.8])
+    error = 1e-3 * np.array(w)
+    disturbed = Rotation.from_rotvec(error).as_matrix() @ R
+    moved = Rotation.from_matrix(reversal(disturbed, along) @ reversal(R, along).T).as_rotvec()
+    told = reversed_covariance(np.outer(error, error), along)
+    np.testing.assert_allclose(told, np.outer(moved, moved), atol=1e-12)
+
+
+def test_the_nose_lies_where_the_target_flies() -> None:
+    away, towards = attitude(0, 3, 20), attitude(0, 3, 160)
+    assert odds(away, NORTH, flight([25.0, 9.0, 0.0])) > 3.0
+    assert odds(towards, NORTH, flight([25.0, 9.0, 0.0])) < -3.0
+    assert odds(towards, NORTH, flight([-25.0, 9.0, 0.0])) > 3.0
+
+
+def test_an_unsure_velocity_and_a_nose_across_the_sight_line_say_little() -> None:
+    assert abs(odds(attitude(0, 0, 20), NORTH, flight([25.0, 9.0, 0.0], std_mps=60.0))) < 0.7
+    assert abs(odds(attitude(0, 0, 88), NORTH, flight([2.0, 25.0, 0.0]))) < 0.5
+
+
+def test_an_aircraft_seen_from_above_flies_level_not_steeply() -> None:
+    """From 20 degrees above, the reversal of a level aircraft points its nose 40 degrees up or down."""
+    down_20 = np.array([np.cos(np.deg2rad(20)), 0.0, np.sin(np.deg2rad(20))])
+    unknown = flight([0.0, 0.0, 0.0], std_mps=40.0)
+    assert odds(attitude(0, 0, 0), down_20, unknown) > 0.7
+    assert odds(attitude(0, 0, 180), down_20, unknown) > 0.7
+
+
+def test_a_bank_leans_into_its_turn() -> None:
+    """Level sight line: the reversal has the opposite bank, and the velocity is too unsure to tell the way."""
+    turning_right = flight([0.0, 20.0, 0.0], std_mps=8.0, turn_rate_radps=0.25)
+    assert odds(attitude(30, 0, 80), NORTH, turning_right) > 1.0
+    assert odds(attitude(-30, 0, 80), NORTH, turning_right) < -1.0
+
+
+def test_relative_motion_counts_with_the_own_ships_nose() -> None:
+    """Flying north behind a target that neither opens nor closes: it flies north too."""
+    way = Flight(np.zeros(3), 9.0 * np.eye(3), None, 0.0, NORTH)
+    assert odds(attitude(0, 0, 10), NORTH, way) > 2.0
+    assert odds(attitude(0, 0, 170), NORTH, way) < -2.0
+
+
+@pytest.mark.parametrize("p", [0.02, 0.2, 0.5])
+def test_the_networks_sigma_is_taken_apart_into_its_doubt_and_the_rest(p: float) -> None:
+    """Told as one sigma for each axis: 6 degrees about the right rotation, and the chance p of the reversal."""
+    R, along = attitude(5, 3, 25), np.array([0.0, 0.0, 1.0])
+    R = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]) @ R  # ned to cam, looking north
+    w = Rotation.from_matrix(reversal(R, along) @ R.T).as_rotvec()
+    covariance = np.eye(6)
+    covariance[3:, 3:] = np.diag(np.deg2rad(6.0) ** 2 + p * w**2)
+    log_odds, about_it = network_opinion(
+        Estimate(0.9, np.zeros(4), R, np.array([0.0, 0.0, 200.0]), covariance, "track"), along
+    )
+    assert log_odds == pytest.approx(np.log((1 - p) / p), abs=0.35)
+    assert np.all(np.sqrt(np.diag(about_it)) < np.deg2rad(9.0))

@@ -1,0 +1,73 @@
+"""Which estimate belongs to which target: the pairing that fits best as a whole. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from edge.tracking import motion as ekf
+from edge.tracking import rotation
+from edge.tracking.motion import Innovation, Motion
+from edge.tracking.rotation import Attitude
+from edge.tracking.view import View
+from edge.types import Array, Estimate
+
+POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as the soft gate is inside it
+ROTATION_D2_MAX = 9.0  # what a rotation that does not fit may cost: a network errs, an aircraft rolls
+
+Pair = tuple[int, int, Innovation]
+
+
+def associate(
+    targets: Sequence[tuple[Motion, Attitude]], estimates: Sequence[Estimate], K: Array, view: View
+) -> list[Pair]:
+    """Pairs inside the gate, each target and estimate once: as many as fit, of least distance in all.
+
+    Where a target or an estimate has a choice, the rotation counts too: two that cross differ in it.
+    """
+    seen: dict[tuple[int, int], Innovation] = {}
+    for i, (motion, _) in enumerate(targets):
+        for j, estimate in enumerate(estimates):
+            one = ekf.innovation(motion, estimate, K, view)
+            if one.d2 < POSITION_GATE_D2:
+                seen[i, j] = one
+    cost = np.full((len(targets), len(estimates)), np.inf)
+    for (i, j), one in seen.items():
+        cost[i, j] = one.d2
+    contested = np.isfinite(cost)
+    for i, j in seen:
+        if contested[i].sum() > 1 or contested[:, j].sum() > 1:
+            d2 = rotation.disagreement_d2(targets[i][1], estimates[j], view)
+            cost[i, j] += min(d2, ROTATION_D2_MAX)
+    return [(i, j, seen[i, j]) for i, j in best_pairs(cost)]
+
+
+def best_pairs(cost: Array) -> list[tuple[int, int]]:
+    """Of a matrix of costs, infinite where a pair cannot be: the most pairs, and of those the cheapest in all.
+
+    Looks at every way, which is quick for the few targets that there are, after taking what nobody contests.
+    """
+    possible = np.isfinite(cost)
+    alone = [
+        (i, int(j))
+        for i in range(len(cost))
+        for j in np.flatnonzero(possible[i])
+        if possible[i].sum() == 1 and possible[:, j].sum() == 1
+    ]
+    rows = [i for i in range(len(cost)) if possible[i].any() and all(i != pair[0] for pair in alone)]
+    _, _, rest = _best(cost, rows, frozenset())
+    return sorted([*alone, *rest])
+
+
+def _best(cost: Array, rows: list[int], taken: frozenset[int]) -> tuple[int, float, list[tuple[int, int]]]:
+    """(minus the number of pairs, their cost, the pairs) of the best way for `rows` with columns `taken`."""
+    if not rows:
+        return 0, 0.0, []
+    i, others = rows[0], rows[1:]
+    ways = [_best(cost, others, taken)]
+    for j in np.flatnonzero(np.isfinite(cost[i])):
+        if int(j) not in taken:
+            count, price, pairs = _best(cost, others, taken | {int(j)})
+            ways.append((count - 1, price + float(cost[i, j]), [(i, int(j)), *pairs]))
+    return min(ways, key=lambda way: way[:2])

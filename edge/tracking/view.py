@@ -1,0 +1,93 @@
+"""The camera in the filter's frame at one instant, and how far off what the own ship told of itself may be.
+
+The own ship's figures are what a small aircraft's autopilot usually achieves, not measurements of one: messages give
+attitude and position without their errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from edge.tracking import so3
+from edge.types import Array, Mount, OwnShip
+
+FrameKind = Literal["ned", "ned_relative", "cam"]
+NS_PER_S = 1e9
+
+ATTITUDE_JITTER_RAD = 1e-3  # from frame to frame: vibration of the mount, rounding
+CLOCK_STD_S = 0.005  # exposure against attitude: times the turning, an error of attitude
+RATE_GAP_MAX_S = 0.5  # frames further apart do not tell how fast the camera turns
+
+# Slow errors, common to all frames: they move a track in ned, but nothing in `cam`.
+TILT_STD_RAD = float(np.deg2rad(0.7))
+HEADING_STD_RAD = float(np.deg2rad(2.0))
+POSITION_STD_M = 1.5
+VELOCITY_STD_MPS = 0.3
+
+
+@dataclass(frozen=True)
+class View:
+    """The camera in a frame at one instant."""
+
+    kind: FrameKind
+    time_ns: int
+    R_frame_cam: Array  # [3, 3]
+    t_frame_cam_m: Array  # [3]
+    v_frame_cam_mps: Array | None  # [3]; zero in the frames that move with the own ship, None: not known
+    nose_frame: Array | None = None  # [3], the own ship's; None in `cam`
+    turning_radps: float = 0.0  # how fast the camera turns
+
+    @classmethod
+    def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount, before: View | None = None) -> View:
+        """`before`: the view of an earlier frame."""
+        if own_ship is None:
+            return cls("cam", time_ns, np.eye(3), np.zeros(3), np.zeros(3))
+        camera = own_ship.camera(mount)
+        R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
+        lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
+        nose, turning = own_ship.R_ned_body[:, 0], _turning_radps(before, time_ns, R_ned_cam)
+        if own_ship.t_ned_body_m is None:
+            return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning)
+        t_m = own_ship.t_ned_body_m + lever_ned_m
+        return cls("ned", time_ns, R_ned_cam, t_m, own_ship.v_ned_body_mps, nose, turning)
+
+    @property
+    def attitude_variance(self) -> float:
+        """Of the attitude from frame to frame, rad^2 about each axis; in `cam` it is not used."""
+        if self.kind == "cam":
+            return 0.0
+        return ATTITUDE_JITTER_RAD**2 + (CLOCK_STD_S * self.turning_radps) ** 2
+
+    def moved_to(self, time_ns: int) -> View:
+        """The same camera later, at constant velocity and attitude."""
+        if self.v_frame_cam_mps is None:
+            return replace(self, time_ns=time_ns)
+        dt_s = (time_ns - self.time_ns) / NS_PER_S
+        return replace(self, time_ns=time_ns, t_frame_cam_m=self.t_frame_cam_m + dt_s * self.v_frame_cam_mps)
+
+    def own_ship_covariance(self, t_m: Array, v_mps: Array) -> Array:
+        """[9, 9] (position, velocity, rotation) of what the own ship's errors do to a target at t_m, v_mps in ned.
+
+        First order in the errors of attitude a, position p, velocity u and clock s: the target's position moves by
+        a x (t - t_own) + p + u_own s, its velocity by a x (v - v_own) + u, its rotation by a.
+        """
+        velocity = np.zeros(3) if self.v_frame_cam_mps is None else self.v_frame_cam_mps
+        by_attitude = np.concatenate([-so3.skew(t_m - self.t_frame_cam_m), -so3.skew(v_mps - velocity), np.eye(3)])
+        attitude = np.array([TILT_STD_RAD, TILT_STD_RAD, HEADING_STD_RAD]) ** 2 + self.attitude_variance
+        covariance = (by_attitude * attitude) @ by_attitude.T
+        if self.kind == "ned":
+            covariance[:3, :3] += POSITION_STD_M**2 * np.eye(3) + CLOCK_STD_S**2 * np.outer(velocity, velocity)
+            covariance[3:6, 3:6] += VELOCITY_STD_MPS**2 * np.eye(3)
+        return covariance
+
+
+def _turning_radps(before: View | None, time_ns: int, R_ned_cam: Array) -> float:
+    if before is None or before.kind == "cam":
+        return 0.0
+    dt_s = (time_ns - before.time_ns) / NS_PER_S
+    if not 0.0 < dt_s <= RATE_GAP_MAX_S:
+        return 0.0
+    return float(np.linalg.norm(so3.log(R_ned_cam @ before.R_frame_cam.T))) / dt_s
