@@ -30,8 +30,13 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from trainer.export import export_models
+    from trainer.export import export_models, export_unmeasured
 
+    if arguments.untrained is not None or arguments.unmeasured:
+        source = arguments.untrained or arguments.checkpoint
+        path = export_unmeasured(source, arguments.out, untrained=arguments.untrained is not None)
+        print(f"wrote {path}, for timing alone")
+        return
     export_models(
         arguments.checkpoint,
         arguments.out,
@@ -100,9 +105,13 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
         "export",
         help="write a checkpoint as FP32 and INT8 model files",
         description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics measured on windows "
-        "of a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch.",
+        "of a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch. With --unmeasured or "
+        "--untrained: write NAME-unmeasured-fp32.onnx alone, in seconds, to be timed and not flown.",
     )
-    export.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
+    source = export.add_mutually_exclusive_group(required=True)
+    source.add_argument("--checkpoint", type=Path, help="run folder or its weights.pt")
+    source.add_argument("--untrained", type=Path, metavar="CONFIG", help="the network of this TOML, random weights")
+    export.add_argument("--unmeasured", action="store_true", help="render, measure and quantise nothing")
     export.add_argument("--out", type=Path, required=True, help="folder for the INT8 file")
     export.add_argument("--float-out", type=Path, help="folder for the FP32 file; default: --out")
     export.add_argument("--config", type=Path, help="take [contract] from this TOML, not from the checkpoint")

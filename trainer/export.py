@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msgs.contract import CONTRACT_VERSION, ModelContract
-from trainer.checkpoint import load_model
-from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfig
+from trainer.checkpoint import load_model, weights_sha256
+from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config
 from trainer.data import Sampler, TrainingBatch, render_once, window_sampler
 from trainer.evaluate import Predictions, Predictor, choose_threshold, difference, measure, predict_all, torch_predictor
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
+from trainer.model import PoseNet
 
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
@@ -82,6 +83,17 @@ def make_contract(
     on = np.concatenate([batch.present for batch in batches])
     focal_px = np.concatenate([batch.K[:, 0, 0] for batch in batches])
     box_px = np.concatenate([batch.size_px.max(axis=1) for batch in batches])[on]
+    return _contract(config, training, sha256, thresholds, _span(focal_px), _span(box_px))
+
+
+def _contract(
+    config: TrainerConfig,
+    training: dict[str, str | int | float],
+    sha256: str,
+    thresholds: tuple[float, float],
+    trained_focal_px: tuple[float, float],
+    trained_box_px: tuple[float, float],
+) -> ModelContract:
     contract = config.contract
     return ModelContract(
         version=CONTRACT_VERSION,
@@ -97,8 +109,8 @@ def make_contract(
         acquire_score_min=thresholds[0],
         track_score_min=thresholds[1],
         trained_range_m=contract.trained_range_m,
-        trained_focal_px=_span(focal_px),
-        trained_box_px=_span(box_px),
+        trained_focal_px=trained_focal_px,
+        trained_box_px=trained_box_px,
         airframes=airframe_names(config.data.airframe_ids),
         training=training,
         metrics={},
@@ -172,6 +184,26 @@ def export_models(
     write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance_deg, say)
     say(f"wrote {float_path} and {int8_path}")
     return float_path, int8_path
+
+
+def export_unmeasured(source: Path, out: Path, *, untrained: bool) -> Path:
+    """Write NAME-unmeasured-fp32.onnx into `out`, for timing alone; returns its path.
+
+    `source` is a checkpoint, or with `untrained` a configuration whose network gets random weights. Nothing is rendered
+    or measured: the contract has no metrics and scores that no peak reaches. Raises ConfigError.
+    """
+    if untrained:
+        config = load_config(source)
+        model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False})).eval()
+        training: dict[str, str | int | float] = {"samples": 0}
+        sha256 = weights_sha256(model.state_dict())
+    else:
+        model, config, training, sha256 = load_model(source)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
+    write_graph(model, path)
+    write_contract(path, _contract(config, training, sha256, (1.0, 1.0), (0.0, 0.0), (0.0, 0.0)))
+    return path
 
 
 def write_int8(

@@ -1,0 +1,56 @@
+"""Files for timing: the network of a configuration or checkpoint, in seconds, that nobody flies by mistake."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from msgs.contract import OUTPUT_NAMES
+from trainer.checkpoint import save_weights
+from trainer.graph import open_session, read_contract
+
+
+def export(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "trainer.cli", "export", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(tiny.TOML)
+    return path
+
+
+@pytest.mark.parametrize("source", ["--untrained", "--checkpoint"])
+def test_a_network_is_written_to_be_timed_and_not_flown(tmp_path: Path, config: Path, source: str) -> None:
+    arguments = ["--untrained", config]
+    if source == "--checkpoint":
+        save_weights(tmp_path / "run" / "weights.pt", tiny.network(), tiny.TOML, {"seed": 3, "samples": 9})
+        arguments = ["--checkpoint", tmp_path / "run", "--unmeasured"]
+    done = export(*arguments, "--out", tmp_path / "models")
+    assert done.returncode == 0, done.stderr
+    (path,) = (tmp_path / "models").iterdir()
+    assert path.name == "tiny-unmeasured-fp32.onnx"
+    contract = read_contract(path)
+    assert contract.metrics == {}
+    assert contract.training["samples"] == (0 if source == "--untrained" else 9)
+    image = np.random.default_rng(1).integers(0, 255, (1, 64, 64, 3), dtype=np.uint8)
+    K = np.array([[[900.0, 0, 32], [0, 900, 32], [0, 0, 1]]], np.float32)
+    outputs = dict(zip(OUTPUT_NAMES, open_session(path).run(None, {"image": image, "K": K}), strict=True))
+    assert outputs["t_cam_target_m"].shape == (1, contract.max_peaks, 3)
+    assert (outputs["score"] < min(contract.acquire_score_min, contract.track_score_min)).all()
+
+
+def test_a_configuration_that_is_wrong_is_named(tmp_path: Path, config: Path) -> None:
+    config.write_text(tiny.TOML.replace('backbone = "repvit_small"', 'backbone = "vgg"'))
+    done = export("--untrained", config, "--out", tmp_path / "models")
+    assert done.returncode == 2
+    assert "tiny.toml" in done.stderr
+    assert "backbone" in done.stderr
+    assert "Traceback" not in done.stderr
