@@ -16,9 +16,17 @@ check:
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
 
-bench:
+bench: out/models/mf-uavpose6d-edge-unmeasured-fp32.onnx out/models/mf-uavpose6d-paper-unmeasured-fp32.onnx
 	@sh deploy/bootstrap.sh demo
-	@.venv/bin/uavpose-edge bench
+	@.venv/bin/uavpose-edge bench edge/estimator/models/mf-uavpose6d-edge-int8.onnx $^
+
+out/models/mf-uavpose6d-edge-unmeasured-fp32.onnx: trainer/checkpoints/mf-uavpose6d-edge.pt
+	@sh deploy/bootstrap.sh dev
+	@.venv/bin/uavpose-trainer export --checkpoint $< --unmeasured --out $(@D)
+
+out/models/mf-uavpose6d-paper-unmeasured-fp32.onnx: trainer/configs/paper.toml
+	@sh deploy/bootstrap.sh dev
+	@.venv/bin/uavpose-trainer export --untrained $< --out $(@D)
 
 clean:
 	rm -rf .venv out build
