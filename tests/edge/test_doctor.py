@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
+from edge.findings import device_fault
+
+from .conftest import Cli
+from .flying import free_port, toml, write_swaying_scene
+
+
+def findings(cli: Cli, tmp_path: Path, text: str) -> tuple[int, dict[str, dict[str, Any]]]:
+    """The exit code and what was found, by what was looked at."""
+    (tmp_path / "config.toml").write_text(text)
+    done = cli("doctor", "--config", "config.toml", "--json")
+    assert "Traceback" not in done.stderr
+    answer = json.loads(done.stdout)
+    assert answer["well"] == (done.returncode == 0)
+    for finding in answer["findings"]:
+        assert bool(finding["advice"]) == (finding["verdict"] != "good")
+    return done.returncode, {finding["what"]: finding for finding in answer["findings"]}
+
+
+def test_a_machine_that_can_fly_is_told_so(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    scene = write_swaying_scene(tmp_path / "000001")
+    more = f'[recorder]\nenabled = true\nfolder = "{tmp_path}"\nfree_min_mb = 1\n'
+    code, found = findings(cli, tmp_path, toml(scene, toy_model, free_port(), more))
+    assert code == 0
+    assert set(found) >= {"processor", "cores", "clock", "disk", "camera", "model", "zenoh"}
+    assert "1920x1080" in found["camera"]["says"]
+    assert "toy fp32" in found["model"]["says"]
+
+
+def test_each_fault_is_found_at_once_with_what_to_do(cli: Cli, tmp_path: Path) -> None:
+    port = free_port()
+    intrinsics = "{ fx = 900, fy = 900, cx = 320, cy = 240, width = 640, height = 480 }"
+    text = (
+        f'[camera]\ntype = "device"\ndevice = "/dev/video-none"\nintrinsics = {intrinsics}\n'
+        '[model]\npath = "none.onnx"\n'
+        '[recorder]\nenabled = true\nfolder = "/proc/none"\n'
+        f'[zenoh]\nlisten = ["tcp/127.0.0.1:{port}"]\nconnect = ["tcp/127.0.0.1:{free_port()}"]\n'
+        '[mavlink]\nendpoints = ["serial:/dev/ttyNone:57600"]\n'
+    )
+    code, found = findings(cli, tmp_path, text)
+    assert code == 1
+    assert {what for what, finding in found.items() if finding["verdict"] == "wrong"} == {
+        "camera", "model", "disk", "mavlink",
+    }  # fmt: skip
+    assert found["camera"]["says"] == "/dev/video-none is not there"
+    assert "none.onnx" in found["model"]["says"]
+    assert found["mavlink"]["says"] == "/dev/ttyNone is not there"
+    assert found["ground"]["verdict"] == "poor"  # the daemon flies without it
+
+
+def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    scene = write_swaying_scene(tmp_path / "000001")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
+        text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0"]\n'
+        code, found = findings(cli, tmp_path, text)
+    assert code == 1
+    assert "cannot be listened on" in found["zenoh"]["says"]
+    assert "no heartbeat" in found["mavlink"]["says"]
+
+
+def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text("[camera]\ntype = 'film'\n")
+    done = cli("doctor", "--config", "config.toml")
+    assert done.returncode == 2
+    assert "config.toml:1: [camera]: type must be one of" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "machine", "verdict"),
+    [
+        ("flags\t\t: fpu avx2 avx512_vnni\n", "x86_64", "good"),
+        ("flags\t\t: fpu avx2 avx_vnni\n", "x86_64", "good"),
+        ("flags\t\t: fpu avx2\n", "x86_64", "poor"),
+        ("Features\t: fp asimd asimddp\n", "aarch64", "good"),  # Cortex-A76, Raspberry Pi 5
+        ("Features\t: fp asimd\n", "aarch64", "poor"),  # Cortex-A72, Raspberry Pi 4
+        ("Features\t: fp asimd\n", "riscv64", "poor"),
+    ],
+)
+def test_the_processor_s_eight_bit_instructions_are_looked_for(cpuinfo: str, machine: str, verdict: str) -> None:
+    assert cpu_finding(cpuinfo, machine).verdict == verdict
+
+
+def test_the_clock_is_judged_by_what_the_kernel_says() -> None:
+    assert clock_finding(0).verdict == "good"
+    assert "chrony" in clock_finding(5).advice
+    assert clock_finding(-1).verdict == "poor"
+
+
+def test_a_disk_without_room_is_wrong(tmp_path: Path) -> None:
+    assert disk_finding(tmp_path / "not" / "yet", 0).verdict == "good"
+    assert "MB free" in disk_finding(tmp_path, 10**18).says
+    file = tmp_path / "file"
+    file.write_text("")
+    assert "cannot be written" in disk_finding(file / "folder", 0).says
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may everything")
+def test_a_device_without_permission_names_the_group(tmp_path: Path) -> None:
+    device = tmp_path / "video0"
+    device.touch(mode=0o000)
+    fault = device_fault(device, "video")
+    assert fault is not None
+    assert "usermod -aG video" in fault[1]
