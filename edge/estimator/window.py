@@ -124,7 +124,7 @@ def window_around(
     x0, y0, x1, y1 = box if lens is None else lens.box_to_pinhole(_clipped(box, image_size_wh))
     side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(seen.width, seen.height)))
     shorter = min(size_wh)
-    width, height = max(round(side * size_wh[0] / shorter), 2), max(round(side * size_wh[1] / shorter), 2)
+    width, height = (_halvable(max(round(side * size / shorter), 2), size) for size in size_wh)
     # Outermost pixel centres lie half a pixel inside the box's edges.
     left = round(0.5 * (x0 + x1) - 0.5 * (width - 1))
     top = round(0.5 * (y0 + y1) - 0.5 * (height - 1))
@@ -163,8 +163,9 @@ def _straightened(image_bgr: Image, lens: Lens, pixel_map: PixelMap, size_wh: tu
     points = lens.to_frame(pinhole[~folded] if not folded.all() else pinhole[:1])
     shrink = min(*pixel_map.scale_xy, 1.0)
     margin_px = _MARGIN_PX / shrink
-    left, right = _span(points[:, 0], margin_px, image_bgr.shape[1])
-    top, bottom = _span(points[:, 1], margin_px, image_bgr.shape[0])
+    step = 2 ** int(-np.log2(shrink))
+    left, right = _span(points[:, 0], margin_px, image_bgr.shape[1], step)
+    top, bottom = _span(points[:, 1], margin_px, image_bgr.shape[0], step)
     part = Window(left, top, right - left, bottom - top)
     pixels: Image = image_bgr[top:bottom, left:right]
     part_wh = (max(round(part.width * shrink), 1), max(round(part.height * shrink), 1))
@@ -187,15 +188,25 @@ def _folded(lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int]) -> NDArra
     return np.asarray(np.hypot(rays[..., 0], rays[..., 1]) > lens.radius_max)
 
 
-def _span(coordinates: Array, margin_px: float, limit: int) -> tuple[int, int]:
-    """First and one past the last pixel, inside 0 .. limit and never empty, that hold the coordinates."""
+def _span(coordinates: Array, margin_px: float, limit: int, step: int) -> tuple[int, int]:
+    """First and one past the last pixel, inside 0 .. limit and never empty, that hold the coordinates.
+
+    So many that `step` divides them, where the limit has room for them.
+    """
     first = int(np.clip(np.floor(coordinates.min() - margin_px), 0, limit - 1))
-    return first, int(np.clip(np.ceil(coordinates.max() + margin_px) + 1, first + 1, limit))
+    last = int(np.clip(np.ceil(coordinates.max() + margin_px) + 1, first + 1, limit))
+    length = -(-(last - first) // step) * step
+    return (min(first, limit - length), min(first, limit - length) + length) if length <= limit else (first, last)
 
 
 def _clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:
     """The box's part on the frame: only there is a lens known. A box beside it becomes the nearest edge."""
     return np.clip(box_xyxy_px, -0.5, np.tile(image_size_wh, 2) - 0.5)
+
+
+def _halvable(length: int, size: int) -> int:
+    """The length, or a little less, that can be halved without remainder as long as it is twice the size: fast."""
+    return length - length % 2 ** int(np.log2(max(length / size, 1.0)))
 
 
 def _inside(start: int, length: int, low: int, limit: int) -> int:
