@@ -36,7 +36,6 @@ from sim_replay.faults.timeline import (
 from sim_replay.play import PlayError
 
 FILLER = "filler"
-SPOILED_BYTES = 100_000
 _BUSY = "while True: pass"
 
 
@@ -128,11 +127,8 @@ def _disk(step: Disk, rig: Rig) -> None:
 @act.register
 def _model_file(step: ModelFile, rig: Rig) -> None:
     good = rig.settings.model.read_bytes()
-    content = {"good": good, "cut_short": good[: len(good) // 2]}.get(step.content)
-    if content is None:
-        content = random.Random(0).randbytes(SPOILED_BYTES)
     new = rig.model_file.with_suffix(".new")
-    new.write_bytes(content)
+    new.write_bytes(good if step.content == "good" else good[: len(good) // 2])
     new.replace(rig.model_file)
 
 

@@ -14,6 +14,8 @@ from sim_replay.faults.timeline import (
     ExpectPoses,
     ExpectSaid,
     ExpectSilence,
+    ExpectState,
+    ExpectStill,
 )
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
@@ -27,7 +29,7 @@ class Since:
 
     acted_ns: int  # UTC, when the last act was over
     began_ns: int  # UTC, when it began: the daemon may answer before it is over
-    counters: dict[str, int] = field(default_factory=dict)  # at the start of the timeline
+    counters: dict[str, int] = field(default_factory=dict)  # of the last diagnostics before it
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,19 @@ def _silence(step: ExpectSilence, rig: Rig, since: Since) -> Seen:
 
 
 @expect.register
+def _state(step: ExpectState, rig: Rig, since: Since) -> Seen:
+    witness = rig.witness
+
+    def told() -> bool:
+        return witness.counted_ns > since.began_ns and re.search(step.pattern, witness.state) is not None
+
+    if not witness.wait_for(told, step.within_s):
+        raise Unmet(f"the state was not '{step.pattern}' within {step.within_s:g} s, but '{witness.state}'")
+    took_s = max(witness.counted_ns - since.acted_ns, 0) / NS
+    return Seen(f"the state after {took_s:.2f} s: {witness.state}", took_s)
+
+
+@expect.register
 def _said(step: ExpectSaid, rig: Rig, since: Since) -> Seen:
     def lines() -> list[tuple[int, str]]:
         return [(ns, line) for ns, line in rig.witness.said if ns >= since.began_ns and re.search(step.pattern, line)]
@@ -94,16 +109,33 @@ def _said(step: ExpectSaid, rig: Rig, since: Since) -> Seen:
 
 @expect.register
 def _counter(step: ExpectCounter, rig: Rig, since: Since) -> Seen:
-    witness, before = rig.witness, since.counters.get(step.name, 0)
+    witness = rig.witness
 
-    def grown() -> bool:
-        return witness.counted_ns >= since.began_ns and witness.counters.get(step.name, 0) - before >= step.by
+    def growth() -> int:
+        return witness.counters.get(step.name, 0) - since.counters.get(step.name, 0)
 
-    if not witness.wait_for(grown, step.within_s):
-        now = witness.counters.get(step.name, 0)
-        raise Unmet(f"{step.name} did not grow by {step.by} within {step.within_s:g} s: {before} to {now}")
+    if not witness.wait_for(lambda: witness.counted_ns >= since.began_ns and growth() >= step.by, step.within_s):
+        raise Unmet(f"{step.name} did not grow by {step.by} within {step.within_s:g} s, but by {growth()}")
     took_s = max(witness.counted_ns - since.acted_ns, 0) / NS
-    return Seen(f"{step.name} grew by {witness.counters[step.name] - before}", took_s)
+    return Seen(f"{step.name} grew by {growth()}", took_s)
+
+
+@expect.register
+def _still(step: ExpectStill, rig: Rig, since: Since) -> Seen:
+    witness = rig.witness
+    grown_ns, count = witness.counted_ns, witness.counters.get(step.name, 0)
+
+    def still() -> bool:
+        nonlocal grown_ns, count
+        if witness.counters.get(step.name, 0) != count:
+            grown_ns, count = witness.counted_ns, witness.counters.get(step.name, 0)
+        # By the diagnostics' own times: none that came is no proof.
+        return witness.counted_ns - grown_ns >= step.for_s * NS
+
+    if not witness.wait_for(still, step.within_s):
+        raise Unmet(f"{step.name} went on growing: not still for {step.for_s:g} s within {step.within_s:g} s")
+    took_s = max(grown_ns - since.acted_ns, 0) / NS
+    return Seen(f"{step.name} stood still for {step.for_s:g} s, from {took_s:.2f} s on", took_s)
 
 
 @expect.register

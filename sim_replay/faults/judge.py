@@ -11,41 +11,54 @@ from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, Recei
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
 TRANSIT_MAX_NS = 700_000_000
 SAME_FRAME_NS = 30_000_000
+# Held back by a cut link, or read late by a peer that stood still: to refuse them is right.
+MAY_REFUSE = {SUBSCRIBER: ("STALE", "SEQUENCE")}
 
 
 def violations(witness: Witness) -> list[str]:
-    """Sentences, none if all is well. A camera's wrong stamps are seen through: ages count from the true exposure."""
-    stamps = _Stamps(witness.frames)
-    found = [text for pose in witness.poses if (text := _fault_of(pose, stamps))]
+    """Sentences, none if all was well, of a run that is over."""
+    found = pose_faults(witness.poses, witness.frames)
     for name, summary in witness.summaries:
-        # A subscriber that was away finds old ones in its queue, and refuses them: that is as it should be.
-        refused = {reason: count for reason, count in summary["refused"].items() if reason not in ALLOWED.get(name, ())}
-        found += [f"the {name} refused {count}: {reason}" for reason, count in refused.items()]
+        refused = summary["refused"].items()
+        found += [f"the {name} refused {n}: {why}" for why, n in refused if why not in MAY_REFUSE.get(name, ())]
     return found
 
 
-# Held back by a cut link, or read late by a peer that stood still.
-ALLOWED = {SUBSCRIBER: ("STALE", "SEQUENCE")}
+def pose_faults(poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame]) -> list[str]:
+    """Sentences for poses that should not have come. A camera's wrong stamps are seen through: ages count from the
+    true exposure."""
+    exposures = _Exposures(frames)
+    return [text for pose in poses if (text := _fault_of(pose, exposures))]
 
 
-class _Stamps:
-    """Frames by the times that a pose may be known by: the stamp that was told, or the true one in its place."""
+def ages_ms(witness: Witness, peer: str) -> list[float]:
+    """Age on receipt of each pose, by its own stamp, sorted."""
+    return sorted((pose.arrival_ns - pose.capture_ns) / 1e6 for pose in witness.poses if pose.peer == peer)
+
+
+class _Exposures:
+    """Frames by the stamp that a pose carries."""
 
     def __init__(self, frames: Sequence[ExposedFrame]) -> None:
-        pairs = [(frame.stamp_ns, frame) for frame in frames]
-        pairs += [(frame.exposed_ns, frame) for frame in frames if frame.stamp_ns != frame.exposed_ns]
-        self._pairs = sorted(pairs, key=lambda pair: pair[0])
-        self._times = [time_ns for time_ns, _ in self._pairs]
+        self._by_stamp = sorted(frames, key=lambda frame: frame.stamp_ns)
+        self._stamps = [frame.stamp_ns for frame in self._by_stamp]
+        self._wrong = sorted(
+            (frame for frame in frames if frame.stamp_ns != frame.exposed_ns), key=lambda frame: frame.exposed_ns
+        )
+        self._wrong_exposed = [frame.exposed_ns for frame in self._wrong]
 
-    def near(self, time_ns: int) -> list[ExposedFrame]:
-        """Frames whose time is within SAME_FRAME_NS."""
-        first = bisect.bisect_left(self._times, time_ns - SAME_FRAME_NS)
-        last = bisect.bisect_right(self._times, time_ns + SAME_FRAME_NS)
-        return [frame for _, frame in self._pairs[first:last]]
+    def of(self, capture_ns: int) -> list[ExposedFrame]:
+        """Those told with this stamp, or else told with one so wrong that their arrival may have taken its place."""
+        first = bisect.bisect_left(self._stamps, capture_ns - SAME_FRAME_NS)
+        last = bisect.bisect_right(self._stamps, capture_ns + SAME_FRAME_NS)
+        if first < last:
+            return self._by_stamp[first:last]
+        first = bisect.bisect_left(self._wrong_exposed, capture_ns - TRANSIT_MAX_NS)
+        return self._wrong[first : bisect.bisect_right(self._wrong_exposed, capture_ns)]
 
 
-def _fault_of(pose: ReceivedPose, stamps: _Stamps) -> str | None:
-    frames = stamps.near(pose.capture_ns)
+def _fault_of(pose: ReceivedPose, exposures: _Exposures) -> str | None:
+    frames = exposures.of(pose.capture_ns)
     told = f"the {pose.peer} received a pose"
     if not frames:
         return f"{told} of a frame that the camera never exposed, stamped {pose.capture_ns}"
@@ -55,8 +68,3 @@ def _fault_of(pose: ReceivedPose, stamps: _Stamps) -> str | None:
     if age_ns > AGE_MAX_NS[pose.peer] + TRANSIT_MAX_NS:
         return f"{told} {age_ns / 1e6:.0f} ms after its frame was exposed"
     return None
-
-
-def ages_ms(witness: Witness, peer: str) -> list[float]:
-    """Age on receipt of each pose, by its own stamp, sorted."""
-    return sorted((pose.arrival_ns - pose.capture_ns) / 1e6 for pose in witness.poses if pose.peer == peer)

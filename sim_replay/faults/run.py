@@ -43,7 +43,6 @@ def play_timeline(rig: Rig, timeline: Timeline, say: Say) -> Outcome:
     since = Since(now_ns, now_ns)
     try:
         expect(ExpectPoses(do="expect_poses"), rig, since)
-        since = Since(now_ns, now_ns, dict(rig.witness.counters))
         for step in timeline.step:
             since = _take(step, rig, since, outcome, say)
     except Unmet as error:
@@ -60,11 +59,11 @@ def _take(step: Step, rig: Rig, since: Since, outcome: Outcome, say: Say) -> Sin
         say(f"  {seen.text}")
         return since
     say("  " + " ".join(f"{value}" if key == "do" else f"{key}={value}" for key, value in what.items()))
-    began_ns = time.time_ns()
+    began_ns, counters = time.time_ns(), rig.witness.counters
     act(step, rig)
     if step.do == "hold":
         return since
-    return Since(time.time_ns(), began_ns, since.counters)
+    return Since(time.time_ns(), began_ns, counters)
 
 
 def register(commands: Any) -> None:

@@ -122,7 +122,7 @@ class ModelFile(_Step):
     """The file that the configuration names; `signal daemon HUP` has it read."""
 
     do: Literal["model_file"]
-    content: Literal["good", "noise", "cut_short"]
+    content: Literal["good", "cut_short"]
 
 
 class Load(_Step):
@@ -150,8 +150,16 @@ class ExpectSilence(_Step):
     within_s: Seconds = WITHIN_S
 
 
+class ExpectState(_Step):
+    """The daemon's state and its reasons, as its diagnostics tell them to a subscriber."""
+
+    do: Literal["expect_state"]
+    pattern: str = Field(description="regular expression, e.g. 'fault: no frame'")
+    within_s: Seconds = WITHIN_S
+
+
 class ExpectSaid(_Step):
-    """A line of the daemon's log since the last act."""
+    """A line of the daemon's log since the last act; the log counts repetitions within a minute, and keeps one."""
 
     do: Literal["expect_said"]
     pattern: str = Field(description="regular expression")
@@ -159,11 +167,20 @@ class ExpectSaid(_Step):
 
 
 class ExpectCounter(_Step):
-    """A counter of the daemon's diagnostics, as a subscriber hears them, grown since the timeline began."""
+    """A counter of the daemon's diagnostics, as a subscriber hears them, grown since the last act."""
 
     do: Literal["expect_counter"]
     name: str
     by: int = Field(default=1, ge=1)
+    within_s: Seconds = WITHIN_S
+
+
+class ExpectStill(_Step):
+    """Such a counter that does not grow for so long."""
+
+    do: Literal["expect_still"]
+    name: str
+    for_s: Seconds
     within_s: Seconds = WITHIN_S
 
 
@@ -186,8 +203,10 @@ Step = Annotated[
     | Load
     | ExpectPoses
     | ExpectSilence
+    | ExpectState
     | ExpectSaid
     | ExpectCounter
+    | ExpectStill
     | ExpectExit,
     Field(discriminator="do"),
 ]

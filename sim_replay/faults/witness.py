@@ -40,7 +40,8 @@ class Witness:
     poses: list[ReceivedPose] = field(default_factory=list)
     said: list[tuple[int, str]] = field(default_factory=list)  # UTC ns, a line of the daemon's log
     counters: dict[str, int] = field(default_factory=dict)  # of the newest diagnostics
-    counted_ns: int = 0  # UTC when they came
+    state: str = ""  # of the same, with its reasons
+    counted_ns: int = 0  # UTC when both came
     ready: set[str] = field(default_factory=set)
     summaries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     complaints: list[str] = field(default_factory=list)  # of other processes than the daemon
@@ -97,7 +98,7 @@ class Witness:
         elif event == "diagnostics":
             values = record["values"].items()
             self.counters = {key: int(value) for key, value in values if value.isdecimal()}
-            self.counted_ns = time.time_ns()
+            self.state, self.counted_ns = record["message"], time.time_ns()
         elif event == "summary":
             self.summaries.append((name, record))
         else:
