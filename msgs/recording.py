@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 WAITING_MAX = 4096  # samples, for a disk that stalls
 STANDING_MAX = 256  # so that made-up names cannot grow it without bound
 FLUSH_S = 1.0
-RETRY_S = 10.0
+RETRY_S = 3.0
 STOP_TIMEOUT_S = 10.0
 
 WhenFull = Literal["oldest", "stop"]
@@ -173,6 +173,7 @@ class Recorder:
                 self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns)
         if self._failure is not None:
             self._set_failure(None)
+            log.info("recording again")
             self._tell(logging.INFO, "recording again")
 
     def _fail(self, error: Exception, lost: int) -> None:
