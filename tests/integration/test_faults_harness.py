@@ -1,0 +1,160 @@
+"""The harness of faults itself: what it says of a bad timeline, and that its judge sees what it is there to see."""
+
+from __future__ import annotations
+
+import argparse
+import random
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from edge.errors import InputError
+from msgs.mavlink import FrameReader, MAVLink, dialect
+from sim_replay.faults import hostile, run
+from sim_replay.faults.judge import pose_faults
+from sim_replay.faults.relay import LOOPBACK, LinkState, TcpRelay, UdpRelay, message_id
+from sim_replay.faults.timeline import load_timeline
+from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose
+
+MS = 1_000_000
+T0 = 1_700_000_000_000_000_000
+FRAMES = [ExposedFrame(T0 + k * 100 * MS, T0 + k * 100 * MS, frozen=k >= 20) for k in range(40)]
+WAIT_S = 30.0
+
+
+def pose(frame: int, age_ms: float, peer: str = AUTOPILOT, off_ms: float = 0.0) -> ReceivedPose:
+    capture_ns = FRAMES[frame].stamp_ns + round(off_ms * MS)
+    return ReceivedPose(peer, capture_ns, FRAMES[frame].exposed_ns + round(age_ms * MS))
+
+
+def test_fresh_poses_of_frames_that_were_exposed_are_no_fault() -> None:
+    assert pose_faults([pose(3, 20.0), pose(4, 190.0, off_ms=0.4), pose(5, 450.0, SUBSCRIBER)], FRAMES) == []
+
+
+@pytest.mark.parametrize(
+    ("received", "words"),
+    [
+        (pose(3, 1500.0), "1500 ms after"),
+        (pose(3, 1500.0, SUBSCRIBER), "1500 ms after"),
+        (pose(25, 20.0), "frozen"),
+        (pose(3, 20.0, off_ms=50.0), "never exposed"),
+    ],
+)
+def test_a_stale_a_frozen_and_an_invented_pose_are_found(received: ReceivedPose, words: str) -> None:
+    (fault,) = pose_faults([pose(1, 20.0), received], FRAMES)
+    assert words in fault
+
+
+def test_a_camera_whose_clock_is_slow_does_not_make_an_old_pose_young() -> None:
+    fast = [ExposedFrame(T0, T0 + 2_000 * MS, frozen=False)]
+    young_by_its_stamp = ReceivedPose(AUTOPILOT, T0 + 2_000 * MS, T0 + 2_010 * MS)
+    (fault,) = pose_faults([young_by_its_stamp], fast)
+    assert "2010 ms after" in fault
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('title = "x"\n[[step]]\ndo = "explode"\n', "step 1"),
+        ('title = "x"\n[[step]]\ndo = "hold"\nfor_s = 1\nsoftly = true\n', "softly: unknown key"),
+        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "mavlink"\ndrop = ["NONE"]\n', "NONE is no MAVLink message"),
+        ("title = \n", "not valid TOML"),
+    ],
+)
+def test_a_bad_timeline_is_told_by_file_and_key(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as told:
+        load_timeline(path)
+    assert str(told.value).startswith(str(path))
+    assert words in str(told.value)
+
+
+def test_the_command_takes_bundled_timelines_by_name_and_refuses_a_missing_one(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    run.register(parser.add_subparsers())
+    for name in run.bundled():
+        load_timeline(run.TIMELINES / f"{name}.toml")
+    args = parser.parse_args(["faults", "--timeline", str(tmp_path / "none.toml"), "--out", str(tmp_path)])
+    with pytest.raises(InputError, match=r"none\.toml: cannot be read"):
+        args.run(args)
+
+
+@pytest.fixture
+def udp() -> Iterator[tuple[UdpRelay, socket.socket, socket.socket]]:
+    """A relay between two sockets: the autopilot's, and the daemon's, which has heard from the other."""
+    with socket.socket(type=socket.SOCK_DGRAM) as autopilot, socket.socket(type=socket.SOCK_DGRAM) as daemon:
+        for end in (autopilot, daemon):
+            end.bind((LOOPBACK, 0))
+            end.settimeout(WAIT_S)
+        with closing(UdpRelay(daemon.getsockname())) as relay:
+            autopilot.connect((LOOPBACK, relay.port))
+            autopilot.send(b"first")
+            _, address = daemon.recvfrom(100)
+            daemon.connect(address)
+            yield relay, autopilot, daemon
+
+
+def test_a_udp_relay_passes_both_ways_and_one_that_is_cut_neither(
+    udp: tuple[UdpRelay, socket.socket, socket.socket],
+) -> None:
+    relay, autopilot, daemon = udp
+    relay.state = LinkState(cut=True)
+    autopilot.send(b"lost")
+    daemon.send(b"lost")
+    autopilot.settimeout(0.5)
+    with pytest.raises(TimeoutError):
+        autopilot.recv(100)
+    relay.state = LinkState(delay_s=0.01)
+    autopilot.send(b"up")
+    daemon.send(b"down")
+    autopilot.settimeout(WAIT_S)
+    assert (daemon.recv(100), autopilot.recv(100)) == (b"up", b"down")
+
+
+def test_a_udp_relay_drops_messages_by_their_id(udp: tuple[UdpRelay, socket.socket, socket.socket]) -> None:
+    relay, autopilot, daemon = udp
+    mav = MAVLink(None, srcSystem=1, srcComponent=1)
+    attitude = bytes(dialect.MAVLink_attitude_quaternion_message(0, 1, 0, 0, 0, 0, 0, 0).pack(mav))
+    time = bytes(dialect.MAVLink_system_time_message(1, 2).pack(mav))
+    relay.state = LinkState(drop_ids=frozenset({dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION}))
+    autopilot.send(attitude)
+    autopilot.send(time)
+    assert daemon.recv(100) == time
+    assert message_id(attitude) == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+    assert message_id(b"\xfe" + bytes(20)) is None
+
+
+def test_a_tcp_relay_holds_bytes_back_while_it_is_cut_and_loses_none() -> None:
+    sent = random.Random(1).randbytes(300_000)
+    with socket.create_server((LOOPBACK, 0)) as server, closing(TcpRelay(server.getsockname())) as relay:
+        relay.state = LinkState(cut=True)
+        with socket.create_connection((LOOPBACK, relay.port)) as near:
+            far, _ = server.accept()
+            sender = threading.Thread(target=near.sendall, args=(sent,))
+            sender.start()
+            far.settimeout(0.5)
+            with pytest.raises(TimeoutError):
+                far.recv(1)
+            relay.state = LinkState()
+            far.settimeout(WAIT_S)
+            received = b""
+            while len(received) < len(sent):
+                received += far.recv(65536)
+            sender.join()
+            far.close()
+    assert received == sent
+
+
+def test_hostile_frames_have_valid_checksums_and_random_ones_are_no_frames() -> None:
+    reader = FrameReader(datagram=True)
+    datagrams = list(hostile.take_bytes(hostile.hostile_datagrams(), 5_000))
+    messages = [message for datagram in datagrams for message in reader.feed(datagram)]
+    assert len(messages) == len(datagrams)
+    assert reader.bad_runs == 0
+    noise = hostile.take_bytes(hostile.random_datagrams(random.Random(0)), 50_000)
+    assert [message for datagram in noise for message in reader.feed(datagram)] == []
