@@ -20,6 +20,12 @@ STAGES = {
 }
 
 
+def table_markdown() -> str:
+    """The table as the documents show it."""
+    rows = [f"| {stage} | {text} |" for stage, text in STAGES.items()]
+    return "\n".join(["| stage | from what to what |", "|---|---|", *rows]) + "\n"
+
+
 class StageClock:
     """Laps of one frame; each belongs to a row of STAGES."""
 

@@ -1,0 +1,101 @@
+"""The documents say what is so: their tables are the code's, their files and commands are there, their examples do."""
+
+from __future__ import annotations
+
+import configparser
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edge import cli, stages, threads
+from edge.config import load_config
+from msgs import topics
+
+ROOT = Path(__file__).parents[1]
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
+INSTALL = (ROOT / "docs" / "install.md").read_text()
+EXAMPLES = sorted((ROOT / "deploy" / "examples").glob("*.toml"))
+UNIT = ROOT / "deploy" / "uavpose-edge.service"
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [
+        ("threads", threads.table_markdown()),
+        ("stages", stages.table_markdown()),
+        ("topics", topics.table_markdown()),
+    ],
+)
+def test_the_tables_of_the_architecture_are_the_code_s(name: str, table: str) -> None:
+    between = re.search(rf"<!-- {name}: .*?-->\n(.*?)<!-- {name}: end -->", ARCHITECTURE, re.DOTALL)
+    assert between is not None
+    assert between[1] == table
+
+
+def test_every_thread_of_the_daemon_is_in_the_table() -> None:
+    sources = [*(ROOT / "edge").rglob("*.py"), ROOT / "msgs" / "recording.py"]
+    started = {
+        name
+        for path in sources
+        for name in re.findall(r'(?:Thread\(.*?\bname|thread_name_prefix)="(\w+)"', path.read_text())
+    }
+    assert started == {row.name for row in threads.THREADS} - {"main"}
+
+
+def test_files_that_the_architecture_names_are_there() -> None:
+    rows = re.findall(r"^\| `(\w+/(?:\w+/)?)`[^|]*\| (.*) \|$", ARCHITECTURE, re.MULTILINE)
+    assert {"edge/cameras/", "msgs/ground/", "trainer/", "sim_replay/"} <= {folder for folder, _ in rows}
+    for folder, text in rows:
+        for name in re.findall(r"`([\w*]+(?:\.py|/))`", text):
+            assert list((ROOT / folder).glob(name.rstrip("/"))), f"{folder}{name}"
+
+
+@pytest.mark.parametrize("document", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text()):
+        assert "://" in target or (document.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_each_example_is_found_valid_by_check(example: Path) -> None:
+    command = [sys.executable, "-m", "edge.cli", "check", "--config", str(example)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{example}: valid")
+
+
+def test_there_is_an_example_for_each_way_to_fly() -> None:
+    ways = {(load_config(path).config.camera.type, load_config(path).config.mavlink.endpoints[0]) for path in EXAMPLES}
+    kinds = {(camera, endpoint.partition(":")[0]) for camera, endpoint in ways}
+    assert kinds == {("device", "serial"), ("stream", "udpin"), ("sequence", "udpin")}
+
+
+def test_files_and_commands_of_the_guide_are_there() -> None:
+    for name in re.findall(r"\bdeploy/[\w./-]+\w", INSTALL):
+        assert (ROOT / name).exists(), name
+    commands = re.findall(r"uavpose-edge ((?:check|doctor|status|run)\b.*)$", INSTALL, re.MULTILINE)
+    assert {command.split()[0] for command in commands} >= {"check", "doctor", "status"}
+    for command in commands:
+        assert callable(cli._parser().parse_args(shlex.split(command, comments=True)).act)
+
+
+def test_the_unit_starts_reloads_and_watches_the_daemon() -> None:
+    unit = configparser.RawConfigParser(strict=False)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(UNIT)
+    service = unit["Service"]
+    _, *words = shlex.split(service["ExecStart"])
+    assert callable(cli._parser().parse_args(words).act)
+    assert service["Type"] == "notify"
+    assert "-HUP" in service["ExecReload"]
+    config = load_config(EXAMPLES[0]).config
+    # Ours says where the loop stood, so it must come first.
+    assert float(service["WatchdogSec"]) > 2 * config.health.loop_stuck_s
+    users = (ROOT / "deploy" / "uavpose.sysusers").read_text()
+    assert f"\nu {service['User']} " in users
+    for group in service["SupplementaryGroups"].split():
+        assert f"\nm {service['User']} {group}\n" in users
