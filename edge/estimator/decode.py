@@ -24,7 +24,7 @@ BOX_MIN_PX = 8.0
 # A box this near to the frame's edge, in its longer sides and in pixels, may be cut by it.
 EDGE_SHARE, EDGE_PX = 0.05, 1.5
 # What is cut off is not known, so neither is how large the whole is nor where its middle: 1-sigma of log Z, and of the
-# origin's pixels in longer sides of the box. They cover the errors of targets cut by up to half (docs/cameras.md).
+# origin's pixels in longer sides of the box. They cover the shipped model's errors on targets of which half is off.
 CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
 
 
