@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import cv2
 
@@ -30,16 +32,32 @@ class StreamSource(LiveSource):
 
     def _connect(self) -> cv2.VideoCapture:
         transport = f"rtsp_transport;{self._settings.rtsp_transport}|" if self._settings.url.startswith("rtsp") else ""
-        os.environ.setdefault(OPTIONS_VARIABLE, transport + LOW_DELAY)
         self._clock = StreamClock()
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
-        return cv2.VideoCapture(self._settings.url, cv2.CAP_FFMPEG, limits)
+        with _ffmpeg_options(transport + LOW_DELAY):
+            return cv2.VideoCapture(self._settings.url, cv2.CAP_FFMPEG, limits)
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
         stamp_ns = self._clock.monotonic_ns(round(position_ms * 1e6), arrival_ns)
         if stamp_ns is None:
             self.counts["unstamped"] += 1
         return (arrival_ns if stamp_ns is None else stamp_ns) - self._latency_ns
+
+
+@contextmanager
+def _ffmpeg_options(options: str) -> Iterator[None]:
+    """For what is opened inside alone: a video opened later with these would lose its last frame.
+
+    Options that the user has set stay.
+    """
+    if OPTIONS_VARIABLE in os.environ:
+        yield
+        return
+    os.environ[OPTIONS_VARIABLE] = options
+    try:
+        yield
+    finally:
+        del os.environ[OPTIONS_VARIABLE]
 
 
 class StreamClock:
