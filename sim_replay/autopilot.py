@@ -24,6 +24,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from edge.errors import InputError
+from edge.links.signing import Signing
+from edge.links.signing_key import load_key
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.mavlink import MAVLink, dialect, pack
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
@@ -52,11 +55,19 @@ class Autopilot:
     `received` counts valid messages by name, `refused` everything else by reason.
     """
 
-    def __init__(self, telemetry: Telemetry, start_at_ns: int, boot_at_ns: int, system_id: int = SYSTEM_ID) -> None:
+    def __init__(
+        self,
+        telemetry: Telemetry,
+        start_at_ns: int,
+        boot_at_ns: int,
+        system_id: int = SYSTEM_ID,
+        signing: Signing | None = None,
+    ) -> None:
         self._telemetry = telemetry
         self._start_at_ns = start_at_ns
         self._boot_at_ns = boot_at_ns
         self._system_id = system_id
+        self._signing = signing
         self._mav = MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
         self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in DEFAULT_RATES_HZ.items()}
         self._next_ns = dict.fromkeys(DEFAULT_RATES_HZ, boot_at_ns)
@@ -73,7 +84,7 @@ class Autopilot:
         packed = []
         for message_id, next_ns in self._next_ns.items():
             if next_ns <= now_ns:
-                packed.append(pack(self._mav, self._telemetry_message(message_id, now_ns)))
+                packed.append(self._packed(self._telemetry_message(message_id, now_ns)))
                 interval_ns = self._interval_ns[message_id]
                 self._next_ns[message_id] = max(next_ns + interval_ns, now_ns + interval_ns // 2)
         return packed
@@ -96,10 +107,15 @@ class Autopilot:
             self.received[message.get_type()] += 1
             reply = self._reply(message, now_ns)
             if reply is not None:
-                replies.append(pack(self._mav, reply))
+                replies.append(self._packed(reply))
             if message.get_msgId() == TARGET_RELATIVE_ID:
                 records.append(_target_record(message, now_ns))
         return replies, records
+
+    def _packed(self, message: Any) -> bytes:
+        if self._signing is not None:
+            self._signing.prepare(self._mav)
+        return pack(self._mav, message)
 
     def _boot_ms(self, now_ns: int) -> int:
         return (now_ns - self._boot_at_ns) // 1_000_000 % 2**32
@@ -139,6 +155,8 @@ class Autopilot:
             return "unknown message"
         if message.get_srcSystem() != self._system_id or message.get_srcComponent() == COMPONENT_ID:
             return "not from a component of this vehicle"
+        if self._signing is not None and (unproven := self._signing.refusal(message)) is not None:
+            return f"signing: {unproven}"
         if message.get_msgId() != TARGET_RELATIVE_ID:
             return None
         numbers = (message.x, message.y, message.z, *message.pos_std, message.yaw_std, *message.q_target)
@@ -239,17 +257,20 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--system-id", type=int, choices=range(1, 256), metavar="ID", default=SYSTEM_ID, help="its own (1)"
     )
+    parser.add_argument("--signing-key", type=Path, metavar="FILE", help="sign all, and believe nothing unsigned")
     args = parser.parse_args(argv)
     try:
         telemetry = read_telemetry(args.telemetry)
-    except TelemetryError as error:
+        key = None if args.signing_key is None else load_key(args.signing_key)
+    except (TelemetryError, InputError) as error:
         print(error, file=sys.stderr)
         return 2
     stop: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, _: stop.append(received))
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
-    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id)
+    signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
+    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing)
     _fly(autopilot, args.endpoint, stop)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0

@@ -23,6 +23,7 @@ import numpy as np
 from edge.cameras.sequence import read_scene
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
+from edge.links.signing_key import write_new_key
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.camera import TOPIC
 from sim_replay.faults.processes import Process
@@ -36,6 +37,7 @@ START_S = 120.0
 UPTIME_NS = 734_567_891_234  # of an autopilot that was there before
 VOLUME_MB = 4
 UAV = "uav1"
+KEY = "mavlink.key"
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class RigSettings:
     model: Path = SHIPPED_MODEL
     fps: float = 10.0
     volume: bool = False
+    signed: bool = False  # daemon and autopilot share a key
 
 
 class Rig:
@@ -165,6 +168,7 @@ class Rig:
             *(*python, "sim_replay.autopilot", "--telemetry", self.settings.out / "telemetry.csv"),
             *("--endpoint", f"{LOOPBACK}:{self.mavlink.port}", "--start-at-ns", str(now_ns)),
             *("--boot-at-ns", str(self._boot_at_ns), "--system-id", str(step.system_id)),
+            *(("--signing-key", self.settings.out / KEY) if self.settings.signed else ()),
         ]
 
     def _daemon_command(self) -> list[str | Path]:
@@ -176,6 +180,8 @@ class Rig:
         out = self.settings.out
         shutil.copyfile(self.settings.model, self.model_file)
         self.recordings.mkdir(exist_ok=True)
+        if self.settings.signed and not (out / KEY).exists():
+            write_new_key(out / KEY)
         (out / "router.toml").write_text(f'listen = ["tcp/{LOOPBACK}:{self._router_port}"]\n', encoding="utf-8")
         write_telemetry(out / "telemetry.csv", at_rest())
         (out / "config.toml").write_text(self._config(), encoding="utf-8")
@@ -203,6 +209,7 @@ class Rig:
             f'connect = ["tcp/{LOOPBACK}:{self.zenoh.port}"]',
             "[mavlink]",
             f'endpoints = ["udpin:{LOOPBACK}:{self.mavlink_port}"]',
+            f"signing_key = {json.dumps(KEY)}" if self.settings.signed else "",
             "[recorder]",
             f"enabled = true\nfolder = {json.dumps(str(self.recordings))}\nfree_min_mb = 0",
             "[health]",

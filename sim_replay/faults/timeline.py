@@ -218,6 +218,7 @@ class Timeline(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     title: str
+    signed: bool = Field(default=False, description="daemon and autopilot sign all that they say")
     volume: bool = Field(default=False, description="recordings go to a small volume of their own (needs unshare)")
     step: list[Step] = Field(min_length=1)
 

@@ -18,8 +18,9 @@ from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 SLOW = {"mavlink-cut-30s", "flood-10mb"}  # the same as a shorter one; played by hand
 NEED_VOLUME = {"disk-full"}
+SIGNED = {"signed-replay"}
 LAST = ["daemon-killed"]  # what ends the daemon comes last: those before share one
-NAMES = sorted({path.stem for path in TIMELINES.glob("*.toml")} - SLOW - NEED_VOLUME - set(LAST)) + LAST
+NAMES = sorted({path.stem for path in TIMELINES.glob("*.toml")} - SLOW - NEED_VOLUME - SIGNED - set(LAST)) + LAST
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +58,12 @@ def test_the_daemon_comes_through_on_a_disk_of_its_own(rig: Rig, name: str) -> N
         pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
     outcome = play_timeline(rig, load_timeline(TIMELINES / f"{name}.toml"), print)
     assert outcome.wrong == []
+
+
+@pytest.mark.parametrize("name", sorted(SIGNED))
+def test_a_daemon_that_signs_comes_through(tmp_path: Path, small_scene: Path, toy_model: Path, name: str) -> None:
+    with Rig(RigSettings(tmp_path, small_scene, toy_model, signed=True)) as rig:
+        outcome = play_timeline(rig, load_timeline(TIMELINES / f"{name}.toml"), print)
+    assert outcome.wrong == []
+    assert violations(rig.witness) == []
+    assert rig.witness.counters["mavlink_reboots"] == 0
