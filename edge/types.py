@@ -115,3 +115,4 @@ class Report:
     own_ship: OwnShip | None  # at meta.capture_ns; None: no attitude, tracks are in `cam` only
     model_sha256: str
     chosen_id: int | None = None  # track_id of the target that a person pointed at
+    distortion: tuple[float, ...] = ()  # of the frame's lens, as Frame has it

@@ -196,7 +196,7 @@ class Desk:
         self._max_age_ms = max_age_ms
         self._clock = UtcClock()
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
-        self._intrinsics: tuple[bytes, tuple[int, int]] | None = None
+        self._intrinsics: tuple[bytes, tuple[int, int], tuple[float, ...]] | None = None
         self._pose_period_s = 0.0
         self._pose_due_s: dict[tuple[str, str | None], float] = {}
         shared = (topics.DETECTIONS, topics.TF, topics.CAMERA_INFO, topics.DIAGNOSTICS, topics.EVENTS)
@@ -223,7 +223,7 @@ class Desk:
         self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
         if report.own_ship is not None:
             self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns))
-        intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh)
+        intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh, report.distortion)
         if intrinsics != self._intrinsics:
             self._put(topics.CAMERA_INFO, ros.camera_info(report, stamp_ns))
             self._intrinsics = intrinsics

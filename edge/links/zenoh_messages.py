@@ -78,12 +78,13 @@ def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
 
 
 def camera_info(report: Report, stamp_ns: int) -> cdr.CameraInfo:
-    """The intrinsics of the frame the poses belong to, whose pixels are free of distortion."""
+    """The intrinsics of the frame the poses belong to, with its lens's distortion (sensor_msgs/CameraInfo)."""
     width_px, height_px = report.image_size_wh
     P = np.hstack([report.K, np.zeros((3, 1))])
-    return cdr.CameraInfo(
-        stamp_ns, topics.FRAME_CAMERA, height_px, width_px, "plumb_bob", np.zeros(5), report.K, np.eye(3), P
-    )
+    model = "rational_polynomial" if len(report.distortion) > 5 else "plumb_bob"
+    D = np.zeros(8 if len(report.distortion) > 5 else 5)
+    D[: len(report.distortion)] = report.distortion
+    return cdr.CameraInfo(stamp_ns, topics.FRAME_CAMERA, height_px, width_px, model, D, report.K, np.eye(3), P)
 
 
 def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> cdr.DiagnosticArray:
