@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from reports import report, track
 
 from edge.links.zenoh_messages import camera_info
 from msgs import cdr
+from tests.edge.reports import report, track
 
 
 @pytest.mark.parametrize(
