@@ -50,12 +50,12 @@ def reversal(R: Array, along: Array) -> Array:
 
     R [3, 3] turns target axes into those of `along`. Doing it twice gives R again.
     """
-    return (np.eye(3) - 2.0 * np.outer(along, along)) @ R @ MIRRORED_WINGS
+    return (so3.IDENTITY - 2.0 * np.outer(along, along)) @ R @ MIRRORED_WINGS
 
 
 def reversed_covariance(P: Array, along: Array) -> Array:
     """[3, 3] of the reversal's error: as R' = M exp(w) R B = exp(-M w) M R B, it turns with the mirror M."""
-    mirror = np.eye(3) - 2.0 * np.outer(along, along)
+    mirror = so3.IDENTITY - 2.0 * np.outer(along, along)
     return mirror @ P @ mirror.T
 
 
@@ -83,9 +83,9 @@ def flown_odds(R: Array, R_reversed: Array, P: Array, flight: Flight) -> float:
 def _log_along_nose(nose: Array, P: Array, flight: Flight) -> float:
     """Log density of the velocity if the target flies along its nose [3]; speed and wind are marginalised."""
     v = flight.v_mps.copy()
-    across = np.eye(3) - np.outer(nose, nose)
+    across = so3.IDENTITY - np.outer(nose, nose)
     slip = SLIP_STD_RAD**2 + float(np.trace(P)) / 3.0
-    S = flight.P_v + WIND_STD_MPS**2 * np.eye(3) + AIRSPEED_STD_MPS**2 * np.outer(nose, nose)
+    S = flight.P_v + WIND_STD_MPS**2 * so3.IDENTITY + AIRSPEED_STD_MPS**2 * np.outer(nose, nose)
     S += AIRSPEED_MPS**2 * slip * across
     if flight.own_nose_ned is not None:
         v += OWN_AIRSPEED_MPS * flight.own_nose_ned

@@ -82,7 +82,7 @@ def measurement_noise(estimate: Estimate, K: Array, view: View) -> tuple[Array, 
     t = estimate.t_cam_target_m
     bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2 + view.attitude_variance
     C = symmetric(estimate.covariance[:3, :3])
-    C += bearing_variance * (t @ t) * np.eye(3) + MODEL_LOG_RANGE**2 * np.outer(t, t)
+    C += bearing_variance * (t @ t) * so3.IDENTITY + MODEL_LOG_RANGE**2 * np.outer(t, t)
     # Marginal along the ray with all else held: taking a share of it away leaves C positive semi-definite.
     bias_variance = BIAS_SHARE / float(t @ np.linalg.solve(C, t))
     return C - bias_variance * np.outer(t, t), bias_variance
@@ -118,7 +118,7 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
     decay = float(np.exp(-dt / BIAS_TIME_S))
 
     F = np.eye(DIMENSION)
-    F[POSITION, VELOCITY] = 0.5 * dt * (np.eye(3) + turn)
+    F[POSITION, VELOCITY] = 0.5 * dt * (so3.IDENTITY + turn)
     F[VELOCITY, VELOCITY] = turn
     if motion.kind == "ned":
         v_by_turn = dt * np.array([-v[1], v[0], 0.0])
@@ -179,7 +179,7 @@ def between(old: View, new: View) -> Array:
     """R_new_old [3, 3] between the frames of two views of one instant; ned's axes are those of ned_relative."""
     if "cam" in (old.kind, new.kind):
         return new.R_frame_cam @ old.R_frame_cam.T
-    return np.eye(3)
+    return so3.IDENTITY
 
 
 def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Innovation:
@@ -248,7 +248,7 @@ def _acceleration_density(motion: Motion) -> Array:
         return ACCELERATION[motion.kind] ** 2 * np.diag([1.0, 1.0, VERTICAL_SHARE**2])
     range_m = float(np.linalg.norm(motion.t_m))
     along = np.outer(motion.t_m, motion.t_m) / max(range_m**2, 1.0)
-    across = (APPARENT_ACCELERATION * range_m) ** 2 * (np.eye(3) - along)
+    across = (APPARENT_ACCELERATION * range_m) ** 2 * (so3.IDENTITY - along)
     return ACCELERATION["ned_relative"] ** 2 * along + across
 
 
@@ -270,5 +270,5 @@ def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
 def _first_velocity(kind: FrameKind, range_m: float) -> Array:
     """Covariance [3, 3] of a velocity that nothing is known of: aircraft fly more or less level."""
     if kind == "cam":
-        return max(SPEED_STD_MPS, APPARENT_RATE_STD * range_m) ** 2 * np.eye(3)
+        return max(SPEED_STD_MPS, APPARENT_RATE_STD * range_m) ** 2 * so3.IDENTITY
     return np.diag([SPEED_STD_MPS, SPEED_STD_MPS, CLIMB_STD_MPS]) ** 2

@@ -72,7 +72,7 @@ def propagate(attitude: Attitude, turn: Array, dt_s: float) -> Attitude:
 
 def reframe(attitude: Attitude, R_new_old: Array, attitude_age_s: float) -> Attitude:
     """The same target in other axes, which an attitude links that was measured `attitude_age_s` ago."""
-    P = R_new_old @ attitude.P @ R_new_old.T + (STALE_ATTITUDE_RADPS * attitude_age_s) ** 2 * np.eye(3)
+    P = R_new_old @ attitude.P @ R_new_old.T + (STALE_ATTITUDE_RADPS * attitude_age_s) ** 2 * so3.IDENTITY
     common = R_new_old @ attitude.common @ R_new_old.T
     return replace(attitude, R_frame_target=R_new_old @ attitude.R_frame_target, P=symmetric(P), common=common)
 
@@ -168,7 +168,7 @@ def _corrected(attitude: Attitude, w: Array, noise: Array) -> Attitude:
     S = attitude.P + white
     white = white * max(1.0, float(w @ np.linalg.solve(S, w)) / SOFT_GATE)
     gain = np.linalg.solve(attitude.P + white, attitude.P).T
-    keep = np.eye(3) - gain
+    keep = so3.IDENTITY - gain
     P = symmetric(keep @ attitude.P @ keep.T + gain @ white @ gain.T)
     return replace(attitude, R_frame_target=_orthonormal(so3.exp(gain @ w) @ attitude.R_frame_target), P=P)
 

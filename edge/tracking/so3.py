@@ -8,6 +8,8 @@ import numpy as np
 
 from edge.types import Array
 
+IDENTITY = np.eye(3)
+IDENTITY.setflags(write=False)
 SMALL_RAD = 1e-4  # below it series are exact to rounding
 
 

@@ -44,7 +44,7 @@ class View:
     def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount, before: View | None = None) -> View:
         """`before`: the view of an earlier frame."""
         if own_ship is None:
-            return cls("cam", time_ns, np.eye(3), np.zeros(3), np.zeros(3))
+            return cls("cam", time_ns, so3.IDENTITY, np.zeros(3), np.zeros(3))
         camera = own_ship.camera(mount)
         R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
         lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
@@ -75,12 +75,12 @@ class View:
         a x (t - t_own) + p + u_own s, its velocity by a x (v - v_own) + u, its rotation by a.
         """
         velocity = np.zeros(3) if self.v_frame_cam_mps is None else self.v_frame_cam_mps
-        by_attitude = np.concatenate([-so3.skew(t_m - self.t_frame_cam_m), -so3.skew(v_mps - velocity), np.eye(3)])
+        by_attitude = np.concatenate([-so3.skew(t_m - self.t_frame_cam_m), -so3.skew(v_mps - velocity), so3.IDENTITY])
         attitude = np.array([TILT_STD_RAD, TILT_STD_RAD, HEADING_STD_RAD]) ** 2 + self.attitude_variance
         covariance = (by_attitude * attitude) @ by_attitude.T
         if self.kind == "ned":
-            covariance[:3, :3] += POSITION_STD_M**2 * np.eye(3) + CLOCK_STD_S**2 * np.outer(velocity, velocity)
-            covariance[3:6, 3:6] += VELOCITY_STD_MPS**2 * np.eye(3)
+            covariance[:3, :3] += POSITION_STD_M**2 * so3.IDENTITY + CLOCK_STD_S**2 * np.outer(velocity, velocity)
+            covariance[3:6, 3:6] += VELOCITY_STD_MPS**2 * so3.IDENTITY
         return covariance
 
 

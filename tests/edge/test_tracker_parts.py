@@ -1,0 +1,111 @@
+"""The tracker's parts by themselves: rotations one at a time, and who belongs to whom."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from edge.tracking import so3
+from edge.tracking.association import best_pairs
+from edge.tracking.tracker import Tracker
+from edge.types import Estimate, Mount, OwnShip, TrackState
+
+component = st.floats(-1.0, 1.0)
+K = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
+SIZE_WH = (1920, 1080)
+LOOKING_NORTH = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
+
+
+@settings(deadline=None)
+@given(st.tuples(component, component, component), st.floats(0.0, np.pi) | st.floats(0.0, 1e-3))
+def test_exp_and_log_are_those_of_scipy(axis: tuple[float, ...], angle: float) -> None:
+    w = np.array(axis)
+    norm = np.linalg.norm(w)
+    w = angle * w / norm if norm > 1e-3 else np.array([0.0, 0.0, angle])
+    R = so3.exp(w)
+    np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
+    assert np.linalg.norm(so3.log(R)) <= np.pi + 1e-9
+    np.testing.assert_allclose(so3.exp(so3.log(R)), R, atol=1e-9)
+    np.testing.assert_allclose(so3.skew(w) @ [1.0, 2.0, 3.0], np.cross(w, [1.0, 2.0, 3.0]), atol=1e-12)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 5))
+def test_pairs_are_the_cheapest_of_the_most(seed: int, targets: int, estimates: int) -> None:
+    """Against SciPy's assignment, in which an impossible pair costs more than all others together."""
+    rng = np.random.default_rng(seed)
+    cost = np.where(rng.random((targets, estimates)) < 0.4, np.inf, rng.uniform(0.0, 50.0, (targets, estimates)))
+    pairs = best_pairs(cost)
+    filled = np.where(np.isinf(cost), 1e4, cost)
+    best = filled[linear_sum_assignment(filled)]
+    assert len(pairs) == np.sum(best < 1e4)
+    assert sum(cost[i, j] for i, j in pairs) == pytest.approx(best[best < 1e4].sum())
+    assert len({i for i, _ in pairs}) == len({j for _, j in pairs}) == len(pairs)
+
+
+def sight(rng: np.random.Generator, t_m: np.ndarray, R_cam_target: np.ndarray) -> Estimate:
+    noise_m = rng.normal(size=3) * [0.2, 0.2, 0.03 * t_m[2]]
+    R = Rotation.from_rotvec(rng.normal(scale=0.08, size=3)).as_matrix() @ R_cam_target
+    center = (K @ t_m)[:2] / t_m[2]
+    covariance = np.diag([0.04, 0.04, (0.03 * t_m[2]) ** 2, 0.0064, 0.0064, 0.0064])
+    return Estimate(0.9, np.concatenate([center - 35, center + 35]), R, t_m + noise_m, covariance, "track")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_that_cross_keep_their_numbers_though_one_hides_the_other(seed: int) -> None:
+    """At nearly one range, seen from the side, opposite ways; while they overlap only the nearer one is seen."""
+    rng = np.random.default_rng(seed)
+    tracker = Tracker(4, LOOKING_NORTH)
+    east, west = (Rotation.from_euler("z", yaw, degrees=True).as_matrix() for yaw in (70, -110))
+    R_cam_ned = LOOKING_NORTH.R_body_cam.T
+    number = {}
+    for i in range(90):
+        t = i / 30.0
+        places = {"east": np.array([-37.5 + 25 * t, 1.0, 200.0]), "west": np.array([37.5 - 25 * t, -1.0, 212.0])}
+        both = [sight(rng, places["east"], R_cam_ned @ east), sight(rng, places["west"], R_cam_ned @ west)]
+        hidden = abs(places["east"][0] - places["west"][0]) < 3.5
+        own = OwnShip(1 + round(t * 1e9), np.eye(3), np.zeros(3), np.zeros(3), None)
+        tracks = tracker.update(own.time_ns, both[:1] if hidden else both[:: 1 if i % 2 else -1], own, K, SIZE_WH)
+        if i in (30, 89):
+            assert len(tracks) == 2
+            for name, place in places.items():
+                nearest = min(tracks, key=lambda one: float(np.linalg.norm(one.t_cam_target_m - place)))
+                assert number.setdefault(name, nearest.track_id) == nearest.track_id
+    assert number["east"] != number["west"]
+
+
+def test_a_target_that_leaves_the_picture_is_not_looked_for_and_taken_up_again_when_it_is_back() -> None:
+    rng = np.random.default_rng(1)
+    tracker = Tracker(4, LOOKING_NORTH)
+    R_cam_target = LOOKING_NORTH.R_body_cam.T @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    for i in range(90):
+        t = i / 30.0
+        yaw = np.deg2rad(40.0) * np.sin(np.pi * t / 3.0) ** 8  # the own ship turns away and back
+        R_ned_body = Rotation.from_euler("z", yaw).as_matrix()
+        R = (R_ned_body @ LOOKING_NORTH.R_body_cam).T
+        t_cam = R @ np.array([200.0 + 5.0 * t, 0.0, 0.0])
+        one = sight(rng, t_cam, R @ LOOKING_NORTH.R_body_cam @ R_cam_target)
+        visible = bool(np.all(one.box_xyxy_px[:2] > 0) and np.all(one.box_xyxy_px[2:] < SIZE_WH))
+        own = OwnShip(1 + round(t * 1e9), R_ned_body, np.zeros(3), np.zeros(3), None)
+        expected = tracker.predict(own.time_ns, own, K, SIZE_WH)
+        if i > 3 and abs(one.box_xyxy_px[0] + 35) > 60:
+            assert bool(expected) == bool(one.box_xyxy_px[2] > 0)
+        tracks = tracker.update(own.time_ns, [one] if visible else [], own, K, SIZE_WH)
+        assert [track.track_id for track in tracks] == [0]
+    assert tracks[0].state is TrackState.CONFIRMED
+
+
+def test_in_cam_no_ned_pose_is_told() -> None:
+    rng = np.random.default_rng(2)
+    tracker = Tracker(4, LOOKING_NORTH)
+    estimate = sight(rng, np.array([0.0, 0.0, 200.0]), np.eye(3))
+    for i in range(4):
+        (track,) = tracker.update(i + 1, [replace(estimate, score=0.8)], None, K, SIZE_WH)
+        told = (track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned)
+        assert all(one is None for one in told)
