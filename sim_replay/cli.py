@@ -21,6 +21,7 @@ from sim_replay.evaluation.judge import judge_frames, score_of
 from sim_replay.evaluation.table import score_table
 from sim_replay.ground_truth import read_sequence
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
+from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError
 
 
@@ -46,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
 
     benchmark.register(commands)
+    pipeline.register(commands)
 
     score = commands.add_parser(
         "score",

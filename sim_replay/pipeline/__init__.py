@@ -1,0 +1,1 @@
+"""`uavpose-replay bench-pipeline`: the daemon on a replayed camera for minutes, held to its budgets."""

@@ -1,0 +1,194 @@
+"""A sequence flown round and round through the real daemon, with a simulated autopilot and a zenoh subscriber."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge.errors import InputError
+from sim_replay.faults.processes import Process
+from sim_replay.faults.relay import LOOPBACK, free_port
+from sim_replay.ground_truth import PlayedSequence
+from sim_replay.pipeline.usage import Usage, usage_of
+from sim_replay.play import LEADS_S, READY_MARGIN_NS, PlayError
+from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+
+UAV = "uav1"
+SAMPLE_S = 1.0
+EXIT_BAD_INPUT = 2
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """What is flown, for how long, and the folder of its files."""
+
+    sequence: PlayedSequence
+    out: Path
+    minutes: float
+    model: Path
+
+    @property
+    def period_s(self) -> float:
+        """One time through the sequence."""
+        return len(self.sequence.scene.images) / self.sequence.fps
+
+
+@dataclass
+class Flight:
+    """What was seen of it. Times are monotonic unless they say UTC."""
+
+    started_ns: int  # the daemon's process
+    start_at_ns: int  # exposure of frame 0
+    utc_minus_monotonic_ns: int
+    ready_ns: int | None = None  # the daemon said that it was warm
+    said: list[str] = field(default_factory=list)  # by the daemon
+    complaints: list[str] = field(default_factory=list)  # of its peers
+    targets: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
+    diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
+    poses: int = 0  # received over zenoh
+    usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
+
+    def hear_daemon(self, line: str, heard_ns: int) -> None:
+        self.said.append(line)
+        if self.ready_ns is None and "ready: " in line:
+            self.ready_ns = heard_ns
+
+    def hear_peer(self, line: str, _: int) -> None:
+        try:
+            record = json.loads(line)
+        except ValueError:  # no record: its last words
+            self.complaints.append(line)
+            return
+        if record["event"] == "target_relative":
+            self.targets.append(record)
+        elif record["event"] == "diagnostics":
+            self.diagnostics.append(record)
+        elif record["event"] == "pose":
+            self.poses += 1
+
+
+def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
+    """Fly for `minutes`; `on_second` hears how much of them is done, 0..1.
+
+    Raises InputError if the daemon refuses what it is given, PlayError if it is late or ends.
+    """
+    settings.out.mkdir(parents=True, exist_ok=True)
+    rounds = math.ceil(settings.minutes * 60 / settings.period_s) + 1
+    telemetry = read_telemetry(settings.sequence.telemetry_csv)
+    looped_csv = settings.out / "telemetry.csv"
+    write_telemetry(looped_csv, looped(telemetry, settings.sequence.frame0_ns, settings.period_s, rounds))
+    for lead_s in LEADS_S:
+        flight = _attempt(settings, looped_csv, lead_s, on_second)
+        if flight is not None:
+            return flight
+    raise PlayError(f"the daemon was not ready within {LEADS_S[-1]:.0f} s; see {settings.out / 'daemon.log'}")
+
+
+def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -> Telemetry:
+    """The part that belongs to the frames, again and again; t_ns is 0 at the exposure of the first frame."""
+    t_ns = telemetry.t_ns - frame0_ns
+    period_ns = round(period_s * 1e9)
+    inside = (t_ns >= 0) & (t_ns < period_ns)
+    times = [t_ns[inside] + turn * period_ns for turn in range(rounds)]
+    before = t_ns < 0
+    values = np.concatenate([telemetry.values[before], *[telemetry.values[inside]] * rounds])
+    return Telemetry(np.concatenate([t_ns[before], *times]), values)
+
+
+def _attempt(
+    settings: FlightSettings, telemetry_csv: Path, lead_s: float, on_second: Callable[[float], None]
+) -> Flight | None:
+    """One flight with frame 0 `lead_s` from now; None if the daemon was ready only after that."""
+    now_ns = time.monotonic_ns()
+    flight = Flight(now_ns, now_ns + round(lead_s * 1e9), time.time_ns() - now_ns)
+    mavlink_port, zenoh_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    config = settings.out / "config.toml"
+    config.write_text(_config_toml(settings, flight.start_at_ns, mavlink_port, zenoh_port), encoding="utf-8")
+    command = Path(sys.executable).parent / "uavpose-edge"
+    log = settings.out / "daemon.log"
+    with ExitStack() as cleanup:
+        cleanup.callback(lambda: log.write_text("".join(f"{line}\n" for line in flight.said), encoding="utf-8"))
+        peers = _peers(flight, telemetry_csv, mavlink_port, zenoh_port)
+        for peer in peers:
+            cleanup.callback(peer.end)
+        daemon = Process([command, "run", "--config", config], flight.hear_daemon)
+        cleanup.callback(daemon.end)  # the first to end: the peers hear it out
+        while flight.ready_ns is None and daemon.exit_code is None:
+            if time.monotonic_ns() > flight.start_at_ns - READY_MARGIN_NS:
+                return None
+            time.sleep(0.02)
+        _watch(settings, flight, daemon, peers, on_second)
+    return flight
+
+
+def _watch(
+    settings: FlightSettings,
+    flight: Flight,
+    daemon: Process,
+    peers: Sequence[Process],
+    on_second: Callable[[float], None],
+) -> None:
+    """Note what the daemon uses until the time is over. Raises InputError, PlayError if a process ends before."""
+    end_ns = flight.start_at_ns + round(settings.minutes * 60e9)
+    next_ns = flight.start_at_ns
+    while next_ns < end_ns:
+        time.sleep(max((next_ns - time.monotonic_ns()) * 1e-9, 0.0))
+        _check_all_run(flight, daemon, peers)
+        flight.usage.append(usage_of(daemon.pid))
+        next_ns += round(SAMPLE_S * 1e9)
+        on_second(min((next_ns - flight.start_at_ns) / (end_ns - flight.start_at_ns), 1.0))
+    time.sleep(max((end_ns - time.monotonic_ns()) * 1e-9, 0.0))
+    _check_all_run(flight, daemon, peers)
+
+
+def _check_all_run(flight: Flight, daemon: Process, peers: Sequence[Process]) -> None:
+    for process, words in ((daemon, flight.said), *((peer, flight.complaints) for peer in peers)):
+        if process.exit_code is not None:
+            code = process.reap()
+            last = words[-1] if words else "it said nothing"
+            if process is daemon and code == EXIT_BAD_INPUT:
+                raise InputError(last)
+            raise PlayError(f"{'the daemon' if process is daemon else 'a peer'} ended with exit code {code}: {last}")
+
+
+def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, zenoh_port: int) -> tuple[Process, Process]:
+    python = [sys.executable, "-m"]
+    autopilot = [*python, "sim_replay.autopilot", "--telemetry", str(telemetry_csv)]
+    autopilot += ["--endpoint", f"{LOOPBACK}:{mavlink_port}", "--start-at-ns", str(flight.start_at_ns)]
+    subscriber = [*python, "sim_replay.subscriber", "--connect", f"tcp/{LOOPBACK}:{zenoh_port}", "--uav", UAV]
+    return Process(autopilot, flight.hear_peer), Process(subscriber, flight.hear_peer)
+
+
+def _config_toml(settings: FlightSettings, start_at_ns: int, mavlink_port: int, zenoh_port: int) -> str:
+    """The daemon's configuration: loopback only. JSON's strings and nested lists are TOML's too."""
+    sequence = settings.sequence
+    lines = [
+        "[vehicle]",
+        f"name = {json.dumps(UAV)}",
+        "[camera]",
+        'type = "sequence"',
+        f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
+        f"fps = {sequence.fps}",
+        f"start_at_ns = {start_at_ns}",
+        "loop = true",
+        "[mount]",
+        f"R_body_cam = {json.dumps(sequence.mount.R_body_cam.tolist())}",
+        f"t_body_cam_m = {json.dumps(sequence.mount.t_body_cam_m.tolist())}",
+        "[model]",
+        f"path = {json.dumps(str(settings.model.resolve()))}",
+        "[zenoh]",
+        f'listen = ["tcp/{LOOPBACK}:{zenoh_port}"]',
+        "[mavlink]",
+        f'endpoints = ["udpin:{LOOPBACK}:{mavlink_port}"]',
+    ]
+    return "\n".join(lines) + "\n"

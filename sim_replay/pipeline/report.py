@@ -1,0 +1,174 @@
+"""A flight set against the budgets. Pure functions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from edge.health import WINDOW_FRAMES
+from edge.stages import STAGES
+from sim_replay.pipeline.flight import Flight
+
+SETTLE_S = 1.0  # after the sequence began again: the target has jumped and must be found anew
+FLAT_FROM_MINUTES = 60.0
+PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """One row of the budget table; `met` is None where this flight cannot tell."""
+
+    name: str
+    limit: float
+    value: float | None
+    unit: str
+    met: bool | None
+
+
+def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[str, Any]:
+    """JSON's types; milliseconds, 10^6 bytes, seconds; null where there is nothing to tell."""
+    latency = mavlink_latency_ms(flight, period_s)
+    stages = stage_latency_ms([record["values"] for record in flight.diagnostics], fps)
+    counters = last_counters(flight)
+    memory = memory_mb(flight)
+    cold_start_s = first_pose_s(flight)
+    result = {
+        "minutes": minutes,
+        "fps": fps,
+        "captured": counters.get("captured"),
+        "dropped": counters.get("dropped"),
+        "poses_mavlink": len(flight.targets),
+        "poses_zenoh": flight.poses,
+        "capture_to_mavlink_ms": latency,
+        "stages_ms": stages,
+        **cpu(flight, counters.get("captured")),
+        "memory_mb": memory,
+        "cold_start_s": cold_start_s,
+    }
+    return {**result, "budgets": [asdict(budget) for budget in budgets(result)]}
+
+
+def budgets(result: dict[str, Any]) -> list[Budget]:
+    """The design's table, for what one flight shows."""
+    steady = result["capture_to_mavlink_ms"]["steady"]
+    memory = result["memory_mb"]
+    growth = memory.get("growth_per_hour")
+    return [
+        _budget("capture to MAVLink, tracking, p50", 15.0, steady.get("p50"), "ms"),
+        _budget("capture to MAVLink, tracking, p99", 25.0, steady.get("p99"), "ms"),
+        _budget("inference in the loop, p50 (track)", 8.0, result["stages_ms"].get("inference", {}).get("p50"), "ms"),
+        _budget("frames dropped", 0.0, result["dropped"], ""),
+        _budget("resident memory, largest", 400.0, memory.get("max"), "MB"),
+        Budget("resident memory, growth an hour", 1.0, growth, "MB", None)
+        if growth is None or result["minutes"] < FLAT_FROM_MINUTES
+        else _budget("resident memory, growth an hour", 1.0, growth, "MB"),
+        _budget("cold start to first pose", 3.0, result["cold_start_s"], "s"),
+    ]
+
+
+def _budget(name: str, limit: float, value: float | None, unit: str) -> Budget:
+    return Budget(name, limit, value, unit, None if value is None else value <= limit)
+
+
+def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, float]]:
+    """From exposure to the autopilot's receiving: `all`, and `steady` without SETTLE_S after each new begin."""
+    captures_ns = [record["capture_utc_us"] * 1000 - flight.utc_minus_monotonic_ns for record in flight.targets]
+    pairs = zip(captures_ns, flight.targets, strict=True)
+    since_s = [((capture_ns - flight.start_at_ns) * 1e-9) % period_s for capture_ns in captures_ns]
+    ms = [(record["received_ns"] - capture_ns) * 1e-6 for capture_ns, record in pairs]
+    steady = [value for value, since in zip(ms, since_s, strict=True) if since >= SETTLE_S]
+    return {"all": _percentiles(ms), "steady": _percentiles(steady)}
+
+
+def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[str, dict[str, float]]:
+    """By stage: the median of the windows' p50, the largest of their p95 and p99.
+
+    `diagnostics` come once a second and tell of the last WINDOW_FRAMES: those of windows that do not overlap count.
+    """
+    step = max(round(WINDOW_FRAMES / fps), 1)
+    windows = list(diagnostics)[::-1][::step]
+    found = {}
+    for stage in STAGES:
+        told = {name: list(_numbers(windows, f"latency_ms/{stage}/{name}")) for name in PERCENTS}
+        if all(told.values()):
+            found[stage] = {"p50": float(np.median(told["p50"])), "p95": max(told["p95"]), "p99": max(told["p99"])}
+    return found
+
+
+def last_counters(flight: Flight) -> dict[str, int]:
+    """The daemon's own, as it last told them over zenoh."""
+    if not flight.diagnostics:
+        return {}
+    return {name: int(text) for name, text in flight.diagnostics[-1]["values"].items() if text.isdecimal()}
+
+
+def memory_mb(flight: Flight) -> dict[str, float]:
+    """Resident memory; its growth is the slope of the second half. Empty: not looked at often enough."""
+    rss = np.array([usage.rss_mb for usage in flight.usage])
+    if len(rss) < 4:
+        return {}
+    half = len(rss) // 2
+    hours = np.array([usage.time_ns for usage in flight.usage[half:]]) / 3.6e12
+    slope = float(np.polyfit(hours - hours[0], rss[half:], 1)[0])
+    return {"first": float(rss[0]), "last": float(rss[-1]), "max": float(rss.max()), "growth_per_hour": slope}
+
+
+def cpu(flight: Flight, captured: int | None) -> dict[str, float | None]:
+    """Cores that the daemon kept busy and cores that it waited for while others had them, on average; processor time
+    of one frame. Decoding the pictures is in all of them."""
+    if len(flight.usage) < 2:
+        return {"cpu_cores": None, "cpu_cores_waited_for": None, "cpu_ms_per_frame": None}
+    first, last = flight.usage[0], flight.usage[-1]
+    elapsed_s, cpu_s = (last.time_ns - first.time_ns) * 1e-9, last.cpu_s - first.cpu_s
+    return {
+        "cpu_cores": cpu_s / elapsed_s,
+        "cpu_cores_waited_for": (last.waited_s - first.waited_s) / elapsed_s,
+        "cpu_ms_per_frame": 1e3 * cpu_s / captured if captured else None,
+    }
+
+
+def first_pose_s(flight: Flight) -> float | None:
+    """From the start of the process to ready, and from the first exposure to the first pose at the autopilot."""
+    if flight.ready_ns is None or not flight.targets:
+        return None
+    first_ns = min(record["received_ns"] for record in flight.targets)
+    return (flight.ready_ns - flight.started_ns + first_ns - flight.start_at_ns) * 1e-9
+
+
+def table(result: dict[str, Any]) -> str:
+    """For a person."""
+    return "\n".join(_lines(result))
+
+
+def _lines(result: dict[str, Any]) -> Iterator[str]:
+    yield f"{'':40} {'budget':>8} {'here':>8}"
+    words = {True: "met", False: "MISSED", None: "not judged"}
+    for budget in result["budgets"]:
+        value = "-" if budget["value"] is None else f"{budget['value']:.1f}"
+        yield f"{budget['name']:40} {budget['limit']:8g} {value:>8} {budget['unit']:3} {words[budget['met']]}"
+    yield ""
+    yield f"{'latency, ms':40} {'p50':>8} {'p95':>8} {'p99':>8}"
+    rows = {f"capture to MAVLink, {name}": ms for name, ms in result["capture_to_mavlink_ms"].items()}
+    for name, ms in {**rows, **result["stages_ms"]}.items():
+        if ms:
+            yield f"{name:40} {ms['p50']:8.2f} {ms['p95']:8.2f} {ms['p99']:8.2f}"
+    yield ""
+    yield f"{result['captured']} frames, {result['poses_mavlink']} poses at the autopilot"
+    if result["cpu_cores"] is not None:
+        waited = result["cpu_cores_waited_for"]
+        yield f"{result['cpu_cores']:.2f} cores busy, {waited:.2f} waited for while other processes had them"
+        if waited > result["cpu_cores"]:
+            yield "This machine was busy with other work: latencies and drops are the machine's, not the daemon's."
+
+
+def _percentiles(values: Sequence[float]) -> dict[str, float]:
+    if not values:
+        return {}
+    return {name: float(np.percentile(values, percent)) for name, percent in PERCENTS.items()}
+
+
+def _numbers(records: Iterable[dict[str, str]], key: str) -> Iterator[float]:
+    return (float(record[key]) for record in records if key in record)

@@ -1,0 +1,133 @@
+"""`bench-pipeline`: a real flight of seconds, and how its figures are made of what was heard."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.ground_truth import read_sequence
+from sim_replay.pipeline.flight import Flight, looped
+from sim_replay.pipeline.report import WINDOW_FRAMES, cpu, mavlink_latency_ms, memory_mb, report, stage_latency_ms
+from sim_replay.pipeline.usage import Usage, usage_of
+from sim_replay.telemetry import read_telemetry
+
+PERIOD_S = 5.0
+START_NS = 7_000_000_000
+UTC_NS = 1_700_000_000_000_000_000
+
+
+def heard(captures_s: list[float], latency_ms: list[float]) -> Flight:
+    """A flight of which the autopilot heard these."""
+    flight = Flight(START_NS - 2_000_000_000, START_NS, UTC_NS, ready_ns=START_NS - 1_000_000_000)
+    for capture_s, ms in zip(captures_s, latency_ms, strict=True):
+        capture_ns = START_NS + round(capture_s * 1e9)
+        flight.targets.append(
+            {"capture_utc_us": (UTC_NS + capture_ns) // 1000, "received_ns": capture_ns + round(ms * 1e6)}
+        )
+    return flight
+
+
+def run(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [str(Path(sys.executable).parent / "uavpose-edge"), "bench", "--pipeline", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=cwd)
+
+
+def test_what_is_found_anew_after_each_round_is_no_steady_tracking() -> None:
+    flight = heard([0.5, 2.0, 4.9, 5.2, 7.0], [80.0, 10.0, 12.0, 90.0, 11.0])
+    latency = mavlink_latency_ms(flight, PERIOD_S)
+    assert latency["steady"]["p50"] == pytest.approx(11.0, abs=1e-3)
+    assert latency["steady"]["p99"] < 12.01
+    assert latency["all"]["p99"] > 80.0
+
+
+def test_stages_are_of_windows_that_do_not_overlap() -> None:
+    step = round(WINDOW_FRAMES / 30.0)
+    seconds = range(3 * step + 1)
+    told = [{f"latency_ms/inference/{p}": str(second) for p in ("p50", "p95", "p99")} for second in seconds]
+    found = stage_latency_ms(told, 30.0)
+    assert found == {"inference": {"p50": 1.5 * step, "p95": 3.0 * step, "p99": 3.0 * step}}
+
+
+def test_growth_is_of_the_second_half() -> None:
+    flight = heard([], [])
+    rss_mb = [100.0 + 20.0 * second for second in range(10)] + [300.0 + 0.01 * second for second in range(10)]
+    flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb) for second, mb in enumerate(rss_mb)]
+    memory = memory_mb(flight)
+    assert memory["max"] == pytest.approx(300.09)
+    assert memory["growth_per_hour"] == pytest.approx(36.0)
+
+
+def test_processor_time_and_waiting_are_told_apart() -> None:
+    flight = heard([], [])
+    flight.usage = [Usage(0, 3.0, 1.0, 100.0), Usage(20_000_000_000, 13.0, 5.0, 100.0)]
+    found = cpu(flight, captured=500)
+    assert found == {"cpu_cores": 0.5, "cpu_cores_waited_for": 0.2, "cpu_ms_per_frame": 20.0}
+
+
+def test_budgets_are_met_missed_or_not_judged() -> None:
+    flight = heard([0.3, 2.0, 3.0], [9.0, 20.0, 22.0])
+    flight.diagnostics = [{"values": {"dropped": "3", "captured": "90", "latency_ms/inference/p50": "4.5"}}]
+    judged = {budget["name"]: budget["met"] for budget in report(flight, 30.0, PERIOD_S, 2.0)["budgets"]}
+    assert judged["capture to MAVLink, tracking, p50"] is False
+    assert judged["capture to MAVLink, tracking, p99"] is True
+    assert judged["frames dropped"] is False
+    assert judged["cold start to first pose"] is True
+    assert judged["resident memory, largest"] is None
+
+
+def test_the_own_ship_flies_round_and_round_with_the_pictures() -> None:
+    sequence = read_sequence(BUNDLED_SEQUENCE)
+    telemetry = read_telemetry(sequence.telemetry_csv)
+    period_s = len(sequence.scene.images) / sequence.fps
+    round_ns = round(period_s * 1e9)
+    flown = looped(telemetry, sequence.frame0_ns, period_s, 3)
+    assert (np.diff(flown.t_ns) > 0).all()
+    for turn in range(3):
+        for t_ns in np.arange(0, round_ns - 40_000_000, 170_000_000):
+            once = telemetry.at(sequence.frame0_ns + int(t_ns))
+            again = flown.at(turn * round_ns + int(t_ns))
+            np.testing.assert_allclose(again.t_ned_body_m, once.t_ned_body_m, atol=1e-9)
+            np.testing.assert_allclose(again.q_ned_body_wxyz, once.q_ned_body_wxyz, atol=1e-9)
+
+
+def test_usage_is_of_the_process_that_is_asked_for() -> None:
+    child = subprocess.Popen(
+        [sys.executable, "-c", "kept = bytearray(80_000_000)\nsum(range(8_000_000))\nprint(1, flush=True)\ninput()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert child.stdout is not None
+    child.stdout.readline()
+    used = usage_of(child.pid)
+    child.communicate(b"\n")
+    assert used.rss_mb > 80.0
+    assert used.cpu_s > 0.0
+    with pytest.raises(OSError, match=str(child.pid)):
+        usage_of(child.pid)
+
+
+def test_the_daemon_is_flown_for_seconds(tmp_path: Path) -> None:
+    done = run(tmp_path, "--minutes", "0.1", "--json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["captured"] > 0
+    assert result["cpu_cores"] > 0
+    assert 50.0 < result["memory_mb"]["max"] < 2000.0
+    assert {"capture", "inference", "total"} <= set(result["stages_ms"])
+    assert len(result["budgets"]) == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"), [(["--minutes", "0"], "--minutes 0"), (["--sequence", "nowhere"], "nowhere")]
+)
+def test_what_cannot_be_flown_is_named(tmp_path: Path, arguments: list[str], named: str) -> None:
+    done = run(tmp_path, *arguments)
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert "Traceback" not in done.stderr
