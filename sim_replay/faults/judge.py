@@ -11,8 +11,12 @@ from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, Recei
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
 TRANSIT_MAX_NS = 700_000_000
 SAME_FRAME_NS = 30_000_000
-# Held back by a cut link, or read late by a peer that stood still: to refuse them is right.
-MAY_REFUSE = {SUBSCRIBER: ("STALE", "SEQUENCE")}
+# To refuse these is right: what a cut link held back or a peer that stood still read late, what a relay spoiled, and
+# what is addressed as from the system that another has just replaced.
+MAY_REFUSE = {
+    SUBSCRIBER: ("STALE", "SEQUENCE"),
+    AUTOPILOT: ("not MAVLink", "unknown message", "not from a component of this vehicle"),
+}
 
 
 def violations(witness: Witness) -> list[str]:
