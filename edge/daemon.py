@@ -53,7 +53,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         gc.collect()
         gc.freeze()
         pipeline.ready()
-        cleanup.callback(pipeline.stopping)
+        cleanup.callback(pipeline.supervisor.stopping)
         capture.start()
         with file.blame(*camera_key(config.camera)):
             pipeline.fly(stop)
@@ -87,7 +87,7 @@ class Pipeline:
         self._acquire_every_n = config.estimator.acquire_every_n
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
-        self._supervisor = Supervisor(config.health, config.mavlink.enabled, outlets, board, self._counters)
+        self.supervisor = Supervisor(config.health, config.mavlink.enabled, outlets, board, self._counters)
         self._since_acquire = 0
         self._out_of_order = 0
 
@@ -99,11 +99,11 @@ class Pipeline:
         if model.fallback_reason is not None:
             log.warning("model: %s", model.fallback_reason)
             self._outlets.event(logging.WARNING, f"model: {model.fallback_reason}")
-        self._supervisor.ready()
+        self.supervisor.ready()
 
     def fly(self, stop: threading.Event) -> None:
         """The loop. Returns when `stop` is set or the recording is over. Raises InputError from the camera."""
-        with self._supervisor.watchdog.armed():
+        with self.supervisor.watchdog.armed():
             while not stop.is_set():
                 try:
                     frame = self._capture.newest(TICK_S)
@@ -111,14 +111,11 @@ class Pipeline:
                     return
                 if frame is not None:
                     self._process(frame)
-                self._supervisor.turn()
+                self.supervisor.turn()
                 self._take_reload()
 
-    def stopping(self) -> None:
-        self._supervisor.stopping()
-
     def snapshot(self) -> HealthSnapshot:
-        return self._supervisor.snapshot()
+        return self.supervisor.snapshot()
 
     def _counters(self) -> dict[str, int]:
         return {
@@ -149,7 +146,7 @@ class Pipeline:
         clock.lap("track")
         self._publish(frame, size_wh, tracks, own_ship)
         clock.lap("publish")
-        self._supervisor.frame_done(frame.meta, clock.stages_ns(), tracks, own_ship is not None)
+        self.supervisor.frame_done(frame.meta, clock.stages_ns(), tracks, own_ship is not None)
 
     def _take_requests(self, capture_ns: int) -> None:
         for request in self._requests.take():
@@ -195,6 +192,6 @@ class Pipeline:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
         self._acquire_every_n = new.file.config.estimator.acquire_every_n
-        self._supervisor.apply(new.file.config.health)
+        self.supervisor.apply(new.file.config.health)
         log.info("%s", new.said)
         self._outlets.event(logging.INFO, new.said)

@@ -58,9 +58,7 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
             zenoh.open(client_config([endpoint], tls=tls)).close()
             yield good("ground", f"{endpoint} answers")
         except zenoh.ZError:
-            advice = (
-                "start `uavpose-ground router` there, check address, firewall, certificates"
-            )
+            advice = "start `uavpose-ground router` there, check address, firewall, certificates"
             yield poor("ground", f"{endpoint} does not answer", advice)
 
 
