@@ -180,7 +180,8 @@ class Pipeline:
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
     ) -> None:
         sha256 = self._estimator.model.sha256
-        report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, sha256, chosen_id=self._by_hand.chosen_id)
+        chosen_id = self._by_hand.chosen_id
+        report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, sha256, chosen_id, frame.distortion)
         self._outlets.publish(report)
 
     def _take_reload(self) -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from edge.links.zenoh_messages import camera_info
 from msgs import cdr
-from tests.edge.reports import report, track
+
+from .reports import make_report, make_track
 
 
 @pytest.mark.parametrize(
@@ -25,7 +26,7 @@ from tests.edge.reports import report, track
 def test_a_ground_tool_projects_to_the_pixels_of_the_frame(
     distortion: tuple[float, ...], model: str, count: int
 ) -> None:
-    told = report(track(1_000))
+    told = make_report(make_track(1_000))
     info = cdr.CameraInfo.decode(camera_info(replace(told, distortion=distortion), 5).encode())
     assert (info.distortion_model, len(info.distortion)) == (model, count)
     points = np.array([[3.0, -2.0, 40.0], [-6.0, 1.0, 50.0]])
