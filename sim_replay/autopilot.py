@@ -205,6 +205,7 @@ def _target_record(message: Any, now_ns: int) -> dict[str, Any]:
         "received_ns": now_ns,
         "t_cam_target_m": [message.x, message.y, message.z],
         "q_cam_target_wxyz": list(message.q_target),
+        "q_ned_cam_wxyz": list(message.q_sensor),
     }
 
 

@@ -5,12 +5,19 @@ from __future__ import annotations
 import bisect
 from collections.abc import Sequence
 
+import numpy as np
+
+from edge.config import R_BODY_CAM_FORWARD
+from msgs.geometry import q_wxyz_from_R
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose, Witness
 
 # The daemon's own limits on a measurement's age, and what a loaded host may add between its look and the peer's.
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
 TRANSIT_MAX_NS = 700_000_000
 SAME_FRAME_NS = 30_000_000
+# The rig's own ship hovers level and looks north through a camera along its nose.
+Q_NED_CAM_WXYZ = q_wxyz_from_R(R_BODY_CAM_FORWARD)
+ATTITUDE_TOLERANCE = 1e-2
 # To refuse these is right: what a cut link held back or a peer that stood still read late, what a relay spoiled, and
 # what is addressed as from the system that another has just replaced.
 MAY_REFUSE = {
@@ -68,7 +75,15 @@ def _fault_of(pose: ReceivedPose, exposures: _Exposures) -> str | None:
         return f"{told} of a frame that the camera never exposed, stamped {pose.capture_ns}"
     if all(frame.frozen for frame in frames):
         return f"{told} of a frozen picture, stamped {pose.capture_ns}"
+    if not _attitude_holds(pose):
+        return f"{told} with an own attitude that nobody flew: {pose.q_ned_cam_wxyz}"
     age_ns = pose.arrival_ns - max(frame.exposed_ns for frame in frames)
     if age_ns > AGE_MAX_NS[pose.peer] + TRANSIT_MAX_NS:
         return f"{told} {age_ns / 1e6:.0f} ms after its frame was exposed"
     return None
+
+
+def _attitude_holds(pose: ReceivedPose) -> bool:
+    """Whether the own attitude is the true one, or said to be unknown."""
+    q = pose.q_ned_cam_wxyz
+    return q is None or not any(q) or bool(abs(np.dot(q, Q_NED_CAM_WXYZ)) >= 1.0 - ATTITUDE_TOLERANCE)

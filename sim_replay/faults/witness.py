@@ -30,6 +30,7 @@ class ReceivedPose:
     peer: str
     capture_ns: int  # as it says
     arrival_ns: int
+    q_ned_cam_wxyz: tuple[float, ...] | None = None  # own attitude it was told with; zeros: unknown; None: not told
 
 
 @dataclass
@@ -91,7 +92,8 @@ class Witness:
             self.frames.append(ExposedFrame(exposed_ns, stamp_ns, record["frozen"]))
         elif event == "target_relative":
             arrival_ns = self._clock.utc_ns(record["received_ns"])
-            self.poses.append(ReceivedPose(AUTOPILOT, record["capture_utc_us"] * 1000, arrival_ns))
+            q_ned_cam = tuple(record["q_ned_cam_wxyz"])
+            self.poses.append(ReceivedPose(AUTOPILOT, record["capture_utc_us"] * 1000, arrival_ns, q_ned_cam))
         elif event == "pose":
             capture_ns = record["capture_utc_ns"]
             self.poses.append(ReceivedPose(SUBSCRIBER, capture_ns, capture_ns + round(record["age_ms"] * 1e6)))

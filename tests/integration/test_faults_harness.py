@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,7 @@ def test_fresh_poses_of_frames_that_were_exposed_are_no_fault() -> None:
         (pose(3, 1500.0, SUBSCRIBER), "1500 ms after"),
         (pose(25, 20.0), "frozen"),
         (pose(3, 20.0, off_ms=50.0), "never exposed"),
+        (replace(pose(3, 20.0), q_ned_cam_wxyz=(1.0, 0.0, 0.0, 0.0)), "nobody flew"),
     ],
 )
 def test_a_stale_a_frozen_and_an_invented_pose_are_found(received: ReceivedPose, words: str) -> None:
