@@ -17,12 +17,12 @@ check:
 	@.venv/bin/lint-imports
 
 bench: out/models/mf-uavpose6d-edge-unmeasured-fp32.onnx out/models/mf-uavpose6d-paper-unmeasured-fp32.onnx
-	@sh deploy/bootstrap.sh demo
+	@sh deploy/bootstrap.sh dev
 	@.venv/bin/uavpose-edge bench edge/estimator/models/mf-uavpose6d-edge-int8.onnx $^
 
-out/models/mf-uavpose6d-edge-unmeasured-fp32.onnx: trainer/checkpoints/mf-uavpose6d-edge.pt
+out/models/mf-uavpose6d-edge-unmeasured-fp32.onnx: trainer/checkpoints/mf-uavpose6d-edge.pt trainer/configs/edge.toml
 	@sh deploy/bootstrap.sh dev
-	@.venv/bin/uavpose-trainer export --checkpoint $< --unmeasured --out $(@D)
+	@.venv/bin/uavpose-trainer export --checkpoint $< --config trainer/configs/edge.toml --unmeasured --out $(@D)
 
 out/models/mf-uavpose6d-paper-unmeasured-fp32.onnx: trainer/configs/paper.toml
 	@sh deploy/bootstrap.sh dev

@@ -32,16 +32,17 @@ def _train(arguments: argparse.Namespace) -> None:
 def _export(arguments: argparse.Namespace) -> None:
     from trainer.export import export_models, export_unmeasured
 
+    contract = load_config(arguments.config).contract if arguments.config else None
     if arguments.untrained is not None or arguments.unmeasured:
-        source = arguments.untrained or arguments.checkpoint
-        path = export_unmeasured(source, arguments.out, untrained=arguments.untrained is not None)
+        source, untrained = arguments.untrained or arguments.checkpoint, arguments.untrained is not None
+        path = export_unmeasured(source, arguments.out, untrained=untrained, contract=contract)
         print(f"wrote {path}, for timing alone")
         return
     export_models(
         arguments.checkpoint,
         arguments.out,
         float_out=arguments.float_out,
-        contract=load_config(arguments.config).contract if arguments.config else None,
+        contract=contract,
         tolerance_deg=arguments.tolerance,
         samples=arguments.samples,
         say=lambda text: print(text, flush=True),

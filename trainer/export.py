@@ -186,11 +186,14 @@ def export_models(
     return float_path, int8_path
 
 
-def export_unmeasured(source: Path, out: Path, *, untrained: bool) -> Path:
+def export_unmeasured(
+    source: Path, out: Path, *, untrained: bool = False, contract: ContractConfig | None = None
+) -> Path:
     """Write NAME-unmeasured-fp32.onnx into `out`, for timing alone; returns its path.
 
-    `source` is a checkpoint, or with `untrained` a configuration whose network gets random weights. Nothing is rendered
-    or measured: the contract has no metrics and scores that no peak reaches. Raises ConfigError.
+    `source` is a checkpoint, or with `untrained` a configuration whose network gets random weights; `contract` as in
+    `export_models`. Nothing is rendered or measured: the file has no metrics, and thresholds that no peak reaches.
+    Raises ConfigError.
     """
     if untrained:
         config = load_config(source)
@@ -199,6 +202,8 @@ def export_unmeasured(source: Path, out: Path, *, untrained: bool) -> Path:
         sha256 = weights_sha256(model.state_dict())
     else:
         model, config, training, sha256 = load_model(source)
+    if contract is not None:
+        config = config.model_copy(update={"contract": contract})
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
     write_graph(model, path)

@@ -18,7 +18,7 @@ HEADLINES = {  # each ratio's stage for the one figure in `ratios`; without that
     "over_vnni_limit": "track",
 }
 MEANING = {
-    "int8_over_fp32": "INT8 / FP32 of the edge configuration",
+    "int8_over_fp32": "INT8 / FP32 of the edge configuration at one input size",
     "edge_over_paper_fp32": "edge / paper configuration, FP32, each at its own input size",
     "ort_over_openvino": "ONNX Runtime / OpenVINO, INT8",
     "over_vnni_limit": "INT8 / its multiply-accumulates at this machine's peak",
@@ -54,8 +54,9 @@ def _at(measured: Measured, stage: str, threads: int) -> Iterator[Ratio]:
 
     int8, fp32, paper = first("edge", "int8"), first("edge", "fp32"), first("paper", "fp32")
     by_openvino = first("edge", "int8", "openvino")
+    same_size = int8 is not None and fp32 is not None and int8.size_wh == fp32.size_wh
     pairs = {
-        "int8_over_fp32": (int8, fp32),
+        "int8_over_fp32": (int8, fp32 if same_size else None),
         "edge_over_paper_fp32": (fp32, paper),
         "ort_over_openvino": (int8, by_openvino),
     }
@@ -130,20 +131,20 @@ def _ratio_lines(measured: Measured) -> Iterator[str]:
             cpu = f"{ratio.cpu:7.2f}" if ratio.cpu is not None else f"{'-':>7}"
             yield f"{meaning:64} {ratio.stage:8} {ratio.threads:7d} {ratio.value:7.2f} {cpu}"
         if not own:
-            reason = "openvino is not installed" if name == "ort_over_openvino" else "needs both models"
+            reason = "openvino is not installed" if name == "ort_over_openvino" else "needs two such models"
             yield f"{meaning:64} {reason:>24}"
 
 
 def _row_lines(measured: Measured) -> Iterator[str]:
     yield (
-        f"{'model':32} {'stage':8} {'input':>8} {'threads':>7} {'engine':12}"
+        f"{'model':34} {'stage':8} {'input':>8} {'threads':>7} {'engine':12}"
         f" {'p10 ms':>8} {'p50 ms':>8} {'p99 ms':>8} {'CPU ms':>8} {'INT8 MMAC':>10} {'FP32 MMAC':>10} {'limit ms':>9}"
     )
     for row in measured.rows:
         case, ms = row.case, row.ms
         size = "x".join(map(str, row.size_wh))
         yield (
-            f"{Path(case.file).stem:32} {case.stage:8} {size:>8} {case.threads:7d} {case.engine:12}"
+            f"{Path(case.file).stem:34} {case.stage:8} {size:>8} {case.threads:7d} {case.engine:12}"
             f" {ms.p10:8.2f} {ms.p50:8.2f} {ms.p99:8.2f} {ms.cpu:8.2f}"
             f" {row.macs.int8 / 1e6:10.1f} {row.macs.float32 / 1e6:10.1f} {row.limit_ms:9.2f}"
         )

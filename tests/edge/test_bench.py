@@ -125,6 +125,14 @@ def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) 
     assert all(peak["int8_gmac_per_s"] > 0 and peak["fp32_gmac_per_s"] > 0 for peak in result["peaks"])
 
 
+def test_precisions_are_compared_at_one_size_alone(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8", track_size_wh=(128, 128))
+    done = cli("bench", toy_model, int8, "--runs", "1", "--threads", "1", "--json")
+    assert done.returncode == 0, done.stderr
+    compared = [r["stage"] for r in json.loads(done.stdout)["all_ratios"] if r["name"] == "int8_over_fp32"]
+    assert compared == ["acquire"]
+
+
 def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
     done = cli("bench", "--runs", "2", "--threads", "1", "--json", timeout_s=200.0)
     assert done.returncode == 0, done.stderr
