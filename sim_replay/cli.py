@@ -19,6 +19,7 @@ from sim_replay.datasets import open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE, show
 from sim_replay.evaluation.judge import judge_frames, score_of
 from sim_replay.evaluation.table import score_table
+from sim_replay.faults import run as faults
 from sim_replay.ground_truth import read_sequence
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
 
     benchmark.register(commands)
     pipeline.register(commands)
+    faults.register(commands)
 
     score = commands.add_parser(
         "score",
