@@ -18,7 +18,7 @@ from msgs import topics
 ROOT = Path(__file__).parents[1]
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 INSTALL = (ROOT / "docs" / "install.md").read_text()
-EXAMPLES = sorted((ROOT / "deploy" / "examples").glob("*.toml"))
+EXAMPLES = sorted(path for path in (ROOT / "deploy" / "examples").glob("*.toml") if not path.name.startswith("camera-"))
 UNIT = ROOT / "deploy" / "uavpose-edge.service"
 
 

@@ -142,7 +142,7 @@ def test_pictures_are_written(demo: DemoRun) -> None:
     frames = 0
     while video.grab():
         frames += 1
-    assert frames == demo.score["frames"]
+    assert frames == demo.score["overall"]["frames"]
 
 
 def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(tmp_path: Path) -> None:
