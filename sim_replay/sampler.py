@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.airframes import AIRFRAMES
+from sim_replay.airframes import AIRFRAMES, airframe_of
 from sim_replay.render.distractors import add_distractors
 from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
 from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
@@ -72,7 +72,7 @@ def _write_target(
     out["mask"][k] = mask
     out["noc"][k][mask] = noc[mask]
     out["airframe_id"][k] = target.airframe_id
-    out["diameter_m"][k] = AIRFRAMES[target.airframe_id].diameter_m()
+    out["diameter_m"][k] = airframe_of(target.airframe_id).diameter_m()
 
 
 def _enlarged(
@@ -96,10 +96,12 @@ class WindowSampler:
         airframe_ids: Sequence[int] | None = None,
         acquire_share: float = 0.3,
         empty_share: float = 0.12,
+        invented_share: float = 0.0,
     ) -> None:
         self.seed, self.size_px = seed, size_px
         self.airframe_ids = tuple(range(len(AIRFRAMES)) if airframe_ids is None else airframe_ids)
         self.acquire_share, self.empty_share = acquire_share, empty_share
+        self.invented_share = invented_share
         self._renderer: Renderer | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -122,7 +124,8 @@ class WindowSampler:
         return SampleBatch(**out)
 
     def _window(self, index: int) -> Window:
-        return draw_window(self.seed, index, self.size_px, self.airframe_ids, self.acquire_share, self.empty_share)
+        shares = self.acquire_share, self.empty_share, self.invented_share
+        return draw_window(self.seed, index, self.size_px, self.airframe_ids, *shares)
 
     def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:
         side, size = window.scene.camera.width_px, self.size_px

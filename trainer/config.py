@@ -89,6 +89,7 @@ class DataConfig(_Section):
     airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
     acquire_share: float = Field(0.3, ge=0, le=1, description="share of views as the acquire stage sees them")
     empty_share: float = Field(0.12, ge=0, lt=1, description="share of windows without a target")
+    invented_share: float = Field(0.0, ge=0, le=1, description="of targets that are no member of the fleet")
     batch_size: int = Field(ge=2)
     workers: int = Field(1, ge=1, description="rendering processes")
     prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")

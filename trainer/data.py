@@ -99,9 +99,10 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
             shares.append(source.share)
     if sum(shares) < 1.0:
-        ids = config.airframe_ids
+        # What is validated on stays comparable whatever is trained on.
+        invented = 0.0 if validating else config.invented_share
         samplers.append(
-            WindowSampler(seed, size_px, ids, acquire_share=config.acquire_share, empty_share=config.empty_share)
+            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented)
         )
         shares.append(1.0 - sum(shares))
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)

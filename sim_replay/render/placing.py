@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.geometry import R_from_euler, so3_exp
+from sim_replay.airframes.invented import draw_invented
 from sim_replay.render.environment import direction_ned
 from sim_replay.render.frame import outline_px
 from sim_replay.render.projection import extents_px, solid_vertices_m
@@ -84,9 +85,12 @@ def _lens_for(rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, lo
     return float(np.clip(rng.uniform(*BOX_PX) * range_m / size_m, *FOCAL_PX))
 
 
-def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int]) -> Scene:
+def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int], invented_share: float = 0.0) -> Scene:
     """A whole 1920 x 1080 frame with one target wholly inside it where the lens allows."""
-    airframe_id = int(rng.choice(np.asarray(airframe_ids)))
+    if invented_share > 0.0 and rng.random() < invented_share:
+        airframe_id = draw_invented(rng, airframe_ids)
+    else:
+        airframe_id = int(rng.choice(np.asarray(airframe_ids)))
     vertices_m = solid_vertices_m(airframe_id)
     range_m = rng.uniform(*RANGE_M) if rng.random() < 0.5 else np.exp(rng.uniform(*np.log(RANGE_M)))
     R_ned_body = R_from_euler(_clipped_normal(rng, 25, 75), _clipped_normal(rng, 8, 30), rng.uniform(-np.pi, np.pi))
@@ -145,14 +149,20 @@ def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[
 
 
 def draw_window(
-    seed: int, index: int, size_px: int, airframe_ids: Sequence[int], acquire_share: float, empty_share: float
+    seed: int,
+    index: int,
+    size_px: int,
+    airframe_ids: Sequence[int],
+    acquire_share: float,
+    empty_share: float,
+    invented_share: float = 0.0,
 ) -> Window:
     """Window number `index`: a pure function of its arguments."""
     rng = np.random.default_rng([seed, index, size_px])
     kind: Kind = "acquire" if rng.random() < acquire_share else "track"
     empty = bool(rng.random() < empty_share)
     distractors = bool(rng.random() < (0.5 if empty else 0.12))
-    frame = frame_scene(rng, airframe_ids)
+    frame = frame_scene(rng, airframe_ids, invented_share)
     x0, y0, side = _acquire_cut(rng, frame, size_px) if kind == "acquire" else _track_cut(rng, frame)
     rendered_px = int(np.clip(round(side), 24, size_px))
     scale = rendered_px / side

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_replay.airframes import AIRFRAMES, Part
+from sim_replay.airframes import Part, airframe_of
 from sim_replay.airframes.mesh import Mesh
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ FARTHEST_RADIUS2 = 25.0  # squared tangent of 79 degrees: no lens here sees furt
 @cache
 def vertices_m(airframe_id: int) -> Array:
     """All vertices [V, 3] of the airframe; read-only."""
-    vertices = AIRFRAMES[airframe_id].mesh().vertices_m.astype(np.float64)
+    vertices = airframe_of(airframe_id).mesh().vertices_m.astype(np.float64)
     vertices.setflags(write=False)
     return vertices
 
@@ -30,7 +30,7 @@ def vertices_m(airframe_id: int) -> Array:
 @cache
 def solid_vertices_m(airframe_id: int) -> Array:
     """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds; read-only."""
-    return _without_disc(AIRFRAMES[airframe_id].mesh())
+    return _without_disc(airframe_of(airframe_id).mesh())
 
 
 def _without_disc(mesh: Mesh) -> Array:
@@ -45,7 +45,7 @@ def fine_mesh(airframe_id: int) -> Mesh:
 
     Halving the longest edge first leaves no sliver, and every vertex of the airframe stays one.
     """
-    airframe = AIRFRAMES[airframe_id]
+    airframe = airframe_of(airframe_id)
     mesh, longest_m = airframe.mesh(), airframe.diameter_m() * LONGEST_EDGE
     vertices, normals, part = mesh.vertices_m, mesh.normals, mesh.part
     done: list[NDArray[np.int32]] = []

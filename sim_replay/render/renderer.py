@@ -18,7 +18,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.airframes import AIRFRAMES, Mesh, Part
+from sim_replay.airframes import Mesh, Part, airframe_of
 from sim_replay.render.backdrop import Backdrop, load_backdrop
 from sim_replay.render.packing import (
     columns,
@@ -143,7 +143,7 @@ class Renderer:
     def _mesh(self, airframe_id: int, fine: bool) -> _GpuMesh:
         key = (airframe_id, fine)
         if key not in self._meshes:
-            mesh: Mesh = fine_mesh(airframe_id) if fine else AIRFRAMES[airframe_id].mesh()
+            mesh: Mesh = fine_mesh(airframe_id) if fine else airframe_of(airframe_id).mesh()
             vertex = np.hstack([mesh.vertices_m, mesh.normals, mesh.part[:, None].astype(np.float32)])
             # The nearly transparent disc goes last, so that it hides nothing it does not cover.
             disc = mesh.part[mesh.faces[:, 0]] == Part.PROPELLER_DISC
@@ -361,7 +361,7 @@ class Renderer:
     def _draw_target(
         self, target: Target, scene: Scene, projection: Array, number: int, slot: int | None, corner: tuple[int, int]
     ) -> None:
-        airframe, camera, program = AIRFRAMES[target.airframe_id], scene.camera, self._aircraft
+        airframe, camera, program = airframe_of(target.airframe_id), scene.camera, self._aircraft
         mesh = self._mesh(target.airframe_id, fine=camera.distortion is not None)
         R_cam_body, t_cam_body_m = target.pose_in(camera)
         cam_from_body = np.eye(4)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.airframes import AIRFRAMES
+from sim_replay.airframes import airframe_of
 from sim_replay.render.projection import NEAREST_VERTEX_M, clip_from_cam, extents_px, project_px, vertices_m
 from sim_replay.render.scene import Camera, Scene, Target, rays_ned
 
@@ -39,13 +39,13 @@ def parts_of(scene: Scene, crop: Crop) -> Parts:
 def is_ahead(target: Target, camera: Camera) -> bool:
     """Whether the whole aircraft lies in front of the camera."""
     depth_m = target.pose_in(camera)[1][2]
-    return bool(depth_m - AIRFRAMES[target.airframe_id].diameter_m() >= NEAREST_VERTEX_M)
+    return bool(depth_m - airframe_of(target.airframe_id).diameter_m() >= NEAREST_VERTEX_M)
 
 
 def diameter_px(target: Target, camera: Camera) -> float:
     """Pixels that the target's diameter takes at its range, seen broadside."""
     range_m = np.linalg.norm(target.t_ned_body_m - camera.t_ned_cam_m)
-    return float(camera.K[0, 0] * AIRFRAMES[target.airframe_id].diameter_m() / range_m)
+    return float(camera.K[0, 0] * airframe_of(target.airframe_id).diameter_m() / range_m)
 
 
 def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
@@ -65,6 +65,6 @@ def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
 
 def depth_projection(targets: Sequence[Target], camera: Camera, crop: Crop) -> Array:
     """[4, 4] projection of a crop whose depth range holds those targets and no more."""
-    reach = [(t.pose_in(camera)[1][2], AIRFRAMES[t.airframe_id].diameter_m()) for t in targets]
+    reach = [(t.pose_in(camera)[1][2], airframe_of(t.airframe_id).diameter_m()) for t in targets]
     near_m, far_m = min(z - size for z, size in reach), max(z + size for z, size in reach)
     return clip_from_cam(camera.K, crop[0], crop[1], crop[2] - crop[0], crop[3] - crop[1], near_m, far_m)

@@ -1,0 +1,66 @@
+"""Aircraft that nobody built are sound meshes, differ from the fleet, and are labelled as what they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_replay.airframes import AIRFRAMES, Part, airframe_of
+from sim_replay.airframes.invented import SPAN_M, draw_invented
+from sim_replay.sampler import WindowSampler
+
+FLEET = len(AIRFRAMES)
+
+
+def test_numbers_of_the_fleet_mean_the_fleet() -> None:
+    assert [airframe_of(number) for number in range(FLEET)] == list(AIRFRAMES)
+    with pytest.raises(IndexError):
+        airframe_of(10**6)
+
+
+def test_invented_aircraft_are_sound_meshes_of_another_size_and_shape() -> None:
+    rng = np.random.default_rng(3)
+    numbers = {draw_invented(rng, [0, 3, 6, 18]) for _ in range(40)}
+    assert len(numbers) > 20
+    sizes = []
+    for number in numbers:
+        airframe = airframe_of(number)
+        mesh = airframe.mesh()
+        assert np.isfinite(mesh.vertices_m).all()
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-4)
+        assert set(np.unique(mesh.faces)) <= set(range(len(mesh.vertices_m)))
+        assert (mesh.part[mesh.faces] == mesh.part[mesh.faces[:, :1]]).all(), "no face joins two parts"
+        assert SPAN_M[0] * 0.99 <= airframe.span_m <= SPAN_M[1] * 1.01
+        assert Part.FUSELAGE in mesh.part or Part.WING in mesh.part
+        sizes.append(airframe.length_m / airframe.span_m)
+    assert np.ptp(sizes) > 0.3
+
+
+def test_only_parts_of_the_given_members_are_used() -> None:
+    rng = np.random.default_rng(1)
+    given = {AIRFRAMES[k].name for k in (2, 5)}
+    for _ in range(30):
+        words = airframe_of(draw_invented(rng, [2, 5])).description.replace(",", "").split()
+        assert {word for word in words if word in {a.name for a in AIRFRAMES}} <= given
+
+
+def test_windows_show_them_with_labels_that_fit() -> None:
+    batch = WindowSampler(5, 96, [0, 3, 6], 0.0, 0.0, 1.0).batch(0, 12)
+    seen = batch.present
+    assert seen.sum() >= 10
+    assert (batch.airframe_id[seen] >= FLEET).all()
+    apart_px = []
+    for k in np.flatnonzero(seen):
+        assert batch.diameter_m[k] == pytest.approx(airframe_of(int(batch.airframe_id[k])).diameter_m())
+        rows, columns = np.nonzero(batch.mask[k])
+        mask_px = np.array([columns.min(), rows.min(), columns.max(), rows.max()])
+        apart_px.append(np.abs(mask_px - batch.box_xyxy_px[k]).max())
+    # An aerial thinner than half a pixel is in the outline and not in the mask.
+    assert np.median(apart_px) < 1.5
+    assert max(apart_px) < 6.0
+
+
+def test_without_a_share_the_windows_are_the_fleets_own() -> None:
+    plain, named = WindowSampler(7, 64).batch(0, 4), WindowSampler(7, 64, invented_share=0.0).batch(0, 4)
+    assert (plain.airframe_id < FLEET).all()
+    assert np.array_equal(plain.image_bgr, named.image_bgr)
