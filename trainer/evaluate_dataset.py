@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from msgs.contract import CONTRACT_VERSION, ModelContract
 from sim_replay.bop import Model as TargetModel
 from sim_replay.datasets import Dataset, open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE
@@ -105,45 +104,10 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
     if path.suffix == ".onnx":
         model = with_score_min(load_model(path, DEFAULT_THREADS), request.score_min)
         return method_of(model), answers(model)
+    from trainer.evaluate import SCORE_THRESHOLD  # torch takes its time
+    from trainer.export import export_unmeasured
+
     with tempfile.TemporaryDirectory() as folder:
-        model = with_score_min(load_model(export_for_now(path, Path(folder)), DEFAULT_THREADS), request.score_min)
+        exported = export_unmeasured(path, Path(folder), score_min=SCORE_THRESHOLD)
+        model = with_score_min(load_model(exported, DEFAULT_THREADS), request.score_min)
     return method_of(model) | {"file": path.name}, answers(model)
-
-
-def export_for_now(checkpoint: Path, folder: Path) -> Path:
-    """Write the checkpoint as an FP32 model file for one evaluation; nothing is measured for its contract.
-
-    The score threshold is trainer.evaluate.SCORE_THRESHOLD for both stages. Raises ConfigError.
-    """
-    from trainer.checkpoint import load_model as load_checkpoint  # torch takes its time
-    from trainer.evaluate import SCORE_THRESHOLD
-    from trainer.export import airframe_names
-    from trainer.graph import write_contract, write_graph
-
-    network, config, training, sha256 = load_checkpoint(checkpoint)
-    promised = config.contract
-    path = folder / f"{promised.name}-fp32.onnx"
-    write_graph(network, path)
-    contract = ModelContract(
-        version=CONTRACT_VERSION,
-        name=promised.name,
-        configuration=config.model.configuration,
-        backbone=config.model.backbone,
-        precision="fp32",
-        max_peaks=config.model.max_peaks,
-        acquire_size_wh=promised.acquire_size_wh,
-        acquire_fit=promised.acquire_fit,
-        track_size_wh=promised.track_size_wh,
-        track_window_scale=promised.track_window_scale,
-        acquire_score_min=SCORE_THRESHOLD,
-        track_score_min=SCORE_THRESHOLD,
-        trained_range_m=promised.trained_range_m,
-        trained_focal_px=(0.0, 0.0),
-        trained_box_px=(0.0, 0.0),
-        airframes=airframe_names(config.data.airframe_ids),
-        training=training,
-        metrics={},
-        weights_sha256=sha256,
-    )
-    write_contract(path, contract)
-    return path

@@ -24,6 +24,7 @@ CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 TOLERANCE_DEG = 2.0
 ACQUIRE_CROP_PX = 384
+UNREACHABLE_SCORE = 1.0
 
 OpenView = Callable[[int, int, float], Callable[[], Sampler]]  # (seed, size_px, acquire_share) to a picklable opener
 
@@ -187,13 +188,18 @@ def export_models(
 
 
 def export_unmeasured(
-    source: Path, out: Path, *, untrained: bool = False, contract: ContractConfig | None = None
+    source: Path,
+    out: Path,
+    *,
+    untrained: bool = False,
+    contract: ContractConfig | None = None,
+    score_min: float = UNREACHABLE_SCORE,
 ) -> Path:
-    """Write NAME-unmeasured-fp32.onnx into `out`, for timing alone; returns its path.
+    """Write NAME-unmeasured-fp32.onnx into `out`; returns its path.
 
     `source` is a checkpoint, or with `untrained` a configuration whose network gets random weights; `contract` as in
-    `export_models`. Nothing is rendered or measured: the file has no metrics, and thresholds that no peak reaches.
-    Raises ConfigError.
+    `export_models`. Nothing is rendered or measured: the file has no metrics, and `score_min` is the threshold of both
+    stages: as it stands one that no peak reaches, so that the file can be timed and not flown. Raises ConfigError.
     """
     if untrained:
         config = load_config(source)
@@ -207,7 +213,7 @@ def export_unmeasured(
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
     write_graph(model, path)
-    write_contract(path, _contract(config, training, sha256, (1.0, 1.0), (0.0, 0.0), (0.0, 0.0)))
+    write_contract(path, _contract(config, training, sha256, (score_min, score_min), (0.0, 0.0), (0.0, 0.0)))
     return path
 
 

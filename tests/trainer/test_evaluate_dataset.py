@@ -17,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from trainer.checkpoint import save_weights
 from trainer.cli import main
-from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset, export_for_now
+from trainer.evaluate import SCORE_THRESHOLD
+from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
+from trainer.export import export_unmeasured
 
 # The dataset's models are drawn nose y, right wing x, up z; z = 0.5 m of theirs is the body's origin.
 R_BODY_MODEL = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -173,7 +175,8 @@ def test_a_checkpoint_scores_as_its_exported_file_does(dataset: Path, tmp_path: 
     run = tmp_path / "run"
     save_weights(run / "weights.pt", tiny.network(), tiny.TOML, {"seed": 3, "samples": 0, "commit": "unknown"})
     one = evaluate_dataset(DatasetRequest(model=run, dataset=dataset))
-    other = evaluate_dataset(DatasetRequest(model=export_for_now(run, tmp_path), dataset=dataset))
+    exported = export_unmeasured(run, tmp_path, score_min=SCORE_THRESHOLD)
+    other = evaluate_dataset(DatasetRequest(model=exported, dataset=dataset))
     assert (one.score["method"]["file"], one.score["method"]["precision"]) == ("run", "fp32")
     for score in (one.score, other.score):
         del score["method"], score["time_ms"]
