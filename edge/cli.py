@@ -11,6 +11,7 @@ from pathlib import Path
 from edge.bench import command as bench
 from edge.errors import InputError
 from edge.logs import set_up_logging
+from msgs.signals import on_signals
 
 EXIT_BAD_INPUT = 2
 
@@ -84,9 +85,7 @@ def _run(options: argparse.Namespace) -> int:
     from edge.reload import Reloader
 
     stop, reloader = threading.Event(), Reloader()
-    signal.signal(signal.SIGHUP, lambda *_: reloader.ask())
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    on_signals({signal.SIGHUP: reloader.ask, signal.SIGTERM: stop.set, signal.SIGINT: stop.set})
     return run(load_config(options.config), stop, reloader)
 
 

@@ -112,7 +112,7 @@ class Reloader:
         self._thread: threading.Thread | None = None
 
     def ask(self) -> None:
-        """From a signal handler, so without a lock: the loop sees it at its next turn."""
+        """From any thread; the loop sees it at its next turn."""
         self._asked = True
 
     def take(

@@ -22,6 +22,7 @@ THREADS = (
     ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),
     ThreadRow("mavlink", "owns the sockets: sends, answers, hears the autopilot", "the loop", watched=True),
     ThreadRow("watchdog", "ends the process when the loop stands still", "anybody"),
+    ThreadRow("signals", "hears SIGTERM, SIGINT and SIGHUP for the loop", "anybody"),
     ThreadRow("reload", "while SIGHUP is obeyed: reads the configuration, loads and warms the model", "the loop"),
     ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
 )

@@ -16,9 +16,9 @@ import argparse
 import json
 import math
 import os
-import signal
 import socket
 import sys
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -29,6 +29,7 @@ from edge.links.signing import Signing
 from edge.links.signing_key import load_key
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.mavlink import MAVLink, dialect, pack
+from msgs.signals import stop_on_signals
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
 SYSTEM_ID = 1
@@ -214,13 +215,13 @@ def _emit(record: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _fly(autopilot: Autopilot, address: tuple[str, int], stop: list[int]) -> None:
-    """Exchange datagrams with the daemon at `address` until `stop` holds a signal or the parent process is gone."""
+def _fly(autopilot: Autopilot, address: tuple[str, int], stop: threading.Event) -> None:
+    """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process is gone."""
     parent = os.getppid()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((address[0] if address[0].startswith("127.") else "0.0.0.0", 0))
         _emit({"event": "ready", "port": link.getsockname()[1]})
-        while not stop and os.getppid() == parent:
+        while not stop.is_set() and os.getppid() == parent:
             next_ns = autopilot.next_due_ns()
             wait_s = _POLL_S if next_ns is None else min((next_ns - time.monotonic_ns()) * 1e-9, _POLL_S)
             link.settimeout(max(wait_s, 1e-4))
@@ -266,9 +267,7 @@ def main(argv: list[str] | None = None) -> int:
     except (TelemetryError, InputError) as error:
         print(error, file=sys.stderr)
         return 2
-    stop: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda received, _: stop.append(received))
+    stop = stop_on_signals()
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
     signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
     autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing)

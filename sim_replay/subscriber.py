@@ -12,8 +12,8 @@ import argparse
 import json
 import os
 import queue
-import signal
 import sys
+import threading
 import time
 from typing import Any
 
@@ -23,9 +23,11 @@ from msgs import topics
 from msgs.cdr import DiagnosticArray
 from msgs.client import connect, subscribe_all
 from msgs.receive import TargetPose
+from msgs.signals import stop_on_signals
 from msgs.wire import PayloadError
 
 _POLL_S = 0.2
+_RETRY_S = 0.1
 
 
 def _pose_record(pose: TargetPose) -> dict[str, Any]:
@@ -37,6 +39,7 @@ def _pose_record(pose: TargetPose) -> dict[str, Any]:
         "age_ms": round(pose.age_s * 1e3, 3),
         "t_cam_target_m": pose.pose.t_cam_target_m.tolist(),
         "q_cam_target_wxyz": [w, x, y, z],
+        "covariance": pose.pose.covariance.tolist(),
     }
 
 
@@ -46,23 +49,23 @@ def _diagnostics_record(payload: bytes) -> dict[str, Any] | None:
     except PayloadError:
         return None
     values = {key: value for status in array.status for key, value in status.values}
-    return {"event": "diagnostics", "message": "; ".join(status.message for status in array.status), "values": values}
+    message = "; ".join(status.message for status in array.status)
+    return {"event": "diagnostics", "stamp_utc_ns": array.stamp_ns, "message": message, "values": values}
 
 
-def _connect(endpoint: str, wait_s: float, stop: list[int]) -> zenoh.Session:
-    """A session with the daemon, however late it starts. Raises ConnectionError after `wait_s`, or on a signal."""
+def _connect(endpoint: str, wait_s: float, stop: threading.Event) -> zenoh.Session:
+    """A session with the daemon, however late it starts. Raises ConnectionError after `wait_s` and on `stop`."""
     deadline = time.monotonic() + wait_s
     while True:
         try:
             return connect(endpoint)
         except ConnectionError:
-            if stop or time.monotonic() > deadline:
+            if stop.wait(_RETRY_S) or time.monotonic() > deadline:
                 raise
-            time.sleep(0.1)
 
 
-def _listen(session: zenoh.Session, uav: str, stop: list[int]) -> dict[str, Any]:
-    """Print what arrives until `stop` holds a signal or the parent process is gone; returns the summary."""
+def _listen(session: zenoh.Session, uav: str, stop: threading.Event) -> dict[str, Any]:
+    """Print what arrives until `stop` is set or the parent process is gone; returns the summary."""
     records: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     parent = os.getppid()
 
@@ -75,7 +78,7 @@ def _listen(session: zenoh.Session, uav: str, stop: list[int]) -> dict[str, Any]
     handler = zenoh.handlers.Callback(on_diagnostics, indirect=False)
     diagnostics = session.declare_subscriber(topics.subscription_key(topics.DIAGNOSTICS, uav), handler)
     _emit({"event": "ready"})
-    while not stop and os.getppid() == parent:
+    while not stop.is_set() and os.getppid() == parent:
         try:
             _emit(records.get(timeout=_POLL_S))
         except queue.Empty:
@@ -99,9 +102,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--uav", default="uav1", help="name of the vehicle")
     parser.add_argument("--wait-s", type=float, default=30.0, help="how long the daemon may take to appear")
     args = parser.parse_args(argv)
-    stop: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda received, _: stop.append(received))
+    stop = stop_on_signals()
     try:
         with _connect(args.connect, args.wait_s, stop) as session:
             summary = _listen(session, args.uav, stop)

@@ -37,7 +37,7 @@ def test_the_tables_of_the_architecture_are_the_code_s(name: str, table: str) ->
 
 
 def test_every_thread_of_the_daemon_is_in_the_table() -> None:
-    sources = [*(ROOT / "edge").rglob("*.py"), ROOT / "msgs" / "recording.py"]
+    sources = [*(ROOT / "edge").rglob("*.py"), ROOT / "msgs" / "recording.py", ROOT / "msgs" / "signals.py"]
     started = {
         name
         for path in sources

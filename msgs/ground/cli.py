@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TypeAlias
 
 from msgs.ground.errors import InputError
 from msgs.session import TlsFiles
+from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
 
 EXIT_BAD_INPUT = 2
@@ -218,13 +218,11 @@ def _say_aside(text: str) -> None:
 
 def _stop_on_signal(after_s: float | None = None) -> threading.Event:
     """Set by SIGTERM and Ctrl-C, or when the time is over."""
-    stop = threading.Event()
+    stop = stop_on_signals()
     if after_s is not None:
         timer = threading.Timer(after_s, stop.set)
         timer.daemon = True
         timer.start()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
     return stop
 
 

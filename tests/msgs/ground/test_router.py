@@ -146,7 +146,7 @@ def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
             token.undeclare()
             assert router.stdout.readline() == "uav1: gone\n"
         router.terminate()
-        assert router.wait(20.0) == 0
+        assert router.wait(60.0) == 0
     finally:
         router.kill()
 
