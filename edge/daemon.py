@@ -87,7 +87,8 @@ class Pipeline:
         self._acquire_every_n = config.estimator.acquire_every_n
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
-        self.supervisor = Supervisor(config.health, config.mavlink.enabled, outlets, board, self._counters)
+        wants_attitude = config.mavlink.enabled
+        self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, capture.reasons)
         self._since_acquire = 0
         self._out_of_order = 0
 

@@ -11,30 +11,83 @@ import numpy as np
 
 from edge.types import Track, TrackState
 
-WINDOW_FRAMES = 900  # half a minute at 30 frames a second
-RATE_OVER_NS = 2_000_000_000
+WINDOW_FRAMES = 900  # of latencies: half a minute at 30 frames a second
+RECENT_NS = 3_000_000_000  # what is wrong is judged by: over, it is soon forgotten
 NO_FRAME_NS = 2_000_000_000
 DROPS_TOLERATED = 0.1
 ANNOUNCE_NS = 1_000_000_000
 
 
-class HealthState(Enum):
-    INIT = "init"  # no frame yet
+class Activity(Enum):
+    """What the loop does, however well. From worst to best."""
+
+    WAITING = "waiting"  # for frames
     SEARCHING = "searching"  # frames, but no target
-    TRACKING = "tracking"  # a confirmed target, seen
     COASTING = "coasting"  # confirmed targets, none seen just now
-    DEGRADED = "degraded"  # works, but less well than it should: see the reasons
+    TRACKING = "tracking"  # a confirmed target, seen
+
+
+class HealthState(Enum):
+    """How the daemon is, in one word. From best to worst."""
+
+    TRACKING = "tracking"
+    COASTING = "coasting"
+    SEARCHING = "searching"
+    INIT = "init"  # no frame yet
+    DEGRADED = "degraded"  # works, but less well than it should: see the reasons, and the activity
     FAULT = "fault"  # gives nothing: see the reasons
 
 
-BEST_TO_WORST = (
-    HealthState.TRACKING,
-    HealthState.COASTING,
-    HealthState.SEARCHING,
-    HealthState.INIT,
-    HealthState.DEGRADED,
-    HealthState.FAULT,
-)
+_WELL = {
+    Activity.TRACKING: HealthState.TRACKING,
+    Activity.COASTING: HealthState.COASTING,
+    Activity.SEARCHING: HealthState.SEARCHING,
+    Activity.WAITING: HealthState.INIT,
+}
+_ACTIVITIES, _STATES = tuple(Activity), tuple(HealthState)
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why all is not well."""
+
+    kind: str  # of a fixed few, for machines
+    text: str  # for a person; may hold numbers that change
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How the daemon is, what it does, and why it is not better."""
+
+    state: HealthState
+    activity: Activity
+    reasons: tuple[Reason, ...] = ()
+
+    @property
+    def headline(self) -> str:
+        """`degraded, tracking`, or a state that says it all."""
+        return f"{self.state.value}, {self.activity.value}" if self.state is HealthState.DEGRADED else self.state.value
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        return tuple(reason.text for reason in self.reasons)
+
+    def __str__(self) -> str:
+        return f"{self.headline}: {'; '.join(self.texts)}" if self.reasons else self.headline
+
+    def same_news(self, other: Condition) -> bool:
+        """Whether an operator who was told the other knows this one: numbers in a reason are no news."""
+        return (self.state, self.activity, self._kinds()) == (other.state, other.activity, other._kinds())
+
+    def worse_than(self, other: Condition) -> bool:
+        """A worse state, or in the same one a worse activity, or a reason that the other has not."""
+        if self.state is not other.state:
+            return _STATES.index(self.state) > _STATES.index(other.state)
+        less = _ACTIVITIES.index(self.activity) < _ACTIVITIES.index(other.activity)
+        return less or bool(self._kinds() - other._kinds())
+
+    def _kinds(self) -> frozenset[str]:
+        return frozenset(reason.kind for reason in self.reasons)
 
 
 @dataclass(frozen=True)
@@ -51,8 +104,7 @@ class HealthSnapshot:
     """What goes out once a second."""
 
     time_ns: int  # monotonic
-    state: HealthState
-    reasons: tuple[str, ...]
+    condition: Condition
     tracks: int  # confirmed or coasting
     frame_rate_hz: float
     counters: Mapping[str, int]
@@ -72,34 +124,35 @@ class HealthSnapshot:
         return f"{self._head()} | ms p50/p95/p99: {latency or 'none'} | {counters}"
 
     def _head(self) -> str:
-        because = f" ({'; '.join(self.reasons)})" if self.reasons else ""
-        return f"{self.state.value}{because} tracks={self.tracks} {self.frame_rate_hz:.1f} Hz"
+        because = f" ({'; '.join(self.condition.texts)})" if self.condition.reasons else ""
+        return f"{self.condition.headline}{because} tracks={self.tracks} {self.frame_rate_hz:.1f} Hz"
 
 
 class Announcer:
-    """When a change of state is worth telling an operator: a state that flickers must not flood a telemetry radio.
+    """When a change is worth telling an operator: a condition that flickers must not flood a telemetry radio.
 
-    A worse state is told at once, a better one when it has lasted ANNOUNCE_NS; never two within that time but for a
+    A worse one is told at once, a better one when it has lasted ANNOUNCE_NS; never two within that time but for a
     fault.
     """
 
     def __init__(self) -> None:
-        self._told: HealthState | None = None
+        self._told: Condition | None = None
         self._told_ns = 0
-        self._current: HealthState | None = None
+        self._current: Condition | None = None
         self._since_ns = 0
 
-    def due(self, state: HealthState, now_ns: int) -> bool:
-        """Whether to tell `state`, which holds at `now_ns`, now; it then counts as told. Call it at every turn."""
-        if state is not self._current:
-            self._current, self._since_ns = state, now_ns
-        if state is self._told:
-            return False
-        if self._told is not None and state is not HealthState.FAULT:
-            worse = BEST_TO_WORST.index(state) > BEST_TO_WORST.index(self._told)
-            if now_ns - (self._told_ns if worse else max(self._told_ns, self._since_ns)) < ANNOUNCE_NS:
+    def due(self, condition: Condition, now_ns: int) -> bool:
+        """Whether to tell what holds at `now_ns` now; it then counts as told. Call it at every turn."""
+        if self._current is None or not condition.same_news(self._current):
+            self._current, self._since_ns = condition, now_ns
+        if self._told is not None:
+            if condition.same_news(self._told):
                 return False
-        self._told, self._told_ns = state, now_ns
+            since_ns = self._told_ns if condition.worse_than(self._told) else max(self._told_ns, self._since_ns)
+            fault = condition.state is HealthState.FAULT is not self._told.state
+            if not fault and now_ns - since_ns < ANNOUNCE_NS:
+                return False
+        self._told, self._told_ns = condition, now_ns
         return True
 
 
@@ -110,25 +163,28 @@ def judge(
     has_attitude: bool,
     wants_attitude: bool,
     no_frame_ns: int = NO_FRAME_NS,
-    faults: Sequence[str] = (),
-) -> tuple[HealthState, tuple[str, ...]]:
-    """The state and its reasons. `frame_age_ns` is None before the first frame; `faults` are what else is less well
-    than it should be. Pure."""
+    faults: Sequence[Reason] = (),
+) -> Condition:
+    """How the daemon is. `frame_age_ns` is None before the first frame; `faults` are what else is less well than it
+    should be. Pure."""
     if frame_age_ns is None:
-        return HealthState.INIT, ("waiting for the camera", *faults)
+        waiting = Reason("no_camera", "waiting for the camera")
+        return Condition(HealthState.INIT, Activity.WAITING, (waiting, *faults))
     if frame_age_ns > no_frame_ns:
-        return HealthState.FAULT, (f"no frame for {frame_age_ns / 1e9:.0f} s", *faults)
+        silent = Reason("no_frame", f"no frame for {frame_age_ns / 1e9:.0f} s")
+        return Condition(HealthState.FAULT, Activity.WAITING, (silent, *faults))
     reasons = list(faults)
     if wants_attitude and not has_attitude:
-        reasons.append("no own attitude: poses in the camera frame only")
+        reasons.append(Reason("no_attitude", "no own attitude: poses in the camera frame only"))
     if drops_share > DROPS_TOLERATED:
-        reasons.append(f"{100 * drops_share:.0f} % of frames dropped")
-    if reasons:
-        return HealthState.DEGRADED, tuple(reasons)
+        reasons.append(Reason("drops", f"{100 * drops_share:.0f} % of frames dropped"))
     states = {track.state for track in tracks}
+    activity = Activity.SEARCHING
     if TrackState.CONFIRMED in states:
-        return HealthState.TRACKING, ()
-    return (HealthState.COASTING if TrackState.COASTING in states else HealthState.SEARCHING), ()
+        activity = Activity.TRACKING
+    elif TrackState.COASTING in states:
+        activity = Activity.COASTING
+    return Condition(HealthState.DEGRADED if reasons else _WELL[activity], activity, tuple(reasons))
 
 
 class Health:
@@ -137,10 +193,10 @@ class Health:
     def __init__(self, wants_attitude: bool, no_frame_ns: int = NO_FRAME_NS) -> None:
         self._wants_attitude = wants_attitude
         self.no_frame_ns = no_frame_ns
-        self.faults: tuple[str, ...] = ()  # what others noticed, told as reasons while it is there
+        self.faults: tuple[Reason, ...] = ()  # what others noticed, told as reasons while it is there
         self._stages_ns: dict[str, deque[int]] = {}
-        self._done_ns: deque[int] = deque(maxlen=WINDOW_FRAMES)
-        self._sequence: deque[int] = deque(maxlen=WINDOW_FRAMES)
+        self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number at the source, total ns
+        self._done_ns: int | None = None
         self._tracks: tuple[Track, ...] = ()
         self._has_attitude = False
         self._poses = 0
@@ -156,16 +212,16 @@ class Health:
         """Note one frame: its number at the source, the time each stage took, what came out."""
         for stage, duration_ns in stages_ns.items():
             self._stages_ns.setdefault(stage, deque(maxlen=WINDOW_FRAMES)).append(duration_ns)
-        self._done_ns.append(now_ns)
-        self._sequence.append(sequence)
+        self._done_ns = now_ns
+        self._recent.append((now_ns, sequence, stages_ns["total"]))
         self._tracks, self._has_attitude = tracks, has_attitude
         self._poses += sum(track.state is not TrackState.TENTATIVE for track in tracks)
 
-    def assess(self, now_ns: int) -> tuple[HealthState, tuple[str, ...]]:
-        frame_age_ns = now_ns - self._done_ns[-1] if self._done_ns else None
+    def assess(self, now_ns: int) -> Condition:
+        self._forget(now_ns)
         return judge(
             self._tracks,
-            frame_age_ns,
+            None if self._done_ns is None else now_ns - self._done_ns,
             self._drops_share(),
             self._has_attitude,
             self._wants_attitude,
@@ -176,22 +232,33 @@ class Health:
     def snapshot(
         self, now_ns: int, counters: Mapping[str, int], facts: Mapping[str, str] | None = None
     ) -> HealthSnapshot:
-        state, reasons = self.assess(now_ns)
+        condition = self.assess(now_ns)
         latency_ms = {stage: percentiles_ms(values) for stage, values in self._stages_ns.items()}
         sure = sum(track.state is not TrackState.TENTATIVE for track in self._tracks)
+        held = 0 if condition.activity is Activity.WAITING else sure  # those of a camera that is gone are history
         counted = {"poses": self._poses, **counters}
-        rate_hz = self._frame_rate_hz(now_ns)
-        return HealthSnapshot(now_ns, state, reasons, sure, rate_hz, counted, latency_ms, facts or {})
+        rate_hz = self._frame_rate_hz()
+        return HealthSnapshot(now_ns, condition, held, rate_hz, counted, latency_ms, facts or {})
+
+    def recent_total_ms(self, now_ns: int) -> Percentiles | None:
+        """From exposure to the links, over RECENT_NS; None without a frame in them."""
+        self._forget(now_ns)
+        return percentiles_ms(total_ns for _, _, total_ns in self._recent) if self._recent else None
+
+    def _forget(self, now_ns: int) -> None:
+        while self._recent and now_ns - self._recent[0][0] > RECENT_NS:
+            self._recent.popleft()
 
     def _drops_share(self) -> float:
-        if len(self._sequence) < 2:
+        if len(self._recent) < 2:
             return 0.0
-        produced = self._sequence[-1] - self._sequence[0]
-        return 1.0 - (len(self._sequence) - 1) / produced if produced > 0 else 0.0
+        produced = self._recent[-1][1] - self._recent[0][1]
+        return 1.0 - (len(self._recent) - 1) / produced if produced > 0 else 0.0
 
-    def _frame_rate_hz(self, now_ns: int) -> float:
-        recent = [done_ns for done_ns in self._done_ns if now_ns - done_ns <= RATE_OVER_NS]
-        return (len(recent) - 1) / ((recent[-1] - recent[0]) / 1e9) if len(recent) > 1 else 0.0
+    def _frame_rate_hz(self) -> float:
+        if len(self._recent) < 2:
+            return 0.0
+        return (len(self._recent) - 1) / ((self._recent[-1][0] - self._recent[0][0]) / 1e9)
 
 
 def percentiles_ms(durations_ns: Iterable[int]) -> Percentiles:

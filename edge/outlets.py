@@ -6,7 +6,7 @@ import logging
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from edge.health import HealthSnapshot, HealthState
+from edge.health import Condition, HealthSnapshot, HealthState
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import Report
@@ -36,14 +36,14 @@ class Outlets:
         if self._zenoh is not None:
             self._zenoh.publish(report)
 
-    def set_health(self, state: HealthState) -> None:
+    def set_health(self, condition: Condition) -> None:
         """Told at every turn of the loop: what follows from it (HEARTBEAT) stops when the loop is stuck."""
         if self._mavlink is not None:
-            self._mavlink.set_health(state)
+            self._mavlink.set_health(condition)
 
-    def tell(self, state: HealthState, text: str) -> None:
+    def tell(self, condition: Condition) -> None:
         """A change of state, as an event."""
-        self.event(LEVELS.get(state, logging.INFO), text)
+        self.event(LEVELS.get(condition.state, logging.INFO), str(condition))
 
     def event(self, level: int, text: str) -> None:
         """Something an operator should know; from any thread."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from edge.errors import InputError
-from edge.health import HealthState
+from edge.health import Activity, HealthState
 from edge.stages import STAGES
 from edge.status_board import StatusBoard
 
@@ -32,6 +32,15 @@ def _lines(board: StatusBoard) -> Iterator[str]:
     yield from _metric("uavpose_state", "gauge", "1 for the state that holds")
     for state in HealthState:
         yield f"uavpose_state{{state={_quoted(state.value)}}} {int(state.value == info['state'])}"
+    yield from _metric("uavpose_activity", "gauge", "1 for what it does, degraded or not")
+    for activity in Activity:
+        yield f"uavpose_activity{{activity={_quoted(activity.value)}}} {int(activity.value == info['activity'])}"
+    yield from _metric("uavpose_reasons", "gauge", "why it is not well: how many reasons hold")
+    yield f"uavpose_reasons {len(info['reason_kinds'])}"
+    if info["reason_kinds"]:
+        yield from _metric("uavpose_reason", "gauge", "1 for each that holds; absent else")
+    for kind in info["reason_kinds"]:
+        yield f"uavpose_reason{{kind={_quoted(kind)}}} 1"
     for name, key, text in (
         ("uavpose_tracks", "tracks", "targets confirmed or coasting"),
         ("uavpose_frame_rate_hertz", "frame_rate_hz", "frames a second, done"),

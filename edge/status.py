@@ -56,7 +56,7 @@ def for_a_person(answer: dict[str, Any]) -> str:
     reasons = f": {'; '.join(info['reasons'])}" if info.get("reasons") else ""
     contract, fallback = model["contract"], model["fallback_reason"]
     lines = [
-        f"{info['vehicle']}  {info.get('state', 'starting')}{reasons}",
+        f"{info['vehicle']}  {_headline(info)}{reasons}",
         f"  up        {info['uptime_s']:.0f} s, process {info['pid']}, version {info['version']}",
         f"  camera    {info['camera']}",
         f"  model     {contract['name']} {contract['precision']} {model['sha256'][:12]} on {model['provider']}"
@@ -73,6 +73,12 @@ def for_a_person(answer: dict[str, Any]) -> str:
     ]
     lines += ["", *(f"  {name:40} {count:>12}" for name, count in info["counters"].items() if count)]
     return "\n".join(lines)
+
+
+def _headline(info: dict[str, Any]) -> str:
+    """The state, and what goes on behind one that does not tell it."""
+    state = info.get("state", "starting")
+    return f"{state}, {info['activity']}" if state == HealthState.DEGRADED.value else state
 
 
 def _ask_one(session: zenoh.Session, uav: str, what: str) -> dict[str, Any] | None:

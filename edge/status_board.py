@@ -56,8 +56,10 @@ class StatusBoard:
         if snapshot is not None:
             told |= {
                 "age_s": round((now_ns - snapshot.time_ns) / 1e9, 3),
-                "state": snapshot.state.value,
-                "reasons": list(snapshot.reasons),
+                "state": snapshot.condition.state.value,
+                "activity": snapshot.condition.activity.value,
+                "reasons": list(snapshot.condition.texts),
+                "reason_kinds": [reason.kind for reason in snapshot.condition.reasons],
                 "tracks": snapshot.tracks,
                 "frame_rate_hz": round(snapshot.frame_rate_hz, 2),
                 "counters": dict(snapshot.counters),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from edge import threads
 from edge.config import HealthSettings
-from edge.health import Announcer, Health, HealthSnapshot
+from edge.health import Announcer, Health, HealthSnapshot, Reason
 from edge.outlets import LEVELS, Outlets
 from edge.status_board import StatusBoard
 from edge.systemd import Notifier
@@ -31,10 +31,13 @@ class Supervisor:
         outlets: Outlets,
         board: StatusBoard,
         count: Callable[[], Mapping[str, int]],
+        camera_reasons: Callable[[int], tuple[Reason, ...]],
     ) -> None:
         self._outlets = outlets
         self._board = board
         self._count = count
+        self._camera_reasons = camera_reasons
+        self._faults: tuple[Reason, ...] = ()
         self._health = Health(wants_attitude)
         self._announcer = Announcer()
         self._notifier = Notifier()
@@ -72,12 +75,12 @@ class Supervisor:
         now_ns = time.monotonic_ns()
         self.watchdog.beat(now_ns)
         self._notifier.feed(now_ns)
-        state, reasons = self._health.assess(now_ns)
-        self._outlets.set_health(state)
-        if self._announcer.due(state, now_ns):
-            text = f"{state.value}: {'; '.join(reasons)}" if reasons else state.value
-            log.log(LEVELS.get(state, logging.INFO), "%s", text)
-            self._outlets.tell(state, text)
+        self._health.faults = (*self._camera_reasons(now_ns), *self._faults)
+        condition = self._health.assess(now_ns)
+        self._outlets.set_health(condition)
+        if self._announcer.due(condition, now_ns):
+            log.log(LEVELS.get(condition.state, logging.INFO), "%s", condition)
+            self._outlets.tell(condition)
         if now_ns >= self._snapshot_due_ns:
             self._snapshot_due_ns = now_ns + SNAPSHOT_PERIOD_NS
             self._tell_snapshot()
@@ -87,7 +90,7 @@ class Supervisor:
 
     def _tell_snapshot(self) -> None:
         snapshot = self.snapshot()
-        self._health.faults = self._faults(snapshot)
+        self._faults = self._find_faults(snapshot.time_ns)
         self._board.snapshot = snapshot
         self._outlets.publish_diagnostics(snapshot)
         self._notifier.status(snapshot.brief())
@@ -95,11 +98,12 @@ class Supervisor:
             log.info("%s", snapshot.brief())
         self._snapshots += 1
 
-    def _faults(self, snapshot: HealthSnapshot) -> tuple[str, ...]:
-        found = [f"the {name} thread has ended" for name in sorted(self._threads_wanted - threads.running())]
-        total = snapshot.latency_ms.get("total")
+    def _find_faults(self, now_ns: int) -> tuple[Reason, ...]:
+        ended = sorted(self._threads_wanted - threads.running())
+        found = [Reason(f"thread_{name}", f"the {name} thread has ended") for name in ended]
+        total = self._health.recent_total_ms(now_ns)
         if self._latency_max_ms is not None and total is not None and total.p95 > self._latency_max_ms:
-            found.append(f"slow: p95 {total.p95:.0f} ms from exposure to the links")
+            found.append(Reason("slow", f"slow: p95 {total.p95:.0f} ms from exposure to the links"))
         return tuple(found)
 
     def _last_words(self, sentence: str) -> None:

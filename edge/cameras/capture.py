@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 
 from edge.cameras.reconnect import LinkState, Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
 from edge.cameras.watch import FrameWatch
+from edge.health import Reason
 from edge.types import Frame
 
 log = logging.getLogger(__name__)
 
 FROZEN_TOLD_NS = 1_000_000_000
+JUMPS_TOLD_NS = 5_000_000_000  # after the last jump of the stamps all is well again
+JUMPS_KEPT = 1000
 
 
 class Capture:
@@ -33,6 +36,9 @@ class Capture:
         )
         self._watch = FrameWatch()
         self._frozen_since_ns: int | None = None
+        self._frozen_told = False
+        self._jumped_ns: deque[int] = deque(maxlen=JUMPS_KEPT)  # when stamps jumped, monotonic
+        self._lost: str | None = None  # why there is no camera just now
         self._link = Reconnect()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
@@ -62,6 +68,21 @@ class Capture:
         """
         with self._fresh:
             return {**self._counts, **{f"camera_{name}": n for name, n in self._source.counts.items()}}
+
+    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        """What is wrong with the camera at `now_ns` (monotonic): lost, frozen, stamps that jump. From any thread."""
+        found = []
+        with self._fresh:
+            if self._lost is not None:
+                found.append(Reason("camera_lost", f"camera lost: {self._lost}"))
+            since_ns = self._frozen_since_ns
+            if since_ns is not None and now_ns - since_ns >= FROZEN_TOLD_NS:
+                found.append(Reason("camera_frozen", f"camera frozen for {(now_ns - since_ns) / 1e9:.0f} s"))
+            jumps = sum(now_ns - jumped_ns <= JUMPS_TOLD_NS for jumped_ns in self._jumped_ns)
+            if jumps:
+                text = f"the camera's timestamps or delays jump: {jumps} times in {JUMPS_TOLD_NS / 1e9:.0f} s"
+                found.append(Reason("camera_stamps", text))
+        return tuple(found)
 
     def stop(self) -> None:
         """Stop the thread and close the source; a driver stuck in a read keeps nobody waiting for long."""
@@ -100,26 +121,32 @@ class Capture:
         self._link = self._link.lost(time.monotonic_ns())
         with self._fresh:
             self._counts["reconnects"] += 1
+            self._lost = str(error)
+            self._frozen_since_ns = None
 
     def _lives(self, frame: Frame) -> bool:
         """Whether the frame shows something new; of a live camera, a picture sent again is stale whatever its stamp."""
+        now_ns = time.monotonic_ns()
         jumps, repeats = self._watch.jumps(frame), self._watch.repeats(frame)
+        frozen = repeats and self._source.live
         with self._fresh:
             self._counts["time_jumps"] += jumps
             self._counts["frozen"] += repeats
+            self._lost = None
+            if jumps:
+                self._jumped_ns.append(now_ns)
+            if not frozen:
+                self._frozen_since_ns, self._frozen_told = None, False
+            elif self._frozen_since_ns is None:
+                self._frozen_since_ns = now_ns
+            if frozen:
+                self._last_sequence = frame.meta.sequence
         if jumps and self._counts["time_jumps"] == 1:
             log.warning("the camera's timestamps jump; the first time at frame %d", frame.meta.sequence)
-        if not (repeats and self._source.live):
-            self._frozen_since_ns = None
-            return True
-        if self._frozen_since_ns is None:
-            self._frozen_since_ns = frame.meta.arrival_ns
-        elif 0 <= self._frozen_since_ns <= frame.meta.arrival_ns - FROZEN_TOLD_NS:
+        if frozen and not self._frozen_told and now_ns - (self._frozen_since_ns or now_ns) >= FROZEN_TOLD_NS:
             log.warning("the camera has sent the same picture for a second: it is frozen")
-            self._frozen_since_ns = -1  # told
-        with self._fresh:
-            self._last_sequence = frame.meta.sequence
-        return False
+            self._frozen_told = True
+        return not frozen
 
     def _offer(self, frame: Frame) -> None:
         with self._fresh:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from edge.config import MavlinkSettings
-from edge.health import HealthState
+from edge.health import Condition
 from edge.links.mavlink_peer import Endpoint
 from edge.links.mavlink_station import Station
 from edge.links.mavlink_vehicle import Contact
@@ -56,7 +56,7 @@ class MavlinkLink:
         self._counted = self._count()  # replaced whole by the thread, so that nobody waits for it
         self._mail_lock = threading.Lock()
         self._report: Report | None = None
-        self._state: HealthState | None = None
+        self._condition: Condition | None = None
         self._events: deque[tuple[int, str]] = deque(maxlen=EVENTS_WAITING)
         self._replaced = self._lost_events = 0
         self._stopping = threading.Event()
@@ -82,10 +82,10 @@ class MavlinkLink:
             self._report = report
         self._poke()
 
-    def set_health(self, state: HealthState) -> None:
+    def set_health(self, condition: Condition) -> None:
         """To be called at every turn of the loop: HEARTBEAT stops when it is not."""
         with self._mail_lock:
-            self._state = state
+            self._condition = condition
 
     def event(self, severity: int, text: str) -> None:
         """Tell the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info)."""
@@ -170,12 +170,12 @@ class MavlinkLink:
             self._woken.recv(65536)
         with self._mail_lock:
             report, self._report = self._report, None
-            state, self._state = self._state, None
+            condition, self._condition = self._condition, None
             events = list(self._events)
             self._events.clear()
         now_ns = time.monotonic_ns()
-        if state is not None:
-            self._station.health(state, now_ns)
+        if condition is not None:
+            self._station.health(condition, now_ns)
         try:
             if report is not None:
                 self._send(self._station.report(report, now_ns))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge.health import HealthState
+from edge.health import Activity, Condition, HealthState
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, CameraInfo, Report, Track, TrackState
 from msgs.geometry import euler_from_R, q_wxyz_from_R
@@ -28,20 +28,27 @@ CAMERA_ABILITIES = (
 )
 
 SYSTEM_STATUS = {
-    HealthState.INIT: dialect.MAV_STATE_BOOT,
-    HealthState.SEARCHING: dialect.MAV_STATE_STANDBY,
-    HealthState.FAULT: dialect.MAV_STATE_CRITICAL,
+    Activity.WAITING: dialect.MAV_STATE_BOOT,
+    Activity.SEARCHING: dialect.MAV_STATE_STANDBY,
+    Activity.COASTING: dialect.MAV_STATE_ACTIVE,
+    Activity.TRACKING: dialect.MAV_STATE_ACTIVE,
 }
+# HEARTBEAT.custom_mode: the activity in the lowest byte, and bits for what is wrong.
+MODE_ACTIVITY = {activity: number for number, activity in enumerate(Activity)}
+MODE_DEGRADED, MODE_FAULT = 1 << 8, 1 << 9
 TRACKING_STATUS = {
     TrackState.CONFIRMED: dialect.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE,
     TrackState.COASTING: dialect.CAMERA_TRACKING_STATUS_FLAGS_COASTING,
 }
 
 
-def heartbeat(kind: int, state: HealthState) -> Any:
-    """HEARTBEAT (0) of one of our components: MAV_TYPE `kind`, no autopilot."""
-    status = SYSTEM_STATUS.get(state, dialect.MAV_STATE_ACTIVE)
-    return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, 0, 0, status, 3)
+def heartbeat(kind: int, condition: Condition) -> Any:
+    """HEARTBEAT (0) of one of our components: MAV_TYPE `kind`, no autopilot; custom_mode as MODE_* says."""
+    fault, degraded = condition.state is HealthState.FAULT, condition.state is HealthState.DEGRADED
+    status = dialect.MAV_STATE_CRITICAL if fault else SYSTEM_STATUS[condition.activity]
+    mode = MODE_ACTIVITY[condition.activity] | MODE_DEGRADED * degraded | MODE_FAULT * fault
+    flags = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, flags, mode, status, 3)
 
 
 def primary(tracks: Sequence[Track], chosen_id: int | None) -> Track | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge.config import MavlinkSettings
-from edge.health import HealthState
+from edge.health import Condition
 from edge.links import mavlink_messages as words
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_announce import TargetAnnouncer
@@ -97,7 +97,7 @@ class Station:
         self._announcer = TargetAnnouncer()
         self._computer = ComputerReader()
         self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
-        self._health: tuple[HealthState, int] | None = None
+        self._health: tuple[Condition, int] | None = None
         self._text_id = 0
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
@@ -130,9 +130,9 @@ class Station:
                 replies += self._believe(message, now_ns)
         return replies
 
-    def health(self, state: HealthState, now_ns: int) -> None:
+    def health(self, condition: Condition, now_ns: int) -> None:
         """A word from the loop; HEARTBEAT follows it and stops without it."""
-        self._health = (state, now_ns)
+        self._health = (condition, now_ns)
 
     def tick(self, now_ns: int) -> Outgoing:
         """Let time pass: heartbeats, own computer, time synchronisation, requests for rates."""
@@ -140,9 +140,9 @@ class Station:
         out = Outgoing()
         if now_ns >= self._heartbeat_due_ns and self._health and now_ns - self._health[1] <= HEALTH_AGE_MAX_NS:
             self._heartbeat_due_ns = now_ns + HEARTBEAT_NS
-            state = self._health[0]
-            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, state)))
-            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, state), camera=True))
+            condition = self._health[0]
+            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
+            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
         if self.vehicle.contact is not Contact.HEARD:
             return out
         if self._schedule.due(COMPUTER_STATUS, 0, now_ns):

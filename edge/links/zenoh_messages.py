@@ -89,7 +89,10 @@ def camera_info(report: Report, stamp_ns: int) -> cdr.CameraInfo:
 
 def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> cdr.DiagnosticArray:
     """Health as one status: its state and reasons, counters and latencies."""
+    condition = snapshot.condition
     values = {
+        "state": condition.state.value,
+        "activity": condition.activity.value,
         "tracks": str(snapshot.tracks),
         "frame_rate_hz": f"{snapshot.frame_rate_hz:.1f}",
         **snapshot.facts,
@@ -100,7 +103,7 @@ def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> c
             for name, value in (("p50", p.p50), ("p95", p.p95), ("p99", p.p99))
         },
     }
-    message = "; ".join((snapshot.state.value, *snapshot.reasons))
-    level = DIAGNOSTIC_LEVEL.get(snapshot.state, 0)
+    message = "; ".join((condition.headline, *condition.texts))
+    level = DIAGNOSTIC_LEVEL.get(condition.state, 0)
     status = cdr.DiagnosticStatus(level, topics.NODE_NAME, message, vehicle_name, tuple(values.items()))
     return cdr.DiagnosticArray(stamp_ns, "", (status,))

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edge.config import MavlinkSettings
-from edge.health import HealthState
 from edge.links.mavlink_link import MavlinkLink
 from edge.links.signing import Signing
 from edge.requests import RequestQueue
@@ -22,7 +21,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .reports import SIZE_WH, K
+from .reports import SIZE_WH, TRACKING, K
 
 SYSTEM_ID = 42
 CAMERA = CameraInfo("front", SIZE_WH, K, 30.0)
@@ -208,7 +207,7 @@ def linked(
 
 def meet(link: MavlinkLink, peer: Peer) -> None:
     """Until the link knows the autopilot and has taken its time."""
-    link.set_health(HealthState.TRACKING)
+    link.set_health(TRACKING)
     peer.settle(lambda: "timesync_uncertainty_us" in link.counters(), "time synchronisation")
 
 

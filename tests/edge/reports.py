@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from edge.health import Activity, Condition, HealthState
 from edge.types import FrameMeta, OwnShip, Report, Track, TrackState
 
 K = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])
@@ -20,6 +21,9 @@ OWN_NED_M = np.array([100.0, 50.0, -120.0])
 ORIGIN = (47.0, 8.0, 400.0)
 V_NED_MPS = np.array([22.0, -4.0, 1.5])
 BOX_XYXY_PX = np.array([1040.0, 480.0, 1080.0, 500.0])
+TRACKING = Condition(HealthState.TRACKING, Activity.TRACKING)
+SEARCHING = Condition(HealthState.SEARCHING, Activity.SEARCHING)
+FAULT = Condition(HealthState.FAULT, Activity.WAITING)
 
 
 def make_track(now_ns: int, **changed: Any) -> Track:

@@ -21,7 +21,19 @@ from edge.config import Config, ConfigFile, SequenceCamera
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
-from edge.health import Announcer, Health, HealthSnapshot, HealthState, Percentiles, judge, percentiles_ms
+from edge.health import (
+    RECENT_NS,
+    Activity,
+    Announcer,
+    Condition,
+    Health,
+    HealthSnapshot,
+    HealthState,
+    Percentiles,
+    Reason,
+    judge,
+    percentiles_ms,
+)
 from edge.outlets import Outlets
 from edge.reload import Reloader
 from edge.requests import RequestQueue
@@ -131,25 +143,49 @@ def track_in(state: TrackState) -> Track:
 
 
 @pytest.mark.parametrize(
-    ("states", "frame_age_s", "drops", "attitude", "state"),
+    ("states", "frame_age_s", "drops", "attitude", "state", "activity"),
     [
-        ([], None, 0.0, False, HealthState.INIT),
-        ([], 0.05, 0.0, True, HealthState.SEARCHING),
-        ([TrackState.TENTATIVE], 0.05, 0.0, True, HealthState.SEARCHING),
-        ([TrackState.COASTING], 0.05, 0.0, True, HealthState.COASTING),
-        ([TrackState.COASTING, TrackState.CONFIRMED], 0.05, 0.0, True, HealthState.TRACKING),
-        ([TrackState.CONFIRMED], 0.05, 0.0, False, HealthState.DEGRADED),
-        ([TrackState.CONFIRMED], 0.05, 0.3, True, HealthState.DEGRADED),
-        ([TrackState.CONFIRMED], 2.5, 0.3, False, HealthState.FAULT),
+        ([], None, 0.0, False, HealthState.INIT, Activity.WAITING),
+        ([], 0.05, 0.0, True, HealthState.SEARCHING, Activity.SEARCHING),
+        ([TrackState.TENTATIVE], 0.05, 0.0, True, HealthState.SEARCHING, Activity.SEARCHING),
+        ([TrackState.COASTING], 0.05, 0.0, True, HealthState.COASTING, Activity.COASTING),
+        ([TrackState.COASTING, TrackState.CONFIRMED], 0.05, 0.0, True, HealthState.TRACKING, Activity.TRACKING),
+        ([TrackState.CONFIRMED], 0.05, 0.0, False, HealthState.DEGRADED, Activity.TRACKING),
+        ([TrackState.COASTING], 0.05, 0.3, True, HealthState.DEGRADED, Activity.COASTING),
+        ([], 0.05, 0.3, True, HealthState.DEGRADED, Activity.SEARCHING),
+        ([TrackState.CONFIRMED], 2.5, 0.3, False, HealthState.FAULT, Activity.WAITING),
     ],
 )
 def test_health_follows_from_what_is_seen(
-    states: list[TrackState], frame_age_s: float | None, drops: float, attitude: bool, state: HealthState
+    states: list[TrackState],
+    frame_age_s: float | None,
+    drops: float,
+    attitude: bool,
+    state: HealthState,
+    activity: Activity,
 ) -> None:
     age_ns = None if frame_age_s is None else round(frame_age_s * 1e9)
-    judged, reasons = judge([track_in(s) for s in states], age_ns, drops, attitude, wants_attitude=True)
-    assert judged is state
-    assert bool(reasons) == (state in (HealthState.INIT, HealthState.DEGRADED, HealthState.FAULT))
+    judged = judge([track_in(s) for s in states], age_ns, drops, attitude, wants_attitude=True)
+    assert (judged.state, judged.activity) == (state, activity)
+    assert bool(judged.reasons) == (state in (HealthState.INIT, HealthState.DEGRADED, HealthState.FAULT))
+
+
+def test_drops_are_forgotten_soon_after_the_last() -> None:
+    health, period_ns = Health(wants_attitude=False), 33_000_000
+
+    def fly(sequence: int, now_ns: int) -> HealthState:
+        health.frame_done(sequence, {"total": 10_000_000}, (track_in(TrackState.CONFIRMED),), False, now_ns)
+        return health.assess(now_ns).state
+
+    for k in range(30):
+        fly(k, k * period_ns)
+    dropped = 60
+    assert fly(30 + dropped, 90 * period_ns) is HealthState.DEGRADED
+    assert health.assess(90 * period_ns).headline == "degraded, tracking"
+    told = [fly(90 + k, (90 + k) * period_ns) for k in range(1, 200)]
+    well = told.index(HealthState.TRACKING)
+    assert told == [HealthState.DEGRADED] * well + [HealthState.TRACKING] * (199 - well)
+    assert (well + 1) * period_ns <= RECENT_NS + period_ns
 
 
 def test_a_snapshot_tells_rate_and_latency_and_notices_a_stuck_pipeline() -> None:
@@ -158,12 +194,13 @@ def test_a_snapshot_tells_rate_and_latency_and_notices_a_stuck_pipeline() -> Non
         stages = {"track": 8_000_000, "total": (10 + (k == 49)) * 1_000_000}
         health.frame_done(k, stages, (track_in(TrackState.CONFIRMED),), False, k * 50_000_000)
     snapshot = health.snapshot(50 * 50_000_000, {"dropped": 0})
-    assert snapshot.state is HealthState.TRACKING
+    assert snapshot.condition == Condition(HealthState.TRACKING, Activity.TRACKING)
     assert snapshot.frame_rate_hz == pytest.approx(20.0)
     assert snapshot.latency_ms["track"].p99 == 8.0
     assert snapshot.latency_ms["total"].p50 == 10.0
     assert 10.0 < snapshot.latency_ms["total"].p99 < 11.0
-    assert health.assess(49 * 50_000_000 + 2_100_000_000)[0] is HealthState.FAULT
+    late = health.snapshot(49 * 50_000_000 + 2_100_000_000, {})
+    assert (late.condition.state, late.tracks) == (HealthState.FAULT, 0)
 
 
 def test_percentiles_agree_with_counting() -> None:
@@ -171,30 +208,48 @@ def test_percentiles_agree_with_counting() -> None:
     assert (percentiles.p50, percentiles.p95, percentiles.p99) == (50.0, 95.0, 99.0)
 
 
-def told_in(states: list[HealthState], period_s: float) -> list[HealthState]:
+WELL = {activity: Condition(HealthState(activity.value), activity) for activity in list(Activity)[1:]}
+FAULT = Condition(HealthState.FAULT, Activity.WAITING, (Reason("no_frame", "no frame for 3 s"),))
+
+
+def degraded(activity: Activity, *kinds: str, text: str = "") -> Condition:
+    return Condition(HealthState.DEGRADED, activity, tuple(Reason(kind, text or kind) for kind in kinds))
+
+
+def told_in(conditions: list[Condition], period_s: float) -> list[Condition]:
     announcer = Announcer()
-    return [state for k, state in enumerate(states) if announcer.due(state, round(k * period_s * 1e9))]
+    return [one for k, one in enumerate(conditions) if announcer.due(one, round(k * period_s * 1e9))]
 
 
 def test_a_state_that_flickers_is_told_once_and_the_worse_of_the_two() -> None:
-    flicker = [HealthState.TRACKING, HealthState.DEGRADED] * 300  # attitude at 15 Hz, frames at 30
-    told = told_in([HealthState.TRACKING] * 60 + flicker, 1 / 30)
-    assert told == [HealthState.TRACKING, HealthState.DEGRADED]
+    well, worse = WELL[Activity.TRACKING], degraded(Activity.TRACKING, "no_attitude")
+    told = told_in([well] * 60 + [well, worse] * 300, 1 / 30)  # attitude at 15 Hz, frames at 30
+    assert told == [well, worse]
 
 
 def test_a_target_that_is_lost_is_told_at_once_and_one_that_is_held_within_a_second() -> None:
     announcer = Announcer()
-    assert announcer.due(HealthState.SEARCHING, 0)
-    assert not announcer.due(HealthState.TRACKING, 5_000_000_000)
-    assert announcer.due(HealthState.TRACKING, 6_000_000_000)
-    assert announcer.due(HealthState.COASTING, 9_000_000_000)
-    assert announcer.due(HealthState.FAULT, 9_100_000_000)
+    assert announcer.due(WELL[Activity.SEARCHING], 0)
+    assert not announcer.due(WELL[Activity.TRACKING], 5_000_000_000)
+    assert announcer.due(WELL[Activity.TRACKING], 6_000_000_000)
+    assert announcer.due(WELL[Activity.COASTING], 9_000_000_000)
+    assert announcer.due(FAULT, 9_100_000_000)
+
+
+def test_while_degraded_a_loss_and_a_new_reason_are_told_and_other_numbers_are_not() -> None:
+    announcer = Announcer()
+    assert announcer.due(degraded(Activity.TRACKING, "drops", text="12 % of frames dropped"), 0)
+    assert not announcer.due(degraded(Activity.TRACKING, "drops", text="40 % of frames dropped"), 3_000_000_000)
+    assert announcer.due(degraded(Activity.SEARCHING, "drops"), 3_100_000_000)
+    assert announcer.due(degraded(Activity.SEARCHING, "drops", "camera_stamps"), 4_200_000_000)
+    fewer = degraded(Activity.SEARCHING, "drops")
+    assert [announcer.due(fewer, t_ns) for t_ns in (6_000_000_000, 7_100_000_000)] == [False, True]
 
 
 def test_the_line_of_each_second_is_short_and_the_last_one_holds_every_counter() -> None:
     counters = {"dropped": 7, **{f"mavlink_sent_{k}": 1 for k in range(40)}}
     stages = {"track": Percentiles(8.0, 9.0, 10.0), "total": Percentiles(12.0, 15.0, 20.0)}
-    snapshot = HealthSnapshot(0, HealthState.TRACKING, (), 1, 30.0, counters, stages)
+    snapshot = HealthSnapshot(0, WELL[Activity.TRACKING], 1, 30.0, counters, stages)
     assert snapshot.brief() == "tracking tracks=1 30.0 Hz, 12/15/20 ms p50/p95/p99, dropped=7"
     assert all(f"{name}={count}" in snapshot.line().split() for name, count in counters.items())
 

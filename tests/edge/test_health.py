@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.estimator.providers import NAMES, choose_provider
-from edge.health import HealthState, judge
+from edge.health import Activity, Condition, HealthState, Reason, judge
 from edge.logs import CountingHandler
 from edge.outlets import Outlets
 from edge.stages import STAGES, StageClock
@@ -116,27 +116,28 @@ def test_a_link_whose_thread_has_ended_is_told(toy_model: Path) -> None:
     config = Config.model_validate({"camera": {"type": "sequence", "path": "/x"}, "mavlink": {"enabled": False}})
     camera = CameraInfo("x", (640, 480), K, None)
     board = StatusBoard(ConfigFile(Path("x.toml"), "", config), load_model(toy_model, 1), camera)
-    supervisor = Supervisor(config.health, False, Outlets(None, None), board, dict)
+    supervisor = Supervisor(config.health, False, Outlets(None, None), board, dict, lambda _: ())
     ends = threading.Event()
     link = threading.Thread(target=ends.wait, name="mavlink")
     link.start()
     supervisor.ready()
     supervisor.turn()
     assert board.snapshot is not None
-    assert not any("thread" in reason for reason in supervisor.snapshot().reasons)
+    assert not any("thread" in text for text in supervisor.snapshot().condition.texts)
     ends.set()
     link.join()
     deadline_s = time.monotonic() + 20
-    while "the mavlink thread has ended" not in supervisor.snapshot().reasons and time.monotonic() < deadline_s:
+    while "the mavlink thread has ended" not in supervisor.snapshot().condition.texts and time.monotonic() < deadline_s:
         supervisor.turn()
-    assert "the mavlink thread has ended" in supervisor.snapshot().reasons
+    assert "the mavlink thread has ended" in supervisor.snapshot().condition.texts
 
 
 def test_what_else_is_wrong_degrades_a_daemon_that_tracks() -> None:
-    state, reasons = judge([], 10_000_000, 0.0, True, True, faults=("slow: p95 90 ms from exposure to the links",))
-    assert state is HealthState.DEGRADED
-    assert reasons == ("slow: p95 90 ms from exposure to the links",)
-    assert judge([], 900_000_000, 0.0, True, True, no_frame_ns=500_000_000)[0] is HealthState.FAULT
+    slow = Reason("slow", "slow: p95 90 ms from exposure to the links")
+    searching = Condition(HealthState.DEGRADED, Activity.SEARCHING, (slow,))
+    assert judge([], 10_000_000, 0.0, True, True, faults=(slow,)) == searching
+    assert str(searching) == "degraded, searching: slow: p95 90 ms from exposure to the links"
+    assert judge([], 900_000_000, 0.0, True, True, no_frame_ns=500_000_000).state is HealthState.FAULT
 
 
 @given(st.lists(st.integers(0, 10**7), min_size=0, max_size=6), st.integers(0, 10**7), st.integers(0, 10**7))

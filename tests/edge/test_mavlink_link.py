@@ -5,17 +5,29 @@ from __future__ import annotations
 import math
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edge.health import HealthState
+from edge.health import Activity, Condition, HealthState, Reason
 from edge.types import TrackState
 from msgs.mavlink import dialect
 
 from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
-from .reports import BOX_XYXY_PX, ORIGIN, OWN_NED_M, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, V_NED_MPS
+from .reports import (
+    BOX_XYXY_PX,
+    FAULT,
+    ORIGIN,
+    OWN_NED_M,
+    R_CAM_TARGET,
+    R_NED_CAM,
+    SIZE_WH,
+    T_CAM_TARGET_M,
+    TRACKING,
+    V_NED_MPS,
+)
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -115,17 +127,17 @@ def test_px4_gets_no_target_relative_unless_asked() -> None:
 def test_heartbeats_come_from_both_components_and_stop_when_the_loop_does() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
-        link.set_health(HealthState.FAULT)
+        link.set_health(FAULT)
         sources = set()
         while sources != {191, 100}:
-            beat = peer.named("HEARTBEAT", lambda: link.set_health(HealthState.FAULT))
+            beat = peer.named("HEARTBEAT", lambda: link.set_health(FAULT))
             sources.add(beat.get_srcComponent())
             assert (beat.get_srcSystem(), beat.autopilot) == (SYSTEM_ID, dialect.MAV_AUTOPILOT_INVALID)
             assert beat.type == {191: 18, 100: 30}[beat.get_srcComponent()]
         peer.until(
             lambda m: m.get_type() == "HEARTBEAT" and m.system_status == dialect.MAV_STATE_CRITICAL,
             "heartbeat that tells the fault",
-            lambda: link.set_health(HealthState.FAULT),
+            lambda: link.set_health(FAULT),
         )
         silent_from = time.monotonic()
         last_beat = silent_from
@@ -133,6 +145,27 @@ def test_heartbeats_come_from_both_components_and_stop_when_the_loop_does() -> N
             if any(m.get_type() == "HEARTBEAT" for m in peer.serve()):
                 last_beat = time.monotonic()
     assert last_beat - silent_from < 4.5
+
+
+def test_a_heartbeat_tells_what_goes_on_behind_degraded() -> None:
+    tracking = Condition(HealthState.DEGRADED, Activity.TRACKING, (Reason("drops", "12 % of frames dropped"),))
+    searching = replace(tracking, activity=Activity.SEARCHING)
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for condition, status, mode in (
+            (tracking, dialect.MAV_STATE_ACTIVE, 3 | 1 << 8),
+            (searching, dialect.MAV_STATE_STANDBY, 1 | 1 << 8),
+            (FAULT, dialect.MAV_STATE_CRITICAL, 1 << 9),
+            (TRACKING, dialect.MAV_STATE_ACTIVE, 3),
+        ):
+            told = (dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, mode, status)
+            peer.until(
+                lambda m, told=told: (
+                    m.get_type() == "HEARTBEAT" and (m.base_mode, m.custom_mode, m.system_status) == told
+                ),
+                f"heartbeat that tells {condition.headline}",
+                lambda condition=condition: link.set_health(condition),
+            )
 
 
 def test_long_events_arrive_in_chunks_that_belong_together() -> None:

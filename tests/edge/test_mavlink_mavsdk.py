@@ -18,13 +18,12 @@ from mavsdk.plugins.camera import Camera
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
 from scipy.spatial.transform import Rotation
 
-from edge.health import HealthState
 from edge.links.mavlink_link import MavlinkLink
 from edge.requests import RequestQueue, StopTracking, TrackBox
 from msgs.mavlink import DIALECT_XML
 
 from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
-from .reports import BOX_XYXY_PX, ORIGIN, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, K
+from .reports import BOX_XYXY_PX, ORIGIN, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, TRACKING, K
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -42,7 +41,7 @@ class Flight:
 
     def _turn(self) -> None:
         """What the daemon's loop does."""
-        self.link.set_health(HealthState.TRACKING)
+        self.link.set_health(TRACKING)
         self.link.publish(report(track(time.monotonic_ns())))
 
     def meanwhile(self, act: Callable[[], Any]) -> Any:

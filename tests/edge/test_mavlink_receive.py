@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edge.health import HealthState
 from edge.requests import RequestQueue, StopTracking
 from msgs.mavlink import MAVLink, dialect
 
 from .mavlink_peer import SYSTEM_ID, Peer, alone, linked, meet
+from .reports import TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -168,7 +168,7 @@ def test_only_commanders_command_where_they_are_named() -> None:
 
 def test_hosts_that_are_not_allowed_are_not_heard() -> None:
     with linked(allowed_hosts=["127.0.0.9"]) as (link, _), Peer(link.ports[0]) as peer:
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         peer.settle(lambda: link.counters().get("refused_host", 0) > 0, "refusal")
         assert alone(peer.wire)
 

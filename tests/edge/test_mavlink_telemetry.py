@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from edge.config import MavlinkSettings
-from edge.health import HealthState
 from edge.links.mavlink_station import Station
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
@@ -22,6 +21,7 @@ from msgs.geometry import rotation_angle
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet
+from .reports import TRACKING
 
 
 def test_own_attitude_is_stamped_with_the_time_it_was_measured() -> None:
@@ -46,7 +46,7 @@ def asks_for_attitude(message: Any) -> bool:
 
 def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
     with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         peer.until(asks_for_attitude, "first request")
         meet(link, peer)
         peer.attitude(Rotation.identity())
@@ -84,7 +84,7 @@ def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
 
 def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
     with linked(attitude_rate_hz=50.0) as (link, _), Peer(link.ports[0]) as peer:
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         first = peer.until(asks_for_attitude, "request for attitude")
         assert (first.command, first.param2) == (dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 20_000.0)
         assert (first.target_system, first.target_component) == (SYSTEM_ID, 1)
@@ -114,7 +114,7 @@ def test_our_clock_is_told_to_who_asks() -> None:
 def test_a_refused_rate_is_counted_and_asked_for_less_often() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         peer.accepts = False
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         peer.settle(lambda: link.counters()["rates_refused"] >= 4, "refusals")
         asked = [m for m in peer.received if asks_for_attitude(m)]
         assert len(asked) < 3, "a refusal is not answered with the same request at once"

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edge.config import MavlinkSettings
-from edge.health import HealthState
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink
@@ -30,6 +29,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import CAMERA, DEADLINE_S, Peer, Pty, Tcp, Udp, alone, linked, meet
+from .reports import SEARCHING, TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -68,7 +68,7 @@ def test_udpout_makes_itself_known_first(host: str) -> None:
     named = f"[{host}]" if ":" in host else host
     with linked(f"udpout:{named}:{wire.port}") as (link, own_ship), Peer(wire) as peer:
         wire.address = (host, link.ports[0])
-        link.set_health(HealthState.SEARCHING)
+        link.set_health(SEARCHING)
         wire.socket.settimeout(DEADLINE_S)
         assert wire.socket.recv(300), "nobody has spoken to the link yet"
         wire.socket.settimeout(0.02)
@@ -101,7 +101,7 @@ def test_a_tcp_client_starts_before_its_server_and_comes_back_after_it() -> None
     with listening() as reserved:
         port = reserved.getsockname()[1]
     with linked(f"tcpout:127.0.0.1:{port}") as (link, own_ship):
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         for _ in range(2):
             with listening(port=port) as server:
                 connected, _ = server.accept()
@@ -136,7 +136,7 @@ def pseudo_terminal(link_at: Path) -> Pty:
 def test_a_serial_port_may_be_absent_at_first_and_pulled_out_later(tmp_path: Path) -> None:
     device = tmp_path / "ttyAutopilot"
     with linked(f"serial:{device}:57600") as (link, own_ship):
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         for _ in range(2):
             with Peer(pseudo_terminal(device)) as peer:
                 exchanges(link, own_ship, peer)
@@ -251,7 +251,7 @@ def test_an_idle_link_sleeps(tmp_path: Path) -> None:
     """A hung-up line or a closed peer must not make the thread spin."""
     device = tmp_path / "ttyAutopilot"
     with linked(f"serial:{device}:57600", "tcpin:127.0.0.1:0") as (link, _):
-        link.set_health(HealthState.TRACKING)
+        link.set_health(TRACKING)
         with Peer(pseudo_terminal(device)) as peer:
             meet(link, peer)
         socket.create_connection(("127.0.0.1", link.ports[0])).close()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from edge.health import HealthState
+from edge.health import Activity, HealthState
 from edge.stages import STAGES
 from msgs import topics
 from msgs.cdr import DiagnosticArray
@@ -49,6 +49,7 @@ def test_status_says_how_the_daemon_is(
     assert info["vehicle"] == "kestrel"
     assert info["pid"] == daemon.process.pid
     assert info["state"] in {state.value for state in HealthState}
+    assert info["activity"] in {activity.value for activity in Activity}
     assert info["counters"]["captured"] > 0
     assert set(info["latency_ms"]) == set(STAGES)
     total, parts = info["latency_ms"]["total"], info["latency_ms"]
@@ -92,6 +93,8 @@ def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
     assert families == {line.split()[2] for line in lines if line.startswith("# TYPE")}
     states = [float(line.split()[-1]) for line in samples if line.startswith("uavpose_state{")]
     assert sorted(states) == [0.0] * (len(HealthState) - 1) + [1.0]
+    activities = [float(line.split()[-1]) for line in samples if line.startswith("uavpose_activity{")]
+    assert sorted(activities) == [0.0] * (len(Activity) - 1) + [1.0]
     for stage in STAGES:
         assert any(f'stage="{stage}",quantile="0.99"' in line for line in samples)
     with pytest.raises(urllib.error.HTTPError, match="404"):

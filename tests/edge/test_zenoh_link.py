@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from edge.config import ZenohSettings
-from edge.health import HealthSnapshot, HealthState, Percentiles
+from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles, Reason
 from edge.links.errors import LinkError
 from edge.links.zenoh_link import ZenohLink
 from edge.types import Mount, TrackState
@@ -27,7 +27,7 @@ from msgs import topics
 from msgs.client import connect, subscribe, subscribe_all
 from msgs.session import router_config
 
-from .reports import OWN_NED_M, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, V_NED_MPS, K
+from .reports import OWN_NED_M, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, TRACKING, V_NED_MPS, K
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -244,8 +244,7 @@ def test_health_arrives_as_diagnostics() -> None:
     endpoint = free_endpoint()
     snapshot = HealthSnapshot(
         time.monotonic_ns(),
-        HealthState.DEGRADED,
-        ("no own attitude",),
+        Condition(HealthState.DEGRADED, Activity.TRACKING, (Reason("no_attitude", "no own attitude"),)),
         1,
         29.97,
         {"capture_dropped": 3},
@@ -256,7 +255,8 @@ def test_health_arrives_as_diagnostics() -> None:
         samples.wait("uav1/diagnostics", each=lambda: link.publish_diagnostics(snapshot))
         (status,) = samples.newest["uav1/diagnostics"].status
     values = {pair.key: pair.value for pair in status.values}
-    assert status.message == "degraded; no own attitude"
+    assert status.message == "degraded, tracking; no own attitude"
+    assert (values["state"], values["activity"]) == ("degraded", "tracking")
     assert status.hardware_id == "uav1"
     assert values["capture_dropped"] == "3"
     assert values["latency_ms/track/p99"] == "8.50"
@@ -314,7 +314,7 @@ def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
         samples = Samples(session)
         now_ns = time.monotonic_ns()
         after_2038_ns = now_ns + 30 * 365 * 86_400 * 1_000_000_000
-        link.publish_diagnostics(HealthSnapshot(after_2038_ns, HealthState.TRACKING, (), 1, 30.0, {}, {}))
+        link.publish_diagnostics(HealthSnapshot(after_2038_ns, TRACKING, 1, 30.0, {}, {}))
         wait_until(lambda: link.counters().get("failed", 0) == 1, "failure")
         samples.wait("uav1/target/t0/pose", each=lambda: link.publish(report(track(time.monotonic_ns()))))
 
