@@ -16,7 +16,7 @@ from edge.errors import InputError
 from edge.estimator.model import load_model
 from sim_replay.benchmark import commands as benchmark
 from sim_replay.datasets import open_dataset
-from sim_replay.demo import BUNDLED_SEQUENCE, show
+from sim_replay.demo import BUNDLED_SEQUENCE, report_flight, show
 from sim_replay.evaluation.judge import judge_frames, score_of
 from sim_replay.evaluation.table import score_table
 from sim_replay.faults import run as faults
@@ -24,6 +24,8 @@ from sim_replay.ground_truth import read_sequence
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError
+from sim_replay.radio import run as radio
+from sim_replay.report.flight_files import read_flight
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -50,14 +52,19 @@ def _parser() -> argparse.ArgumentParser:
     benchmark.register(commands)
     pipeline.register(commands)
     faults.register(commands)
+    radio.register(commands)
 
     score = commands.add_parser(
         "score",
-        help="score a model on a BOP dataset frame by frame, without the daemon",
-        description="Run acquire and track on every frame by itself, with no tracker and no clock, "
-        "and set the poses against the ground truth.",
+        help="score a recorded flight against the truth, or a model on a dataset frame by frame",
+        description="With FLIGHT, a folder that demo or play wrote: set what the subscriber and the autopilot received "
+        "against the truth and write score.json, frames.jsonl and overlay.mp4. With --dataset: run acquire and track "
+        "on every frame by itself, with no tracker, no clock and no daemon.",
     )
-    score.add_argument("--dataset", type=Path, required=True, metavar="DIR", help="BOP scene, split or dataset folder")
+    score.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="folder that demo or play wrote")
+    score.add_argument("--sequence", type=Path, metavar="DIR", help="scene folder (default: the one that was flown)")
+    score.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: FLIGHT)")
+    score.add_argument("--dataset", type=Path, metavar="DIR", help="BOP scene, split or dataset folder")
     score.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
     score.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
     score.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th picture (default: all)")
@@ -70,7 +77,9 @@ def _run(args: argparse.Namespace) -> int:
         return int(args.run(args))
     console = Console()
     if args.command == "score":
-        return _score(args, console)
+        if (args.flight is None) == (args.dataset is None):
+            raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
+        return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
     if show(read_sequence(folder), args.out, args.model, console):
         return 0
@@ -78,7 +87,17 @@ def _run(args: argparse.Namespace) -> int:
     return 1
 
 
-def _score(args: argparse.Namespace, console: Console) -> int:
+def _score_flight(args: argparse.Namespace, console: Console) -> int:
+    flight = read_flight(args.flight)
+    sequence = read_sequence(args.sequence or flight.sequence)
+    told = Console(stderr=True, quiet=True) if args.json else console
+    score = report_flight(sequence, flight, args.out or args.flight, told)
+    if args.json:
+        print(json.dumps(score, indent=2))
+    return 0
+
+
+def _score_dataset(args: argparse.Namespace, console: Console) -> int:
     if args.every < 1:
         raise InputError(f"--every {args.every}: must be at least 1")
     model = load_model(args.model, DEFAULT_THREADS)

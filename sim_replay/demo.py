@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.console import Console
 from rich.live import Live
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 from edge.estimator.model import load_model
 from sim_replay.ground_truth import PlayedSequence
-from sim_replay.overlay import Image, Overlay, showcase_index, write_video
+from sim_replay.offline import method_of
 from sim_replay.play import PlaySettings, Record, Recording, play
-from sim_replay.result import (
-    Result,
-    frame_of_record,
-    frame_views,
-    judge,
-    latency_ms,
-    pose_of,
-    score_json,
-)
+from sim_replay.report.flight_files import RecordedFlight, write_flight
+from sim_replay.report.write import write_report
+from sim_replay.result import frame_of_record, latency_ms, pose_of
 from sim_replay.score import match_poses
 
 BUNDLED_SEQUENCE = Path(__file__).parent / "data" / "crossing"
@@ -131,7 +122,7 @@ class LiveView:
 
 
 def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> bool:
-    """Play a sequence and write score.json, overlay.png and overlay.mp4 into `out`.
+    """Play a sequence, keep what the peers received in `out`, and write the report of it there.
 
     Returns:
         Whether both peers received poses.
@@ -145,32 +136,22 @@ def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> 
     figures = LiveFigures(sequence)
     with LiveView(console, figures) as view:
         recording = play(PlaySettings(sequence, out, model), view.on_record)
-    result = judge(sequence, recording)
-    score = score_json(sequence, result, loaded)
-    (out / "score.json").write_text(json.dumps(score, indent=2) + "\n", encoding="utf-8")
-    console.print(summary_table(score))
-    say(f"drawing {len(sequence.scene.images)} frames")
-    _draw(sequence, result, out, console)
-    say(f"written to {out}: score.json, overlay.mp4, overlay.png, daemon.log, config.toml")
+    flight = RecordedFlight(sequence.scene.folder, method_of(loaded), recording)
+    write_flight(out, flight)
+    report_flight(sequence, flight, out, console)
     return bool(recording.poses) and bool(recording.targets)
 
 
-def _draw(sequence: PlayedSequence, result: Result, out: Path, console: Console) -> None:
-    """overlay.png of a typical frame and overlay.mp4 of all."""
-    scene = sequence.scene
-    views = frame_views(sequence, result)
-    first = scene.undistorted_bgr(0)
-    size_wh = (first.shape[1], first.shape[0])
-    overlay = Overlay(views, size_wh)
-    shown = showcase_index(views)
-    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, scene.undistorted_bgr(shown)))
-
-    def frames() -> Iterator[Image]:
-        order = range(len(views))
-        for index in track(order, "drawing overlay.mp4", console=console, disable=not console.is_terminal):
-            yield overlay.draw(index, scene.undistorted_bgr(index))
-
-    write_video(out / "overlay.mp4", frames(), sequence.fps, size_wh)
+def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, console: Console) -> dict[str, Any]:
+    """Score a flight, write the report of it into `out` and tell of both; returns the score. Raises OSError."""
+    say = partial(console.print, highlight=False, soft_wrap=True)
+    say(f"scoring and drawing {len(sequence.scene.images)} frames")
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("drawing", total=len(sequence.scene.images))
+        score, files = write_report(sequence, flight, out, lambda: progress.advance(task))
+    console.print(summary_table(score))
+    say(f"written to {out}: {', '.join(files)}")
+    return score
 
 
 def summary_table(score: dict[str, Any]) -> Table:

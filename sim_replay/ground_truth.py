@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
 from msgs.geometry import Array
-from sim_replay.bop import Distortion, Model, read_scene
+from sim_replay.bop import BopFrame, Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
 from sim_replay.overlay import Extents
@@ -30,6 +31,7 @@ class SceneTruth:
     truths: list[Truth]
     extents: dict[int, Extents]  # by object id
     distortions: list[Distortion | None]  # of each picture on disk; None: a pinhole camera
+    cameras_world: list[tuple[Array, Array] | None]  # R_world_cam [3, 3], t_world_cam_m [3]; None: not known
 
     @property
     def name(self) -> str:
@@ -58,11 +60,15 @@ def read_scene_truth(folder: Path) -> SceneTruth:
     frames = scene.pictured
     truths = []
     for index, frame in enumerate(frames):
+        seen: Counter[int] = Counter()
         for target in frame.targets:
             if target.object_id not in models:
                 raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
-            truths.append(Truth(index, R, t_m, target.object_id, model.diameter_m, model.name, model.points_m))
+            instance, visible = seen[target.object_id], target.visible_px != 0
+            known = (target.object_id, model.diameter_m, model.name, model.points_m)
+            truths.append(Truth(index, R, t_m, *known, instance=instance, visible=visible))
+            seen[target.object_id] += 1
     return SceneTruth(
         folder,
         [scene.image_path(frame) for frame in frames],
@@ -70,7 +76,15 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         truths,
         {object_id: extents_of(model) for object_id, model in models.items()},
         [frame.distortion for frame in frames],
+        [_camera_world(frame) for frame in frames],
     )
+
+
+def _camera_world(frame: BopFrame) -> tuple[Array, Array] | None:
+    if frame.R_cam_world is None or frame.t_cam_world_m is None:
+        return None
+    R_world_cam = frame.R_cam_world.T
+    return R_world_cam, -R_world_cam @ frame.t_cam_world_m
 
 
 def extents_of(model: Model) -> Extents:

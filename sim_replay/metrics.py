@@ -102,3 +102,20 @@ def rotation_inside(R_est: ArrayLike, R_gt: ArrayLike, covariance: ArrayLike, si
     error_rad = so3_log(gt @ np.swapaxes(est, -1, -2))
     variance = np.diagonal(np.asarray(covariance, dtype=np.float64)[..., 3:, 3:], axis1=-2, axis2=-1)
     return np.abs(error_rad) <= sigmas * np.sqrt(variance)
+
+
+def nees(
+    R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """Normalised estimation error squared [...]: e' P^-1 e of the whole pose, of its position and of its rotation."""
+    est = np.asarray(R_est, dtype=np.float64)
+    turn_rad = so3_log(np.asarray(R_gt, dtype=np.float64) @ np.swapaxes(est, -1, -2))
+    shift_m = np.asarray(t_gt, dtype=np.float64) - np.asarray(t_est, dtype=np.float64)
+    error = np.concatenate([shift_m, turn_rad], axis=-1)
+    P = np.asarray(covariance, dtype=np.float64)
+
+    def of(part: slice) -> Array:
+        e = error[..., part]
+        return np.sum(e * np.linalg.solve(P[..., part, part], e[..., None])[..., 0], axis=-1)
+
+    return of(slice(0, 6)), of(slice(0, 3)), of(slice(3, 6))

@@ -2,41 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from edge.estimator.model import Model
 from msgs.geometry import R_from_q_wxyz
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import FrameView
 from sim_replay.play import Record, Recording
-from sim_replay.score import (
-    Match,
-    TargetPose,
-    frame_of,
-    latency_statistics,
-    match_poses,
-    statistics,
-)
+from sim_replay.report.peer import peer_figures
+from sim_replay.score import Match, TargetPose, frame_of, latency_statistics, match_poses, statistics
+
+PEERS = ("subscriber", "autopilot")
+
+
+@dataclass(frozen=True, eq=False)
+class PeerResult:
+    """What one peer received, judged. Frames are indices into the sequence."""
+
+    matches: tuple[Match, ...]  # of every visible target of every frame
+    false_poses: tuple[TargetPose, ...]  # those of a frame that belong to no target
+    strays: int  # poses of no frame of the sequence
+    ages: tuple[tuple[int, float], ...]  # of each pose of a frame, as it came: frame, ms from exposure to receipt
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One replay, judged."""
+    """One replay, judged by what each of its peers received."""
 
-    matches: tuple[Match, ...]
-    false_poses: tuple[TargetPose, ...]  # those of a frame that belong to no target
-    strays: int  # poses of no frame of the sequence
-    latencies_ms: dict[int, float]  # by frame: capture to the first TARGET_RELATIVE of that frame
+    subscriber: PeerResult
+    autopilot: PeerResult
     recording: Recording
+
+    @property
+    def latencies_ms(self) -> dict[int, float]:
+        """By frame: capture to the first TARGET_RELATIVE of that frame."""
+        first: dict[int, float] = {}
+        for frame, age_ms in self.autopilot.ages:
+            first.setdefault(frame, age_ms)
+        return first
 
 
 def pose_of(record: Record, frame: int) -> TargetPose:
     """The pose in a peer's record."""
     R_cam_target = R_from_q_wxyz(record["q_cam_target_wxyz"])
-    return TargetPose(frame, R_cam_target, np.array(record["t_cam_target_m"], dtype=np.float64))
+    covariance = np.array(record["covariance"], dtype=np.float64) if "covariance" in record else None
+    t_m = np.array(record["t_cam_target_m"], dtype=np.float64)
+    return TargetPose(frame, R_cam_target, t_m, covariance=covariance, track=str(record["target"]))
 
 
 def frame_of_record(record: Record, recording: Recording, sequence: PlayedSequence) -> int | None:
@@ -50,52 +64,66 @@ def latency_ms(record: Record, recording: Recording) -> float:
 
 
 def judge(sequence: PlayedSequence, recording: Recording) -> Result:
-    """Set what zenoh brought against the truth, and MAVLink's arrival against the exposure."""
-    estimates, strays = [], 0
-    for record in recording.poses:
+    """Set what zenoh brought, and what MAVLink brought, against the truth and the exposure."""
+    subscriber = ((record, float(record["age_ms"])) for record in recording.poses)
+    autopilot = ((record, latency_ms(record, recording)) for record in recording.targets)
+    return Result(_judge_peer(sequence, recording, subscriber), _judge_peer(sequence, recording, autopilot), recording)
+
+
+def _judge_peer(sequence: PlayedSequence, recording: Recording, received: Iterable[tuple[Record, float]]) -> PeerResult:
+    estimates, ages, strays = [], [], 0
+    for record, age_ms in received:
         frame = frame_of_record(record, recording, sequence)
         if frame is None:
             strays += 1
         else:
             estimates.append(pose_of(record, frame))
+            ages.append((frame, age_ms))
     matches, false_poses = match_poses(sequence.scene.truths, estimates)
-    latencies_ms: dict[int, float] = {}
-    for record in recording.targets:
-        frame = frame_of_record(record, recording, sequence)
-        if frame is not None:
-            latencies_ms.setdefault(frame, latency_ms(record, recording))
-    return Result(tuple(matches), tuple(false_poses), strays, latencies_ms, recording)
+    visible = tuple(match for match in matches if match.truth.visible)
+    return PeerResult(visible, tuple(false_poses), strays, tuple(ages))
 
 
-def score_json(sequence: PlayedSequence, result: Result, model: Model) -> dict[str, Any]:
+def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) -> dict[str, Any]:
     """score.json: shares 0..1, degrees, metres, milliseconds; null where there is nothing to tell.
 
-    The figures of the poses are those of `sim_replay.score.statistics`.
+    The figures of the poses are those of `sim_replay.score.statistics`, of what the subscriber received; under "peers"
+    is what each peer received, as `sim_replay.report.peer.peer_figures` has it.
     """
-    recording = result.recording
+    recording, subscriber = result.recording, result.subscriber
+    frames = len(sequence.scene.images)
     return {
         "sequence": sequence.scene.name,
         "poses": len(recording.poses),
-        "stray_poses": result.strays,
-        **statistics(len(sequence.scene.images), result.matches, result.false_poses),
+        "stray_poses": subscriber.strays,
+        **statistics(frames, subscriber.matches, subscriber.false_poses),
         "latency_ms": latency_statistics([latency_ms(record, recording) for record in recording.targets]),
         "dropped_frames": recording.daemon_counters.get("dropped", 0),
+        "peers": {
+            name: {
+                "poses": len(peer.ages) + peer.strays,
+                "stray_poses": peer.strays,
+                **peer_figures(frames, sequence.fps, peer.matches, peer.false_poses, peer.ages),
+            }
+            for name, peer in zip(PEERS, (subscriber, result.autopilot), strict=True)
+        },
         "mavlink_received": recording.mavlink.get("received", {}),
         "mavlink_refused": recording.mavlink.get("refused", {}),
         "zenoh_received": recording.zenoh.get("received", {}),
         "zenoh_refused": recording.zenoh.get("refused", {}),
-        "model": {"file": model.path.name, "sha256": model.sha256, "precision": model.contract.precision},
+        "model": model,
     }
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
-    """What the overlay draws of each frame: its first target."""
+    """What the overlay draws of each frame: its first target, as the subscriber has it."""
     by_frame: dict[int, Match] = {}
-    for match in result.matches:
+    for match in result.subscriber.matches:
         by_frame.setdefault(match.truth.frame, match)
+    latencies_ms = result.latencies_ms
     views = []
     for frame, K in enumerate(sequence.scene.K):
         seen = by_frame.get(frame)
         extents = None if seen is None else sequence.scene.extents[seen.truth.object_id]
-        views.append(FrameView(K, seen, extents, result.latencies_ms.get(frame)))
+        views.append(FrameView(K, seen, extents, latencies_ms.get(frame)))
     return views

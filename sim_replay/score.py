@@ -30,6 +30,7 @@ class TargetPose:
     t_cam_target_m: Array  # [3]
     score: float | None = field(default=None, kw_only=True)
     covariance: Array | None = field(default=None, kw_only=True)  # [6, 6], as edge.types.Estimate has it
+    track: str = field(default="", kw_only=True)  # the name that its sender knows the target by; empty: none
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,8 @@ class Truth(TargetPose):
     diameter_m: float  # largest distance between two points of the target
     airframe: str = ""  # its name; empty: the dataset gives none
     points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
+    instance: int = field(default=0, kw_only=True)  # which of the frame's targets of that object
+    visible: bool = field(default=True, kw_only=True)  # False: the sequence says that nothing of it is to be seen
 
     @property
     def airframe_label(self) -> str:

@@ -40,24 +40,25 @@ def frame_record(frame: JudgedFrame, root: Path) -> dict[str, Any]:
         "im_id": frame.picture.image_id,
         "image": str(path.relative_to(root) if path.is_relative_to(root) else path),
         "time_ms": None if frame.time_ms is None else round(frame.time_ms, 3),
-        "targets": [_target_record(match) for match in frame.matches],
-        "false_poses": [_pose_record(pose) for pose in frame.false_poses],
+        "targets": [target_record(match) for match in frame.matches],
+        "false_poses": [pose_record(pose) for pose in frame.false_poses],
     }
 
 
-def _target_record(match: Match) -> dict[str, Any]:
+def target_record(match: Match) -> dict[str, Any]:
+    """A true target, what was found of it, and the errors of that: metres, degrees."""
     truth, estimate = match.truth, match.estimate
     record: dict[str, Any] = {
         "obj_id": truth.object_id,
         "airframe": truth.airframe_label,
         "range_m": round(float(np.linalg.norm(truth.t_cam_target_m)), 3),
-        "truth": _pose_record(truth),
+        "truth": pose_record(truth),
         "estimate": None,
     }
     if estimate is not None:
         R_est, t_est = estimate.R_cam_target, estimate.t_cam_target_m
         R_gt, t_gt = truth.R_cam_target, truth.t_cam_target_m
-        record["estimate"] = _pose_record(estimate)
+        record["estimate"] = pose_record(estimate)
         record["rotation_error_deg"] = round(float(metrics.rotation_error_deg(R_est, R_gt)), 4)
         record["translation_error_m"] = round(float(metrics.translation_error_m(t_est, t_gt)), 4)
         record["depth_error_m"] = round(float(metrics.depth_error_m(t_est, t_gt)), 4)
@@ -67,7 +68,8 @@ def _target_record(match: Match) -> dict[str, Any]:
     return record
 
 
-def _pose_record(pose: TargetPose) -> dict[str, Any]:
+def pose_record(pose: TargetPose) -> dict[str, Any]:
+    """A pose in `cam`, rounded, with score and sigma where they are known."""
     record: dict[str, Any] = {
         "R_cam_target": _rounded(pose.R_cam_target, 6),
         "t_cam_target_m": _rounded(pose.t_cam_target_m, 4),

@@ -1,0 +1,101 @@
+"""How well each target was held on to: acquired, lost, found again, under how many names. Pure functions.
+
+Counted as CLEAR MOT does (Bernardin & Stiefelhagen 2008): an identity switch is a frame whose pose names another track
+than the target's last one did; a fragment is each time that poses of a visible target cease and begin again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from sim_replay.score import Match
+
+
+def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
+    """The figures over all targets, and each target's own under "targets"; seconds by the frames' own clock.
+
+    Args:
+        matches: Of all visible targets of all frames; a frame is an index that grows by one every 1 / fps.
+
+    Returns:
+        JSON's types. `time_to_acquire_s` counts from a target's first visible frame to the first that has a pose of
+        it; `time_to_reacquire_s` from the first frame without one, or from where it came into view again. One that
+        was not found (again) before it left is in `never_acquired` or `never_reacquired` and in no time.
+    """
+    by_target: dict[tuple[int, int], list[Match]] = {}
+    for match in sorted(matches, key=lambda match: match.truth.frame):
+        by_target.setdefault((match.truth.object_id, match.truth.instance), []).append(match)
+    targets = [target_continuity(seen, fps) for seen in by_target.values()]
+    acquired = [target["time_to_acquire_s"] for target in targets if target["time_to_acquire_s"] is not None]
+    losses = [loss for target in targets for loss in target["losses"]]
+    regained = [loss["lasted_s"] for loss in losses if loss["regained"]]
+    return {
+        "identity_switches": sum(target["identity_switches"] for target in targets),
+        "fragments": sum(target["fragments"] for target in targets),
+        "never_acquired": len(targets) - len(acquired),
+        "time_to_acquire_s": _spread(acquired),
+        "reacquired": len(regained),
+        "never_reacquired": len(losses) - len(regained),
+        "time_to_reacquire_s": _spread(regained),
+        "targets": targets,
+    }
+
+
+def target_continuity(seen: Sequence[Match], fps: float) -> dict[str, Any]:
+    """The same of one target, from its matches in the order of their frames."""
+    tracks = [match.estimate.track for match in seen if match.estimate is not None]
+    switches = sum(after != before for before, after in pairwise(tracks))
+    runs = list(_missing(seen))
+    first = next((k for k, match in enumerate(seen) if match.estimate is not None), None)
+    losses = [(start, stop) for start, stop in runs if first is not None and start > first]
+    told = [
+        {
+            "frame": seen[start].truth.frame,
+            "lasted_s": round((stop - start) / fps, 4),
+            "regained": stop < len(seen) and _follows(seen, stop),
+            "while_in_view": _follows(seen, start),
+        }
+        for start, stop in losses
+    ]
+    acquired = None if first is None else (seen[first].truth.frame - seen[0].truth.frame) / fps
+    return {
+        "target": seen[0].truth.airframe_label,
+        "instance": seen[0].truth.instance,
+        "frames": len(seen),
+        "found": len(tracks),
+        "tracks": list(dict.fromkeys(tracks)),
+        "time_to_acquire_s": None if acquired is None else round(acquired, 4),
+        "identity_switches": switches,
+        "fragments": sum(
+            loss["regained"] and _follows(seen, start) for loss, (start, _) in zip(told, losses, strict=True)
+        ),
+        "losses": told,
+    }
+
+
+def _missing(seen: Sequence[Match]) -> Iterator[tuple[int, int]]:
+    """Runs [start, stop) of matches without a pose; one that leaves view in between is split there."""
+    start = None
+    for k, match in enumerate(seen):
+        if start is not None and (match.estimate is not None or not _follows(seen, k)):
+            yield start, k
+            start = None
+        if start is None and match.estimate is None:
+            start = k
+    if start is not None:
+        yield start, len(seen)
+
+
+def _follows(seen: Sequence[Match], k: int) -> bool:
+    """Whether the frame of the k-th match comes right after that of the one before."""
+    return k > 0 and seen[k].truth.frame == seen[k - 1].truth.frame + 1
+
+
+def _spread(seconds: Sequence[float]) -> dict[str, float | None]:
+    if not seconds:
+        return {"median": None, "max": None}
+    return {"median": round(float(np.median(seconds)), 4), "max": round(float(np.max(seconds)), 4)}

@@ -1,0 +1,87 @@
+"""What a replay leaves behind so that it can be scored again: flight.json, and received.jsonl as the peers told it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edge.errors import InputError
+from sim_replay.play import Recording
+
+FLIGHT_JSON, RECEIVED_JSONL = "flight.json", "received.jsonl"
+_PEER_OF = {"target_relative": "autopilot", "pose": "subscriber", "diagnostics": "subscriber"}
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFlight:
+    """A flight as it was recorded."""
+
+    sequence: Path  # folder of the scene that was flown
+    model: dict[str, Any]  # file, sha256, precision
+    recording: Recording
+
+
+def is_flight(folder: Path) -> bool:
+    """Whether a replay left its files there."""
+    return (folder / FLIGHT_JSON).is_file()
+
+
+def write_flight(out: Path, flight: RecordedFlight) -> None:
+    """Write both files into `out`, which exists."""
+    recording = flight.recording
+    about = {
+        "sequence": str(flight.sequence.resolve()),
+        "model": flight.model,
+        "start_at_ns": recording.start_at_ns,
+        "utc_minus_monotonic_ns": recording.utc_minus_monotonic_ns,
+        "mavlink_port": recording.mavlink_port,
+        "zenoh_endpoint": recording.zenoh_endpoint,
+        "daemon_exit": recording.daemon_exit,
+        "daemon_counters": recording.daemon_counters,
+    }
+    (out / FLIGHT_JSON).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    lines = [(_PEER_OF[r["event"]], r) for r in (*recording.poses, *recording.targets, *recording.diagnostics)]
+    summaries = (("autopilot", recording.mavlink), ("subscriber", recording.zenoh))
+    lines += [(peer, {"event": "summary", **summary}) for peer, summary in summaries if summary]
+    with (out / RECEIVED_JSONL).open("w", encoding="utf-8") as file:
+        for peer, record in lines:
+            file.write(json.dumps({"peer": peer, **record}) + "\n")
+
+
+def read_flight(folder: Path) -> RecordedFlight:
+    """Read what `write_flight` left in `folder`. Raises InputError, naming file and key or line."""
+    path = folder / FLIGHT_JSON
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+        recording = Recording(
+            start_at_ns=int(about["start_at_ns"]),
+            utc_minus_monotonic_ns=int(about["utc_minus_monotonic_ns"]),
+            mavlink_port=int(about["mavlink_port"]),
+            zenoh_endpoint=str(about["zenoh_endpoint"]),
+            daemon_exit=about["daemon_exit"],
+            daemon_counters=dict(about["daemon_counters"]),
+        )
+        sequence, model = Path(about["sequence"]), dict(about["model"])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; is {folder} what a replay wrote?") from error
+    except KeyError as error:
+        raise InputError(f"{path}: {error.args[0]!r} is missing") from error
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: not as expected: {error}") from error
+    _read_received(folder / RECEIVED_JSONL, recording)
+    return RecordedFlight(sequence, model, recording)
+
+
+def _read_received(path: Path, recording: Recording) -> None:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', 'not UTF-8 text')}") from error
+    for number, line in enumerate(lines, 1):
+        try:
+            record = json.loads(line)
+            recording.take(record.pop("peer"), record)
+        except (ValueError, KeyError, AttributeError, TypeError) as error:
+            raise InputError(f"{path}: line {number} is not a record of a peer") from error

@@ -1,0 +1,166 @@
+"""The figures of what one peer received of a flight: errors, honesty of covariances, age, continuity, tracks. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from msgs.geometry import Array, euler_from_R
+from sim_replay import metrics
+from sim_replay.report.continuity import continuity
+from sim_replay.score import Match, TargetPose, stacked, statistics
+
+COORDINATES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
+# 95 % of a chi-square variable with as many degrees of freedom lies below (any table of its quantiles).
+CHI2_95 = {3: 7.815, 6: 12.592}
+# cam to a frame that looks along the optical axis as a pilot does: x forward, y right, z down.
+R_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def peer_figures(
+    frames: int,
+    fps: float,
+    matches: Sequence[Match],
+    false_poses: Sequence[TargetPose],
+    ages: Sequence[tuple[int, float]],
+) -> dict[str, Any]:
+    """JSON's types: shares 0..1, degrees, metres, milliseconds, seconds; None where there is nothing to tell.
+
+    Args:
+        frames: How many the sequence has.
+        matches: Of every visible target of every frame.
+        false_poses: Those of a frame that belong to no target.
+        ages: Of each pose in the order of arrival: its frame, and ms from exposure to receipt.
+    """
+    return {
+        **statistics(frames, matches, false_poses),
+        "rmse": rmse(matches),
+        "range_error_m": range_error_m(matches),
+        "nees": nees(matches),
+        "age_ms": percentiles([age_ms for _, age_ms in ages]),
+        "longest_silence_s": longest_silence_s(matches, ages, fps),
+        "continuity": continuity(matches, fps),
+        "tracks": tracks(matches, false_poses),
+    }
+
+
+def coordinates(poses: Sequence[TargetPose]) -> Array:
+    """[N, 6] of poses: x, y, z in `cam`, metres; roll, pitch, yaw against the camera's axes, degrees.
+
+    Roll, pitch and yaw are zero for a target that flies straight away from the camera, wings along the rows.
+    """
+    R, t_m = stacked(poses)
+    angles = euler_from_R(R_FORWARD_CAM @ R)
+    return np.column_stack([t_m, *(np.rad2deg(angle) for angle in angles)])
+
+
+def coordinate_errors(found: Sequence[tuple[TargetPose, TargetPose]]) -> Array:
+    """[N, 6]: estimate minus truth of pairs (truth, estimate), as `coordinates` has them; angles within ±180°."""
+    error = coordinates([estimate for _, estimate in found]) - coordinates([truth for truth, _ in found])
+    error[:, 3:] = (error[:, 3:] + 180.0) % 360.0 - 180.0
+    return error
+
+
+def pairs(matches: Sequence[Match]) -> list[tuple[TargetPose, TargetPose]]:
+    """(truth, estimate) of all that was found."""
+    return [(match.truth, match.estimate) for match in matches if match.estimate is not None]
+
+
+def rmse(matches: Sequence[Match]) -> dict[str, float | None]:
+    """Root of the mean square error of each of COORDINATES (paper, its figures of a sequence)."""
+    found = pairs(matches)
+    if not found:
+        return dict.fromkeys(COORDINATES)
+    values = np.sqrt((coordinate_errors(found) ** 2).mean(axis=0))
+    return {name: round(float(value), 4) for name, value in zip(COORDINATES, values, strict=True)}
+
+
+def range_error_m(matches: Sequence[Match]) -> dict[str, float | None]:
+    """Estimated minus true range: its mean (a bias) and root mean square, metres, and the mean as a share."""
+    found = pairs(matches)
+    if not found:
+        return {"mean": None, "rms": None, "mean_rel": None}
+    _, t_gt = stacked([truth for truth, _ in found])
+    _, t_est = stacked([estimate for _, estimate in found])
+    range_m = np.linalg.norm(t_gt, axis=1)
+    error = np.linalg.norm(t_est, axis=1) - range_m
+    values = {"mean": error.mean(), "rms": np.sqrt((error**2).mean()), "mean_rel": (error / range_m).mean()}
+    return {name: round(float(value), 4) for name, value in values.items()}
+
+
+def nees(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
+    """Normalised estimation error squared, e' P^-1 e (Bar-Shalom), of the pose and of its two halves.
+
+    For an honest covariance the mean is the degrees of freedom and 95 % lie below their chi-square quantile. Errors of
+    neighbouring frames are alike, so the mean of one flight scatters more than its count says. None: no covariances.
+    """
+    sure = [(truth, estimate) for truth, estimate in pairs(matches) if estimate.covariance is not None]
+    if not sure:
+        return None
+    R_gt, t_gt = stacked([truth for truth, _ in sure])
+    R_est, t_est = stacked([estimate for _, estimate in sure])
+    covariance = np.array([estimate.covariance for _, estimate in sure])
+    parts = metrics.nees(R_est, t_est, R_gt, t_gt, covariance)
+    return {
+        name: {
+            "mean": round(float(values.mean()), 4),
+            "median": round(float(np.median(values)), 4),
+            "degrees_of_freedom": dof,
+            "within_95pct": round(float((values <= CHI2_95[dof]).mean()), 4),
+        }
+        for (name, dof), values in zip((("pose", 6), ("position", 3), ("rotation", 3)), parts, strict=True)
+    }
+
+
+def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
+    """p50, p95, p99 and the largest."""
+    if not values_ms:
+        return dict.fromkeys(("p50", "p95", "p99", "max"))
+    found = np.percentile(values_ms, [50, 95, 99, 100])
+    return {name: round(float(v), 3) for name, v in zip(("p50", "p95", "p99", "max"), found, strict=True)}
+
+
+def longest_silence_s(matches: Sequence[Match], ages: Sequence[tuple[int, float]], fps: float) -> float | None:
+    """The longest time without a pose while a target was to be seen, from the first that came on; None: none came."""
+    arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages)
+    if not arrivals:
+        return None
+    seen = np.array(sorted({match.truth.frame for match in matches})) / fps
+    bounds = [*arrivals, max(arrivals[-1], seen[-1] if len(seen) else 0.0)]
+    silences = [after - before for before, after in pairwise(bounds) if ((seen > before) & (seen < after)).any()]
+    return round(max(silences, default=max(np.diff(bounds), default=0.0)), 4)
+
+
+def tracks(matches: Sequence[Match], false_poses: Sequence[TargetPose]) -> dict[str, dict[str, Any]]:
+    """Each track by the name that the daemon gave it: when it lived, what it followed, how wrong it was."""
+    found: dict[str, list[Match]] = {}
+    for match in matches:
+        if match.estimate is not None:
+            found.setdefault(match.estimate.track, []).append(match)
+    false: dict[str, int] = {}
+    for pose in false_poses:
+        false[pose.track] = false.get(pose.track, 0) + 1
+    return {name: _track(found.get(name, []), false.get(name, 0)) for name in sorted({*found, *false})}
+
+
+def _track(followed: Sequence[Match], false_poses: int) -> dict[str, Any]:
+    frames = [match.truth.frame for match in followed]
+    R_gt, t_gt = stacked([truth for truth, _ in pairs(followed)])
+    R_est, t_est = stacked([estimate for _, estimate in pairs(followed)])
+    errors = {
+        "rotation_error_deg": metrics.rotation_error_deg(R_est, R_gt),
+        "translation_error_m": metrics.translation_error_m(t_est, t_gt),
+        "bearing_error_deg": metrics.bearing_error_deg(t_est, t_gt),
+    }
+    return {
+        "poses": len(followed) + false_poses,
+        "false_poses": false_poses,
+        "first_frame": min(frames, default=None),
+        "last_frame": max(frames, default=None),
+        "targets": sorted({match.truth.airframe_label for match in followed}),
+        **{name: round(float(values.mean()), 4) if values.size else None for name, values in errors.items()},
+        "range_error_m": range_error_m(followed)["mean"],
+    }

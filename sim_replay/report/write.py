@@ -1,0 +1,80 @@
+"""Everything that is made of a recorded flight, written into one folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from sim_replay.evaluation.files import target_record
+from sim_replay.ground_truth import PlayedSequence
+from sim_replay.overlay import Image, Overlay, showcase_index, write_video
+from sim_replay.report.flight_files import RecordedFlight
+from sim_replay.result import PEERS, Result, frame_views, judge, score_json
+
+
+def write_report(
+    sequence: PlayedSequence, flight: RecordedFlight, out: Path, on_frame: Callable[[], None]
+) -> tuple[dict[str, Any], list[str]]:
+    """Judge a flight and write score.json, frames.jsonl, overlay.mp4 and overlay.png.
+
+    Returns:
+        The score, and the names of the files.
+
+    Raises:
+        InputError, OSError.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    result = judge(sequence, flight.recording)
+    score = score_json(sequence, result, flight.model)
+    (out / "score.json").write_text(json.dumps(score, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with (out / "frames.jsonl").open("w", encoding="utf-8") as file:
+        for record in frame_records(sequence, result):
+            file.write(json.dumps(record, allow_nan=False) + "\n")
+    _draw(sequence, result, out, on_frame)
+    return score, ["score.json", "frames.jsonl", "overlay.mp4", "overlay.png"]
+
+
+def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:
+    """One a frame: each visible target with what each peer received of it, its errors, and that pose's age."""
+    scene = sequence.scene
+    peers = dict(zip(PEERS, (result.subscriber, result.autopilot), strict=True))
+    for frame, image in enumerate(scene.images):
+        yield {
+            "frame": frame,
+            "t_s": round(frame / sequence.fps, 6),
+            "image": image.name,
+            **{
+                name: {
+                    "targets": [
+                        {**target_record(match), "track": None if match.estimate is None else match.estimate.track}
+                        for match in peer.matches
+                        if match.truth.frame == frame
+                    ],
+                    "false_poses": sum(pose.frame == frame for pose in peer.false_poses),
+                    "age_ms": [round(age_ms, 3) for at, age_ms in peer.ages if at == frame],
+                }
+                for name, peer in peers.items()
+            },
+        }
+
+
+def _draw(sequence: PlayedSequence, result: Result, out: Path, on_frame: Callable[[], None]) -> None:
+    """overlay.png of a typical frame and overlay.mp4 of all."""
+    scene = sequence.scene
+    views = frame_views(sequence, result)
+    first = scene.undistorted_bgr(0)
+    size_wh = (first.shape[1], first.shape[0])
+    overlay = Overlay(views, size_wh)
+    shown = showcase_index(views)
+    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, scene.undistorted_bgr(shown)))
+
+    def frames() -> Iterator[Image]:
+        for index in range(len(views)):
+            on_frame()
+            yield overlay.draw(index, scene.undistorted_bgr(index))
+
+    write_video(out / "overlay.mp4", frames(), sequence.fps, size_wh)
