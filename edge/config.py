@@ -6,12 +6,11 @@ Paths are taken from the folder the file lies in. `uavpose-edge check --config F
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -20,13 +19,14 @@ from edge.config_camera import CameraSettings
 from edge.config_camera import SequenceCamera as SequenceCamera
 from edge.config_camera import camera_key as camera_key
 from edge.config_ground import RecorderSettings, ZenohSettings
-from edge.config_section import ConfigPath, Section
+from edge.config_path import ConfigPath
 from edge.errors import InputError
 from edge.estimator.providers import Provider
 from edge.links.mavlink_endpoints import parse_endpoint
 from edge.links.signing_key import load_key
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
+from msgs.settings import Fault, Section, faults_of, parse_toml, read_text
 
 SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
@@ -228,40 +228,29 @@ class ConfigFile:
 
 def load_config(path: Path) -> ConfigFile:
     """Read and validate a TOML file. Raises InputError: one line a fault, each naming file, line and key."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: cannot be read: {reason}") from error
-    try:
-        tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+    text = read_text(path, InputError)
+    tree = parse_toml(text, path, InputError)
     try:
         config = Config.model_validate(tree, context={"folder": path.resolve().parent})
     except ValidationError as error:
-        lines = [_sentence(path, text, _key(item), _reason(item)) for item in error.errors()]
+        lines = [_sentence(path, text, _key(fault), _reason(fault)) for fault in faults_of(error)]
         raise InputError("\n".join(lines)) from error
     return ConfigFile(path, text, config)
 
 
-def _key(item: Any) -> tuple[str, ...]:
-    parts = [str(part) for part in item["loc"]]
+def _key(fault: Fault) -> tuple[str, ...]:
+    parts = [str(part) for part in fault.location]
     if parts[:1] == ["camera"] and len(parts) > 1:
         parts = parts[:1] + parts[2:]  # pydantic puts the chosen type there
     return tuple(parts)
 
 
-def _reason(item: Any) -> str:
-    if item["type"] == "extra_forbidden":
-        return "unknown key"
-    if item["type"] == "missing":
-        return "is missing"
-    if item["type"] == "union_tag_not_found":
+def _reason(fault: Fault) -> str:
+    if fault.type == "union_tag_not_found":
         return "needs type = one of 'sequence', 'folder', 'file', 'device', 'stream', 'zenoh'"
-    if item["type"] == "union_tag_invalid":
-        return f"type must be one of {item['ctx']['expected_tags']}"
-    return str(item["msg"]).removeprefix("Value error, ")
+    if fault.type == "union_tag_invalid":
+        return f"type must be one of {fault.context['expected_tags']}"
+    return fault.reason
 
 
 def _sentence(path: Path, text: str, key: tuple[str, ...], reason: str) -> str:

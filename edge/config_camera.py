@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from edge.config_ground import ZenohTlsSettings
-from edge.config_section import ConfigPath, Section
+from edge.config_path import ConfigPath
 from msgs.session import check_endpoint
+from msgs.settings import Section
 
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

@@ -7,9 +7,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from edge.config_section import ConfigPath, Section
+from edge.config_path import ConfigPath
 from msgs.recording import RecordingLimits
 from msgs.session import TlsFiles, check_endpoint
+from msgs.settings import Section
 
 _MB = 1_000_000
 

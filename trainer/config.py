@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
+
+from msgs.settings import Section, load_settings, parse_settings
 
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
@@ -19,11 +20,7 @@ class RenderingError(RuntimeError):
     """A rendering process failed; the message carries its traceback."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ModelConfig(_Section):
+class ModelConfig(Section):
     configuration: Literal["edge", "paper"] = Field(description="which of the two configurations this is")
     backbone: BackboneName
     pretrained: bool = Field(description="start from public ImageNet weights (efficientnet_lite0 only)")
@@ -55,7 +52,7 @@ class ModelConfig(_Section):
         return self
 
 
-class LossConfig(_Section):
+class LossConfig(Section):
     """Weights of the joint loss; `heatmap`, `size`, `translation`, `rotation` are the paper's lambda_1..4."""
 
     heatmap: float = Field(50.0, ge=0)
@@ -74,7 +71,7 @@ class LossConfig(_Section):
     uncertainty: float = Field(0.0, ge=0)
 
 
-class DatasetSource(_Section):
+class DatasetSource(Section):
     """A BOP dataset whose pictures are trained on beside rendered windows."""
 
     path: Path
@@ -83,7 +80,7 @@ class DatasetSource(_Section):
     share: float = Field(gt=0, le=1, description="of every batch")
 
 
-class DataConfig(_Section):
+class DataConfig(Section):
     seed: int = Field(ge=0)
     validation_seed: int = Field(ge=0)
     airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
@@ -109,12 +106,12 @@ class DataConfig(_Section):
         return self
 
 
-class SizeStage(_Section):
+class SizeStage(Section):
     from_progress: float = Field(ge=0, lt=1, description="share of the run after which this size is used")
     size_px: int = Field(ge=32, multiple_of=32)
 
 
-class ScheduleConfig(_Section):
+class ScheduleConfig(Section):
     samples: int = Field(ge=1, description="planned number of training samples")
     warmup_samples: int = Field(ge=0)
     lr: float = Field(5e-4, gt=0)
@@ -134,7 +131,7 @@ class ScheduleConfig(_Section):
         return self
 
 
-class RunConfig(_Section):
+class RunConfig(Section):
     threads: int = Field(2, ge=1, description="CPU threads of the training process")
     bf16: bool = Field(True, description="run the convolutions in bfloat16")
     log_every_steps: int = Field(25, ge=1)
@@ -142,7 +139,7 @@ class RunConfig(_Section):
     checkpoint_every_s: float = Field(120.0, gt=0)
 
 
-class ContractConfig(_Section):
+class ContractConfig(Section):
     """What export writes into the model file and measurement cannot find out."""
 
     name: str
@@ -153,7 +150,7 @@ class ContractConfig(_Section):
     trained_range_m: tuple[float, float] = (100.0, 500.0)
 
 
-class TrainerConfig(_Section):
+class TrainerConfig(Section):
     model: ModelConfig
     loss: LossConfig
     data: DataConfig
@@ -164,19 +161,9 @@ class TrainerConfig(_Section):
 
 def parse_config(text: str, source: str) -> TrainerConfig:
     """TOML text to a configuration. Raises ConfigError naming `source` and every wrong key."""
-    try:
-        return TrainerConfig.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{source}: not valid TOML: {error}") from None
-    except ValidationError as error:
-        lines = [f"{'.'.join(map(str, item['loc'])) or 'file'}: {item['msg']}" for item in error.errors()]
-        raise ConfigError(f"{source}: " + "; ".join(lines)) from None
+    return parse_settings(text, source, TrainerConfig, ConfigError)
 
 
 def load_config(path: Path) -> TrainerConfig:
     """Read a TOML file. Raises ConfigError when it is missing or wrong."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    return parse_config(text, str(path))
+    return load_settings(path, TrainerConfig, ConfigError)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from msgs.settings import read_toml
 from trainer.config import ConfigError
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
@@ -84,7 +84,7 @@ def measure(
 
 def _manifest(dataset: Path) -> dict[str, Any]:
     path = dataset / "dataset.toml"
-    return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_toml(path, ConfigError) if path.is_file() else {}
 
 
 def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str:

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from edge.errors import InputError
 from edge.estimator.providers import ChosenProvider, Provider, choose_provider
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
+from msgs.settings import dotted, faults_of
 
 INPUT_TYPES = {"image": ("tensor(uint8)", 4), "K": ("tensor(float)", 3)}
 OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
@@ -158,9 +159,8 @@ def _contract(metadata: dict[str, str], path: Path) -> ModelContract:
             raise InputError(f"model {path} has contract version {version}; this program reads {CONTRACT_VERSION}")
         contract = ModelContract.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"model {path}: contract key {key}: {first['msg']}") from error
+        first = faults_of(error)[0]
+        raise InputError(f"model {path}: contract key {dotted(first.location)}: {first.reason}") from error
     except json.JSONDecodeError as error:
         raise InputError(f"model {path}: its contract is not JSON: {error}") from error
     for size_wh in filter(None, (contract.acquire_size_wh, contract.track_size_wh)):

@@ -24,6 +24,7 @@ from zenoh import handlers
 
 from edge.requests import Request, StopTracking, TrackBox
 from msgs.recording import Recorder
+from msgs.settings import dotted, faults_of
 
 log = logging.getLogger(__name__)
 
@@ -88,10 +89,9 @@ def parse(name: str, body: bytes) -> Command:
     try:
         return COMMANDS[name].model_validate_json(body or b"{}")
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        reason = str(first["msg"]).removeprefix("Value error, ")
-        raise Refused(f"{key}: {reason}" if key else reason) from error
+        first = faults_of(error)[0]
+        key = dotted(first.location)
+        raise Refused(f"{key}: {first.reason}" if key else first.reason) from error
 
 
 def carry_out(command: Command, actions: Actions) -> dict[str, Any]:

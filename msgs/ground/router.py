@@ -17,41 +17,37 @@ loopback_reads = true
 from __future__ import annotations
 
 import threading
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from msgs.ground.access import Access, access_control
 from msgs.ground.errors import InputError
 from msgs.session import TlsFiles, check_endpoint, router_config
+from msgs.settings import Section, load_settings
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,62}$")]
 VehicleName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TlsSettings(_Section):
+class TlsSettings(Section):
     root_ca: Path = Field(description="the authority that signed every certificate, PEM")
     certificate: Path = Field(description="the router's, PEM")
     private_key: Path = Field(description="the router's, PEM, mode 0600")
 
 
-class AccessSettings(_Section):
+class AccessSettings(Section):
     vehicles: list[VehicleName] = Field(default_factory=list, description="write below their own name, nowhere else")
     operators: list[CommonName] = Field(default_factory=list, description="read everything and command")
     readers: list[CommonName] = Field(default_factory=list, description="read everything")
     loopback_reads: bool = Field(default=False, description="tcp from this machine reads without a certificate")
 
 
-class RouterSettings(_Section):
+class RouterSettings(Section):
     listen: list[str] = Field(min_length=1, description="endpoints: quic/HOST:PORT?mixed_rel=1, tls/, tcp/")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     tls: TlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
@@ -69,27 +65,9 @@ class RouterSettings(_Section):
         return self
 
 
-def load_settings(path: Path) -> RouterSettings:
+def load_router(path: Path) -> RouterSettings:
     """Read a router's TOML; its paths are taken from its folder. Raises InputError naming file and key."""
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: cannot be read: {reason}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    try:
-        return RouterSettings.model_validate(tree)
-    except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {_fault(item)}" for item in error.errors())) from error
-
-
-def _fault(item: object) -> str:
-    assert isinstance(item, dict)
-    key = ".".join(str(part) for part in item["loc"])
-    known = {"extra_forbidden": "unknown key", "missing": "is missing"}
-    reason = known.get(item["type"], str(item["msg"]).removeprefix("Value error, "))
-    return f"{key}: {reason}" if key else reason
+    return load_settings(path, RouterSettings, InputError)
 
 
 @contextmanager
@@ -116,7 +94,7 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
 
 def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
     """Run the router of a TOML file until `stop` is set, saying which vehicles come and go; 0."""
-    settings = load_settings(path)
+    settings = load_router(path)
     with open_router(settings, path.resolve().parent) as session:
 
         def seen(sample: zenoh.Sample) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from edge.errors import InputError
+from msgs.settings import read_text, read_toml
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import SPLITS
 from sim_replay.benchmark.scene_store import is_finished, replace_text
@@ -53,11 +53,8 @@ def claim(out: Path, recipe: Recipe, preset_text: str, resume: bool) -> None:
         return
     if not resume:
         raise InputError(f"{out}: already holds a dataset; --resume goes on with it, or choose another --out")
-    try:
-        found = tomllib.loads((out / FILE).read_text(encoding="utf-8"))
-        text = (out / PRESET_FILE).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{out}: {FILE} or {PRESET_FILE} cannot be read: {error}") from error
+    found = read_toml(out / FILE, InputError)
+    text = read_text(out / PRESET_FILE, InputError)
     for key, value in vars(recipe).items():
         if found.get(key) != value:
             raise InputError(f"{out / FILE}: {key} is {found.get(key)!r} there and {value!r} now; it must stay")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from edge.errors import InputError
+from msgs.settings import Section, parse_settings, read_text
 from sim_replay.airframes import AIRFRAMES
 
 Split = Literal["train", "val", "test"]
@@ -24,10 +24,6 @@ SHIPPED = ("fw-uav6d", "unseen", "stress")
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _rises(name: str, bounds: tuple[float, float]) -> None:
@@ -207,10 +203,7 @@ def preset_text(name_or_path: str) -> tuple[str, str]:
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise InputError(f"no preset is called {name_or_path!r}; there are {', '.join(SHIPPED)}, or name a .toml file")
-    try:
-        return str(path), path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from error
+    return str(path), read_text(path, InputError)
 
 
 def load_preset(name_or_path: str) -> Preset:
@@ -220,15 +213,4 @@ def load_preset(name_or_path: str) -> Preset:
 
 def parse_preset(place: str, text: str) -> Preset:
     """The preset in `text`, which lies at `place`. Raises InputError."""
-    try:
-        return Preset.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{place}: not valid TOML: {error}") from error
-    except ValidationError as error:
-        raise InputError("\n".join(f"{place}: {_fault(item)}" for item in error.errors())) from error
-
-
-def _fault(item: Any) -> str:
-    key = ".".join(str(part) for part in item["loc"] if part != "[key]") or "the file"
-    said = {"extra_forbidden": "unknown key", "missing": "is missing"}
-    return f"{key}: {said.get(item['type'], str(item['msg']).removeprefix('Value error, '))}"
+    return parse_settings(text, place, Preset, InputError)

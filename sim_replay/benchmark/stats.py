@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from edge.errors import InputError
+from msgs.settings import read_toml
 from sim_replay.airframes import AIRFRAMES
 from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
 
@@ -114,10 +114,7 @@ def _picture_size(scene: BopScene, frame: BopFrame) -> tuple[int, int]:
 
 
 def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+    return read_toml(path, InputError) if path.is_file() else {}
 
 
 def _recipe(root: Path) -> dict[str, Any]:

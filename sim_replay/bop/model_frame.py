@@ -11,13 +11,13 @@ diameter_m = 12.0                                    # optional: for datasets th
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from msgs.settings import read_toml
 from sim_replay.bop.fields import is_rotation
 from sim_replay.bop.records import Array, BopError, BopTarget
 
@@ -69,12 +69,7 @@ def read_model_frames(root: Path | None) -> ModelFrames:
 
 
 def _parse(path: Path) -> ModelFrames:
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise BopError(f"{path} cannot be read: {getattr(error, 'strerror', 'not UTF-8 text')}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise BopError(f"{path} is not TOML: {error}") from error
+    table = read_toml(path, BopError)
     objects = table.pop("objects", {})
     common = _frame(path, "", table, ModelFrame())
     if not isinstance(objects, dict):

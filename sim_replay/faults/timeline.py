@@ -21,14 +21,14 @@ do = "expect_poses"
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from edge.errors import InputError
 from msgs.mavlink import dialect
+from msgs.settings import Section, load_settings
 
 Who = Literal["camera", "daemon", "autopilot", "router", "subscriber"]
 Peer = Literal["autopilot", "subscriber", "both"]
@@ -36,18 +36,14 @@ Seconds = Annotated[float, Field(gt=0, le=600)]
 WITHIN_S = 60.0  # a loaded machine takes its time; what was taken is reported
 
 
-class _Step(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Hold(_Step):
+class Hold(Section):
     """Leave everything as it is."""
 
     do: Literal["hold"]
     for_s: Seconds
 
 
-class Start(_Step):
+class Start(Section):
     do: Literal["start"]
     who: Who
     system_id: int = Field(default=1, ge=1, le=255, description="autopilot: its MAVLink system")
@@ -55,7 +51,7 @@ class Start(_Step):
     clock_ahead_s: float = Field(default=0.0, ge=-60, le=60, description="autopilot: boot clock against the last one's")
 
 
-class Signal(_Step):
+class Signal(Section):
     """STOP freezes a process, CONT lets it go on; after KILL and TERM it is waited for."""
 
     do: Literal["signal"]
@@ -63,7 +59,7 @@ class Signal(_Step):
     name: Literal["TERM", "KILL", "HUP", "STOP", "CONT"]
 
 
-class Camera(_Step):
+class Camera(Section):
     """What the camera does from now on; what is left out is as it should be."""
 
     do: Literal["camera"]
@@ -72,7 +68,7 @@ class Camera(_Step):
     stamp_jitter_s: float = Field(default=0.0, ge=0, le=60, description="added and taken off, frame by frame")
 
 
-class Link(_Step):
+class Link(Section):
     """How a link is from now on; what is left out is as it should be, so `which` alone mends it."""
 
     do: Literal["link"]
@@ -91,7 +87,7 @@ class Link(_Step):
         return names
 
 
-class Flood(_Step):
+class Flood(Section):
     """Datagrams at the daemon's MAVLink port, as fast as they go."""
 
     do: Literal["flood"]
@@ -102,14 +98,14 @@ class Flood(_Step):
     total_bytes: int = Field(gt=0, le=1_000_000_000)
 
 
-class SlowSubscriber(_Step):
+class SlowSubscriber(Section):
     """A second subscriber, frozen once it has subscribed, or let go of."""
 
     do: Literal["slow_subscriber"]
     there: bool = True
 
 
-class Disk(_Step):
+class Disk(Section):
     """What the recorder's disk lets be written from now on; what is left out is as it should be."""
 
     do: Literal["disk"]
@@ -118,14 +114,14 @@ class Disk(_Step):
     file_max_bytes: int | None = Field(default=None, gt=0, description="no file grows beyond this (RLIMIT_FSIZE)")
 
 
-class ModelFile(_Step):
+class ModelFile(Section):
     """The file that the configuration names; `signal daemon HUP` has it read."""
 
     do: Literal["model_file"]
     content: Literal["good", "cut_short"]
 
 
-class Load(_Step):
+class Load(Section):
     """Busy processes for each core."""
 
     do: Literal["load"]
@@ -133,7 +129,7 @@ class Load(_Step):
     for_s: Seconds
 
 
-class ExpectPoses(_Step):
+class ExpectPoses(Section):
     """Three new poses of frames exposed after the last act."""
 
     do: Literal["expect_poses"]
@@ -141,7 +137,7 @@ class ExpectPoses(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectSilence(_Step):
+class ExpectSilence(Section):
     """No pose for so long."""
 
     do: Literal["expect_silence"]
@@ -150,7 +146,7 @@ class ExpectSilence(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectState(_Step):
+class ExpectState(Section):
     """The daemon's state and its reasons, as its diagnostics tell them to a subscriber."""
 
     do: Literal["expect_state"]
@@ -158,7 +154,7 @@ class ExpectState(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectSaid(_Step):
+class ExpectSaid(Section):
     """A line of the daemon's log since the last act; the log counts repetitions within a minute, and keeps one."""
 
     do: Literal["expect_said"]
@@ -166,7 +162,7 @@ class ExpectSaid(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectCounter(_Step):
+class ExpectCounter(Section):
     """A counter of the daemon's diagnostics, as a subscriber hears them, grown since the last act."""
 
     do: Literal["expect_counter"]
@@ -175,7 +171,7 @@ class ExpectCounter(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectStill(_Step):
+class ExpectStill(Section):
     """Such a counter that does not grow for so long."""
 
     do: Literal["expect_still"]
@@ -184,7 +180,7 @@ class ExpectStill(_Step):
     within_s: Seconds = WITHIN_S
 
 
-class ExpectExit(_Step):
+class ExpectExit(Section):
     do: Literal["expect_exit"]
     code: int = Field(description="of the daemon; of a signal, minus its number")
     within_s: Seconds = WITHIN_S
@@ -212,10 +208,8 @@ Step = Annotated[
 ]
 
 
-class Timeline(BaseModel):
+class Timeline(Section):
     """It begins once both peers have poses."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     title: str
     signed: bool = Field(default=False, description="daemon and autopilot sign all that they say")
@@ -225,21 +219,9 @@ class Timeline(BaseModel):
 
 def load_timeline(path: Path) -> Timeline:
     """Raises InputError: one line a fault, each naming file, step and key."""
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise InputError(f"{path}: cannot be read: {reason}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    try:
-        return Timeline.model_validate(tree)
-    except ValidationError as error:
-        raise InputError("\n".join(f"{path}: {_fault(item)}" for item in error.errors())) from error
+    return load_settings(path, Timeline, InputError, _step_and_key)
 
 
-def _fault(item: object) -> str:
-    assert isinstance(item, dict)
-    place = [f"step {part + 1}" if isinstance(part, int) else str(part) for part in item["loc"] if part != "step"]
-    known = {"extra_forbidden": "unknown key", "missing": "is missing"}
-    return f"{', '.join(place) or 'the file'}: {known.get(item['type'], item['msg'].removeprefix('Value error, '))}"
+def _step_and_key(location: tuple[str | int, ...]) -> str:
+    place = [f"step {part + 1}" if isinstance(part, int) else part for part in location if part != "step"]
+    return ", ".join(place)

@@ -104,7 +104,7 @@ def test_every_point_stays_where_it_is_in_cam(
         ("[objects.1]\ndiameter_m = -1", "'objects.1.diameter_m' is not above zero"),
         ("[objects.1]\nlength_m = 1", "unknown key 'objects.1.length_m'"),
         ("[objects.hawk]\ndiameter_m = 1", "'objects.hawk' is not a table named by an object's number"),
-        ("R_body_model = [", "is not TOML"),
+        ("R_body_model = [", "not valid TOML"),
     ],
 )
 def test_a_wrong_sidecar_is_told_with_file_and_key(root: Path, text: str, said: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from msgs.ground.keys import init_authority, issue
-from msgs.ground.router import load_settings, open_router
+from msgs.ground.router import load_router, open_router
 from msgs.session import TlsFiles
 
 from ..conftest import free_endpoint
@@ -57,5 +57,5 @@ def ground(request: pytest.FixtureRequest, tmp_path: Path, keys: dict[str, TlsFi
     loopback = free_endpoint()
     access = 'vehicles = ["uav1", "uav2"]\noperators = ["alice"]\nreaders = ["screen"]\nloopback_reads = true\n'
     path = write_router_config(tmp_path, [secure, loopback], keys["ground"], access)
-    with open_router(load_settings(path), tmp_path) as router:
+    with open_router(load_router(path), tmp_path) as router:
         yield Ground(secure, loopback, keys, tmp_path, router)

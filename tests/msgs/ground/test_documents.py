@@ -12,7 +12,7 @@ import pytest
 from edge.config import load_config
 from msgs.ground import cli
 from msgs.ground.keys import init_authority, issue
-from msgs.ground.router import load_settings
+from msgs.ground.router import load_router
 from msgs.topics import table_markdown
 
 TEXT = (Path(__file__).parents[3] / "docs" / "ground.md").read_text()
@@ -30,7 +30,7 @@ def test_the_router_s_file_loads(tmp_path: Path) -> None:
     (router,) = (block for block in BLOCKS if "[access]" in block)
     path = tmp_path / "router.toml"
     path.write_text(router)
-    settings = load_settings(path)
+    settings = load_router(path)
     assert settings.access is not None
     assert set(tomllib.loads(router)["access"]) == set(type(settings.access).model_fields)
 

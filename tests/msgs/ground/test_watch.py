@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from msgs import cdr, topics
-from msgs.ground.router import load_settings, open_router
+from msgs.ground.router import load_router, open_router
 from msgs.publish import Node, TopicPublisher
 from msgs.session import TlsFiles, peer_config, router_config
 
@@ -250,7 +250,7 @@ def test_over_a_radio_that_loses_a_fifth_poses_come_in_order_and_fresh(
     relay.start()
     with ExitStack() as stack:
         stack.callback(relay.done.set)
-        stack.enter_context(open_router(load_settings(path), tmp_path))
+        stack.enter_context(open_router(load_router(path), tmp_path))
         far = f"quic/127.0.0.1:{relay.port}?mixed_rel=1"
         uav1 = Vehicle(stack.enter_context(zenoh.open(peer_config([], [far], tls=keys["uav1"]))), "uav1", stack)
         _, lines = stack.enter_context(ground("watch", "--json", "-e", loopback))

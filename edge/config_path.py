@@ -1,11 +1,11 @@
-"""What every section of the configuration is made of."""
+"""Paths in the configuration: taken from the folder that its file lies in."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationInfo
+from pydantic import AfterValidator, ValidationInfo
 
 
 def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
@@ -14,7 +14,3 @@ def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
 
 
 ConfigPath = Annotated[Path, AfterValidator(_from_config_folder)]
-
-
-class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
