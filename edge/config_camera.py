@@ -55,6 +55,11 @@ class SequenceCamera(Camera):
         default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
     )
     loop: bool = Field(default=False, description="begin again after the last frame")
+    lockstep: str | None = Field(
+        default=None,
+        pattern=r"^(127\.0\.0\.1|localhost):[1-9][0-9]{0,4}$",
+        description="HOST:PORT of the player that steps the frames and the daemon's clock; not for flight",
+    )
     intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
 
 

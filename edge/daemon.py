@@ -9,12 +9,11 @@ from __future__ import annotations
 import gc
 import logging
 import threading
-import time
 from contextlib import ExitStack
 
-from edge.cameras import open_source
-from edge.cameras.capture import Capture
+from edge.cameras import FrameSupply, open_capture
 from edge.cameras.source import EndOfStream
+from edge.clock import monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.estimator import Estimator
 from edge.health import HealthSnapshot
@@ -40,8 +39,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
     with ExitStack() as cleanup:
         model = load_configured(file)
         with file.blame(*camera_key(config.camera)):
-            source, camera_info, opened = open_source(config.camera)
-        capture = Capture(source, opened)
+            capture, camera_info = open_capture(config.camera)
         cleanup.callback(capture.stop)
         own_ship = OwnShipBuffer(gimballed=config.camera.mount == "gimbal")
         requests = RequestQueue()
@@ -54,7 +52,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         gc.freeze()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
-        capture.start()
+        capture.start(outlets.settle)
         with file.blame(*camera_key(config.camera)):
             pipeline.fly(stop)
     # With the links stopped, their counts are whole.
@@ -71,7 +69,7 @@ class Pipeline:
         estimator: Estimator,
         own_ship: OwnShipBuffer,
         outlets: Outlets,
-        capture: Capture,
+        capture: FrameSupply,
         requests: RequestQueue,
         reloader: Reloader,
     ) -> None:
@@ -132,7 +130,7 @@ class Pipeline:
             # The tracks are valid at a later time than this frame's: told with its stamp they would be wrong.
             self._out_of_order += 1
             return
-        clock = StageClock(frame.meta, time.monotonic_ns())
+        clock = StageClock(frame.meta, monotonic_ns())
         capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         own_ship = self._own_ship.at(capture_ns)
         self._take_requests(capture_ns)

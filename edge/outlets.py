@@ -56,6 +56,13 @@ class Outlets:
         if self._zenoh is not None:
             self._zenoh.publish_diagnostics(snapshot)
 
+    def settle(self) -> None:
+        """In lock-step: return when what was told has been sent and what was received is heard."""
+        if self._mavlink is not None:
+            self._mavlink.settle()
+        if self._zenoh is not None:
+            self._zenoh.settle()
+
     def counters(self) -> dict[str, int]:
         links = {"zenoh": self._zenoh, "mavlink": self._mavlink, "recorder": self._recorder}
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}

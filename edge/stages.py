@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 
+from edge import clock
 from edge.types import FrameMeta
 
 STAGES = {
@@ -36,7 +36,7 @@ class StageClock:
 
     def lap(self, stage: str) -> None:
         """All since the lap before was `stage`."""
-        self._until(time.monotonic_ns(), stage)
+        self._until(clock.monotonic_ns(), stage)
 
     def estimated(self, runs_ns: Sequence[tuple[int, int]]) -> None:
         """All since the lap before was the estimator's, and `runs_ns` (begin, end) its inferences."""
@@ -45,7 +45,7 @@ class StageClock:
             self._until(begin_ns, before)
             self._until(end_ns, "inference")
             before = "decode"
-        self._until(time.monotonic_ns(), before)
+        self._until(clock.monotonic_ns(), before)
 
     def stages_ns(self) -> dict[str, int]:
         """Nanoseconds by stage, and from exposure to the last lap as `total`."""

@@ -10,7 +10,6 @@ import importlib.metadata
 import json
 import os
 import re
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
+from edge import clock
 from edge.config import ConfigFile
 from edge.estimator.model import Model
 from edge.health import HealthSnapshot
@@ -36,7 +36,7 @@ class StatusBoard:
         self.model = model
         self.camera = camera
         self.snapshot: HealthSnapshot | None = None
-        self._start_ns = time.monotonic_ns()
+        self._start_ns = clock.monotonic_ns()
         self._version = importlib.metadata.version(DISTRIBUTION)
 
     def facts(self) -> dict[str, str]:
@@ -44,7 +44,7 @@ class StatusBoard:
         return {"version": self._version, "model_sha256": self.model.sha256, "model_provider": self.model.provider}
 
     def info(self) -> dict[str, Any]:
-        snapshot, now_ns = self.snapshot, time.monotonic_ns()
+        snapshot, now_ns = self.snapshot, clock.monotonic_ns()
         width, height = self.camera.image_size_wh
         told: dict[str, Any] = {
             "vehicle": self.file.config.vehicle.name,

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 
-from edge import threads
+from edge import clock, threads
 from edge.config import HealthSettings
 from edge.health import Announcer, Health, HealthSnapshot, Reason
 from edge.outlets import LEVELS, Outlets
@@ -68,12 +68,12 @@ class Supervisor:
         if not self._flew:
             self._flew = True
             log.info("first frame done, %.0f ms after its exposure", stages_ns["total"] / 1e6)
-        self._health.frame_done(meta.sequence, stages_ns, tracks, has_attitude, time.monotonic_ns())
+        self._health.frame_done(meta.sequence, stages_ns, tracks, has_attitude, clock.monotonic_ns())
 
     def turn(self) -> None:
         """Once each time round the loop, whether or not a frame came."""
-        now_ns = time.monotonic_ns()
-        self.watchdog.beat(now_ns)
+        now_ns = clock.monotonic_ns()
+        self.watchdog.beat(time.monotonic_ns())
         self._notifier.feed(now_ns)
         self._health.faults = (*self._camera_reasons(now_ns), *self._faults)
         condition = self._health.assess(now_ns)
@@ -86,7 +86,7 @@ class Supervisor:
             self._tell_snapshot()
 
     def snapshot(self) -> HealthSnapshot:
-        return self._health.snapshot(time.monotonic_ns(), self._count(), self._board.facts())
+        return self._health.snapshot(clock.monotonic_ns(), self._count(), self._board.facts())
 
     def _tell_snapshot(self) -> None:
         snapshot = self.snapshot()

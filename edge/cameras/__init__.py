@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Protocol
 
+from edge.cameras.capture import Capture
 from edge.cameras.device import DeviceSource
 from edge.cameras.file import FileSource
 from edge.cameras.folder import FolderSource
 from edge.cameras.live import LiveSource
+from edge.cameras.lockstep import LockstepCapture
 from edge.cameras.sequence import SequenceSource
 from edge.cameras.source import Source, SourceLost
 from edge.cameras.stream import StreamSource
@@ -20,10 +23,38 @@ from edge.config_camera import (
     StreamCamera,
     ZenohCamera,
 )
-from edge.types import CameraInfo
+from edge.health import Reason
+from edge.types import CameraInfo, Frame
 
 if TYPE_CHECKING:
     from edge.cameras.zenoh_topic import ZenohSource
+
+
+class FrameSupply(Protocol):
+    """Where the loop's frames come from."""
+
+    def start(self, settle: Callable[[], None]) -> None:
+        """Begin; `settle` has the links send what they were told, for who waits for it."""
+
+    def newest(self, timeout_s: float) -> Frame | None:
+        """The newest frame not yet taken, waiting up to `timeout_s`. Raises EndOfStream after the last."""
+
+    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        """What is wrong with the camera at `now_ns` (monotonic)."""
+
+    def counters(self) -> Mapping[str, int]:
+        """Frames captured, and what was amiss, by name."""
+
+    def stop(self) -> None:
+        """End it and close the camera."""
+
+
+def open_capture(settings: CameraSettings) -> tuple[FrameSupply, CameraInfo]:
+    """What supplies the configured camera's frames, to be started and stopped, and what it gives. Raises InputError."""
+    source, info, opened = open_source(settings)
+    if isinstance(settings, SequenceCamera) and settings.lockstep is not None and isinstance(source, SequenceSource):
+        return LockstepCapture(source, settings.lockstep), info
+    return Capture(source, opened), info
 
 
 def open_source(settings: CameraSettings) -> tuple[Source, CameraInfo, bool]:

@@ -6,6 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 
 from edge.cameras.reconnect import LinkState, Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
@@ -42,7 +43,8 @@ class Capture:
         self._link = Reconnect()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
-    def start(self) -> None:
+    def start(self, _: Callable[[], None] = lambda: None) -> None:
+        """Begin to read; nobody waits here for what the links send."""
         self._thread.start()
 
     def newest(self, timeout_s: float) -> Frame | None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge import clock
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
 from edge.config_camera import FolderCamera, SequenceCamera
@@ -86,6 +87,13 @@ class SequenceSource:
         meta = FrameMeta(index, capture_ns, time.monotonic_ns())
         picture = self._at(index)
         return Frame(meta, image_bgr, picture.K, picture.distortion)
+
+    def exposed_now(self, index: int, sequence: int) -> Frame:
+        """Picture `index` as if exposed this instant, the camera's frame `sequence`. Raises InputError."""
+        if not self._exists(index):
+            raise InputError(f"{self._settings.path} has no picture {index}: it has {len(self._pictures)}")
+        picture, now_ns = self._at(index), clock.monotonic_ns()
+        return Frame(FrameMeta(sequence, now_ns, now_ns), _decode(picture.path), picture.K, picture.distortion)
 
     def close(self) -> None:
         if self._decoder is not None:

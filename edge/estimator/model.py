@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from edge import clock
 from edge.errors import InputError
 from edge.estimator.providers import ChosenProvider, Provider, choose_provider
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
@@ -76,9 +76,9 @@ class Model:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
         feeds = {"image": images_bgr, "K": K.astype(np.float32)}
         session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
-        begin_ns = time.monotonic_ns()
+        begin_ns = clock.monotonic_ns()
         peaks = Peaks(*session.run(list(OUTPUT_NAMES), feeds))
-        self._runs_ns.append((begin_ns, time.monotonic_ns()))
+        self._runs_ns.append((begin_ns, clock.monotonic_ns()))
         return peaks
 
     def take_runs_ns(self) -> list[tuple[int, int]]:

@@ -7,11 +7,11 @@ import logging
 import select
 import socket
 import threading
-import time
 from collections import deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from edge import clock
 from edge.config import MavlinkSettings
 from edge.health import Condition
 from edge.links.mavlink_peer import Endpoint
@@ -36,7 +36,7 @@ def signing_of(settings: MavlinkSettings) -> Signing | None:
     if settings.signing_key is None:
         return None
     state = settings.signing_state or Path(f"{settings.signing_key}.timestamp")
-    return open_signing(settings.signing_key, state, time.time_ns)
+    return open_signing(settings.signing_key, state, clock.utc_ns)
 
 
 class MavlinkLink:
@@ -62,6 +62,7 @@ class MavlinkLink:
         self._stopping = threading.Event()
         self._wake, self._woken = socket.socketpair()
         self._thread: threading.Thread | None = None
+        self._next_tick_ns = 0
 
     def start(self) -> None:
         """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
@@ -72,8 +73,9 @@ class MavlinkLink:
             self._endpoints.append(Endpoint(transport, hosts, station.refused, station.authentic, station.introduces))
         for end in (self._wake, self._woken):
             end.setblocking(False)
-        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
-        self._thread.start()
+        if not clock.stepped():  # else each step takes its turn here
+            self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+            self._thread.start()
 
     def publish(self, report: Report) -> None:
         """Leave a report for the thread; one it has not taken yet is replaced and counted."""
@@ -93,6 +95,11 @@ class MavlinkLink:
             self._lost_events += len(self._events) == EVENTS_WAITING
             self._events.append((severity, text))
         self._poke()
+
+    def settle(self) -> None:
+        """In lock-step: a turn on the caller's thread: send what was left, hear what came, let time pass."""
+        self._turn()
+        self._counted = self._count()
 
     def stop(self) -> None:
         """End the thread and close the sockets. May be called twice, or without start."""
@@ -123,24 +130,26 @@ class MavlinkLink:
             self._wake.send(b"\0")
 
     def _run(self) -> None:
-        next_tick_ns = 0
         while not self._stopping.is_set():
-            self._wait(max(0.0, (next_tick_ns - time.monotonic_ns()) / 1e9))
+            self._wait(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e9))
             try:
-                self._deliver()
-                for number, endpoint in enumerate(self._endpoints):
-                    self._hear(number, endpoint)
-                now_ns = time.monotonic_ns()
-                if now_ns >= next_tick_ns:
-                    next_tick_ns = now_ns + round(TICK_S * 1e9)
-                    self._tick(now_ns)
-                    self._counted = self._count()
+                self._turn()
             except Exception:
                 # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
                 self._station.counters["failed"] += 1
                 log.exception("mavlink: a turn of the link failed")
-                next_tick_ns = time.monotonic_ns() + round(TICK_S * 1e9)
+                self._next_tick_ns = clock.monotonic_ns() + round(TICK_S * 1e9)
         self._counted = self._count()
+
+    def _turn(self) -> None:
+        self._deliver()
+        for number, endpoint in enumerate(self._endpoints):
+            self._hear(number, endpoint)
+        now_ns = clock.monotonic_ns()
+        if now_ns >= self._next_tick_ns:
+            self._next_tick_ns = now_ns + round(TICK_S * 1e9)
+            self._tick(now_ns)
+            self._counted = self._count()
 
     def _wait(self, timeout_s: float) -> None:
         """Until something is to be read or told, or the time is over."""
@@ -173,7 +182,7 @@ class MavlinkLink:
             condition, self._condition = self._condition, None
             events = list(self._events)
             self._events.clear()
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         if condition is not None:
             self._station.health(condition, now_ns)
         try:
@@ -187,10 +196,10 @@ class MavlinkLink:
             log.warning("mavlink: not sent: %s", error)
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         until_ns = now_ns + HEARING_A_TURN_NS
         while now_ns < until_ns and (received := endpoint.transport.receive()) is not None:
-            now_ns = time.monotonic_ns()
+            now_ns = clock.monotonic_ns()
             messages = endpoint.believed(received, now_ns)
             for reply in self._station.take(messages, number, now_ns):
                 self._station.counters["send_failed"] += not endpoint.send(reply)

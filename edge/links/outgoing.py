@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from edge import clock
 from edge.types import Report, Track, TrackState
 from msgs.wire import is_covariance
 
@@ -51,7 +51,7 @@ class UtcClock:
     _measured_ns: int | None = field(default=None)
 
     def utc_ns(self, monotonic_ns: int) -> int:
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         if self._measured_ns is None or now_ns - self._measured_ns > UTC_PERIOD_NS:
             self._measure()
             self._measured_ns = now_ns
@@ -60,7 +60,7 @@ class UtcClock:
     def _measure(self) -> None:
         readings = []
         for _ in range(5):
-            before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+            before_ns, utc_ns, after_ns = clock.monotonic_ns(), clock.utc_ns(), clock.monotonic_ns()
             readings.append((after_ns - before_ns, utc_ns - (before_ns + after_ns) // 2))
         spread_ns, self._offset_ns = min(readings)
         self.uncertainty_ns = spread_ns // 2

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import Counter, deque
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import zenoh
 
+from edge import clock
 from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 
 EVENTS_WAITING = 64
 STOP_TIMEOUT_S = 5.0
+SETTLE_TIMEOUT_S = 60.0
 
 
 @dataclass
@@ -70,6 +71,7 @@ class ZenohLink:
         self._waiting = threading.Condition()
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
+        self._delivering = False
         self._links = 0  # routers and peers connected just now
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
@@ -112,8 +114,15 @@ class ZenohLink:
         """`level` counts as in rcl_interfaces/Log: 10 debug, 20 info, 30 warn, 40 error, 50 fatal."""
         with self._waiting:
             self._counters["events_lost"] += len(self._mailbox.events) == EVENTS_WAITING
-            self._mailbox.events.append((time.monotonic_ns(), level, text))
+            self._mailbox.events.append((clock.monotonic_ns(), level, text))
             self._waiting.notify()
+
+    def settle(self) -> None:
+        """In lock-step: wait until all that was left is handed to zenoh. Raises LinkError if it is not."""
+        with self._waiting:
+            idle = self._waiting.wait_for(lambda: self._mailbox.empty() and not self._delivering, SETTLE_TIMEOUT_S)
+        if not idle:
+            raise LinkError(f"zenoh: not sent within {SETTLE_TIMEOUT_S:.0f} s")
 
     def stop(self) -> None:
         """Send what waits, then close the session. May be called twice, or without start."""
@@ -141,6 +150,7 @@ class ZenohLink:
         with self._waiting:
             self._waiting.wait_for(lambda: self._mailbox.stopping or not self._mailbox.empty())
             taken, self._mailbox = self._mailbox, Mailbox(stopping=self._mailbox.stopping)
+            self._delivering = True
             return taken
 
     def _work(self, session: zenoh.Session | None) -> None:
@@ -163,6 +173,8 @@ class ZenohLink:
                 with self._waiting:
                     self._links = links
                     self._counters.update(counted)
+                    self._delivering = False
+                    self._waiting.notify_all()
                     if mail.stopping and self._mailbox.empty():
                         return
 
@@ -211,7 +223,7 @@ class Desk:
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
-        tracks = sendable(report, time.monotonic_ns(), self._max_age_ms)
+        tracks = sendable(report, clock.monotonic_ns(), self._max_age_ms)
         self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
         for track in tracks:
             name = ros.target_name(track)
@@ -238,7 +250,7 @@ class Desk:
     def _put(self, topic: Topic, message: Payload, target: str | None = None) -> None:
         payload = message.encode()
         if self._recorder is not None and topic.recorded:
-            self._recorder.record(topic, self._vehicle_name, target, payload, time.time_ns())
+            self._recorder.record(topic, self._vehicle_name, target, payload, clock.utc_ns())
         if self._node is not None and self._due(topic, target):
             self._publisher(self._node, topic, target).put(payload)
             self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
@@ -246,7 +258,7 @@ class Desk:
     def _due(self, topic: Topic, target: str | None) -> bool:
         if not topic.per_target or self._pose_period_s == 0.0:
             return True
-        now_s = time.monotonic()
+        now_s = clock.monotonic_ns() / 1e9
         due_s = self._pose_due_s.get((topic.name, target), 0.0)
         if now_s < due_s:
             return False

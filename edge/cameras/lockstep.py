@@ -1,0 +1,113 @@
+"""A sequence in lock-step: a player says over a socket what time it is and which frame is next, and waits for the end.
+
+One line a step, answered `ok` when the loop has come round and the links have sent what it told them:
+
+    time NS      let it be NS (monotonic); what the peers sent before is heard
+    frame INDEX  picture INDEX of the sequence is exposed now
+
+`ready` goes out first, when the daemon is warm. The recording is over when the player hangs up.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable
+
+from edge import clock
+from edge.cameras.sequence import SequenceSource
+from edge.cameras.source import EndOfStream
+from edge.errors import InputError
+from edge.health import Reason
+from edge.types import Frame
+
+CONNECT_TIMEOUT_S = 10.0
+LINE_MAX = 64
+
+
+class LockstepCapture:
+    """In place of `Capture`: the same to the loop, but on the loop's own thread. From now on time stands still."""
+
+    def __init__(self, source: SequenceSource, address: str) -> None:
+        """`address` is the player's HOST:PORT. Raises InputError if nobody answers there."""
+        self._source = source
+        self._settle: Callable[[], None] = lambda: None
+        self._frames = 0
+        self._owes_answer = False
+        self._unread = b""
+        host, _, port = address.rpartition(":")
+        try:
+            self._player = socket.create_connection((host, int(port)), CONNECT_TIMEOUT_S)
+        except OSError as error:
+            raise InputError(
+                f"no player answers at {address}: {error.strerror or error}", ("camera", "lockstep")
+            ) from error
+        self._player.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        clock.step_to(0)
+
+    def start(self, settle: Callable[[], None]) -> None:
+        """Say that all is ready, and wait for the first word: before it there is no time to go by.
+
+        `settle` has the links send what the loop told them.
+        """
+        self._settle = settle
+        self._say("ready")
+        self._obey(self._line(None))
+
+    def newest(self, timeout_s: float) -> Frame | None:
+        """Carry out the player's next word, waiting up to `timeout_s` for it; the frame, if it was one.
+
+        Raises EndOfStream when the player has hung up, InputError when it asks for what the sequence does not have.
+        """
+        if self._owes_answer:
+            self._settle()
+            self._say("ok")
+            self._owes_answer = False
+        line = self._line(timeout_s)
+        return None if line is None else self._obey(line)
+
+    def reasons(self, _: int) -> tuple[Reason, ...]:
+        """Nothing is ever wrong with this camera."""
+        return ()
+
+    def counters(self) -> dict[str, int]:
+        """captured: frames asked for so far; none is ever dropped."""
+        return {"captured": self._frames, "dropped": 0}
+
+    def stop(self) -> None:
+        """Hang up and close the sequence."""
+        self._player.close()
+        self._source.close()
+
+    def _obey(self, line: str | None) -> Frame | None:
+        word, _, number = (line or "").partition(" ")
+        if not number.isdecimal() or word not in ("time", "frame"):
+            raise InputError(f"the player said {line!r}, neither time NS nor frame INDEX", ("camera", "lockstep"))
+        self._owes_answer = True
+        if word == "time":
+            clock.step_to(int(number))
+            return None
+        frame = self._source.exposed_now(int(number), self._frames)
+        self._frames += 1
+        return frame
+
+    def _line(self, timeout_s: float | None) -> str | None:
+        """The player's next line; None when none came in time. Raises EndOfStream when it has hung up."""
+        while b"\n" not in self._unread:
+            if not select.select([self._player], [], [], timeout_s)[0]:
+                return None
+            try:
+                more = self._player.recv(LINE_MAX)
+            except OSError:
+                more = b""
+            if not more:
+                raise EndOfStream
+            self._unread += more
+        line, _, self._unread = self._unread.partition(b"\n")
+        return line.decode("ascii", "replace")
+
+    def _say(self, word: str) -> None:
+        try:
+            self._player.sendall(f"{word}\n".encode())
+        except OSError as error:
+            raise EndOfStream from error
