@@ -1,0 +1,172 @@
+"""Both peers of the daemon in lock-step: an autopilot on the sequence's time, a subscriber that knows when all came.
+
+What they record holds no time but the sequence's: stamps count from the exposure of its first frame.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import socket
+import time
+from typing import Any
+
+import zenoh
+
+from edge.status_board import key_of
+from msgs import topics
+from msgs.cdr import Detection3DArray
+from msgs.client import connect
+from msgs.mavlink import MAVLink
+from msgs.receive import PoseReceiver, TargetPose
+from sim_replay.autopilot import Autopilot
+from sim_replay.play import PlayError
+
+Record = dict[str, Any]
+
+ARRIVAL_TIMEOUT_S = 60.0
+_DATAGRAM_BYTES = 65535
+# Fields that tell a time of the daemon's clock, and the nanoseconds of one unit.
+STAMPS_NS = {
+    ("TARGET_RELATIVE", "timestamp"): 1_000,
+    ("FOLLOW_TARGET", "timestamp"): 1_000_000,
+    ("CAMERA_INFORMATION", "time_boot_ms"): 1_000_000,
+    ("TIMESYNC", "ts1"): 1,
+}
+
+
+class MavlinkPeer:
+    """A simulated autopilot behind a socket of its own; `records` has every message that it got."""
+
+    def __init__(self, autopilot: Autopilot, port: int, frame0_ns: int) -> None:
+        """`port` is the daemon's, `frame0_ns` the exposure of the first frame on the stepped clock."""
+        self.records: list[Record] = []
+        self._autopilot = autopilot
+        self._frame0_ns = frame0_ns
+        self._parser = MAVLink(None)
+        self._parser.robust_parsing = True
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._socket.setblocking(False)
+
+    def next_due_ns(self) -> int | None:
+        """When it has something to say next."""
+        return self._autopilot.next_due_ns()
+
+    def speak(self, now_ns: int) -> None:
+        """Send the telemetry that is due."""
+        for packed in self._autopilot.due(now_ns):
+            self._socket.send(packed)
+
+    def listen(self, now_ns: int) -> bool:
+        """Take all that has come, and answer; whether there was anything to answer."""
+        answered = False
+        while True:
+            try:
+                datagram = self._socket.recv(_DATAGRAM_BYTES)
+            except (BlockingIOError, ConnectionRefusedError):
+                return answered
+            self._record(datagram, now_ns)
+            replies, _ = self._autopilot.take(datagram, now_ns)
+            for reply in replies:
+                answered = True
+                self._socket.send(reply)
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _record(self, datagram: bytes, now_ns: int) -> None:
+        for message in self._parser.parse_buffer(datagram) or []:
+            name = message.get_type()
+            fields = {field: _plain(getattr(message, field)) for field in message.get_fieldnames()}
+            for (stamped, field), unit_ns in STAMPS_NS.items():
+                # An unset stamp is 0 and stays it.
+                if name == stamped and fields[field]:
+                    fields[field] -= self._frame0_ns // unit_ns
+            sender = {"system": message.get_srcSystem(), "component": message.get_srcComponent()}
+            self.records.append({"t_ns": now_ns - self._frame0_ns, "message": name, **sender, **fields})
+
+
+def _plain(value: Any) -> Any:
+    """A field as JSON has it: text, numbers, lists; null for what is not a number."""
+    if isinstance(value, bytes | bytearray):
+        return bytes(value).rstrip(b"\0").decode("utf-8", "replace")
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class Subscriber:
+    """Takes poses as an integrator's program does; the frame's detections say which poses belong to it."""
+
+    def __init__(self, endpoint: str, uav: str, frame0_ns: int) -> None:
+        """Raises PlayError if the daemon does not answer at `endpoint`."""
+        self.records: list[Record] = []
+        self._frame0_ns = frame0_ns
+        self._receiver = PoseReceiver(uav)
+        self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
+        self._poses: dict[tuple[int, str], TargetPose] = {}
+        self._frames: dict[int, list[str]] = {}
+        self._uav = uav
+        self._session = _connect(endpoint)
+        handler = zenoh.handlers.Callback(self._on_sample, indirect=False)
+        keys = [topics.subscription_key(topic, uav) for topic in (topics.POSE, topics.DETECTIONS)]
+        self._subscribers = [self._session.declare_subscriber(key, handler) for key in keys]
+        self._wait_until_known(uav)
+
+    def collect(self, frame: int, now_ns: int) -> None:
+        """Wait for the poses of the frame exposed at `now_ns`, and record them. Raises PlayError if none come."""
+        deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
+        while now_ns not in self._frames or any((now_ns, name) not in self._poses for name in self._frames[now_ns]):
+            try:
+                key, payload, attachment = self._came.get(timeout=max(deadline_s - time.monotonic(), 0.0))
+            except queue.Empty:
+                raise PlayError(f"what the daemon says of frame {frame} did not reach the subscriber") from None
+            self._take(key, payload, attachment, now_ns)
+        for name in sorted(self._frames.pop(now_ns)):
+            self.records.append(self._record(frame, self._poses.pop((now_ns, name))))
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
+        self._session.close()
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        self._came.put((str(sample.key_expr), sample.payload.to_bytes(), attachment))
+
+    def _take(self, key: str, payload: bytes, attachment: bytes, now_ns: int) -> None:
+        row = topics.parse_key(key, self._uav)
+        if row is not None and row[0] is topics.DETECTIONS:
+            array = Detection3DArray.decode(payload)
+            self._frames[array.stamp_ns] = [one.id for one in array.detections]
+            return
+        pose = self._receiver.receive(key, payload, attachment, now_ns)
+        if pose is None:
+            raise PlayError(f"the subscriber refused a pose: {dict(self._receiver.refused)}")
+        self._poses[pose.stamp_ns, pose.target] = pose
+
+    def _record(self, frame: int, taken: TargetPose) -> Record:
+        x, y, z, w = taken.pose.q_cam_target_xyzw.tolist()
+        return {
+            "frame": frame,
+            "t_ns": taken.stamp_ns - self._frame0_ns,
+            "target": taken.target,
+            "t_cam_target_m": taken.pose.t_cam_target_m.tolist(),
+            "q_cam_target_wxyz": [w, x, y, z],
+            "covariance": taken.pose.covariance.tolist(),
+        }
+
+    def _wait_until_known(self, uav: str) -> None:
+        # An answer to a question asked after them says that the declarations have reached the daemon.
+        deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
+        while not any(reply.ok for reply in self._session.get(key_of(uav, "info"), timeout=2.0)):
+            if time.monotonic() > deadline_s:
+                raise PlayError("the daemon does not answer over zenoh")
+
+
+def _connect(endpoint: str) -> zenoh.Session:
+    try:
+        return connect(endpoint)
+    except ConnectionError as error:
+        raise PlayError(str(error)) from error
