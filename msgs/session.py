@@ -19,6 +19,9 @@ import zenoh
 LEASE_MS = 2000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
+# On a link whose poses are capped: what a person needs beside them, and no more.
+TF_RATE_MAX_HZ = 5.0
+DETECTIONS_RATE_MAX_HZ = 2.0
 SECURE = ("tls", "quic")
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5}))([?#].*)?")
 
@@ -74,7 +77,8 @@ def peer_config(
 ) -> zenoh.Config:
     """The daemon's session: opens whether or not anything listens at `connect`, and goes on trying.
 
-    `pose_rate_max_hz` thins poses and odometry on quic, tls and udp links; plain tcp, for tools on board, keeps all.
+    `pose_rate_max_hz` thins poses and odometry on quic, tls and udp links, and more than those the own ship's
+    transforms and detections, which come with each frame too; plain tcp, for tools on board, keeps all.
     Raises zenoh.ZError for an endpoint that is no endpoint.
     """
     config = _config("peer", listen, connect, discovery, tls)
@@ -83,7 +87,13 @@ def peer_config(
     retry = {"period_init_ms": RETRY_PERIOD_MS, "period_max_ms": RETRY_PERIOD_MAX_MS, "period_increase_factor": 2}
     _insert(config, "connect/retry", retry)
     if pose_rate_max_hz is not None:
-        rules = [{"key_expr": f"*/*/target/*/{topic}/**", "freq": pose_rate_max_hz} for topic in ("pose", "odom")]
+        rates_hz = {
+            "target/*/pose": pose_rate_max_hz,
+            "target/*/odom": pose_rate_max_hz,
+            "target/detections": min(pose_rate_max_hz, DETECTIONS_RATE_MAX_HZ),
+            "tf": min(pose_rate_max_hz, TF_RATE_MAX_HZ),
+        }
+        rules = [{"key_expr": f"*/*/{name}/**", "freq": rate_hz} for name, rate_hz in rates_hz.items()]
         rule_set = {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}
         _insert(config, "downsampling", [rule_set])
     return config

@@ -74,13 +74,13 @@ DETECTIONS = Topic(
     "target/detections",
     "vision_msgs/msg/Detection3DArray",
     "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018",
-    _BEST_EFFORT, _DROP, Priority.DATA, False, "frame rate, off on radio", 0, True,
+    _BEST_EFFORT, _DROP, Priority.DATA, False, "frame rate; 2 Hz where poses are capped", 0, True,
 )  # fmt: skip
 TF = Topic(
     "tf",
     "tf2_msgs/msg/TFMessage",
     "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    _BEST_EFFORT, _DROP, Priority.DATA, False, "own-ship rate", 0, True,
+    _BEST_EFFORT, _DROP, Priority.DATA, False, "frame rate; 5 Hz where poses are capped", 0, True,
 )  # fmt: skip
 CAMERA_INFO = Topic(
     "camera_info",

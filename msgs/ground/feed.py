@@ -71,11 +71,16 @@ def linked(opened: zenoh.Session) -> bool:
 
 @contextmanager
 def listening(
-    opened: zenoh.Session, uavs: Sequence[str], domain: int, on_sample: OnSample, on_alive: OnAlive
+    opened: zenoh.Session,
+    uavs: Sequence[str],
+    domain: int,
+    on_sample: OnSample,
+    on_alive: OnAlive,
+    wanted: Sequence[Topic] = topics.TOPICS,
 ) -> Iterator[None]:
     """Call `on_sample` and `on_alive` for these vehicles, all if none is named, on zenoh's receiving threads.
 
-    What is cached (intrinsics, events) comes with its history.
+    What is cached (intrinsics, events) comes with its history. A topic that nobody wants does not leave the vehicle.
     """
 
     def sample(one: zenoh.Sample) -> None:
@@ -94,7 +99,7 @@ def listening(
     handler = handlers.Callback(sample, indirect=False)
     declared: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
     for uav in uavs or ("*",):
-        for topic in topics.TOPICS:
+        for topic in wanted:
             key = topics.subscription_key(topic, uav, domain=domain)
             if not topic.cache:
                 declared.append(opened.declare_subscriber(key, handler))

@@ -27,6 +27,7 @@ ATTITUDE_AGE_NS = 1_000_000_000
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
 _RANGES_KEPT = 256
+TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # what a fleet looks at
 VEHICLES_MAX = 64  # so that made-up names cannot grow this without bound
 
 
@@ -110,7 +111,7 @@ class Fleet:
             if incoming.topic is topics.POSE:
                 pose = vehicle.receiver.receive(incoming.key, incoming.payload, incoming.attachment, now_ns)
                 return None if pose is None else self._take_pose(vehicle, pose)
-            if incoming.topic not in (topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS):
+            if incoming.topic not in TAKEN:
                 return None
             try:
                 message = DECODERS[incoming.topic.ros_type](incoming.payload)

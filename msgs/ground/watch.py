@@ -17,7 +17,7 @@ from rich.text import Text
 
 from msgs.cdr import DiagnosticArray, Log
 from msgs.ground.feed import Incoming, linked, listening, session
-from msgs.ground.fleet import Fleet, TargetRow, VehicleRow
+from msgs.ground.fleet import TAKEN, Fleet, TargetRow, VehicleRow
 from msgs.session import TlsFiles
 
 REFRESH_S = 0.25
@@ -59,7 +59,7 @@ def _watch_table(
         return table(fleet.rows(now_ns), linked(opened), options.endpoint, now_ns)
 
     with (
-        listening(opened, options.uavs, options.domain, take, fleet.alive),
+        listening(opened, options.uavs, options.domain, take, fleet.alive, TAKEN),
         Live(picture(), console=console, auto_refresh=False) as live,
     ):
         while not stop.wait(REFRESH_S):
@@ -104,7 +104,7 @@ def _watch_json(
         fleet.alive(uav, here)
         tell(type="vehicle", uav=uav, alive=here)
 
-    with listening(opened, options.uavs, options.domain, take, alive):
+    with listening(opened, options.uavs, options.domain, take, alive, TAKEN):
         up: bool | None = None
         while True:
             if linked(opened) != up:

@@ -1,0 +1,84 @@
+"""`uavpose-replay radio` and `uavpose-replay fleet`: bad links and many vehicles, measured on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.util import find_spec
+from typing import Any, get_args
+
+from edge.errors import InputError
+from sim_replay.radio.channel import CHANNELS
+from sim_replay.radio.rig import Transport
+from sim_replay.radio.trial import Outcome, Plan, Tool, play
+
+EXIT_LATE = 1
+
+
+def register(commands: Any) -> None:
+    """Add the commands to what add_subparsers() gave; each sets `run`, a function of the parsed arguments."""
+    radio = commands.add_parser(
+        "radio",
+        help="fly the daemon's zenoh link over slow, lossy and interrupted radios and look at every pose shown",
+        description="A vehicle's zenoh session, a router with certificates, and between them a relay on loopback that "
+        "behaves like a radio. Prints the share of poses delivered and how old they truly were when shown. "
+        "Links: " + "; ".join(f"{name}: {one.what}" for name, one in CHANNELS.items()) + ". "
+        "Exit code 0 if no late pose was shown as good, 1 if one was.",
+    )
+    radio.add_argument("--link", action="append", choices=list(CHANNELS), help="default: all; repeatable")
+    radio.add_argument("--transport", action="append", choices=get_args(Transport), help="default: both; repeatable")
+    radio.add_argument(
+        "--tool", action="append", choices=get_args(Tool), help="who listens (default: both); repeatable"
+    )
+    radio.add_argument("--seconds", type=_seconds, default=30.0, help="of each trial (default 30)")
+    radio.add_argument("--fps", type=_seconds, default=20.0, help="poses a second (default 20)")
+    radio.add_argument("--max-age", type=_seconds, default=1.0, metavar="S", help="the client refuses older ones")
+    radio.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
+    radio.set_defaults(run=run_radio)
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value <= 3600.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number up to 3600")
+    return value
+
+
+def run_radio(args: argparse.Namespace) -> int:
+    """Play every combination that was asked for. Raises InputError without the package that makes certificates."""
+    _need_certificates()
+    outcomes = []
+    for link in args.link or CHANNELS:
+        for transport in args.transport or get_args(Transport):
+            for tool in args.tool or get_args(Tool):
+                plan = Plan(CHANNELS[link], transport, tool, args.seconds, args.fps, args.max_age)
+                outcomes.append(play(plan))
+                if not args.json:
+                    print(table(outcomes[-1:], head=len(outcomes) == 1), flush=True)
+    if args.json:
+        print(json.dumps([{**asdict(one), "delivered": one.delivered} for one in outcomes], indent=2))
+    return EXIT_LATE if any(one.late_shown for one in outcomes) else 0
+
+
+def _need_certificates() -> None:
+    if find_spec("cryptography") is None:
+        raise InputError("certificates need the extra `ground`: pip install '.[ground]'")
+
+
+def table(outcomes: Sequence[Outcome], head: bool = True) -> str:
+    """Markdown; ages in milliseconds."""
+    lines = [
+        "| link | transport | tool | sent | delivered | p50 | p95 | p99 | max ms | refused | late shown "
+        "| longest gap s | again after s | up kbit/s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for one in outcomes:
+        ages = " | ".join(f"{1e3 * s:.0f}" for s in (one.age_p50_s, one.age_p95_s, one.age_p99_s, one.age_max_s))
+        back = "–" if one.back_s is None else f"{one.back_s:.1f}"
+        lines.append(
+            f"| {one.channel} | {one.transport} | {one.tool} | {one.sent} | {one.delivered:.1%} | {ages} "
+            f"| {one.refused} | {one.late_shown} | {one.gap_max_s:.2f} | {back} | {one.up_kbps:.0f} |"
+        )
+    return "\n".join(lines if head else lines[2:])
