@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from msgs.definitions import DEFINITIONS
+from msgs.definitions import definition
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _PROFILE = "ros2"
@@ -71,8 +71,8 @@ class McapFile:
 
     def _register(self, name: str, ros_type: str) -> int:
         if ros_type not in self._schemas:
-            definition = DEFINITIONS[ros_type].encode()
-            self._schemas[ros_type] = self._writer.register_schema(ros_type, "ros2msg", definition)
+            text = definition(ros_type).encode()
+            self._schemas[ros_type] = self._writer.register_schema(ros_type, "ros2msg", text)
         return self._writer.register_channel(f"/{name}", "cdr", self._schemas[ros_type])
 
 
