@@ -12,6 +12,7 @@ from edge.health import Announcer, Health, HealthSnapshot, Reason
 from edge.outlets import LEVELS, Outlets
 from edge.status_board import StatusBoard
 from edge.systemd import Notifier
+from edge.target_news import TargetNews
 from edge.types import FrameMeta, Track
 from edge.watchdog import Watchdog
 
@@ -40,6 +41,7 @@ class Supervisor:
         self._faults: tuple[Reason, ...] = ()
         self._health = Health(wants_attitude)
         self._announcer = Announcer()
+        self._targets = TargetNews()
         self._notifier = Notifier()
         self.watchdog = Watchdog(settings.loop_stuck_s, self._last_words)
         self._threads_wanted: frozenset[str] = frozenset()
@@ -69,6 +71,9 @@ class Supervisor:
             self._flew = True
             log.info("first frame done, %.0f ms after its exposure", stages_ns["total"] / 1e6)
         self._health.frame_done(meta.sequence, stages_ns, tracks, has_attitude, clock.monotonic_ns())
+        for level, text in self._targets.words(tracks):
+            log.info("%s", text)
+            self._outlets.event(level, text)
 
     def turn(self) -> None:
         """Once each time round the loop, whether or not a frame came."""

@@ -17,7 +17,7 @@ from edge.types import Frame
 log = logging.getLogger(__name__)
 
 FROZEN_TOLD_NS = 1_000_000_000
-JUMPS_TOLD_NS = 5_000_000_000  # after the last jump of the stamps all is well again
+JUMPS_TOLD_S = 5  # after the last jump of the stamps all is well again
 JUMPS_KEPT = 1000
 
 
@@ -80,10 +80,9 @@ class Capture:
             since_ns = self._frozen_since_ns
             if since_ns is not None and now_ns - since_ns >= FROZEN_TOLD_NS:
                 found.append(Reason("camera_frozen", f"camera frozen for {(now_ns - since_ns) / 1e9:.0f} s"))
-            jumps = sum(now_ns - jumped_ns <= JUMPS_TOLD_NS for jumped_ns in self._jumped_ns)
+            jumps = sum(now_ns - jumped_ns <= JUMPS_TOLD_S * 1_000_000_000 for jumped_ns in self._jumped_ns)
             if jumps:
-                text = f"the camera's timestamps or delays jump: {jumps} times in {JUMPS_TOLD_NS / 1e9:.0f} s"
-                found.append(Reason("camera_stamps", text))
+                found.append(Reason("camera_stamps", f"camera timestamps jump ({jumps} in {JUMPS_TOLD_S} s)"))
         return tuple(found)
 
     def stop(self) -> None:

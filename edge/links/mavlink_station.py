@@ -15,7 +15,6 @@ from edge.config import MavlinkSettings
 from edge.health import Condition
 from edge.links import mavlink_messages as words
 from edge.links.computer_status import ComputerReader, onboard_computer_status
-from edge.links.mavlink_announce import TargetAnnouncer
 from edge.links.mavlink_commands import answer
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
 from edge.links.mavlink_schedule import Schedule
@@ -94,7 +93,6 @@ class Station:
         self._packers = {component: MAVLink(None, srcComponent=component) for component in self._components}
         self._virtual = MAVLink(None, settings.virtual_system_id, settings.component_id)
         self._schedule = Schedule(_rates_hz(settings))
-        self._announcer = TargetAnnouncer()
         self._computer = ComputerReader()
         self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
         self._health: tuple[Condition, int] | None = None
@@ -170,10 +168,7 @@ class Station:
         place = words.geo_status(report, first) if first is not None and geo_due else None
         if place is not None:
             out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
-        out += self._traffic(report, tracks, first, now_ns)
-        for severity, text in self._announcer.words(report.tracks):
-            out += self.event(severity, text)
-        return out
+        return out + self._traffic(report, tracks, first, now_ns)
 
     def event(self, severity: int, text: str) -> list[bytes]:
         """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY."""

@@ -238,16 +238,6 @@ def test_a_vehicle_that_has_the_virtual_systems_id_gets_no_traffic() -> None:
     assert "FOLLOW_TARGET" not in {m.get_type() for m in peer.received}
 
 
-def test_targets_are_told_when_they_come_and_go() -> None:
-    with linked() as (link, _), Peer(link.ports[0]) as peer:
-        meet(link, peer)
-        link.publish(report(track(time.monotonic_ns(), track_id=3)))
-        assert peer.named("STATUSTEXT").text == "target 3 acquired at 240 m"
-        link.publish(report(track(time.monotonic_ns(), track_id=3, state=TrackState.COASTING)))
-        link.publish(report())
-        assert peer.named("STATUSTEXT").text == "target 3 lost"
-
-
 def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:
     with linked(onboard_computer_status=True) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)

@@ -1,0 +1,49 @@
+"""Which targets came and went from frame to frame, as words for an operator. Pure."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.types import Track, TrackState
+
+NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class _Held:
+    since_ns: int  # confirmed, monotonic
+    measured_ns: int
+    range_m: float  # then
+
+
+class TargetNews:
+    """A target is acquired when its track is confirmed, and lost when that track is no more."""
+
+    def __init__(self) -> None:
+        self._held: dict[int, _Held] = {}
+
+    def words(self, tracks: Iterable[Track]) -> list[tuple[int, str]]:
+        """(logging level, text) of what changed since the frame before. Call it for every frame: numbers are used
+        again."""
+        sure = {track.track_id: track for track in tracks if track.state is not TrackState.TENTATIVE}
+        told = [(logging.WARNING, _lost(number, self._held[number])) for number in sorted(self._held.keys() - sure)]
+        acquired = sorted(sure.keys() - self._held.keys())
+        now = {}
+        for number, track in sure.items():
+            before = self._held.get(number)
+            if before is not None and before.measured_ns == track.measured_ns:
+                now[number] = before
+                continue
+            since_ns = track.time_ns if before is None else before.since_ns
+            now[number] = _Held(since_ns, track.measured_ns, float(np.linalg.norm(track.t_cam_target_m)))
+        self._held = now
+        return told + [(logging.INFO, f"target {one} acquired at {now[one].range_m:.0f} m") for one in acquired]
+
+
+def _lost(number: int, held: _Held) -> str:
+    held_s = (held.measured_ns - held.since_ns) / NS_PER_S
+    return f"target {number} lost: held for {held_s:.1f} s, last seen at {held.range_m:.0f} m"

@@ -1,0 +1,66 @@
+"""A confirmed target that is lost is told with its number and how long it was held."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.target_news import TargetNews
+from edge.types import TrackState
+from msgs import topics
+from msgs.cdr import Log
+from msgs.client import connect
+
+from .flying import flying, free_port, toml
+from .reports import make_track as track
+from .toy_scene import K, draw
+
+FRAME_NS = 33_000_000
+SEEN, COASTING = TrackState.CONFIRMED, TrackState.COASTING
+
+
+def test_coming_and_going_are_told_once_and_held_counts_to_the_last_measurement() -> None:
+    news, told = TargetNews(), []
+    states = [TrackState.TENTATIVE] * 3 + [SEEN] * 31 + [COASTING] * 60 + [None] * 5
+    for frame, state in enumerate(states):
+        now_ns = frame * FRAME_NS
+        measured_ns = min(frame, 33) * FRAME_NS
+        t_m = np.array([0.0, 0.0, 100.0 + frame])
+        one = [] if state is None else [track(now_ns, state=state, measured_ns=measured_ns, t_cam_target_m=t_m)]
+        told += [(frame, *words) for words in news.words(one)]
+    assert told == [
+        (3, logging.INFO, "target 0 acquired at 103 m"),
+        (94, logging.WARNING, "target 0 lost: held for 1.0 s, last seen at 133 m"),
+    ]
+
+
+def test_a_number_that_is_used_again_is_another_target() -> None:
+    news = TargetNews()
+    assert [text for _, text in news.words([track(0, track_id=2)])] == ["target 2 acquired at 240 m"]
+    (lost,) = news.words([track(FRAME_NS, track_id=2, state=TrackState.TENTATIVE)])
+    assert lost[1].startswith("target 2 lost")
+    assert [text for _, text in news.words([track(2 * FRAME_NS, track_id=2)])] == ["target 2 acquired at 240 m"]
+
+
+def test_the_ground_hears_that_a_target_is_lost(tmp_path: Path, toy_model: Path) -> None:
+    scene = tmp_path / "000001"
+    (scene / "rgb").mkdir(parents=True)
+    seen, empty = draw((500.5, 420.5)), np.full_like(draw((500.5, 420.5)), draw((500.5, 420.5))[0, 0])
+    for index in range(40):
+        cv2.imwrite(str(scene / "rgb" / f"{index:06d}.png"), seen if index < 10 else empty)
+    cameras = {str(index): {"cam_K": K.ravel().tolist(), "depth_scale": 1.0} for index in range(40)}
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    port = free_port()
+    with flying(tmp_path, toml(scene, toy_model, port)) as flight, connect(f"tcp/127.0.0.1:{port}") as session:
+        with session.declare_subscriber(topics.subscription_key(topics.EVENTS, "uav1")) as events:
+            for sample in events:
+                event = Log.decode(sample.payload.to_bytes())
+                if re.fullmatch(r"target 0 lost: held for \d+\.\d s, last seen at \d+ m", event.msg):
+                    break
+        assert event.level == logging.WARNING
+        assert flight.process.poll() is None
