@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 from edge.links.errors import LinkError
@@ -67,6 +68,21 @@ def resolve(endpoint: NetworkEndpoint, kind: socket.SocketKind) -> tuple[socket.
             f"MAVLink endpoint {endpoint.text}: host {endpoint.host!r} cannot be resolved: {error.strerror}"
         ) from error
     return found[0][0], found[0][4]
+
+
+@contextmanager
+def opening(endpoint: NetworkEndpoint, unready: socket.socket) -> Iterator[None]:
+    """While a socket is made ready to be called. It is closed, and LinkError raised, if something will not do."""
+    try:
+        yield
+    except OSError as error:
+        unready.close()
+        raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
+
+
+def local_port(bound: socket.socket) -> int:
+    """The port that a network socket is bound to."""
+    return int(bound.getsockname()[1])
 
 
 class Outbox:

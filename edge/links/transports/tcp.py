@@ -8,10 +8,9 @@ import socket
 import time
 from collections.abc import Sequence
 
-from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.transports.backoff import Backoff
-from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received, resolve
+from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received, local_port, opening, resolve
 from msgs.mavlink import FrameReader
 
 log = logging.getLogger(__name__)
@@ -170,19 +169,16 @@ class TcpServer:
         self._heeded: Address | None = None
         family, address = resolve(endpoint, socket.SOCK_STREAM)
         self._socket = socket.socket(family, socket.SOCK_STREAM)
-        try:
+        with opening(endpoint, self._socket):
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind(address)
             self._socket.listen(CALLERS_MAX)
-        except OSError as error:
-            self._socket.close()
-            raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
 
     @property
     def port(self) -> int:
         """The local port."""
-        return int(self._socket.getsockname()[1])
+        return local_port(self._socket)
 
     def filenos(self) -> Sequence[int]:
         return (self._socket.fileno(), *(caller.fileno() for caller in self._callers.values()))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import socket
 from collections.abc import Sequence
 
-from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
-from edge.links.transports.medium import DATAGRAM_MAX, Address, Received, resolve
+from edge.links.transports.medium import DATAGRAM_MAX, Address, Received, local_port, opening, resolve
 from msgs.mavlink import FrameReader
 
 RECEIVE_BUFFER = 1 << 20
@@ -23,18 +22,15 @@ class Udp:
         family, address = resolve(endpoint, socket.SOCK_DGRAM)
         self.peer: Address | None = None if self.finds_peers else address
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        try:
+        with opening(endpoint, self._socket):
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
             self._socket.bind(address if self.finds_peers else ("", 0))
-        except OSError as error:
-            self._socket.close()
-            raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
 
     @property
     def port(self) -> int:
         """The local port."""
-        return int(self._socket.getsockname()[1])
+        return local_port(self._socket)
 
     def filenos(self) -> Sequence[int]:
         return (self._socket.fileno(),)
