@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 from edge.errors import InputError
 from sim_replay.radio.channel import CHANNELS
+from sim_replay.radio.fleet import fly_fleet
 from sim_replay.radio.rig import Transport
 from sim_replay.radio.trial import Outcome, Plan, Tool, play
 
@@ -37,6 +38,20 @@ def register(commands: Any) -> None:
     radio.add_argument("--max-age", type=_seconds, default=1.0, metavar="S", help="the client refuses older ones")
     radio.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
     radio.set_defaults(run=run_radio)
+    fleet = commands.add_parser(
+        "fleet",
+        help="put many simulated vehicles on one router and watch them all",
+        description="Each vehicle is a process with the daemon's zenoh session and a certificate of its own; router "
+        "and watcher share one process. Exit code 0 if no late pose was shown as good, 1 if one was.",
+    )
+    fleet.add_argument(
+        "--vehicles", type=int, choices=range(1, 65), default=10, metavar="N", help="default 10, up to 64"
+    )
+    fleet.add_argument("--transport", choices=get_args(Transport), default="quic", help="default quic")
+    fleet.add_argument("--seconds", type=_seconds, default=30.0, help="default 30")
+    fleet.add_argument("--fps", type=_seconds, default=20.0, help="poses a second of each vehicle (default 20)")
+    fleet.add_argument("--json", action="store_true", help="print one JSON object instead of a line")
+    fleet.set_defaults(run=run_fleet)
 
 
 def _seconds(text: str) -> float:
@@ -60,6 +75,23 @@ def run_radio(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([{**asdict(one), "delivered": one.delivered} for one in outcomes], indent=2))
     return EXIT_LATE if any(one.late_shown for one in outcomes) else 0
+
+
+def run_fleet(args: argparse.Namespace) -> int:
+    """Raises InputError without the package that makes certificates."""
+    _need_certificates()
+    one = fly_fleet(args.vehicles, args.seconds, args.fps, args.transport)
+    if args.json:
+        print(json.dumps(asdict(one), indent=2))
+    else:
+        ages = "/".join(f"{1e3 * s:.0f}" for s in (one.age_p50_s, one.age_p95_s, one.age_p99_s, one.age_max_s))
+        print(
+            f"{one.vehicles} vehicles over {one.transport} at {one.fps:g} Hz for {one.seconds:g} s: {one.shown_hz:.0f} "
+            f"poses/s shown, {one.delivered:.1%} delivered (worst vehicle {one.delivered_min:.1%}), age {ages} ms "
+            f"p50/p95/p99/max, {one.refused} refused, {one.late_shown} late shown, router and watcher together "
+            f"{one.processor_share:.0%} of a core"
+        )
+    return EXIT_LATE if one.late_shown else 0
 
 
 def _need_certificates() -> None:

@@ -89,6 +89,12 @@ class Ledger:
             if not self.changed.wait_for(lambda: self.rows, START_S):
                 raise PlayError(f"no pose came within {START_S:.0f} s")
 
+    def offered(self, sent: int) -> int:
+        """How many poses there were to show since the first that was, of `sent` in all."""
+        sequences = [row[1] for row in self.rows]
+        # The last one may have gone out after the vehicle had counted.
+        return max(sent, *sequences) - min(sequences) + 1
+
 
 def play(plan: Plan) -> Outcome:
     """Play a plan in real time. Raises PlayError if the vehicle does not start or nothing ever comes."""
@@ -179,8 +185,7 @@ def outcome_of(plan: Plan, ledger: Ledger, sent: int, refused: int, restored_s: 
         channel=plan.channel.name,
         transport=plan.transport,
         tool=plan.tool,
-        # The last one may have gone out after the vehicle had counted.
-        sent=max(sent, *(row[1] for row in rows)) - min(row[1] for row in rows) + 1,
+        sent=ledger.offered(sent),
         shown=len(rows),
         refused=refused,
         late_shown=int((ages_s > plan.max_age_s + CLOCK_TOLERANCE_S).sum()),

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_replay.radio.channel import NARROW, OUTAGE, UDP_HEADER_BYTES, Channel, Lane
+from sim_replay.radio.fleet import fly_fleet
 from sim_replay.radio.rig import Transport
 from sim_replay.radio.trial import Ledger, Plan, outcome_of, play
 from sim_replay.radio.vehicle import content_age_s, range_m
@@ -97,3 +98,9 @@ def test_a_pose_is_late_by_what_it_tells_and_not_by_its_stamp() -> None:
     outcome = outcome_of(Plan(NARROW, max_age_s=1.0), ledger, 10, 0, None, 0.0)
     assert (outcome.late_shown, outcome.sent, outcome.delivered) == (1, 4, 0.75)
     assert outcome.age_max_s == pytest.approx(1.2, abs=1e-5)
+
+
+def test_each_of_several_vehicles_on_one_router_gets_through() -> None:
+    outcome = fly_fleet(3, seconds=3.0, fps=10.0)
+    assert outcome.delivered_min > 0.8
+    assert outcome.late_shown == 0
