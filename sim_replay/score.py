@@ -69,6 +69,12 @@ class Match:
             return None
         return float(metrics.translation_error_m(self.estimate.t_cam_target_m, self.truth.t_cam_target_m))
 
+    @property
+    def bearing_error_deg(self) -> float | None:
+        if self.estimate is None:
+            return None
+        return float(metrics.bearing_error_deg(self.estimate.t_cam_target_m, self.truth.t_cam_target_m))
+
     @cached_property
     def add_m(self) -> float | None:
         """ADD; None where nothing was found or the target's model is not known."""

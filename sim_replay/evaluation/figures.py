@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from msgs.geometry import euler_from_R
 from sim_replay import metrics
 from sim_replay.bop import Model
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.evaluation.worst import write_worst
-from sim_replay.score import Match, TargetPose, stacked
+from sim_replay.report.peer import coordinate_errors, coordinates
+from sim_replay.score import Match, stacked
 
 Array = NDArray[np.float64]
 
@@ -30,8 +30,6 @@ _RATES = {
     "add_0_5d": "ADD-0.5d",
     "add_0_1d": "ADD-0.1d",
 }
-# cam to a frame that looks along the optical axis as a pilot does: x forward, y right, z down.
-R_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def write_figures(
@@ -133,8 +131,7 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
         found = [(image_id, m.truth, m.estimate) for image_id, m in seen if m.estimate is not None]
         true = coordinates([m.truth for _, m in seen])
         estimated = coordinates([estimate for _, _, estimate in found])
-        error = estimated - coordinates([truth for _, truth, _ in found])
-        error[:, 3:] = (error[:, 3:] + 180.0) % 360.0 - 180.0
+        error = coordinate_errors([(truth, estimate) for _, truth, estimate in found])
         for column, axes in enumerate(panels):
             label = {"label": "truth"} if k == 0 else {}
             axes.plot([i for i, _ in seen], true[:, column], ".", ms=4, color=TRUTH_COLOR, **label)
@@ -153,13 +150,6 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
         panels[0].legend(fontsize=8)
     figure.suptitle(title)
     return figure
-
-
-def coordinates(poses: Sequence[TargetPose]) -> Array:
-    """[N, 6] of poses: x, y, z in `cam`, metres; roll, pitch, yaw against the camera's axes, degrees."""
-    R, t_m = stacked(poses)
-    angles = euler_from_R(R_FORWARD_CAM @ R)
-    return np.column_stack([t_m, *(np.rad2deg(angle) for angle in angles)])
 
 
 def _save(figure: Figure, path: Path) -> None:

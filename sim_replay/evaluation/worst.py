@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs.geometry import Array
 from sim_replay import metrics
 from sim_replay.bop import Model
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.ground_truth import extents_of
-from sim_replay.overlay import ESTIMATE_BGR, TRUTH_BGR, draw_pose, project, window_camera
+from sim_replay.overlay import ESTIMATE_BGR, TRUTH_BGR, Extents, draw_pose, project, window_camera
 from sim_replay.score import Match
 
 Image = NDArray[np.uint8]
@@ -62,21 +63,10 @@ def write_worst(path: Path, judged: Sequence[JudgedFrame], models: Mapping[int, 
 
 def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Image:
     """The target's surroundings, enlarged, with a caption above."""
-    truth, estimate = match.truth, match.estimate
+    truth = match.truth
     image_bgr, K = frame.picture.undistorted_bgr(), frame.picture.K
-    extents = extents_of(models[truth.object_id])
-    corners = project(extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, K)
-    low, high = (np.zeros(2), np.array(image_bgr.shape[1::-1])) if corners is None else (corners.min(0), corners.max(0))
-    side = int(min(max(_VIEW_SCALE * float(np.max(high - low)), _VIEW_MIN_PX), 2 * max(image_bgr.shape)))
-    left, top = (int(value) for value in np.round(0.5 * (low + high - side)))
-    view = _cut(image_bgr, left, top, side)
     tile = np.full((_TILE_PX + _CAPTION_PX, _TILE_PX, 3), 255, dtype=np.uint8)
-    inset = np.asarray(cv2.resize(view, (_TILE_PX, _TILE_PX), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
-    K_view = window_camera(K, (left, top), _TILE_PX / side)
-    draw_pose(inset, K_view, truth, extents, TRUTH_BGR, 2)
-    if estimate is not None:
-        draw_pose(inset, K_view, estimate, extents, ESTIMATE_BGR, 1)
-    tile[_CAPTION_PX:] = inset
+    tile[_CAPTION_PX:] = close_up(image_bgr, K, match, extents_of(models[truth.object_id]), _TILE_PX)
     range_m = float(np.linalg.norm(truth.t_cam_target_m))
     told = "not found"
     if match.rotation_error_deg is not None and match.translation_error_m is not None:
@@ -85,6 +75,22 @@ def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Imag
     for line, text in enumerate((where, told)):
         cv2.putText(tile, text, (8, 22 + 23 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (20, 20, 20), 1, cv2.LINE_AA)
     return tile
+
+
+def close_up(image_bgr: Image, K: Array, match: Match, extents: Extents, side_px: int) -> Image:
+    """The target's surroundings enlarged to [side_px, side_px, 3], true and estimated box drawn on them."""
+    truth, estimate = match.truth, match.estimate
+    corners = project(extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, K)
+    low, high = (np.zeros(2), np.array(image_bgr.shape[1::-1])) if corners is None else (corners.min(0), corners.max(0))
+    side = int(min(max(_VIEW_SCALE * float(np.max(high - low)), _VIEW_MIN_PX), 2 * max(image_bgr.shape)))
+    left, top = (int(value) for value in np.round(0.5 * (low + high - side)))
+    view = _cut(image_bgr, left, top, side)
+    inset = np.asarray(cv2.resize(view, (side_px, side_px), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
+    K_view = window_camera(K, (left, top), side_px / side)
+    draw_pose(inset, K_view, truth, extents, TRUTH_BGR, 2)
+    if estimate is not None:
+        draw_pose(inset, K_view, estimate, extents, ESTIMATE_BGR, 1)
+    return inset
 
 
 def _cut(image_bgr: Image, left: int, top: int, side: int) -> Image:

@@ -13,13 +13,14 @@ from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import Image, Overlay, showcase_index, write_video
 from sim_replay.report.flight_files import RecordedFlight
+from sim_replay.report.page import report_html
 from sim_replay.result import PEERS, Result, frame_views, judge, score_json
 
 
 def write_report(
     sequence: PlayedSequence, flight: RecordedFlight, out: Path, on_frame: Callable[[], None]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Judge a flight and write score.json, frames.jsonl, overlay.mp4 and overlay.png.
+    """Judge a flight and write score.json, frames.jsonl, overlay.mp4, overlay.png and report.html.
 
     Returns:
         The score, and the names of the files.
@@ -35,7 +36,8 @@ def write_report(
         for record in frame_records(sequence, result):
             file.write(json.dumps(record, allow_nan=False) + "\n")
     _draw(sequence, result, out, on_frame)
-    return score, ["score.json", "frames.jsonl", "overlay.mp4", "overlay.png"]
+    (out / "report.html").write_text(report_html(sequence, result, score, out), encoding="utf-8")
+    return score, ["report.html", "score.json", "frames.jsonl", "overlay.mp4", "overlay.png"]
 
 
 def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:

@@ -17,9 +17,10 @@ from edge.errors import InputError
 from sim_replay.bop import BopScene, Model, ModelFrame, ModelFrames
 from sim_replay.datasets import Dataset, DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, read_results, results_name, write_results
-from sim_replay.evaluation.figures import R_FORWARD_CAM, coordinates, sequence
+from sim_replay.evaluation.figures import sequence
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames
 from sim_replay.evaluation.worst import worst_matches, write_worst
+from sim_replay.report.peer import R_FORWARD_CAM, coordinates
 from sim_replay.score import Match, TargetPose, Truth
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time\n"
