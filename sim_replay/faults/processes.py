@@ -15,10 +15,13 @@ Heard = Callable[[str, int], None]  # a line, and when it came (monotonic ns)
 
 
 class Process:
-    """A child process whose standard output and error are one stream of lines for `heard`, in a thread of its own."""
+    """A child process whose standard output and error are one stream of lines for `heard`, in a thread of its own.
 
-    def __init__(self, command: Sequence[str | Path], heard: Heard) -> None:
-        self._heard = heard
+    `ended` is called in the same thread once there is an exit code.
+    """
+
+    def __init__(self, command: Sequence[str | Path], heard: Heard, ended: Callable[[], object] = lambda: None) -> None:
+        self._heard, self._ended = heard, ended
         self._popen = subprocess.Popen(
             [str(word) for word in command],
             stdin=subprocess.PIPE,
@@ -74,3 +77,5 @@ class Process:
         assert self._popen.stdout is not None
         for line in self._popen.stdout:
             self._heard(line.rstrip("\n"), time.monotonic_ns())
+        self._popen.wait()
+        self._ended()

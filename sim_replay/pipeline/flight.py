@@ -6,6 +6,7 @@ import json
 import math
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -57,11 +58,18 @@ class Flight:
     diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
     poses: int = 0  # received over zenoh
     usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
+    ended: threading.Event = field(default_factory=threading.Event)  # a process has
+    ready_or_ended: threading.Event = field(default_factory=threading.Event)
+
+    def hear_end(self) -> None:
+        self.ended.set()
+        self.ready_or_ended.set()
 
     def hear_daemon(self, line: str, heard_ns: int) -> None:
         self.said.append(line)
         if self.ready_ns is None and "ready: " in line:
             self.ready_ns = heard_ns
+            self.ready_or_ended.set()
 
     def hear_peer(self, line: str, _: int) -> None:
         try:
@@ -121,12 +129,10 @@ def _attempt(
         peers = _peers(flight, telemetry_csv, mavlink_port, zenoh_port)
         for peer in peers:
             cleanup.callback(peer.end)
-        daemon = Process([command, "run", "--config", config], flight.hear_daemon)
+        daemon = Process([command, "run", "--config", config], flight.hear_daemon, flight.hear_end)
         cleanup.callback(daemon.end)  # the first to end: the peers hear it out
-        while flight.ready_ns is None and daemon.exit_code is None:
-            if time.monotonic_ns() > flight.start_at_ns - READY_MARGIN_NS:
-                return None
-            time.sleep(0.02)
+        if not _came(flight.ready_or_ended, flight.start_at_ns - READY_MARGIN_NS):
+            return None
         _watch(settings, flight, daemon, peers, on_second)
     return flight
 
@@ -142,13 +148,23 @@ def _watch(
     end_ns = flight.start_at_ns + round(settings.minutes * 60e9)
     next_ns = flight.start_at_ns
     while next_ns < end_ns:
-        time.sleep(max((next_ns - time.monotonic_ns()) * 1e-9, 0.0))
+        _came(flight.ended, next_ns)
         _check_all_run(flight, daemon, peers)
         flight.usage.append(usage_of(daemon.pid))
         next_ns += round(SAMPLE_S * 1e9)
         on_second(min((next_ns - flight.start_at_ns) / (end_ns - flight.start_at_ns), 1.0))
-    time.sleep(max((end_ns - time.monotonic_ns()) * 1e-9, 0.0))
+    _came(flight.ended, end_ns)
     _check_all_run(flight, daemon, peers)
+
+
+def _came(event: threading.Event, until_ns: int) -> bool:
+    """Wait for an event until a monotonic time; whether it came.
+
+    In pieces: if the kernel gave another thread a signal, this one acts on it between two of them.
+    """
+    while (left_s := (until_ns - time.monotonic_ns()) * 1e-9) > 0 and not event.is_set():
+        event.wait(min(left_s, SAMPLE_S))
+    return event.is_set()
 
 
 def _check_all_run(flight: Flight, daemon: Process, peers: Sequence[Process]) -> None:
@@ -161,12 +177,12 @@ def _check_all_run(flight: Flight, daemon: Process, peers: Sequence[Process]) ->
             raise PlayError(f"{'the daemon' if process is daemon else 'a peer'} ended with exit code {code}: {last}")
 
 
-def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, zenoh_port: int) -> tuple[Process, Process]:
+def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, zenoh_port: int) -> tuple[Process, ...]:
     python = [sys.executable, "-m"]
     autopilot = [*python, "sim_replay.autopilot", "--telemetry", str(telemetry_csv)]
     autopilot += ["--endpoint", f"{LOOPBACK}:{mavlink_port}", "--start-at-ns", str(flight.start_at_ns)]
     subscriber = [*python, "sim_replay.subscriber", "--connect", f"tcp/{LOOPBACK}:{zenoh_port}", "--uav", UAV]
-    return Process(autopilot, flight.hear_peer), Process(subscriber, flight.hear_peer)
+    return tuple(Process(command, flight.hear_peer, flight.hear_end) for command in (autopilot, subscriber))
 
 
 def _config_toml(settings: FlightSettings, start_at_ns: int, mavlink_port: int, zenoh_port: int) -> str:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edge.config import SHIPPED_MODEL
+from edge.errors import InputError
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
-from sim_replay.pipeline.flight import Flight, looped
+from sim_replay.pipeline import flight as pipeline_flight
+from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped
 from sim_replay.pipeline.report import WINDOW_FRAMES, cpu, mavlink_latency_ms, memory_mb, report, stage_latency_ms
 from sim_replay.pipeline.usage import Usage, usage_of
+from sim_replay.play import PlayError
 from sim_replay.telemetry import read_telemetry
+from tests.waiting import until
 
 PERIOD_S = 5.0
 START_NS = 7_000_000_000
@@ -121,6 +129,39 @@ def test_the_daemon_is_flown_for_seconds(tmp_path: Path) -> None:
     assert 50.0 < result["memory_mb"]["max"] < 2000.0
     assert {"capture", "inference", "total"} <= set(result["stages_ms"])
     assert len(result["budgets"]) == 7
+
+
+LONG_S = 3600.0  # until frame 0: a test that waited for it would never end
+
+
+def settings(out: Path, model: Path) -> FlightSettings:
+    return FlightSettings(read_sequence(BUNDLED_SEQUENCE), out, 0.1, model)
+
+
+def test_a_daemon_that_refuses_its_model_is_noticed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline_flight, "LEADS_S", (LONG_S,))
+    model = tmp_path / "spoiled.onnx"
+    model.write_bytes(b"no model")
+    with pytest.raises(InputError, match=r"spoiled\.onnx"):
+        fly(settings(tmp_path, model), lambda _: None)
+
+
+def test_a_peer_that_ends_is_noticed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline_flight, "LEADS_S", (LONG_S,))
+
+    def subscribers() -> list[int]:
+        children = " ".join(path.read_text() for path in Path("/proc/self/task").glob("*/children")).split()
+        return [int(pid) for pid in children if b"sim_replay.subscriber" in Path("/proc", pid, "cmdline").read_bytes()]
+
+    def kill() -> None:
+        until(subscribers, what="the subscriber's process")
+        os.kill(subscribers()[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    with pytest.raises(PlayError, match="a peer ended with exit code -9"):
+        fly(settings(tmp_path, SHIPPED_MODEL), lambda _: None)
+    killer.join()
 
 
 @pytest.mark.parametrize(
