@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -127,20 +126,8 @@ def sheet(airframes: Sequence[Airframe], out: Path, livery_seed: int = 0) -> Non
     out.write_bytes(encoded.tobytes())
 
 
-def register(commands: Any) -> None:
-    """Add the sub-command `sheet` to what argparse's add_subparsers() gave."""
-    parser = commands.add_parser(
-        "sheet",
-        help="draw the airframes from all sides",
-        description="Draw each airframe from the front, rear, side, top, below and two oblique sides into one JPEG.",
-    )
-    parser.add_argument("--airframe", nargs="+", metavar="NAME", help="which to draw (default: all)")
-    parser.add_argument("--livery-seed", type=int, default=0, metavar="N", help="paint (default %(default)s)")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JPEG to write")
-
-
 def run(args: argparse.Namespace) -> int:
-    """Run the sub-command. Raises InputError."""
+    """`uavpose-replay sheet` without --dataset. Raises InputError."""
     try:
         chosen = [AIRFRAMES[airframe_id(name)] for name in args.airframe] if args.airframe else AIRFRAMES
     except ValueError as error:

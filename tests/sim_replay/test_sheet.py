@@ -12,17 +12,19 @@ import pytest
 from edge.errors import InputError
 from sim_replay import sheet
 from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.benchmark import commands
 
 
-def _args(*words: str) -> argparse.Namespace:
+def _run(*words: str) -> int:
     parser = argparse.ArgumentParser()
-    sheet.register(parser.add_subparsers(dest="command"))
-    return parser.parse_args(["sheet", *words])
+    commands.register(parser.add_subparsers(dest="command"))
+    args = parser.parse_args(["sheet", *words])
+    return int(args.run(args))
 
 
 def test_the_whole_fleet_fits_one_small_picture(tmp_path: Path) -> None:
     out = tmp_path / "fleet.jpg"
-    assert sheet.run(_args("--out", str(out))) == 0
+    assert _run("--out", str(out)) == 0
     assert out.stat().st_size <= 400_000
     picture = cv2.imread(str(out))
     row_px = sheet.HEADING_PX + sheet.TILE_HEIGHT_PX
@@ -61,4 +63,4 @@ def test_paint_follows_the_seed() -> None:
 )
 def test_a_mistaken_order_is_answered_with_a_sentence(words: list[str], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        sheet.run(_args(*words))
+        _run(*words)
