@@ -7,6 +7,9 @@ Whatever decides or stamps by time asks here, so that a replay can own time. Wha
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
+
+UTC_PERIOD_NS = 1_000_000_000
 
 _stepped_ns: int | None = None
 
@@ -38,3 +41,34 @@ def run_freely() -> None:
     """Keep to the host's clocks again."""
     global _stepped_ns
     _stepped_ns = None
+
+
+@dataclass
+class UtcClock:
+    """UTC of a monotonic time and back, by an offset measured anew each second. Use from one thread."""
+
+    uncertainty_ns: int = 0  # of the last measurement: half the time between the two readings around it
+    _offset_ns: int = 0
+    _measured_ns: int | None = field(default=None)
+
+    def utc_ns(self, at_monotonic_ns: int) -> int:
+        return at_monotonic_ns + self._offset()
+
+    def monotonic_ns(self, at_utc_ns: int) -> int:
+        return at_utc_ns - self._offset()
+
+    def _offset(self) -> int:
+        now_ns = monotonic_ns()
+        if self._measured_ns is None or now_ns - self._measured_ns > UTC_PERIOD_NS:
+            self._measure()
+            self._measured_ns = now_ns
+        return self._offset_ns
+
+    def _measure(self) -> None:
+        """Bracketed, and the tightest of a few: whoever is held up between two readings tells nothing false."""
+        readings = []
+        for _ in range(5):
+            before_ns, now_utc_ns, after_ns = monotonic_ns(), utc_ns(), monotonic_ns()
+            readings.append((after_ns - before_ns, now_utc_ns - (before_ns + after_ns) // 2))
+        spread_ns, self._offset_ns = min(readings)
+        self.uncertainty_ns = spread_ns // 2

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# A variance that says that nothing is known: ROS has no other way to say so.
+NOT_ESTIMATED = 1e6
 
 
 def skew(vector: ArrayLike) -> Array:
@@ -106,3 +108,8 @@ def euler_from_R(R_ned_body: ArrayLike) -> tuple[Array, Array, Array]:
     roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
     return roll, pitch, yaw
+
+
+def rotation_estimated(covariance: Array) -> bool:
+    """Whether a pose's covariance [6, 6] (position, rotation) says that its rotation is known at all."""
+    return bool(np.trace(covariance[3:, 3:]) < NOT_ESTIMATED)

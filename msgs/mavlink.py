@@ -128,15 +128,16 @@ def pack_target_relative(
     t_cam_target_m: Sequence[float],
     position_std_m: Sequence[float],
     attitude_std_rad: float,
-    q_cam_target_wxyz: Sequence[float],
+    q_cam_target_wxyz: Sequence[float] | None,
     q_ned_cam_wxyz: Sequence[float] | None,
 ) -> bytes:
     """TARGET_RELATIVE (511) with the target's full pose in `cam` (frame OTHER), as one MAVLink 2 packet.
 
-    Vectors are [3], quaternions [4] of unit length; `q_ned_cam_wxyz` None: own attitude unknown. `utc_us` is the
-    exposure time. Raises ValueError for a value that is not finite, no rotation, or does not fit its field.
+    Vectors are [3], quaternions [4] of unit length; `q_cam_target_wxyz` None: the target's attitude is not known,
+    `q_ned_cam_wxyz` None: the own one; all zeros say so. `utc_us` is the exposure time. Raises ValueError for a value
+    that is not finite, no rotation, or does not fit its field.
     """
-    q_target = _unit_quaternion("q_target", q_cam_target_wxyz)
+    q_target = _Q_UNKNOWN if q_cam_target_wxyz is None else _unit_quaternion("q_target", q_cam_target_wxyz)
     q_sensor = _Q_UNKNOWN if q_ned_cam_wxyz is None else _unit_quaternion("q_sensor", q_ned_cam_wxyz)
     message = MAVLink_target_relative_message(
         utc_us,

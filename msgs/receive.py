@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from msgs import topics
 from msgs.cdr import PoseWithCovarianceStamped
+from msgs.geometry import rotation_estimated
 from msgs.wire import PayloadError, Refusal
 
 _NS = 1_000_000_000
@@ -27,6 +28,11 @@ class TargetPose:
     def stamp_ns(self) -> int:
         """UTC of the exposure."""
         return self.pose.stamp_ns
+
+    @property
+    def rotation_known(self) -> bool:
+        """False: the quaternion is a placeholder; how the target is turned is not known."""
+        return rotation_estimated(self.pose.covariance)
 
     @property
     def age_s(self) -> float:

@@ -163,7 +163,7 @@ class Autopilot:
         numbers = (message.x, message.y, message.z, *message.pos_std, message.yaw_std, *message.q_target)
         if not all(math.isfinite(value) for value in (*numbers, *message.q_sensor)):
             return "TARGET_RELATIVE is not finite"
-        if not abs(math.hypot(*message.q_target) - 1.0) <= 1e-3:
+        if any(message.q_target) and not abs(math.hypot(*message.q_target) - 1.0) <= 1e-3:
             return "TARGET_RELATIVE holds no rotation"
         if message.timestamp <= self._last_target_us.get(message.id, -1):
             return "TARGET_RELATIVE is not newer than the last"
@@ -199,13 +199,15 @@ class Autopilot:
 
 
 def _target_record(message: Any, now_ns: int) -> dict[str, Any]:
+    known = any(message.q_target)
     return {
         "event": "target_relative",
         "target": message.id,
         "capture_utc_us": message.timestamp,
         "received_ns": now_ns,
         "t_cam_target_m": [message.x, message.y, message.z],
-        "q_cam_target_wxyz": list(message.q_target),
+        "rotation_known": known,
+        "q_cam_target_wxyz": list(message.q_target) if known else [1.0, 0.0, 0.0, 0.0],
         "q_ned_cam_wxyz": list(message.q_sensor),
     }
 

@@ -38,6 +38,7 @@ def _pose_record(pose: TargetPose) -> dict[str, Any]:
         "capture_utc_ns": pose.stamp_ns,
         "age_ms": round(pose.age_s * 1e3, 3),
         "t_cam_target_m": pose.pose.t_cam_target_m.tolist(),
+        "rotation_known": pose.rotation_known,
         "q_cam_target_wxyz": [w, x, y, z],
         "covariance": pose.pose.covariance.tolist(),
     }

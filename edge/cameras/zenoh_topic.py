@@ -14,6 +14,7 @@ from zenoh import handlers
 
 from edge.cameras.intrinsics import Intrinsics, load_intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
+from edge.clock import UtcClock
 from edge.config_camera import ZenohCamera
 from edge.types import CameraInfo, Frame, FrameMeta
 from msgs.cdr import CompressedImage
@@ -41,6 +42,7 @@ class ZenohSource:
         self._session: zenoh.Session | None = None
         self._arrived = threading.Condition()
         self._sample: tuple[int, bytes, bytes] | None = None  # arrival_ns, payload, attachment
+        self._clock = UtcClock()
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # the publisher and its number of the last picture
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0)
@@ -99,7 +101,7 @@ class ZenohSource:
         if fitted is None:
             self.counts["misfit"] += 1
             return None
-        stamp_ns = message.stamp_ns - (time.time_ns() - time.monotonic_ns())
+        stamp_ns = self._clock.monotonic_ns(message.stamp_ns)
         if not 0 <= arrival_ns - stamp_ns <= STAMP_AGE_MAX_NS:
             self.counts["unstamped"] += 1
             stamp_ns = arrival_ns

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge.health import Activity, Condition, HealthState
+from edge.links.outgoing import rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, CameraInfo, Report, Track, TrackState
 from msgs.geometry import euler_from_R, q_wxyz_from_R
@@ -71,7 +72,7 @@ def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
         t_cam_target_m=track.t_cam_target_m.tolist(),
         position_std_m=np.sqrt(variance[:3]).tolist(),
         attitude_std_rad=float(np.sqrt(np.mean(variance[3:]))),
-        q_cam_target_wxyz=q_wxyz_from_R(track.R_cam_target).tolist(),
+        q_cam_target_wxyz=q_wxyz_from_R(track.R_cam_target).tolist() if rotation_known(track) else None,
         q_ned_cam_wxyz=None if R_ned_cam is None else q_wxyz_from_R(R_ned_cam).tolist(),
     )
 
@@ -109,7 +110,9 @@ def geo_status(report: Report, track: Track) -> Any | None:
     # Without own position the velocity is relative to the own ship, which this message cannot say.
     if own_ship.t_ned_body_m is not None and track.v_ned_target_mps is not None:
         velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
-    _, _, yaw_rad = euler_from_R(R)
+    heading_rad, heading_std_rad = NAN, NAN
+    if rotation_known(track):
+        heading_rad, heading_std_rad = float(euler_from_R(R)[2]) % (2.0 * math.pi), math.sqrt(P[8, 8])
     return dialect.MAVLink_camera_tracking_geo_status_message(
         TRACKING_STATUS[track.state],
         round(lat * 1e7),
@@ -120,8 +123,8 @@ def geo_status(report: Report, track: Track) -> Any | None:
         *velocity,
         vel_acc,
         float(np.linalg.norm(track.t_cam_target_m)),
-        float(yaw_rad) % (2.0 * math.pi),
-        math.sqrt(P[8, 8]),
+        heading_rad,
+        heading_std_rad,
     )
 
 

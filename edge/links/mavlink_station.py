@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+from edge.clock import UtcClock
 from edge.config import MavlinkSettings
 from edge.health import Condition
 from edge.links import mavlink_messages as words
@@ -38,7 +39,7 @@ from edge.links.mavlink_table import (
 from edge.links.mavlink_telemetry import Telemetry
 from edge.links.mavlink_traffic import adsb_vehicle, follow_target
 from edge.links.mavlink_vehicle import Contact, Vehicle
-from edge.links.outgoing import UtcClock, sendable
+from edge.links.outgoing import sendable
 from edge.links.signing import Signing
 from edge.requests import RequestQueue
 from edge.tracking.clock import TimesyncEstimator

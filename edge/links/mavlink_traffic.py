@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from edge.links.outgoing import rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import OwnShip, Report, Track
 from msgs.geometry import q_wxyz_from_R
@@ -31,7 +32,8 @@ def follow_target(report: Report, track: Track) -> Any | None:
     if place is None or R is None or P is None:
         return None
     velocity = _velocity_mps(report.own_ship, track)
-    known = POSITION_KNOWN | ATTITUDE_KNOWN | (VELOCITY_KNOWN if velocity is not None else 0)
+    turned = rotation_known(track)
+    known = POSITION_KNOWN | ATTITUDE_KNOWN * turned | VELOCITY_KNOWN * (velocity is not None)
     horizontal_std_m = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
     lat, lon, alt = place
     return dialect.MAVLink_follow_target_message(
@@ -42,7 +44,7 @@ def follow_target(report: Report, track: Track) -> Any | None:
         alt,
         velocity or [0.0] * 3,
         [0.0] * 3,
-        q_wxyz_from_R(R).tolist(),
+        q_wxyz_from_R(R).tolist() if turned else [0.0] * 4,
         [0.0] * 3,
         [horizontal_std_m, math.sqrt(P[2, 2]), 0.0],
         0,

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge import clock
 from edge.types import Report, Track, TrackState
 from msgs.wire import is_covariance
 
 UNSURE_RANGE_SHARE = 0.5  # range known worse than this is not told as a pose
+UNSURE_ROTATION_RAD = 1.0  # root mean square over the axes; of a rotation of which nothing is known it is 1.33
 ROTATION_TOLERANCE = 1e-3
-UTC_PERIOD_NS = 1_000_000_000
 NS_PER_MS = 1e6
 
 
@@ -25,6 +23,11 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
         for track in report.tracks
         if track.state is not TrackState.TENTATIVE and track.measured_ns >= oldest_ns and _whole(track)
     ]
+
+
+def rotation_known(track: Track) -> bool:
+    """Whether the covariance leaves any meaning to how the target is turned; else no link may tell an attitude."""
+    return float(np.trace(track.covariance[3:, 3:])) <= 3.0 * UNSURE_ROTATION_RAD**2
 
 
 def _whole(track: Track) -> bool:
@@ -40,27 +43,3 @@ def _whole(track: Track) -> bool:
     range_std_m = math.sqrt(max(float(along @ track.covariance[:3, :3] @ along), 0.0))
     skewness = np.abs(track.R_cam_target @ track.R_cam_target.T - np.eye(3)).max()
     return bool(skewness <= ROTATION_TOLERANCE and range_std_m <= UNSURE_RANGE_SHARE * range_m)
-
-
-@dataclass
-class UtcClock:
-    """UTC of a monotonic time, by an offset measured anew each second. Use from one thread."""
-
-    uncertainty_ns: int = 0  # of the last measurement: half the time between the two readings around it
-    _offset_ns: int = 0
-    _measured_ns: int | None = field(default=None)
-
-    def utc_ns(self, monotonic_ns: int) -> int:
-        now_ns = clock.monotonic_ns()
-        if self._measured_ns is None or now_ns - self._measured_ns > UTC_PERIOD_NS:
-            self._measure()
-            self._measured_ns = now_ns
-        return monotonic_ns + self._offset_ns
-
-    def _measure(self) -> None:
-        readings = []
-        for _ in range(5):
-            before_ns, utc_ns, after_ns = clock.monotonic_ns(), clock.utc_ns(), clock.monotonic_ns()
-            readings.append((after_ns - before_ns, utc_ns - (before_ns + after_ns) // 2))
-        spread_ns, self._offset_ns = min(readings)
-        self.uncertainty_ns = spread_ns // 2

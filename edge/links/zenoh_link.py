@@ -17,11 +17,12 @@ import numpy as np
 import zenoh
 
 from edge import clock
+from edge.clock import UtcClock
 from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
-from edge.links.outgoing import UtcClock, sendable
+from edge.links.outgoing import sendable
 from edge.links.zenoh_commands import Actions, declare_commands
 from edge.requests import RequestQueue
 from edge.types import Mount, Report

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edge.health import HealthSnapshot, HealthState
+from edge.links.outgoing import rotation_known
 from edge.types import Array, Mount, OwnShip, Report, Track
 from msgs import cdr, topics
-from msgs.geometry import q_wxyz_from_R
+from msgs.geometry import NOT_ESTIMATED, q_wxyz_from_R
 
 CLASS_FIXED_WING = "fixed_wing"
-# A twist's part that is not estimated: ROS has no other way to say so than a variance that outweighs any use.
-NOT_ESTIMATED = 1e6
 DIAGNOSTIC_LEVEL = {HealthState.DEGRADED: 1, HealthState.FAULT: 2}
 
 
@@ -27,9 +26,11 @@ def target_name(track: Track) -> str:
 
 
 def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
-    """The target in `cam`."""
-    q = q_xyzw(track.R_cam_target)
-    return cdr.PoseWithCovarianceStamped(stamp_ns, topics.FRAME_CAMERA, track.t_cam_target_m, q, track.covariance)
+    """The target in `cam`; a rotation that is not known is none, with a variance that says so."""
+    R, covariance = track.R_cam_target, track.covariance
+    if not rotation_known(track):
+        R, covariance = np.eye(3), _without_rotation(covariance)
+    return cdr.PoseWithCovarianceStamped(stamp_ns, topics.FRAME_CAMERA, track.t_cam_target_m, q_xyzw(R), covariance)
 
 
 def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | None:
@@ -38,6 +39,9 @@ def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | N
     if R is None or t_m is None or v_mps is None or P is None:
         return None
     pose_index = np.r_[0:3, 6:9]
+    covariance = P[np.ix_(pose_index, pose_index)]
+    if not rotation_known(track):
+        R, covariance = np.eye(3), _without_rotation(covariance)
     twist = np.diag([NOT_ESTIMATED] * 6)
     twist[:3, :3] = R.T @ P[3:6, 3:6] @ R
     return cdr.Odometry(
@@ -46,7 +50,7 @@ def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | N
         child_frame_id=topics.FRAME_TARGET,
         t_ned_target_m=t_m,
         q_ned_target_xyzw=q_xyzw(R),
-        covariance=P[np.ix_(pose_index, pose_index)],
+        covariance=covariance,
         v_target_mps=R.T @ v_mps,
         omega_target_radps=np.zeros(3),
         covariance_twist=0.5 * (twist + twist.T),
@@ -57,10 +61,19 @@ def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
     """All targets of one frame in `cam`; an empty array says that none was seen."""
     found = []
     for track in tracks:
-        t_m, q = track.t_cam_target_m, q_xyzw(track.R_cam_target)
-        one = cdr.Hypothesis(CLASS_FIXED_WING, track.score, t_m, q, track.covariance)
+        told = pose(track, stamp_ns)
+        t_m, q = told.t_cam_target_m, told.q_cam_target_xyzw
+        one = cdr.Hypothesis(CLASS_FIXED_WING, track.score, t_m, q, told.covariance)
         found.append(cdr.Detection3D(stamp_ns, topics.FRAME_CAMERA, (one,), t_m, q, np.zeros(3), target_name(track)))
     return cdr.Detection3DArray(stamp_ns, topics.FRAME_CAMERA, tuple(found))
+
+
+def _without_rotation(covariance: Array) -> Array:
+    """[6, 6] of which only the position's part is left."""
+    told = np.zeros((6, 6))
+    told[:3, :3] = covariance[:3, :3]
+    told[3:, 3:] = NOT_ESTIMATED * np.eye(3)
+    return told
 
 
 def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:

@@ -43,10 +43,10 @@ class TargetRow:
     elevation_deg: float
     frame: Literal["ned", "cam"]  # of bearing and elevation
     closing_mps: float | None  # positive: comes nearer
-    attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in ned
+    attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in ned; None: own or its own not known
     score: float | None
     sigma_range_m: float
-    sigma_rotation_deg: float
+    sigma_rotation_deg: float | None  # None: how it is turned is not known
     t_cam_target_m: tuple[float, float, float]
     q_cam_target_xyzw: tuple[float, float, float, float]
 
@@ -208,9 +208,11 @@ def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None,
         right, down, ahead = t_m
     else:
         ahead, right, down = R_ned_cam @ t_m
+    if R_ned_cam is not None and pose.rotation_known:
         R_cam_target = R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
         roll, pitch, yaw = np.degrees(euler_from_R(R_ned_cam @ R_cam_target))
         attitude = (float(roll), float(pitch), float(yaw) % 360.0)
+    sigma_rotation_rad = math.sqrt(max(float(np.trace(covariance[3:, 3:])), 0.0) / 3.0)
     bearing_deg = math.degrees(math.atan2(right, ahead))
     x, y, z, w = map(float, pose.pose.q_cam_target_xyzw)
     return TargetRow(
@@ -225,7 +227,7 @@ def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None,
         attitude_deg=attitude,
         score=score,
         sigma_range_m=math.sqrt(max(float(along @ covariance[:3, :3] @ along), 0.0)),
-        sigma_rotation_deg=math.degrees(math.sqrt(max(float(np.trace(covariance[3:, 3:])), 0.0) / 3.0)),
+        sigma_rotation_deg=math.degrees(sigma_rotation_rad) if pose.rotation_known else None,
         t_cam_target_m=(float(t_m[0]), float(t_m[1]), float(t_m[2])),
         q_cam_target_xyzw=(x, y, z, w),
     )

@@ -144,7 +144,7 @@ def _cells(row: TargetRow, now_ns: int) -> tuple[str, ...]:
         f"{row.bearing_deg:.1f}" + ("" if row.frame == "ned" else "c"),
         f"{row.elevation_deg:+.1f}",
         "–" if heading is None else f"{heading:.0f}/{pitch:+.0f}/{roll:+.0f}",
-        f"{row.sigma_rotation_deg:.0f}",
+        "?" if row.sigma_rotation_deg is None else f"{row.sigma_rotation_deg:.0f}",
         "–" if row.score is None else f"{row.score:.2f}",
         f"{_age_s(row, now_ns):.2f}",
     )

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge.links.outgoing import UtcClock
+from edge.clock import UtcClock
 
 AUTOPILOT, SUBSCRIBER = "autopilot", "subscriber"
 

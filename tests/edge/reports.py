@@ -26,6 +26,9 @@ SEARCHING = Condition(HealthState.SEARCHING, Activity.SEARCHING)
 FAULT = Condition(HealthState.FAULT, Activity.WAITING)
 
 
+ROTATION_UNKNOWN = np.diag([0.09, 0.16, 144.0, 1.1, 1.2, 1.3])  # radians that amount to any attitude
+
+
 def make_track(now_ns: int, **changed: Any) -> Track:
     """A confirmed, fresh track in both frames; `changed` replaces fields."""
     covariance = np.diag([0.09, 0.16, 144.0, 0.01, 0.02, 0.03])

@@ -23,6 +23,7 @@ from .reports import (
     OWN_NED_M,
     R_CAM_TARGET,
     R_NED_CAM,
+    ROTATION_UNKNOWN,
     SIZE_WH,
     T_CAM_TARGET_M,
     TRACKING,
@@ -122,6 +123,20 @@ def test_px4_gets_no_target_relative_unless_asked() -> None:
             link.publish(report(track(time.monotonic_ns())))
             peer.named("CAMERA_TRACKING_IMAGE_STATUS")
             assert ("TARGET_RELATIVE" in {m.get_type() for m in peer.received}) == asked
+
+
+def test_an_attitude_that_is_not_known_is_told_as_unknown_and_the_place_all_the_same() -> None:
+    with linked(follow_target=True) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.publish(report(track(time.monotonic_ns(), covariance=ROTATION_UNKNOWN)))
+        told = {name: peer.named(name) for name in ("TARGET_RELATIVE", "CAMERA_TRACKING_GEO_STATUS", "FOLLOW_TARGET")}
+    pose, place, traffic = told.values()
+    assert list(pose.q_target) == [0.0] * 4
+    assert math.hypot(*pose.q_sensor) == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose([pose.x, pose.y, pose.z], T_CAM_TARGET_M, atol=1e-4)
+    assert (math.isnan(place.hdg), math.isnan(place.hdg_acc)) == (True, True)
+    assert math.isfinite(place.h_acc)
+    assert (list(traffic.attitude_q), traffic.est_capabilities & 8) == ([0.0] * 4, 0)
 
 
 def test_heartbeats_come_from_both_components_and_stop_when_the_loop_does() -> None:

@@ -27,7 +27,17 @@ from msgs import topics
 from msgs.client import connect, subscribe, subscribe_all
 from msgs.session import router_config
 
-from .reports import OWN_NED_M, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, TRACKING, V_NED_MPS, K
+from .reports import (
+    OWN_NED_M,
+    R_CAM_TARGET,
+    R_NED_CAM,
+    ROTATION_UNKNOWN,
+    SIZE_WH,
+    T_CAM_TARGET_M,
+    TRACKING,
+    V_NED_MPS,
+    K,
+)
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -221,6 +231,29 @@ def test_who_joins_late_gets_intrinsics_and_events_from_the_cache() -> None:
                 lambda: counts.counts().get("uav1/events", 0) >= 2 and counts.counts().get("uav1/camera_info", 0) >= 1,
                 "history",
             )
+
+
+def test_an_attitude_that_is_not_known_is_told_as_unknown_on_every_topic() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link, connect(endpoint) as session, subscribe(session, "uav1") as poses:
+        samples = Samples(session)
+        blind = lambda: link.publish(report(track(time.monotonic_ns(), covariance=ROTATION_UNKNOWN)))  # noqa: E731
+        names = ("uav1/target/t0/pose", "uav1/target/t0/odom", "uav1/target/detections")
+        samples.wait(*names, each=blind)
+        pose, odom, found = (samples.newest[name] for name in names)
+        (result,) = found.detections[0].results
+        for told in (pose.pose, odom.pose, result.pose):
+            q = told.pose.orientation
+            assert (q.x, q.y, q.z, q.w) == (0.0, 0.0, 0.0, 1.0)
+            assert np.diag(told.covariance.reshape(6, 6))[3:].tolist() == [1e6] * 3
+        np.testing.assert_allclose(vector(pose.pose.pose.position), T_CAM_TARGET_M)
+        # The velocity is in the target's axes, which without an attitude are ned's.
+        np.testing.assert_allclose(vector(odom.twist.twist.linear), V_NED_MPS)
+        taken = next(iter(poses))
+        assert not taken.rotation_known
+        samples.newest.clear()
+        samples.wait(names[0], each=lambda: link.publish(report(track(time.monotonic_ns()))))
+        assert any(one.rotation_known for one in iter(poses.poll, None))
 
 
 def test_intrinsics_are_told_again_only_when_they_change() -> None:
