@@ -21,9 +21,10 @@ from edge.links.zenoh_link import ZenohLink
 from msgs import recording
 from msgs.client import connect
 from msgs.recording import Recorder, RecordingLimits
+from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint, wait_until
+from .test_zenoh_link import MOUNT, free_endpoint
 
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
 
@@ -51,7 +52,7 @@ def test_the_recording_holds_the_bytes_that_went_over_the_wire(tmp_path: Path) -
             came.append((name, sample.payload.to_bytes()))
 
         session.declare_subscriber("0/uav1/target/*/pose/**", zenoh.handlers.Callback(take, indirect=False))
-        wait_until(lambda: len(came) >= 5, "poses", lambda: link.publish(make_report(make_track(time.monotonic_ns()))))
+        until(lambda: len(came) >= 5, lambda: link.publish(make_report(make_track(time.monotonic_ns()))), what="poses")
         link.publish_event(20, "tracking")
         link.stop()
     recorder.stop()
@@ -86,12 +87,12 @@ def test_a_folder_that_cannot_be_written_is_an_event_and_poses_still_leave(
     link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT, recorder)
     recorder.start()
     link.start()
-    wait_until(lambda: told != [], "the event", lambda: link.publish(make_report(make_track(time.monotonic_ns()))))
+    until(lambda: told != [], lambda: link.publish(make_report(make_track(time.monotonic_ns()))), what="the event")
     sent = link.counters()["sent_pose"]
-    wait_until(
+    until(
         lambda: link.counters()["sent_pose"] > sent + 5,
-        "poses",
         lambda: link.publish(make_report(make_track(time.monotonic_ns()))),
+        what="poses",
     )
     link.stop()
     recorder.stop()
@@ -131,12 +132,12 @@ def test_a_killed_daemon_leaves_a_recording_that_its_next_start_makes_whole(
     for attempt, number in ((1, signal.SIGKILL), (2, signal.SIGTERM)):
         daemon = subprocess.Popen([sys.executable, "-m", "edge.cli", "run", "--config", str(config)])
         try:
-            wait_until(
+            until(
                 lambda attempt=attempt: (
                     len(list(folder.glob("*"))) == attempt  # type: ignore[misc]
                     and os.path.getsize(max(folder.iterdir())) > 2000
                 ),
-                "recording",
+                what="recording",
             )
         finally:
             daemon.send_signal(number)

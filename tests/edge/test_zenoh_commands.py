@@ -24,9 +24,12 @@ from edge.requests import WAITING_MAX, RequestQueue, StopTracking, TrackBox
 from msgs.client import connect
 from msgs.ground.command import ask
 from msgs.recording import Recorder, RecordingLimits
+from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint, wait_until
+from .test_zenoh_link import MOUNT, free_endpoint
+
+REPORT_PERIOD_S = 0.02
 
 
 @dataclass
@@ -65,7 +68,7 @@ def answered(one: Commanded, name: str, body: dict[str, Any]) -> dict[str, Any]:
         said.clear()
         said.update(ask(one.session, "uav1", name, body, timeout_s=2.0))
 
-    wait_until(lambda: bool(said) and "does not answer" not in said.get("error", ""), "an answer", turn)
+    until(lambda: bool(said) and "does not answer" not in said.get("error", ""), turn, what="an answer")
     return said
 
 
@@ -84,7 +87,7 @@ def test_recording_is_switched_by_command(tmp_path: Path) -> None:
     with vehicle(tmp_path / "r") as one:
         put(one)
         assert answered(one, "record", {"on": True})["done"] == {"recording": True}
-        wait_until(lambda: one.recorder.counters()["recorded"] > 0, "recording", lambda: put(one))
+        until(lambda: one.recorder.counters()["recorded"] > 0, lambda: put(one), what="recording")
         assert answered(one, "record", {"on": False})["done"] == {"recording": False}
     assert len(list((tmp_path / "r").iterdir())) == 1
 
@@ -98,15 +101,15 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
 
         def turn() -> None:
             put(one)
-            time.sleep(0.02)
+            time.sleep(REPORT_PERIOD_S)
 
-        wait_until(lambda: one.link.counters().get("sent_detections", 0) >= reports, "40 reports", turn)
+        until(lambda: one.link.counters().get("sent_detections", 0) >= reports, turn, what="40 reports")
         sent = one.link.counters()["sent_pose"] - before
         assert 1 <= sent <= 4 * (time.monotonic() - began) + 2
         assert answered(one, "rate", {"max_hz": None})["ok"]
         before = one.link.counters()["sent_pose"]
-        wait_until(lambda: one.link.counters()["sent_pose"] >= before + 20, "all poses", turn)
-        wait_until(lambda: one.recorder.counters()["recorded"] > 4 * 40, "the recording", turn)
+        until(lambda: one.link.counters()["sent_pose"] >= before + 20, turn, what="all poses")
+        until(lambda: one.recorder.counters()["recorded"] > 4 * 40, turn, what="the recording")
 
 
 @pytest.mark.parametrize(
@@ -149,7 +152,7 @@ def test_a_command_names_one_vehicle_and_one_command(tmp_path: Path) -> None:
 
 def test_with_commands_off_nothing_answers(tmp_path: Path) -> None:
     with vehicle(tmp_path, commands=False) as one:
-        wait_until(lambda: one.link.counters().get("sent_pose", 0) > 0, "the link", lambda: put(one))
+        until(lambda: one.link.counters().get("sent_pose", 0) > 0, lambda: put(one), what="the link")
         assert "does not answer" in ask(one.session, "uav1", "stop", {}, timeout_s=2.0)["error"]
 
 

@@ -16,9 +16,10 @@ from edge.links.zenoh_link import ZenohLink
 from msgs.client import connect, subscribe
 from msgs.ground.keys import init_authority, issue
 from msgs.session import TlsFiles, router_config
+from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint, wait_until
+from .test_zenoh_link import MOUNT, free_endpoint
 
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
 TLS = '[zenoh.tls]\nroot_ca = "ca.pem"\ncertificate = "uav1.pem"\nprivate_key = "uav1.key"\n'
@@ -93,7 +94,7 @@ def test_the_link_reaches_the_ground_over_quic_with_its_certificate_and_caps_pos
         handler = zenoh.handlers.Callback(lambda s: came.append(str(s.key_expr)), indirect=False)
         ground.declare_subscriber("0/uav1/target/*/pose/**", handler)
         with subscribe(board, "uav1", depth=500) as poses:
-            wait_until(lambda: bool(came), "a pose on the ground", lambda: put(link))
+            until(lambda: bool(came), lambda: put(link), what="a pose on the ground")
             list(iter(poses.poll, None))
             came.clear()
             taken, began = 0, time.monotonic()
@@ -103,7 +104,7 @@ def test_the_link_reaches_the_ground_over_quic_with_its_certificate_and_caps_pos
                 put(link)
                 taken += sum(1 for _ in iter(poses.poll, None))
 
-            wait_until(lambda: taken >= 50, "poses on board", turn)
+            until(lambda: taken >= 50, turn, what="poses on board")
             elapsed_s = time.monotonic() - began
     # One for the period that had begun, one that was on its way when counting started.
     assert 1 <= len(came) <= 5.0 * elapsed_s + 2

@@ -15,8 +15,9 @@ from msgs.publish import Node
 from msgs.receive import TargetPose
 from msgs.topics import POSE
 from msgs.wire import Refusal
+from tests.waiting import until
 
-from .conftest import Network, free_endpoint, pose_now, until
+from .conftest import Network, free_endpoint, pose_now
 
 
 def test_a_sample_is_what_a_ros_2_publisher_sends(network: Network) -> None:

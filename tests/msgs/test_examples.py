@@ -11,8 +11,9 @@ import numpy as np
 import msgs.examples
 from msgs import topics
 from msgs.publish import Node
+from tests.waiting import until
 
-from .conftest import Network, pose_now, until
+from .conftest import Network, pose_now
 
 EXAMPLES = sorted(path.stem for path in Path(msgs.examples.__file__).parent.glob("*.py"))
 RUN = """

@@ -18,9 +18,10 @@ from msgs import recording, topics
 from msgs.definitions import definition
 from msgs.mcap_file import McapFile, finish_unfinished
 from msgs.recording import Recorder, RecordingLimits
+from tests.waiting import until
 
 from . import make_definitions
-from .conftest import pose_now, until
+from .conftest import pose_now
 from .ros_oracle import STORE, deserialize, serialize
 
 ROOM = RecordingLimits(free_bytes_min=0)
@@ -84,12 +85,13 @@ from msgs import topics
 from msgs.recording import Recorder, RecordingLimits
 recorder = Recorder(Path(sys.argv[1]), "uav1", RecordingLimits(free_bytes_min=0), print)
 recorder.start()
+PERIOD_S = 0.005
 n = 0
 while True:
     recorder.record(topics.EVENTS, "uav1", None, n.to_bytes(4, "little"), time.time_ns())
     n += 1
     print(n, recorder.counters()["recorded"], flush=True)
-    time.sleep(0.005)
+    time.sleep(PERIOD_S)
 """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import time
 from collections import Counter
@@ -16,8 +15,9 @@ import zenoh
 
 from msgs import client, session, topics
 from msgs.publish import Node
+from tests.waiting import until
 
-from .conftest import free_endpoint, pose_now, until
+from .conftest import free_endpoint, pose_now
 
 
 def sockets() -> set[str]:
@@ -77,8 +77,6 @@ def _identity(folder: Path, name: str, authority: tuple[Path, Path]) -> session.
 @pytest.fixture
 def identities(tmp_path: Path) -> Sequence[session.TlsFiles]:
     """Ground and UAV of one authority, and a stranger of another."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl makes the certificates of this test and is not installed")
     folders = [tmp_path / name for name in ("ours", "theirs")]
     for folder in folders:
         folder.mkdir()

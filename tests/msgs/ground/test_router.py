@@ -14,8 +14,9 @@ import zenoh
 from msgs import client, topics
 from msgs.publish import Node
 from msgs.session import TlsFiles, peer_config
+from tests.waiting import until
 
-from ..conftest import free_endpoint, pose_now, until
+from ..conftest import free_endpoint, pose_now
 from .conftest import Ground, write_router_config
 
 
