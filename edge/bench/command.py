@@ -25,6 +25,7 @@ def register(commands: argparse._SubParsersAction) -> None:
     bench.add_argument("--threads", default="1,2", metavar="N,N", help="CPU threads of one inference (default 1,2)")
     bench.add_argument("--runs", type=int, default=50, help="timed inferences of each row (default %(default)s)")
     bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
+    bench.add_argument("--alone", action="store_true", help="ONNX Runtime alone, without the other engines installed")
     bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     bench.add_argument("--pipeline", action="store_true", help=f"run `{PIPELINE} bench-pipeline`")
     bench.add_argument("--sequence", type=Path, metavar="DIR", help="with --pipeline: scene folder that is replayed")
@@ -52,7 +53,9 @@ def run(options: argparse.Namespace) -> int:
             end = "\n" if done == options.runs + UNTIMED_ROUNDS else ""
             print(f"\rround {done} of {options.runs + UNTIMED_ROUNDS}", end=end, file=sys.stderr, flush=True)
 
-    measured = measure(options.models or [SHIPPED_MODEL], threads, options.spinning, options.runs, on_round)
+    measured = measure(
+        options.models or [SHIPPED_MODEL], threads, options.spinning, options.runs, not options.alone, on_round
+    )
     print(json.dumps(to_tree(measured)) if options.json else table(measured))
     return 0
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import onnxruntime as ort
+from numpy.typing import NDArray
 
 from edge.bench import openvino, peak
+from edge.bench.engines import Engine, other_engines
 from edge.bench.macs import Macs, count_macs
 from edge.bench.peak import Peak
 from edge.bench.timing import Milliseconds, time_in_turns
@@ -24,7 +26,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 @dataclass(frozen=True)
 class Case:
-    """One row: a file's stage on so many threads of an engine (`onnxruntime`, `openvino`)."""
+    """One row: a file's stage on so many threads of an engine (`onnxruntime`, `openvino`, `pytorch`)."""
 
     file: str
     stage: str
@@ -63,16 +65,25 @@ class Measured:
 
 
 def measure(
-    models: Sequence[Path], threads: Sequence[int], spinning: bool, rounds: int, on_round: Callable[[int], None]
+    models: Sequence[Path],
+    threads: Sequence[int],
+    spinning: bool,
+    rounds: int,
+    others: bool,
+    on_round: Callable[[int], None],
 ) -> Measured:
-    """Time all of it in turns, on noise. Raises InputError on a file that is no model."""
+    """Time all of it in turns, on noise, with `others` in every engine there is.
+
+    Raises InputError on a file that is no model.
+    """
+    engines = other_engines() if others else {}
     calls: dict[Case, Callable[[], object]] = {}
     loaded: dict[str, Model] = {}
     for path in models:
         for count in threads:
             loaded[str(path)] = model = load_model(path, count, spinning)
             model.warm_up()
-            calls |= _cases(model, count)
+            calls |= _cases(model, count, engines)
     peaks: dict[Case, Callable[[], object]] = {
         Case("", precision, count, "peak"): peak.product(precision, session_options(count, spinning))
         for count in threads
@@ -96,15 +107,16 @@ def stages(contract: ModelContract) -> dict[str, tuple[int, int]]:
     return {"acquire": contract.acquire_size_wh, **track}
 
 
-def _cases(model: Model, threads: int) -> dict[Case, Callable[[], object]]:
+def _cases(model: Model, threads: int, others: Mapping[str, Engine]) -> dict[Case, Callable[[], object]]:
     calls: dict[Case, Callable[[], object]] = {}
     for stage, (width, height) in stages(model.contract).items():
         image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), dtype=np.uint8)
-        K = np.array([[[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]])
+        K: NDArray[np.float32] = np.array([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]], np.float32)
         calls[Case(str(model.path), stage, threads, "onnxruntime")] = partial(model.run, image, K)
-        if openvino.version() is not None:
-            by_openvino = openvino.inference(model.path, image, K.astype(np.float32), threads)
-            calls[Case(str(model.path), stage, threads, "openvino")] = by_openvino
+        for name, engine in others.items():
+            call = engine(model.path, model.contract, image, K, threads)
+            if call is not None:
+                calls[Case(str(model.path), stage, threads, name)] = call
     return calls
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from msgs.contract import ModelContract
+
 PACKAGE = "openvino"
 
 
@@ -19,11 +21,15 @@ def version() -> str | None:
     return importlib.metadata.version(PACKAGE) if importlib.util.find_spec(PACKAGE) is not None else None
 
 
-def inference(path: Path, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int) -> Callable[[], object]:
-    """One inference a call on the CPU, at this size alone."""
+def engine(
+    path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
+) -> Callable[[], object]:
+    """`edge.bench.engines.Engine` on the CPU, compiled for this size alone."""
     core = importlib.import_module(PACKAGE).Core()
     network = core.read_model(str(path))
     network.reshape({"image": list(image.shape), "K": list(K.shape)})
-    settings = {"INFERENCE_NUM_THREADS": threads, "NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY"}
+    # Left to itself it computes FP32 files in bfloat16 where the processor can.
+    precision = {"INFERENCE_PRECISION_HINT": "f32"}
+    settings = {"INFERENCE_NUM_THREADS": threads, "NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY", **precision}
     request = core.compile_model(network, "CPU", settings).create_infer_request()
     return lambda: request.infer({"image": image, "K": K})

@@ -10,17 +10,20 @@ from typing import Any
 from edge.bench.measure import Measured, Row
 
 ORT = "onnxruntime"
+BETWEEN_ENGINES = ("ort_over_openvino", "ort_over_eager")
 STATISTICS = {"track_ms": "p50", "acquire_ms": "p50", "ratios": "p10", "all_ratios.cpu": "p50 of processor time"}
 HEADLINES = {  # each ratio's stage for the one figure in `ratios`; without that stage, the other
     "int8_over_fp32": "track",
     "edge_over_paper_fp32": "acquire",
     "ort_over_openvino": "track",
+    "ort_over_eager": "track",
     "over_vnni_limit": "track",
 }
 MEANING = {
     "int8_over_fp32": "INT8 / FP32 of the edge configuration at one input size",
     "edge_over_paper_fp32": "edge / paper configuration, FP32, each at its own input size",
     "ort_over_openvino": "ONNX Runtime / OpenVINO, INT8",
+    "ort_over_eager": "ONNX Runtime / PyTorch eager, FP32",
     "over_vnni_limit": "INT8 / its multiply-accumulates at this machine's peak",
 }
 
@@ -53,12 +56,12 @@ def _at(measured: Measured, stage: str, threads: int) -> Iterator[Ratio]:
         return next(rows, None)
 
     int8, fp32, paper = first("edge", "int8"), first("edge", "fp32"), first("paper", "fp32")
-    by_openvino = first("edge", "int8", "openvino")
     same_size = int8 is not None and fp32 is not None and int8.size_wh == fp32.size_wh
     pairs = {
         "int8_over_fp32": (int8, fp32 if same_size else None),
         "edge_over_paper_fp32": (fp32, paper),
-        "ort_over_openvino": (int8, by_openvino),
+        "ort_over_openvino": (int8, first("edge", "int8", "openvino")),
+        "ort_over_eager": (fp32, first("edge", "fp32", "pytorch")),
     }
     for name, (one, other) in pairs.items():
         if one is not None and other is not None:
@@ -131,7 +134,7 @@ def _ratio_lines(measured: Measured) -> Iterator[str]:
             cpu = f"{ratio.cpu:7.2f}" if ratio.cpu is not None else f"{'-':>7}"
             yield f"{meaning:64} {ratio.stage:8} {ratio.threads:7d} {ratio.value:7.2f} {cpu}"
         if not own:
-            reason = "openvino is not installed" if name == "ort_over_openvino" else "needs two such models"
+            reason = "no such engine" if name in BETWEEN_ENGINES else "needs two such models"
             yield f"{meaning:64} {reason:>24}"
 
 

@@ -109,7 +109,7 @@ def test_cases_take_turns() -> None:
 def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8")
     paper = write_toy_model(tmp_path / "paper.onnx", configuration="paper", track_size_wh=None)
-    done = cli("bench", toy_model, int8, paper, "--runs", "5", "--threads", "1,2", "--json")
+    done = cli("bench", toy_model, int8, paper, "--runs", "5", "--threads", "1,2", "--alone", "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     rows = {(Path(r["file"]).stem, r["stage"], r["threads"]): r for r in result["rows"]}
@@ -125,16 +125,33 @@ def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) 
     assert all(peak["int8_gmac_per_s"] > 0 and peak["fp32_gmac_per_s"] > 0 for peak in result["peaks"])
 
 
+def test_other_engines_infer_the_same_files(cli: Cli, tmp_path: Path) -> None:
+    small = {"acquire_size_wh": (96, 64), "track_size_wh": (64, 64)}
+    fp32 = write_toy_model(tmp_path / "fp32.onnx", **small)
+    int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8", **small)
+    done = cli("bench", fp32, int8, "--runs", "1", "--threads", "1", "--json", timeout_s=200.0)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    p10 = {(Path(r["file"]).stem, r["engine"]): r["ms"]["p10"] for r in result["rows"] if r["stage"] == "track"}
+    assert set(p10) == {
+        *(("fp32", engine) for engine in ("onnxruntime", "openvino", "pytorch")),
+        *(("int8", engine) for engine in ("onnxruntime", "openvino")),
+    }
+    ratios = result["ratios"]
+    assert ratios["ort_over_openvino"] == pytest.approx(p10["int8", "onnxruntime"] / p10["int8", "openvino"])
+    assert ratios["ort_over_eager"] == pytest.approx(p10["fp32", "onnxruntime"] / p10["fp32", "pytorch"])
+
+
 def test_precisions_are_compared_at_one_size_alone(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8", track_size_wh=(128, 128))
-    done = cli("bench", toy_model, int8, "--runs", "1", "--threads", "1", "--json")
+    done = cli("bench", toy_model, int8, "--runs", "1", "--threads", "1", "--alone", "--json")
     assert done.returncode == 0, done.stderr
     compared = [r["stage"] for r in json.loads(done.stdout)["all_ratios"] if r["name"] == "int8_over_fp32"]
     assert compared == ["acquire"]
 
 
 def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
-    done = cli("bench", "--runs", "2", "--threads", "1", "--json", timeout_s=200.0)
+    done = cli("bench", "--runs", "2", "--threads", "1", "--alone", "--json", timeout_s=200.0)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     for row in result["rows"]:

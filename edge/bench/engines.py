@@ -1,0 +1,33 @@
+"""Other engines that time the same network: those that packages installed beside this one bring with them.
+
+A package offers one under the entry point group GROUP. So nothing that flies depends on any of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.bench import openvino
+from msgs.contract import ModelContract
+
+GROUP = "uavpose_edge.bench_engines"
+
+
+class Engine(Protocol):
+    """A call that infers once, on image [1, H, W, 3] and K [1, 3, 3], on so many threads; None: not this file."""
+
+    def __call__(
+        self, path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
+    ) -> Callable[[], object] | None: ...
+
+
+def other_engines() -> Mapping[str, Engine]:
+    """By name: `openvino` if it is installed, and what the entry points bring. Loading one may take seconds."""
+    own: dict[str, Engine] = {"openvino": openvino.engine} if openvino.version() is not None else {}
+    return own | {entry.name: entry.load() for entry in entry_points(group=GROUP)}

@@ -1,0 +1,38 @@
+"""PyTorch eager as an engine of `uavpose-edge bench`: what the network takes before any export."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from msgs.contract import ModelContract
+from trainer.backbones import fuse_branches
+from trainer.config import load_config
+from trainer.model import PoseNet
+
+
+def engine(
+    path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
+) -> Callable[[], object] | None:
+    """`edge.bench.engines.Engine`: the float network of the file's configuration as the configs of this package build
+    it. Its weights are random, since they change nothing of the time. None for an INT8 file.
+    """
+    if contract.precision != "fp32":
+        return None
+    config = load_config(Path(str(files("trainer") / "configs" / f"{contract.configuration}.toml")))
+    lean = config.model.model_copy(update={"pretrained": False, "dense": False})
+    model = fuse_branches(PoseNet(lean).eval())
+    inputs = torch.from_numpy(image), torch.from_numpy(K)
+
+    def infer() -> object:
+        # The number is the process's, and rows of other numbers take turns with this one.
+        torch.set_num_threads(threads)
+        with torch.inference_mode():
+            return model(*inputs)
+
+    return infer
