@@ -20,7 +20,9 @@ from sim_replay.demo import BUNDLED_SEQUENCE, report_flight, show
 from sim_replay.evaluation.judge import judge_frames, score_of
 from sim_replay.evaluation.table import score_table
 from sim_replay.faults import run as faults
+from sim_replay.golden import run as golden
 from sim_replay.ground_truth import read_sequence
+from sim_replay.lockstep import command as lockstep
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError
@@ -41,10 +43,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     play = commands.add_parser(
         "play",
-        help="the same with a sequence of your own",
+        help="the same with a sequence of your own, or in lock-step",
         description="Like demo, with a BOP scene folder that also holds sequence.toml and telemetry.csv.",
     )
-    play.add_argument("--sequence", type=Path, required=True, metavar="DIR", help="scene folder")
+    bundled = "scene folder (default: the bundled sequence)"
+    play.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help=bundled)
+    lockstep.add_options(play)
     for name, command in (("demo", demo), ("play", play)):
         command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="folder to write to")
         command.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
@@ -52,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     benchmark.register(commands)
     pipeline.register(commands)
     faults.register(commands)
+    golden.register(commands)
     radio.register(commands)
 
     score = commands.add_parser(
@@ -80,6 +85,8 @@ def _run(args: argparse.Namespace) -> int:
         if (args.flight is None) == (args.dataset is None):
             raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
         return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
+    if args.command == "play" and lockstep.asked_for(args):
+        return lockstep.run(args, console)
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
     if show(read_sequence(folder), args.out, args.model, console):
         return 0

@@ -114,8 +114,8 @@ class Subscriber:
         self._subscribers = [self._session.declare_subscriber(key, handler) for key in keys]
         self._wait_until_known(uav)
 
-    def collect(self, frame: int, now_ns: int) -> None:
-        """Wait for the poses of the frame exposed at `now_ns`, and record them. Raises PlayError if none come."""
+    def collect(self, frame: int, now_ns: int) -> list[Record]:
+        """The records of the frame exposed at `now_ns`, waited for. Raises PlayError if they do not come."""
         deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
         while now_ns not in self._frames or any((now_ns, name) not in self._poses for name in self._frames[now_ns]):
             try:
@@ -123,8 +123,10 @@ class Subscriber:
             except queue.Empty:
                 raise PlayError(f"what the daemon says of frame {frame} did not reach the subscriber") from None
             self._take(key, payload, attachment, now_ns)
-        for name in sorted(self._frames.pop(now_ns)):
-            self.records.append(self._record(frame, self._poses.pop((now_ns, name))))
+        names = sorted(self._frames.pop(now_ns))
+        records = [self._record(frame, self._poses.pop((now_ns, name))) for name in names]
+        self.records += records
+        return records
 
     def close(self) -> None:
         for subscriber in self._subscribers:

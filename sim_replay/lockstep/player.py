@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 import socket
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from edge.errors import InputError
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
@@ -21,6 +23,7 @@ from sim_replay.faults.relay import free_port
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
+from sim_replay.pipeline.flight import looped
 from sim_replay.play import PlayError
 from sim_replay.telemetry import read_telemetry
 
@@ -28,16 +31,30 @@ BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: lat
 LEAD_NS = 1_000_000_000  # of telemetry before the first frame
 UAV = "uav1"
 EXIT_BAD_INPUT = 2
+ENDING_S = 3.0  # from hanging up to its end
+
+BeforeFrame = Callable[[int], None]
+AfterFrame = Callable[[int, list[Record]], None]
 
 
 @dataclass(frozen=True)
 class LockstepSettings:
-    """What is played, and where its files go. `frames` None: all."""
+    """What is played: the pictures from `start` to before `stop` (None: to the last), `rounds` times over."""
 
     sequence: PlayedSequence
-    out: Path
     model: Path
-    frames: Sequence[int] | None = None
+    start: int = 0
+    stop: int | None = None
+    rounds: int = 1
+
+    @property
+    def frames(self) -> list[int]:
+        """Numbers of the pictures, in the order they are shown."""
+        return list(range(self.start, len(self.sequence.scene.images))[: self._count]) * self.rounds
+
+    @property
+    def _count(self) -> int | None:
+        return None if self.stop is None else max(self.stop - self.start, 0)
 
 
 @dataclass(frozen=True)
@@ -49,45 +66,48 @@ class Outputs:
 
     def write(self, folder: Path) -> None:
         """poses.jsonl and mavlink.jsonl."""
+        folder.mkdir(parents=True, exist_ok=True)
         for name, records in (("poses", self.poses), ("mavlink", self.mavlink)):
             lines = "".join(json.dumps(record) + "\n" for record in records)
             (folder / f"{name}.jsonl").write_text(lines, encoding="utf-8")
 
 
-def play_lockstep(settings: LockstepSettings, on_frame: Callable[[int], None]) -> Outputs:
-    """Play the sequence; `on_frame` hears each frame's number when its outputs are there.
+def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_frame: AfterFrame) -> Outputs:
+    """Play the sequence. `before_frame` hears each picture's number first and may take its time; `after_frame` hears it
+    again with the poses that came of it.
 
     Raises:
         InputError: the daemon refuses what it is given.
-        PlayError: it ends or does not answer.
+        PlayError: it ends or does not answer; the text has its last words.
     """
-    settings.out.mkdir(parents=True, exist_ok=True)
     said: list[str] = []
-    log = settings.out / "daemon.log"
     with ExitStack() as cleanup:
-        cleanup.callback(lambda: log.write_text("".join(f"{line}\n" for line in said), encoding="utf-8"))
+        folder = Path(cleanup.enter_context(TemporaryDirectory(prefix="uavpose-lockstep-")))
         control = cleanup.enter_context(closing(Control()))
         mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-        config = settings.out / "config.toml"
+        config = folder / "config.toml"
         config.write_text(_config_toml(settings, control.address, mavlink_port, endpoint), encoding="utf-8")
-        daemon = Process(
-            [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config], lambda line, _: said.append(line)
-        )
+        command = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
+        daemon = Process(command, lambda line, _: said.append(line))
         cleanup.callback(daemon.end)
         try:
             control.wait_until_ready(lambda: daemon.exit_code is None)
-            outputs = _fly(settings, control, mavlink_port, endpoint, cleanup, on_frame)
-            control.close()
-            code = daemon.reap()
+            flight = Flight(settings, control, mavlink_port, endpoint)
+            cleanup.callback(flight.close)
+            flight.fly(before_frame, after_frame)
         except PlayError as error:
             raise _because(daemon, said, error) from error
-    if code != 0:
-        raise PlayError(f"the daemon ended with exit code {code}: {said[-1] if said else 'it said nothing'}")
-    return outputs
+        control.close()
+        if (code := daemon.reap()) != 0:
+            raise PlayError(f"the daemon ended with exit code {code}: {said[-1] if said else 'it said nothing'}")
+        return flight.outputs
 
 
 def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputError | PlayError:
     """What the player met, with the daemon's last words if it has ended."""
+    deadline_s = time.monotonic() + ENDING_S
+    while daemon.exit_code is None and time.monotonic() < deadline_s:
+        time.sleep(0.05)
     if daemon.exit_code is None:
         return error
     code = daemon.reap()
@@ -95,28 +115,41 @@ def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputErr
     return InputError(last) if code == EXIT_BAD_INPUT else PlayError(f"{error}: {last}")
 
 
-def _fly(
-    settings: LockstepSettings,
-    control: Control,
-    mavlink_port: int,
-    endpoint: str,
-    cleanup: ExitStack,
-    on_frame: Callable[[int], None],
-) -> Outputs:
-    sequence = settings.sequence
-    frame0_ns = BASE_NS + sequence.frame0_ns
-    autopilot = Autopilot(read_telemetry(sequence.telemetry_csv), BASE_NS, BASE_NS - BOOT_BEFORE_START_NS)
-    mavlink = cleanup.enter_context(closing(MavlinkPeer(autopilot, mavlink_port, frame0_ns)))
-    subscriber = cleanup.enter_context(closing(Subscriber(endpoint, UAV, frame0_ns)))
-    frames = range(len(sequence.scene.images)) if settings.frames is None else settings.frames
-    exposed_ns = [frame0_ns + round(frame * 1e9 / sequence.fps) for frame in frames]
-    stepper = Stepper(control, mavlink, exposed_ns[0] - LEAD_NS)
-    for frame, time_ns in zip(frames, exposed_ns, strict=True):
-        stepper.advance(time_ns)
-        stepper.expose(frame)
-        subscriber.collect(frame, time_ns)
-        on_frame(frame)
-    return Outputs(subscriber.records, mavlink.records)
+class Flight:
+    """Both peers and the clock of one play, once the daemon is warm."""
+
+    def __init__(self, settings: LockstepSettings, control: Control, mavlink_port: int, endpoint: str) -> None:
+        sequence, frames = settings.sequence, settings.frames
+        offset_ns = round(settings.start * 1e9 / sequence.fps)
+        telemetry, first_ns = read_telemetry(sequence.telemetry_csv), sequence.frame0_ns + offset_ns
+        if settings.rounds > 1:
+            round_s = len(frames) / settings.rounds / sequence.fps
+            telemetry, first_ns = looped(telemetry, first_ns, round_s, settings.rounds), 0
+        self._fps = sequence.fps
+        self._frames = frames
+        self._first_ns = BASE_NS + first_ns
+        frame0_ns = self._first_ns - offset_ns
+        autopilot = Autopilot(telemetry, BASE_NS, BASE_NS - BOOT_BEFORE_START_NS)
+        self._subscriber = Subscriber(endpoint, UAV, frame0_ns)
+        self._mavlink = MavlinkPeer(autopilot, mavlink_port, frame0_ns)
+        self._stepper = Stepper(control, self._mavlink, self._first_ns - LEAD_NS)
+
+    @property
+    def outputs(self) -> Outputs:
+        return Outputs(self._subscriber.records, self._mavlink.records)
+
+    def fly(self, before_frame: BeforeFrame, after_frame: AfterFrame) -> None:
+        """All frames, one after the other. Raises PlayError."""
+        for count, frame in enumerate(self._frames):
+            before_frame(frame)
+            exposed_ns = self._first_ns + round(count * 1e9 / self._fps)
+            self._stepper.advance(exposed_ns)
+            self._stepper.expose(frame)
+            after_frame(frame, self._subscriber.collect(frame, exposed_ns))
+
+    def close(self) -> None:
+        self._subscriber.close()
+        self._mavlink.close()
 
 
 class Stepper:

@@ -1,0 +1,173 @@
+"""Two sets of lock-step outputs against each other, field by field. Pure.
+
+Records are reduced to what is held: covariances to standard deviations, numbers to nine digits. Floats may differ
+between machines, since processors round networks' sums differently; on one machine they are the same.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sim_replay.lockstep.player import Outputs
+
+Record = dict[str, Any]
+Key = tuple[Any, ...]
+
+DIGITS = 9
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """How far a field's numbers may be off: `least`, plus `share` of the expected value's (a list's: norm's) size."""
+
+    least: float
+    share: float = 0.0
+
+    def allows(self, expected: Sequence[float]) -> float:
+        return self.least + self.share * math.hypot(*expected)
+
+
+POSITION = Tolerance(0.2, 0.01)  # m
+ROTATION_DEG = 2.0
+DEVIATION = Tolerance(0.02, 0.1)
+# By record and field; what is not here is OTHER if it is a float, and exact if not.
+TOLERANCES = {
+    ("pose", "t_cam_target_m"): POSITION,
+    ("pose", "std"): DEVIATION,
+    ("TARGET_RELATIVE", "x"): Tolerance(2.0),
+    ("TARGET_RELATIVE", "y"): Tolerance(2.0),
+    ("TARGET_RELATIVE", "z"): Tolerance(0.2, 0.01),
+    ("TARGET_RELATIVE", "pos_std"): DEVIATION,
+    ("TARGET_RELATIVE", "yaw_std"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "lat"): Tolerance(300),  # 1e-7 degrees: 3 m
+    ("CAMERA_TRACKING_GEO_STATUS", "lon"): Tolerance(300),
+    ("CAMERA_TRACKING_GEO_STATUS", "alt"): Tolerance(2.0),
+    ("CAMERA_TRACKING_GEO_STATUS", "dist"): Tolerance(0.2, 0.01),
+    ("CAMERA_TRACKING_GEO_STATUS", "h_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "v_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "vel_n"): Tolerance(1.0, 0.05),
+    ("CAMERA_TRACKING_GEO_STATUS", "vel_e"): Tolerance(1.0, 0.05),
+    ("CAMERA_TRACKING_GEO_STATUS", "vel_d"): Tolerance(1.0, 0.05),
+    ("CAMERA_TRACKING_GEO_STATUS", "vel_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "hdg"): Tolerance(math.radians(3.0)),
+    ("CAMERA_TRACKING_GEO_STATUS", "hdg_acc"): DEVIATION,
+}
+OTHER = Tolerance(0.005, 0.01)
+QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
+NAMES = ("kind", "t_ns", "frame", "target", "system", "component")  # what a record is known by
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One thing that is not as expected, in words."""
+
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}"
+
+
+def reduced(outputs: Outputs) -> list[Record]:
+    """The records that a golden file holds: poses first, then MAVLink messages, each in the order they came."""
+    records = []
+    for pose in outputs.poses:
+        std = [math.sqrt(max(pose["covariance"][k][k], 0.0)) for k in range(6)]
+        kept = {name: pose[name] for name in ("t_ns", "frame", "target", "t_cam_target_m", "q_cam_target_wxyz")}
+        records.append({"kind": "pose", **kept, "std": std})
+    for message in outputs.mavlink:
+        fields = {name: value for name, value in message.items() if name != "message"}
+        records.append({"kind": message["message"], **fields})
+    return [{name: _rounded(value) for name, value in record.items()} for record in records]
+
+
+def differences(expected: Iterable[Record], actual: Iterable[Record]) -> list[Difference]:
+    """All that is missing, new or off by more than its tolerance, in the order of time."""
+    old, new = _keyed(expected), _keyed(actual)
+    found = []
+    for key in sorted(old.keys() | new.keys(), key=lambda key: (key[1], str(key))):
+        where = _where(old.get(key) or new[key])
+        if key not in new:
+            found.append(Difference(where, "expected, and did not come"))
+        elif key not in old:
+            found.append(Difference(where, "came, and was not expected"))
+        else:
+            found += [Difference(where, text) for text in _off(old[key], new[key])]
+    return found
+
+
+def _keyed(records: Iterable[Record]) -> dict[Key, Record]:
+    seen: Counter[Key] = Counter()
+    keyed = {}
+    for record in records:
+        name = tuple(record.get(part) for part in NAMES)
+        seen[name] += 1
+        keyed[*name, seen[name]] = record
+    return keyed
+
+
+def _where(record: Record) -> str:
+    told = f"{record['t_ns'] / 1e9:+.3f} s {record['kind']}"
+    if "frame" in record:
+        return f"{told} frame {record['frame']} {record['target']}"
+    return f"{told} from {record['system']}/{record['component']}"
+
+
+def _off(expected: Record, actual: Record) -> list[str]:
+    told = []
+    for field in sorted((expected.keys() | actual.keys()) - set(NAMES)):
+        if field not in expected or field not in actual:
+            told.append(f"{field} {'is new' if field in actual else 'is gone'}")
+            continue
+        text = _field_off(expected["kind"], field, expected[field], actual[field])
+        if text is not None:
+            told.append(text)
+    return told
+
+
+def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
+    said = f"{field} is {_short(actual)}, expected {_short(expected)}"
+    if isinstance(expected, str) and isinstance(actual, str):
+        # Numbers in a sentence are rounded from fields that are held themselves.
+        same = re.sub(r"[-\d.]+", "#", expected) == re.sub(r"[-\d.]+", "#", actual)
+        return None if same else said
+    old, new = _numbers(expected), _numbers(actual)
+    if old is None or new is None or len(old) != len(new):
+        return None if expected == actual else said
+    if field in QUATERNIONS:
+        angle_deg = math.degrees(2.0 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(old, new, strict=True))))))
+        return None if angle_deg <= ROTATION_DEG else f"{said}: {angle_deg:.2f}° apart, {ROTATION_DEG:.0f}° allowed"
+    tolerance = TOLERANCES.get((kind, field))
+    if tolerance is None:
+        if all(isinstance(value, int) for value in (*old, *new)):
+            return None if old == new else said
+        tolerance = OTHER
+    error, allowed = max(abs(a - b) for a, b in zip(old, new, strict=True)), tolerance.allows(old)
+    return None if error <= allowed else f"{said}: {error:.4g} off, {allowed:.4g} allowed"
+
+
+def _numbers(value: Any) -> list[float] | None:
+    values = value if isinstance(value, list) else [value]
+    return values if values and all(isinstance(one, int | float) for one in values) else None
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + " ".join(_short(one) for one in value) + "]"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
+    """How many records there are of each kind."""
+    return dict(Counter(record["kind"] for record in records))

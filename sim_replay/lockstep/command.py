@@ -1,0 +1,127 @@
+"""`uavpose-replay play` in lock-step: at any speed, from any frame, round and round, or a frame at a time."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.progress import Progress
+
+from edge.errors import InputError
+from sim_replay.ground_truth import PlayedSequence, read_sequence
+from sim_replay.lockstep.peers import Record
+from sim_replay.lockstep.player import LockstepSettings, play_lockstep
+
+SLOWEST = 0.25
+GO_ON = "g"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `play` takes beside the sequence, its model and its folder."""
+    group = parser.add_argument_group(
+        "lock-step",
+        "the daemon's clock is the sequence's, and the next frame comes when the outputs of the last one are there; "
+        "writes poses.jsonl and mavlink.jsonl, the same each time. Each of the other options asks for it too",
+    )
+    group.add_argument("--lockstep", action="store_true", help="play so, as fast as the machine can")
+    group.add_argument("--speed", type=_speed, metavar="X", help=f"{SLOWEST} or more times real time, or max")
+    group.add_argument("--start", type=float, metavar="S", help="begin S seconds into the sequence")
+    group.add_argument("--loop", type=int, metavar="N", help="play it N times over, in one flight")
+    group.add_argument("--pause", type=int, metavar="FRAME", help=f"stop before FRAME; Enter shows it, {GO_ON} goes on")
+    group.add_argument("--step", action="store_true", help=f"stop before every frame; Enter shows it, {GO_ON} goes on")
+
+
+def asked_for(args: argparse.Namespace) -> bool:
+    """Whether the parsed options ask for lock-step."""
+    given = (args.speed, args.start, args.loop, args.pause)
+    return bool(args.lockstep or args.step or any(value is not None for value in given))
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    """Play, and write what came out. Raises InputError, PlayError."""
+    sequence = read_sequence(args.sequence)
+    settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=_rounds(args.loop))
+    if args.pause is not None and args.pause not in settings.frames:
+        raise InputError(f"--pause {args.pause}: is none of the frames {settings.frames[0]} to {settings.frames[-1]}")
+    gate = Gate(sequence.fps, args.speed, args.pause, args.step, console.input)
+    told = args.step or args.pause is not None
+
+    with Progress(console=console, disable=told or not console.is_terminal) as progress:
+        task = progress.add_task("playing", total=len(settings.frames))
+
+        def after_frame(frame: int, poses: list[Record]) -> None:
+            progress.advance(task)
+            if told:
+                console.print(_line(frame, poses), highlight=False, soft_wrap=True)
+
+        outputs = play_lockstep(settings, gate.before, after_frame)
+    outputs.write(args.out)
+    text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.mavlink)} MAVLink messages"
+    console.print(f"{text}; written to {args.out}: poses.jsonl, mavlink.jsonl", highlight=False, soft_wrap=True)
+    return 0
+
+
+class Gate:
+    """Holds a frame back until its time has come, or until a person lets it through."""
+
+    def __init__(
+        self, fps: float, speed: float | None, pause: int | None, step: bool, ask: Callable[[str], str]
+    ) -> None:
+        """`speed` None: as fast as it goes; `ask` prompts a person and returns the line, or raises EOFError."""
+        self._period_s = 0.0 if speed is None else 1.0 / (fps * speed)
+        self._pause = pause
+        self._step = step
+        self._ask = ask
+        self._due_s: float | None = None
+
+    def before(self, frame: int) -> None:
+        """Returns when `frame` may be shown."""
+        if self._step or frame == self._pause:
+            self._step = self._person_steps(frame)
+            self._pause = None
+            self._due_s = None
+        now_s = time.monotonic()
+        if self._due_s is not None:
+            time.sleep(max(self._due_s - now_s, 0.0))
+        self._due_s = max(now_s, self._due_s or now_s) + self._period_s
+
+    def _person_steps(self, frame: int) -> bool:
+        try:
+            return self._ask(f"before frame {frame}> ").strip() != GO_ON
+        except EOFError:
+            return False
+
+
+def _line(frame: int, poses: list[Record]) -> str:
+    told = [f"{pose['target']} at {' '.join(f'{x:.2f}' for x in pose['t_cam_target_m'])} m" for pose in poses]
+    return f"frame {frame}: {', '.join(told) or 'no target'}"
+
+
+def _speed(text: str) -> float:
+    if text == "max":
+        return math.inf
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not SLOWEST <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number from {SLOWEST} up nor max")
+    return value
+
+
+def _start(seconds: float | None, sequence: PlayedSequence) -> int:
+    if seconds is None:
+        return 0
+    last_s = (len(sequence.scene.images) - 1) / sequence.fps
+    if not 0.0 <= seconds <= last_s:
+        raise InputError(f"--start {seconds}: the sequence's frames are from 0 to {last_s:.3f} s")
+    return round(seconds * sequence.fps)
+
+
+def _rounds(times: int | None) -> int:
+    if times is not None and times < 1:
+        raise InputError(f"--loop {times}: must be at least 1")
+    return times or 1
