@@ -128,10 +128,12 @@ def longest_silence_s(matches: Sequence[Match], ages: Sequence[tuple[int, float]
     arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages)
     if not arrivals:
         return None
-    seen = np.array(sorted({match.truth.frame for match in matches})) / fps
-    bounds = [*arrivals, max(arrivals[-1], seen[-1] if len(seen) else 0.0)]
-    silences = [after - before for before, after in pairwise(bounds) if ((seen > before) & (seen < after)).any()]
-    return round(max(silences, default=max(np.diff(bounds), default=0.0)), 4)
+    frames = np.unique([match.truth.frame for match in matches])
+    spans = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1) if len(frames) else []
+    views_s = [(span[0] / fps, (span[-1] + 1) / fps) for span in spans]
+    bounds = [*arrivals, max([arrivals[-1], *(stop for _, stop in views_s)])]
+    silences = [min(after, stop) - max(before, start) for before, after in pairwise(bounds) for start, stop in views_s]
+    return round(float(max(silences, default=0.0)), 4)
 
 
 def tracks(matches: Sequence[Match], false_poses: Sequence[TargetPose]) -> dict[str, dict[str, Any]]:

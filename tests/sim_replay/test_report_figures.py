@@ -1,0 +1,134 @@
+"""Figures of what a peer received: known losses, names, ages and covariances, and what is then told of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from msgs.geometry import so3_exp
+from sim_replay.report.continuity import continuity
+from sim_replay.report.peer import CHI2_95, longest_silence_s, nees, peer_figures, range_error_m, rmse, tracks
+from sim_replay.score import Match, TargetPose, Truth
+
+FPS = 10.0
+
+
+def matches(pattern: str, object_id: int = 1, first_frame: int = 0) -> list[Match]:
+    """One frame a character: a digit is a pose of that track, `-` none, a space a frame without the target."""
+    made = []
+    for frame, mark in enumerate(pattern, first_frame):
+        truth = Truth(frame, np.eye(3), np.array([0.0, 0.0, 200.0]), object_id, 12.0)
+        pose = None if mark == "-" else TargetPose(frame, np.eye(3), np.array([0.0, 0.0, 190.0]), track=f"t{mark}")
+        if mark != " ":
+            made.append(Match(truth, pose))
+    return made
+
+
+def test_a_target_that_is_held_has_no_losses() -> None:
+    held = continuity(matches("0000000000"), FPS)
+    assert (held["identity_switches"], held["fragments"], held["reacquired"], held["never_reacquired"]) == (0, 0, 0, 0)
+    assert held["time_to_acquire_s"] == {"median": 0.0, "max": 0.0}
+
+
+def test_losses_names_and_times_are_told() -> None:
+    held = continuity(matches("---00---0011-1--"), FPS)
+    assert held["time_to_acquire_s"]["median"] == pytest.approx(0.3)
+    assert held["identity_switches"] == 1
+    assert held["fragments"] == held["reacquired"] == 2
+    assert held["never_reacquired"] == 1
+    assert held["time_to_reacquire_s"] == {"median": pytest.approx(0.2), "max": pytest.approx(0.3)}
+    assert held["targets"][0]["tracks"] == ["t0", "t1"]
+    assert [loss["frame"] for loss in held["targets"][0]["losses"]] == [5, 12, 14]
+
+
+def test_out_of_view_is_no_loss_and_coming_back_is_a_reacquisition() -> None:
+    held = continuity(matches("0000     --00"), FPS)
+    assert held["fragments"] == 0
+    assert held["reacquired"] == 1
+    assert held["time_to_reacquire_s"]["max"] == pytest.approx(0.2)
+
+
+def test_two_targets_that_swap_names_are_two_switches() -> None:
+    swapped = matches("000111", object_id=1) + matches("111000", object_id=2)
+    assert continuity(swapped, FPS)["identity_switches"] == 2
+
+
+def test_one_that_is_never_found_is_counted_and_has_no_time() -> None:
+    held = continuity(matches("0000") + matches("----", object_id=2), FPS)
+    assert held["never_acquired"] == 1
+    assert held["time_to_acquire_s"] == {"median": 0.0, "max": 0.0}
+
+
+def drawn(count: int, honesty: float) -> list[Match]:
+    """Truths scattered about estimates by a correlated covariance that is told `honesty` times as large."""
+    chance = np.random.default_rng(7)
+    root = np.array([0.5, 0.5, 4.0, 0.02, 0.02, 0.02])[:, None] * np.tril(chance.normal(size=(6, 6)))
+    P = root @ root.T + np.diag([0.1, 0.1, 1.0, 1e-4, 1e-4, 1e-4])
+    made = []
+    for frame, error in enumerate(chance.multivariate_normal(np.zeros(6), P, size=count)):
+        R_est, t_est = so3_exp(chance.normal(size=3)), np.array([3.0, -2.0, 250.0])
+        truth = Truth(frame, so3_exp(error[3:]) @ R_est, t_est + error[:3], 1, 12.0)
+        made.append(Match(truth, TargetPose(frame, R_est, t_est, covariance=honesty * P)))
+    return made
+
+
+def test_nees_of_an_honest_covariance_is_its_degrees_of_freedom() -> None:
+    told = nees(drawn(3000, 1.0))
+    assert told is not None
+    for part, dof in (("pose", 6), ("position", 3), ("rotation", 3)):
+        assert told[part]["mean"] == pytest.approx(dof, rel=0.1)
+        assert told[part]["within_95pct"] == pytest.approx(0.95, abs=0.02)
+    boastful = nees(drawn(3000, 0.25))
+    assert boastful is not None
+    assert boastful["pose"]["mean"] == pytest.approx(4 * told["pose"]["mean"], rel=1e-3)
+    assert nees(matches("000")) is None
+
+
+def test_the_bounds_are_those_of_chi_square() -> None:
+    assert {dof: pytest.approx(chi2.ppf(0.95, dof), abs=1e-3) for dof in CHI2_95} == CHI2_95
+
+
+def test_rmse_and_bias_of_a_pose_that_is_short_and_turned_about_the_optical_axis() -> None:
+    turned = []
+    for frame, roll_rad in enumerate((0.1, -0.1)):
+        truth = Truth(frame, np.eye(3), np.array([0.0, 0.0, 200.0]), 1, 12.0)
+        R_est = so3_exp([0.0, 0.0, roll_rad])
+        turned.append(Match(truth, TargetPose(frame, R_est, np.array([3.0, 0.0, 180.0]))))
+    told = rmse(turned)
+    assert (told["x_m"], told["y_m"], told["z_m"]) == (3.0, 0.0, 20.0)
+    angles = [told[name] for name in ("roll_deg", "pitch_deg", "yaw_deg")]
+    assert max(value for value in angles if value is not None) == pytest.approx(np.rad2deg(0.1), rel=1e-3)
+    bias = range_error_m(turned)["mean"]
+    assert bias == pytest.approx(np.hypot(3, 180) - 200, abs=1e-3)
+
+
+def test_silence_counts_only_while_a_target_is_to_be_seen() -> None:
+    seen = matches("00000-----00000     00000")
+    received = [(m.truth.frame, 20.0) for m in seen if m.estimate is not None]
+    assert longest_silence_s(seen, received, FPS) == pytest.approx(0.6)
+    unbroken = matches("00000") + matches("00000", first_frame=15)
+    assert longest_silence_s(unbroken, [(m.truth.frame, 20.0) for m in unbroken], FPS) == pytest.approx(0.1, abs=0.005)
+    assert longest_silence_s(seen, [], FPS) is None
+
+
+def test_tracks_tell_what_they_followed_and_what_was_false() -> None:
+    seen = matches("0011")
+    false = [TargetPose(2, np.eye(3), np.array([90.0, 0.0, 200.0]), track="t7")]
+    told = tracks(seen, false)
+    assert {name: (track["poses"], track["false_poses"]) for name, track in told.items()} == {
+        "t0": (2, 0),
+        "t1": (2, 0),
+        "t7": (1, 1),
+    }
+    assert (told["t1"]["first_frame"], told["t1"]["last_frame"]) == (2, 3)
+    assert told["t1"]["range_error_m"] == -10.0
+
+
+def test_nothing_received_is_told_with_nulls_and_not_nan() -> None:
+    told = peer_figures(4, FPS, matches("----"), [], [])
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert told["rmse"]["z_m"] is None
+    assert told["age_ms"]["p99"] is None

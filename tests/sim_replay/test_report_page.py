@@ -1,0 +1,145 @@
+"""`uavpose-replay score FLIGHT` on a recorded flight, and report.html in a real browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import sync_playwright
+
+from sim_replay.cli import main
+from sim_replay.ground_truth import PlayedSequence, read_sequence
+from sim_replay.play import Recording
+from sim_replay.report.flight_files import RecordedFlight, read_flight, write_flight
+from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
+
+START_NS, UTC_NS, FPS = 50_000_000_000, 1_700_000_000_000_000_000, 30.0
+PLOTS = {"pose", "trajectory", "timeline", "ages", "range"}
+BROWSER = next((path for name in ("chromium", "google-chrome") if (path := shutil.which(name))), None)
+
+
+@pytest.fixture
+def flown(dark_spot_scene: Path) -> PlayedSequence:
+    """The scene of five frames with all that it takes to have been flown."""
+    identity = np.eye(3).tolist()
+    settings = f"fps = {FPS}\nt0_ns = 0\nR_body_cam = {identity}\nt_body_cam_m = [0.0, 0.0, 0.0]\n"
+    (dark_spot_scene / "sequence.toml").write_text(settings)
+    row = np.zeros(len(COLUMNS) - 1)
+    row[0] = 1.0
+    write_telemetry(dark_spot_scene / "telemetry.csv", Telemetry(np.array([0, 10**9]), np.stack([row, row])))
+    return read_sequence(dark_spot_scene)
+
+
+def recording(sequence: PlayedSequence, frames: set[int]) -> Recording:
+    """Poses of these frames at both peers, 10 m short, with a covariance that allows for it."""
+    made = Recording(START_NS, UTC_NS, 14550, "tcp/127.0.0.1:7448", 0, {"dropped": 1})
+    for truth in sequence.scene.truths:
+        if truth.frame not in frames:
+            continue
+        capture_ns = START_NS + round(truth.frame * 1e9 / FPS)
+        t_m = (truth.t_cam_target_m * 0.95).tolist()
+        pose: dict[str, Any] = {"t_cam_target_m": t_m, "q_cam_target_wxyz": [1.0, 0.0, 0.0, 0.0]}
+        covariance = np.diag([4.0, 4.0, 100.0, 0.01, 0.01, 0.01]).tolist()
+        stamp = {"capture_utc_ns": capture_ns + UTC_NS, "age_ms": 14.0, "covariance": covariance}
+        made.take("subscriber", {"event": "pose", "target": "t0", **stamp, **pose})
+        times = {"capture_utc_us": (capture_ns + UTC_NS) // 1000, "received_ns": capture_ns + 12_000_000}
+        made.take("autopilot", {"event": "target_relative", "target": 0, **times, **pose})
+    for second, message in enumerate(("init; waiting for the camera", "tracking")):
+        values = {"frame_rate_hz": "30.0", "dropped": "1"}
+        stamp_ns = START_NS + UTC_NS + (second - 1) * 10**9
+        record = {"event": "diagnostics", "stamp_utc_ns": stamp_ns, "message": message, "values": values}
+        made.take("subscriber", record)
+    made.take("autopilot", {"event": "summary", "received": {"TARGET_RELATIVE": 2}, "refused": {}})
+    return made
+
+
+@pytest.fixture
+def flight(flown: PlayedSequence, tmp_path: Path) -> Path:
+    """A recorded flight that lost its target in frame 1."""
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    model = {"file": "<b>model</b>.onnx", "sha256": "ab" * 32, "precision": "int8"}
+    write_flight(folder, RecordedFlight(flown.scene.folder, model, recording(flown, {0, 2, 3})))
+    return folder
+
+
+def test_a_recorded_flight_reads_back_as_it_was(flown: PlayedSequence, tmp_path: Path) -> None:
+    made = recording(flown, {0, 1, 2, 3})
+    write_flight(tmp_path, RecordedFlight(flown.scene.folder, {"file": "m"}, made))
+    back = read_flight(tmp_path)
+    assert back.recording == made
+    assert back.sequence == flown.scene.folder.resolve()
+
+
+def test_the_command_scores_what_each_peer_received(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["score", str(flight), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == json.loads((flight / "score.json").read_text())
+    assert told["overall"]["recall"] == 0.75
+    for name, age_ms in (("subscriber", 14.0), ("autopilot", 12.0)):
+        peer = told["peers"][name]
+        assert peer["poses"] == 3
+        assert peer["age_ms"]["p50"] == pytest.approx(age_ms, abs=0.01)
+        assert peer["range_error_m"]["mean_rel"] == pytest.approx(-0.05)
+        assert peer["continuity"]["fragments"] == 1
+    assert told["peers"]["subscriber"]["nees"]["pose"]["within_95pct"] == 1.0
+    assert told["peers"]["autopilot"]["nees"] is None
+    frames = [json.loads(line) for line in (flight / "frames.jsonl").read_text().splitlines()]
+    assert [frame["subscriber"]["targets"][0]["track"] for frame in frames[:4]] == ["t0", None, "t0", "t0"]
+    assert frames[4]["subscriber"]["targets"] == []
+
+
+def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:
+    assert main(["score", str(flight)]) == 0
+    assert BROWSER is not None, "no chromium: sh deploy/bootstrap.sh dev installs it"
+    alone = flight / "elsewhere"
+    alone.mkdir()
+    page_file = shutil.copy(flight / "report.html", alone)
+    complaints, asked = [], []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1360, "height": 900})
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(Path(page_file).as_uri())
+        page.wait_for_function("document.querySelector('video').readyState >= 2")
+        boxes = {plot.get_attribute("data-plot"): plot.bounding_box() for plot in page.locator("svg[data-plot]").all()}
+        drawn = [page.locator(f"svg[data-plot={name}] path").count() for name in PLOTS]
+        broken = page.evaluate("[...document.images].filter(image => !image.complete || !image.naturalWidth).length")
+        sideways = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+        moments, text = page.locator(".moments figure").count(), page.inner_text("body")
+        page.screenshot(path=flight / "report.png", full_page=True)
+        browser.close()
+    assert complaints == []
+    assert all(url.startswith(("file:", "data:")) for url in asked), asked
+    assert set(boxes) == PLOTS
+    assert all(box is not None and box["width"] > 800 and box["height"] > 150 for box in boxes.values()), boxes
+    assert min(drawn) > 20
+    assert (broken, sideways) == (0, 0)
+    assert moments == 1  # five frames last a sixth of a second
+    assert "<b>model</b>.onnx" in text
+    assert "waiting for the camera" in text
+    assert "75.0 %" in text
+
+
+def test_a_flight_that_is_none_or_is_damaged_is_named(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (flight / "received.jsonl").write_text('{"peer": "subscriber"}\n')
+    spoiled = tmp_path / "spoiled"
+    spoiled.mkdir()
+    (spoiled / "flight.json").write_text('{"sequence": "x"}')
+    for arguments, named in (
+        ([tmp_path / "nowhere"], "nowhere/flight.json"),
+        ([spoiled], "'start_at_ns' is missing"),
+        ([flight], "received.jsonl: line 1"),
+        ([], "FLIGHT"),
+        ([flight, "--dataset", tmp_path], "FLIGHT"),
+    ):
+        assert main(["score", *map(str, arguments)]) == 2
+        assert named in capsys.readouterr().err
