@@ -44,7 +44,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         own_ship = OwnShipBuffer(gimballed=config.camera.mount == "gimbal")
         requests = RequestQueue()
         board = StatusBoard(file, model, camera_info)
-        outlets = start_outlets(board, own_ship, requests, cleanup)
+        outlets = start_outlets(board, own_ship, requests, reloader.ask_for, cleanup)
         estimator = warm_estimator(model, config.estimator.max_targets, camera_info)
         pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader)
         # What lives by now lives to the end: the collector need not walk it between frames.

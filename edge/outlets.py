@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from edge.health import Condition, HealthSnapshot, HealthState
-from edge.requests import RequestQueue
+from edge.requests import AskReload, RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import Report
 
@@ -68,7 +68,9 @@ class Outlets:
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
 
 
-def start_outlets(board: StatusBoard, own_ship: OwnShipBuffer, requests: RequestQueue, cleanup: ExitStack) -> Outlets:
+def start_outlets(
+    board: StatusBoard, own_ship: OwnShipBuffer, requests: RequestQueue, reload: AskReload, cleanup: ExitStack
+) -> Outlets:
     """Start the enabled links, to be stopped by `cleanup`. A link that is off is not even imported.
 
     Over zenoh the board answers who asks.
@@ -92,7 +94,7 @@ def start_outlets(board: StatusBoard, own_ship: OwnShipBuffer, requests: Request
         )
         cleanup.callback(recorder.stop)
         with file.blame("zenoh", "listen"):
-            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests)
+            zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)
             zenoh.start()
         if zenoh.session is not None:

@@ -1,4 +1,4 @@
-"""SIGHUP: the configuration read again, and a new model put in between two frames; what is wrong changes nothing.
+"""SIGHUP or a command: the configuration read again, a new model put in between two frames; what is wrong is refused.
 
 | key                             | when it is changed                    |
 |---------------------------------|---------------------------------------|
@@ -23,6 +23,7 @@ from edge.config import Config, ConfigFile, load_config
 from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model, load_model
+from edge.requests import ReloadOutcome
 from edge.types import CameraInfo, Frame, FrameMeta
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,12 @@ class Reloaded:
 
     file: ConfigFile  # what flies from now on: the old, but for what can be changed in flight
     estimator: Estimator  # warm
-    said: str  # a sentence for the operator
+    outcome: ReloadOutcome
+
+    @property
+    def said(self) -> str:
+        """A sentence for the operator."""
+        return self.outcome.said
 
 
 def load_configured(file: ConfigFile) -> Model:
@@ -99,21 +105,34 @@ def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Relo
         said.append(f"taken over: {', '.join(live)}")
     if changed:
         said.append(f"needs a restart: {', '.join(changed)}")
-    return Reloaded(file, estimator, f"reloaded: {'; '.join(said) or 'nothing has changed'}")
+    sentence = f"reloaded: {'; '.join(said) or 'nothing has changed'}"
+    outcome = ReloadOutcome(True, sentence, estimator.model.sha256, tuple(live), tuple(changed))
+    return Reloaded(file, estimator, outcome)
 
 
 class Reloader:
-    """Asked by a signal, works in a thread of its own, delivers to the loop; one reload at a time."""
+    """Asked by a signal or a command, works in a thread of its own, delivers to the loop; one reload at a time."""
 
     def __init__(self) -> None:
         self._asked = False
         self._ready: Reloaded | None = None
         self._taken = threading.Event()
         self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._answer: Callable[[ReloadOutcome], None] | None = None  # of what is asked for, or under way
 
     def ask(self) -> None:
         """From any thread; the loop sees it at its next turn."""
         self._asked = True
+
+    def ask_for(self, answer: Callable[[ReloadOutcome], None]) -> bool:
+        """The same, and `answer` hears the outcome on the reload's thread; False if another one waits for its own."""
+        with self._lock:
+            if self._answer is not None or (self._thread is not None and self._thread.is_alive()):
+                return False
+            self._answer = answer
+        self._asked = True
+        return True
 
     def take(
         self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
@@ -136,20 +155,22 @@ class Reloader:
     ) -> None:
         log.info("reload: reading %s", flying.path)
         try:
-            self._ready = reload(flying, estimator, camera)
-        except InputError as error:
-            _refuse(str(error), event)
+            ready = reload(flying, estimator, camera)
         except Exception as error:  # whatever is wrong with a new model, the old one flies on
-            _refuse(repr(error), event)
+            reason = str(error) if isinstance(error, InputError) else repr(error)
+            text = f"reload refused, flying on as before: {reason}"
+            log.error("%s", text)
+            event(logging.ERROR, text)
+            outcome = ReloadOutcome(False, text, estimator.model.sha256)
         else:
+            outcome, self._ready = ready.outcome, ready
+            del ready
             # `estimator` is let go of here, when the loop has the new one: freeing its memory takes time.
             self._taken.wait()
-
-
-def _refuse(reason: str, event: Callable[[int, str], None]) -> None:
-    text = f"reload refused, flying on as before: {reason}"
-    log.error("%s", text)
-    event(logging.ERROR, text)
+        with self._lock:
+            answer, self._answer = self._answer, None
+        if answer is not None:
+            answer(outcome)
 
 
 def _keys(section: Any) -> dict[str, Any]:

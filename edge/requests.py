@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 WAITING_MAX = 8
@@ -21,6 +22,21 @@ class StopTracking:
 
 
 Request = TrackBox | StopTracking
+
+
+@dataclass(frozen=True)
+class ReloadOutcome:
+    """What came of a reload of model and configuration."""
+
+    flies: bool  # False: refused, all is as before
+    said: str  # a sentence for a person
+    model_sha256: str  # that flies now
+    taken_over: tuple[str, ...] = ()  # `[section] key`
+    needs_restart: tuple[str, ...] = ()
+
+
+# Asks for a reload, whose outcome is told once, from another thread; False, and nothing is told: one is under way.
+AskReload = Callable[[Callable[[ReloadOutcome], None]], bool]
 
 
 class RequestQueue:

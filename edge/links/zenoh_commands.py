@@ -5,6 +5,7 @@
 | `track`  | `{"box": [x0, y0, x1, y1]}`       | look for a target there; shares of the picture's width and height |
 | `stop`   | `{}`                              | drop all targets                                                 |
 | `record` | `{"on": true}` or `{"on": false}` | begin a recording, or end it                                     |
+| `reload` | `{}`                              | read the configuration and the model again; answered when it is done |
 | `rate`   | `{"max_hz": 10}` or `{"max_hz": null}` | send poses and odometry no more often; null: every one      |
 
 The answer is `{"ok": true, "command": ..., "done": ...}` or `{"ok": false, "command": ..., "error": "a sentence"}`.
@@ -22,7 +23,7 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from zenoh import handlers
 
-from edge.requests import Request, StopTracking, TrackBox
+from edge.requests import AskReload, ReloadOutcome, Request, StopTracking, TrackBox
 from msgs.recording import Recorder
 from msgs.settings import dotted, faults_of
 
@@ -59,8 +60,12 @@ class Rate(_Body):
     max_hz: Annotated[float, Field(gt=0.0, le=240.0, allow_inf_nan=False)] | None
 
 
-Command = Track | Stop | Record | Rate
-COMMANDS: dict[str, type[Command]] = {"track": Track, "stop": Stop, "record": Record, "rate": Rate}
+class Reload(_Body):
+    pass
+
+
+Command = Track | Stop | Record | Rate | Reload
+COMMANDS: dict[str, type[Command]] = {"track": Track, "stop": Stop, "reload": Reload, "record": Record, "rate": Rate}
 
 
 class Refused(Exception):
@@ -74,6 +79,7 @@ class Actions:
     request: Callable[[Request], bool] | None  # False: too many wait
     recorder: Recorder | None
     set_rate: Callable[[float | None], None]
+    reload: AskReload | None
 
 
 def commands_key(uav: str) -> str:
@@ -94,7 +100,7 @@ def parse(name: str, body: bytes) -> Command:
         raise Refused(f"{key}: {first.reason}" if key else first.reason) from error
 
 
-def carry_out(command: Command, actions: Actions) -> dict[str, Any]:
+def carry_out(command: Track | Stop | Record | Rate, actions: Actions) -> dict[str, Any]:
     """Do it and say what was done, or raise Refused. Never waits."""
     match command:
         case Record(on=on):
@@ -119,27 +125,53 @@ def carry_out(command: Command, actions: Actions) -> dict[str, Any]:
             return command.model_dump()
 
 
-def answer(name: str, body: bytes, actions: Actions) -> dict[str, Any]:
-    """What goes back."""
+def answer(name: str, body: bytes, actions: Actions, reply: Callable[[dict[str, Any]], None]) -> None:
+    """Have `reply` send what goes back: at once, or from another thread when a reload is over."""
+
+    def done(what: dict[str, Any]) -> None:
+        reply({"ok": True, "command": name, "done": what})
+
+    def refused(why: str) -> None:
+        reply({"ok": False, "command": name, "error": why})
+
+    def reloaded(outcome: ReloadOutcome) -> None:
+        if not outcome.flies:
+            return refused(outcome.said)
+        keys = {"taken_over": list(outcome.taken_over), "needs_restart": list(outcome.needs_restart)}
+        return done({"said": outcome.said, "model_sha256": outcome.model_sha256, **keys})
+
     try:
-        return {"ok": True, "command": name, "done": carry_out(parse(name, body), actions)}
+        command = parse(name, body)
+        if not isinstance(command, Reload):
+            done(carry_out(command, actions))
+        elif actions.reload is None:
+            raise Refused("this vehicle does not reload")
+        elif not actions.reload(reloaded):
+            raise Refused("a reload is under way; try again")
     except Refused as error:
-        return {"ok": False, "command": name, "error": str(error)}
+        refused(str(error))
 
 
 def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zenoh.Queryable:
     """Answer commands until the queryable is undeclared, on zenoh's receiving thread."""
 
     def on_query(query: zenoh.Query) -> None:
-        with query:
-            key = str(query.key_expr)
-            if "*" in key:
-                # One word must not turn all vehicles at once, nor run every command.
+        key = str(query.key_expr)
+        if "*" in key:
+            # One word must not turn all vehicles at once, nor run every command.
+            with query:
                 query.reply_err(b'{"ok": false, "error": "name one vehicle and one command"}')
-                return
-            body = b"" if query.payload is None else query.payload.to_bytes()
-            said = answer(key.rpartition("/")[2], body, actions)
+            return
+
+        def reply(said: dict[str, Any]) -> None:
             log.info("command over zenoh: %s", said)
-            query.reply(key, json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
+            try:
+                with query:
+                    query.reply(key, json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
+            except zenoh.ZError as error:
+                log.warning("command over zenoh: not answered: %s", error)
+
+        body = b"" if query.payload is None else query.payload.to_bytes()
+        answer(key.rpartition("/")[2], body, actions, reply)
 
     return session.declare_queryable(commands_key(uav), handlers.Callback(on_query, indirect=False))

@@ -24,7 +24,7 @@ from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
 from edge.links.outgoing import sendable
 from edge.links.zenoh_commands import Actions, declare_commands
-from edge.requests import RequestQueue
+from edge.requests import AskReload, RequestQueue
 from edge.types import Mount, Report
 from msgs import topics
 from msgs.cdr import Log, Payload
@@ -63,9 +63,11 @@ class ZenohLink:
         mount: Mount,
         recorder: Recorder | None = None,
         requests: RequestQueue | None = None,
+        reload: AskReload | None = None,
     ) -> None:
         self._settings = settings
         self._requests = requests
+        self._reload = reload
         self._recorder = recorder
         self._vehicle_name = vehicle_name
         self._mount = mount
@@ -165,7 +167,7 @@ class ZenohLink:
             desk = Desk(node, self._recorder, self._vehicle_name, self._mount, self._settings.max_age_ms)
             if session is not None and self._settings.commands:
                 request = self._requests.put if self._requests is not None else None
-                actions = Actions(request, self._recorder, desk.set_pose_rate)
+                actions = Actions(request, self._recorder, desk.set_pose_rate, self._reload)
                 stack.enter_context(declare_commands(session, self._vehicle_name, actions))
             while True:
                 mail = self._take()

@@ -1,4 +1,4 @@
-"""`uavpose-ground command`: tell one vehicle to track, stop, record or send less, and print its answer."""
+"""`uavpose-ground command`: tell one vehicle to track, stop, reload, record or send less, and print its answer."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from msgs.ground.feed import session
 from msgs.session import TlsFiles
 
 ANSWER_S = 5.0
+RELOAD_ANSWER_S = 60.0  # a model is loaded and warmed up first
 EXIT_REFUSED = 1
 
 
 def body(name: str, words: Sequence[str]) -> dict[str, Any]:
-    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `stop`, `record on|off`, `rate HZ|all`.
+    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `stop`, `reload`,
+    `record on|off`, `rate HZ|all`.
 
     Raises InputError.
     """
@@ -26,7 +28,7 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
         match name, *words:
             case ["track", _, _, _, _]:
                 return {"box": [float(word) for word in words]}
-            case ["stop"]:
+            case ["stop" | "reload"]:
                 return {}
             case ["record", ("on" | "off") as state]:
                 return {"on": state == "on"}
@@ -35,7 +37,7 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{name}: {error}") from error
     raise InputError("a command is one of: track LEFT TOP RIGHT BOTTOM (shares of the picture, 0 to 1); stop; "
-                     "record on|off; rate HZ|all")  # fmt: skip
+                     "reload; record on|off; rate HZ|all")  # fmt: skip
 
 
 def ask(
@@ -71,6 +73,6 @@ def command(
     with session(endpoint, tls, stop, say) as opened:
         answer = {"ok": False, "command": name, "error": f"no link to {endpoint}"}
         if opened is not None:
-            answer = ask(opened, uav, name, asked)
+            answer = ask(opened, uav, name, asked, RELOAD_ANSWER_S if name == "reload" else ANSWER_S)
     print(json.dumps(answer))
     return 0 if answer["ok"] is True else EXIT_REFUSED

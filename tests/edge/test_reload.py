@@ -4,15 +4,19 @@ import hashlib
 import json
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.config import Config
-from edge.reload import needs_restart, with_live_keys
+from edge.reload import Reloader, needs_restart, with_live_keys
+from edge.requests import ReloadOutcome
 from edge.status import ask
 from msgs.client import connect, subscribe
 
@@ -94,6 +98,42 @@ def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Pa
     config.write_text(good)
     flight.process.send_signal(signal.SIGHUP)
     assert "nothing has changed" in flight.until("reloaded: ")
+
+
+def commanded(port: int, *words: str) -> dict[str, Any]:
+    """What `uavpose-ground command` prints; its exit code must agree."""
+    command = [sys.executable, "-m", "msgs.ground.cli", "command", "-e", f"tcp/127.0.0.1:{port}", "uav1", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    said = json.loads(done.stdout)
+    assert done.returncode == (0 if said["ok"] else 1)
+    return dict(said)
+
+
+def test_the_ground_commands_a_reload_and_is_told_how_it_went(
+    flight: Flight, tmp_path: Path, swaying: Path, port: int
+) -> None:
+    model, config = tmp_path / "flown.onnx", tmp_path / "config.toml"
+    good = toml(swaying, model, port)
+    write_toy_model(model, name="another")
+    config.write_text(toml(swaying, model, port, "[estimator]\nacquire_every_n = 50\n", fps=11))
+    said = commanded(port, "reload")
+    assert said["ok"], said
+    assert said["done"]["model_sha256"] == sha256(model) == model_hash(port)
+    assert said["done"]["taken_over"] == ["[estimator] acquire_every_n"]
+    assert said["done"]["needs_restart"] == ["[camera] fps"]
+    config.write_text(good + "[health]\nmood = 3\n")
+    said = commanded(port, "reload")
+    assert not said["ok"]
+    assert "reload refused, flying on as before: " in said["error"]
+    assert "[health] mood: unknown key" in said["error"]
+    assert flight.process.poll() is None
+
+
+def test_one_reload_at_a_time() -> None:
+    reloader, told = Reloader(), list[ReloadOutcome]()
+    assert reloader.ask_for(told.append)
+    assert not reloader.ask_for(told.append)
+    assert told == []
 
 
 def config_of(**sections: dict[str, object]) -> Config:

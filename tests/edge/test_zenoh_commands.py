@@ -119,14 +119,16 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
         ("track", b'{"box": [0.4, 0.1, 0.2, 0.3]}', "a box is [left, top, right, bottom]"),
         ("track", b'{"box": [0.1, 0.1, 1.2, 0.3]}', "box.2: Input should be less than or equal to 1"),
         ("track", b'{"box": [0.1, 0.1, NaN, 0.3]}', "box.2: Input should be a finite number"),
-        ("track", b"{}", "box: Field required"),
+        ("track", b"{}", "box: is missing"),
         ("record", b'{"on": "yes"}', "on: Input should be a valid boolean"),
-        ("record", b'{"on": true, "path": "/etc"}', "path: Extra inputs are not permitted"),
+        ("record", b'{"on": true, "path": "/etc"}', "path: unknown key"),
         ("rate", b'{"max_hz": 0}', "max_hz: Input should be greater than 0"),
+        ("reload", b'{"file": "/etc/passwd"}', "file: unknown key"),
+        ("reload", b"{}", "this vehicle does not reload"),
         ("stop", b"[]", "Input should be an object"),
         ("stop", b"\xff\x00", "Invalid JSON"),
         ("stop", b" " * 5000, "a body of 5000 bytes is too long"),
-        ("self_destruct", b"{}", "no such command; there are track, stop, record, rate"),
+        ("self_destruct", b"{}", "no such command; there are track, stop, reload, record, rate"),
     ],
 )
 def test_what_makes_no_sense_is_refused(tmp_path: Path, name: str, body: bytes, error: str) -> None:
@@ -162,7 +164,9 @@ def test_with_commands_off_nothing_answers(tmp_path: Path) -> None:
     st.binary(max_size=60) | st.from_regex(r'\{"[a-z_]{0,6}": .{0,20}\}').map(str.encode),
 )
 def test_no_body_does_more_than_be_refused(name: str, body: bytes) -> None:
-    said = answer(name, body, Actions(None, None, lambda _: None))
+    answers: list[dict[str, Any]] = []
+    answer(name, body, Actions(None, None, lambda _: None, None), answers.append)
+    (said,) = answers
     assert said["ok"] is (name == "rate" and said.get("done") is not None)
     assert json.loads(json.dumps(said)) == said
 
