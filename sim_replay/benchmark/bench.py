@@ -49,7 +49,8 @@ def _measure(kind: Kind, seconds: float, worker: int, tell: Tell, stopped: Stopp
 def _frames(seconds: float, worker: int) -> Measured:
     """Frames of fw-uav6d, drawn, labelled, compressed and written as `generate` does."""
     preset = load_preset("fw-uav6d")
-    plan = plan_dataset(preset, 0)[worker]
+    plans = plan_dataset(preset, 0)
+    plan = plans[worker % len(plans)]
     with tempfile.TemporaryDirectory() as folder:
         job = Job(preset, Path(folder), "uavpose-replay bench", {plan.index: plan.focal_px})
         film = job.film(plan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import InputError
-from sim_replay.airframes import AIRFRAMES
-from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
 
 Image = NDArray[np.uint8]
 COLUMNS, ROWS = 4, 5
@@ -41,7 +40,7 @@ def _inset(image_bgr: Image, box: NDArray[np.float64]) -> Image:
     return inset
 
 
-def tile(image_bgr: Image, frame: BopFrame) -> Image:
+def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
     """A small picture [225, 400, 3] of the frame [H, W, 3]: boxes, the first target enlarged, its name and range."""
     scale = np.array(TILE_WH_PX) / image_bgr.shape[1::-1]
     out = np.asarray(cv2.resize(image_bgr, TILE_WH_PX, interpolation=cv2.INTER_AREA), np.uint8)
@@ -55,16 +54,15 @@ def tile(image_bgr: Image, frame: BopFrame) -> Image:
         left = TILE_WH_PX[0] - INSET_PX if middle[0] < 0.5 * TILE_WH_PX[0] else 0
         top = TILE_WH_PX[1] - INSET_PX if middle[1] < 0.5 * TILE_WH_PX[1] else 0
         out[top : top + INSET_PX, left : left + INSET_PX] = _inset(image_bgr, boxes[0])
-    _caption(out, _words(frame))
+    _caption(out, _words(frame, names))
     return out
 
 
-def _words(frame: BopFrame) -> str:
+def _words(frame: BopFrame, names: Mapping[int, str]) -> str:
     if not frame.targets:
         return "no target"
     first = frame.targets[0]
-    known = 1 <= first.object_id <= len(AIRFRAMES)
-    name = AIRFRAMES[first.object_id - 1].name if known else f"object {first.object_id}"
+    name = names.get(first.object_id, f"object {first.object_id}")
     more = f" and {len(frame.targets) - 1} more" if len(frame.targets) > 1 else ""
     return f"{name} {np.linalg.norm(first.t_cam_target_m):.0f} m{more}"
 
@@ -93,8 +91,9 @@ def _chosen(scenes: Sequence[BopScene]) -> list[tuple[BopScene, BopFrame]]:
 def contact_sheet(dataset: Path) -> Image:
     """The grid [H, W, 3]. Raises InputError."""
     try:
-        chosen = _chosen(find_scenes(dataset))
-        tiles = [tile(scene.image_bgr(frame), frame) for scene, frame in chosen]
+        scenes = find_scenes(dataset)
+        names = object_names(scenes[0].root)
+        tiles = [tile(scene.image_bgr(frame), frame, names) for scene, frame in _chosen(scenes)]
     except BopError as error:
         raise InputError(str(error)) from error
     if not tiles:

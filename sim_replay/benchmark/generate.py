@@ -21,7 +21,7 @@ from sim_replay.benchmark.crew import CrewError, available_cores, crew
 from sim_replay.benchmark.lenses import lenses_of
 from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, write_manifest
 from sim_replay.benchmark.plan import SequencePlan, plan_dataset
-from sim_replay.benchmark.preset import Preset, load_preset, preset_text
+from sim_replay.benchmark.preset import Preset, parse_preset, preset_text
 from sim_replay.benchmark.progress import Report, flights_bar
 from sim_replay.benchmark.sequence_files import FrameNews, Job, make_sequence
 from sim_replay.bop import write_models
@@ -29,8 +29,8 @@ from sim_replay.bop import write_models
 
 def run(args: argparse.Namespace) -> int:
     """Make the dataset. Exit codes: 0 made, 1 a worker could not go on. Raises InputError."""
-    place_and_text = preset_text(args.preset)
-    preset = load_preset(args.preset)
+    place, text = preset_text(args.preset)
+    preset = parse_preset(place, text)
     plans = _plans(preset, args)
     chosen = _chosen(plans, args.split, args.sequences)
     backdrops = _backdrops(args.backdrops)
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     if workers < 1:
         raise InputError("--workers: must be at least 1")
     with _alone_in(args.out):
-        claim(args.out, recipe, place_and_text[1], args.resume)
+        claim(args.out, recipe, text, args.resume)
         job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
         write_manifest(job, recipe, plans)
         names = {airframe_id(name) + 1: name for name in preset.airframe_names()}
@@ -116,7 +116,7 @@ def _command(args: argparse.Namespace) -> str:
     words += ["--every", str(args.every)] if args.every != 1 else []
     words += [f"--{name.replace('_', '-')}" for name in ("labels_only", "undistorted") if getattr(args, name)]
     words += ["--backdrops", str(args.backdrops)] if args.backdrops else []
-    return shlex.join(words).replace('"', "'")
+    return shlex.join(words)
 
 
 @contextmanager

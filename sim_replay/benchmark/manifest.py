@@ -11,7 +11,7 @@ from edge.errors import InputError
 from msgs.settings import read_text, read_toml
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import SPLITS
-from sim_replay.benchmark.scene_store import is_finished, replace_text
+from sim_replay.benchmark.scene_store import is_finished, replace_text, toml_string
 from sim_replay.benchmark.sequence_files import Job
 
 FILE = "dataset.toml"
@@ -24,7 +24,7 @@ PACKAGES = ("mf-uavpose6d-edge", "numpy", "opencv-python-headless", "moderngl", 
 class Recipe:
     """What decides every byte of a dataset, on one machine."""
 
-    preset: str  # a shipped preset's name, or the file's stem
+    preset: str  # its own name for itself
     seed: int
     every: int
     labels_only: bool
@@ -66,8 +66,7 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
     """Write dataset.toml: recipe, packages, and what is finished of all planned sequences."""
     there = [plan for plan in plans if is_finished(job.folder(plan))]
     lines = [
-        f"# Made by: {job.command}",
-        f'command = "{job.command}"',
+        f"command = {toml_string(job.command)}  # makes it again",
         *recipe.lines(),
         f"complete = {str(len(there) == len(plans)).lower()}  # every sequence of the preset is there",
         f"sequences = {len(there)}",

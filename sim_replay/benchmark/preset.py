@@ -20,6 +20,7 @@ Gust = Literal["calm", "light", "moderate"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 SHIPPED = ("fw-uav6d", "unseen", "stress")
+RANGE_LIMITS_M = (95.0, 510.0)  # in the middle of a sequence; sim_replay.flight finds no encounter beyond
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -165,12 +166,19 @@ class Preset(Section):
     @model_validator(mode="after")
     def _possible(self) -> Preset:
         _rises("range_m", self.range_m)
+        if self.range_m[0] < RANGE_LIMITS_M[0] or self.range_m[1] > RANGE_LIMITS_M[1]:
+            raise ValueError("range_m must lie within {:g} and {:g} m".format(*RANGE_LIMITS_M))
         _rises("sequence_frames", self.sequence_frames)
         shortest, longest = self.sequence_frames
         if shortest < 2:
             raise ValueError("sequence_frames must be at least 2")
         if min(self.size_wh_px) < 64:
             raise ValueError("size_wh_px must be at least 64 by 64")
+        if any(side % 2 for side in self.size_wh_px) and any(c.h264_kbps for c in self.compression):
+            raise ValueError("size_wh_px must be even where compression has h264_kbps")
+        frame_ms = 1000.0 / max(self.fps)
+        if self.picture.exposure_ms[1] > frame_ms:
+            raise ValueError(f"picture.exposure_ms must not exceed a frame's {frame_ms:g} ms at fps {max(self.fps):g}")
         for name, size in self.splits.items():
             if not size.sequences * shortest <= size.frames <= size.sequences * longest:
                 raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from rich.table import Table
 
 from edge.errors import InputError
 from msgs.settings import read_toml
-from sim_replay.airframes import AIRFRAMES
-from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
+from sim_replay.bop.fields import integer, load_object
 
 RANGE_EDGES_M = tuple(range(100, 501, 50))
 # FW-UAV6DPose as the paper's section on the dataset gives it. It prints 7,725 training images; its total needs 8,425.
@@ -58,33 +58,35 @@ def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) 
     """
     counts = _Counts()
     try:
-        for scene in find_scenes(root):
-            _take_scene(counts, scene)
+        scenes = find_scenes(root)
+        names = object_names(scenes[0].root)
+        for scene in scenes:
+            _take_scene(counts, scene, names)
             on_scene()
     except BopError as error:
         raise InputError(str(error)) from error
     return {"dataset": str(root), **_recipe(root), **_summary(counts)}
 
 
-def _take_scene(counts: _Counts, scene: BopScene) -> None:
+def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> None:
     split = scene.split or scene.folder.parent.name
     frames = scene.frames
     if not frames:
         return
-    size = _picture_size(scene, frames[0])
+    size = _picture_size(scene)
     counts.sequences[split] += 1
     counts.frames[split] += len(frames)
     counts.pictures[size] += 1
     counts.focal_px.append(float(np.sqrt(frames[0].K[0, 0] * frames[0].K[1, 1])))
     counts.distorted += frames[0].distortion is not None
     for frame in frames:
-        _take_frame(counts, split, frame, size[0] * size[1])
+        _take_frame(counts, split, frame, size[0] * size[1], names)
     flown = _toml(scene.folder / "sequence.toml")
     if flown.get("airframe") and "flight_seed" in flown:
         counts.flights[split].add((str(flown["airframe"]), int(flown["flight_seed"])))
 
 
-def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int) -> None:
+def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str]) -> None:
     counts.targets_in_frame[len(frame.targets)] += 1
     for k, target in enumerate(frame.targets):
         counts.range_m.append(float(np.linalg.norm(target.t_cam_target_m)))
@@ -96,21 +98,19 @@ def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int) -> N
         if frame.R_cam_world is not None:
             # World is local NED where this project wrote it: further down than the camera is before the ground.
             counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
-        counts.airframes[split][_airframe(target.object_id)] += 1
+        counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
 
 
-def _airframe(object_id: int) -> str:
-    return AIRFRAMES[object_id - 1].name if 1 <= object_id <= len(AIRFRAMES) else f"object {object_id}"
-
-
-def _picture_size(scene: BopScene, frame: BopFrame) -> tuple[int, int]:
+def _picture_size(scene: BopScene) -> tuple[int, int]:
+    """Width and height of the scene's first picture, else as camera.json has them, else zeros. Raises BopError."""
     try:
-        height, width = scene.image_bgr(frame).shape[:2]
+        height, width = scene.image_bgr(scene.pictured[0]).shape[:2]
         return width, height
     except BopError:
         path = scene.folder / "camera.json"
-        entry = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        return int(entry.get("width", 0)), int(entry.get("height", 0))
+        entry = load_object(path, optional=True)
+        width, height = (integer(path, "camera", entry, name) if name in entry else 0 for name in ("width", "height"))
+        return width, height
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_replay.bop.fields import load_object, matrix, number_key
+from sim_replay.bop.fields import by_number, load_object, matrix, number_key
 from sim_replay.bop.model_frame import ModelFrame, ModelFrames
 from sim_replay.bop.ply import read_ply_vertices_m
 from sim_replay.bop.records import MM_PER_M, Array, BopError
@@ -70,6 +70,21 @@ def models_folder(root: Path) -> Path | None:
     preferred = ("models", "models_eval")
     names = sorted(root.glob("models*"), key=lambda path: (*(path.name != name for name in preferred), path.name))
     return next((path for path in names if (path / "models_info.json").is_file() or any(path.glob("obj_*.ply"))), None)
+
+
+def object_names(root: Path | None) -> dict[int, str]:
+    """What models_info.json of a dataset calls its objects, by id; those without "name" are left out. Raises BopError.
+
+    "name" is a key of ours: an id alone means another object in each dataset.
+    """
+    folder = None if root is None else models_folder(root)
+    if folder is None:
+        return {}
+    path = folder / "models_info.json"
+    entries = by_number(path, load_object(path, optional=True))
+    return {
+        number: str(entry["name"]) for number, entry in entries.items() if isinstance(entry, dict) and "name" in entry
+    }
 
 
 def read_models(root: Path, frames: ModelFrames) -> dict[int, Model]:

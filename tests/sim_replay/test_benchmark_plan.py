@@ -15,7 +15,8 @@ import trainer
 from edge.errors import InputError
 from sim_replay.airframes import AIRFRAMES
 from sim_replay.benchmark.plan import SequencePlan, allotted, cut_frames, plan_dataset, spread_ranges
-from sim_replay.benchmark.preset import held_out_airframes, load_preset, parse_preset
+from sim_replay.benchmark.preset import RANGE_LIMITS_M, held_out_airframes, load_preset, parse_preset
+from sim_replay.flight import EncounterPlan, fly_encounter
 
 MINIMAL = """
 name = "mine"
@@ -143,13 +144,32 @@ def test_ranges_of_equal_sequences_are_equally_spaced() -> None:
         ("[picture]", "[airframes]\nonly = ['zeppelin']\n[picture]", r"airframes: only: .*'zeppelin'; there are male"),
         ("[picture]", "[picture", r"mine\.toml: not valid TOML"),
         ("clear = 1", "clear = -1", r"picture\.weather\.clear: .*greater than or equal to 0"),
+        (
+            'name = "mine"',
+            'name = "mine"\nrange_m = [50.0, 300.0]',
+            r"mine\.toml: range_m must lie within 95 and 510 m",
+        ),
+        ('name = "mine"', 'name = "mine"\nrange_m = [100, 900]', r"mine\.toml: range_m must lie within 95 and 510 m"),
+        ("[picture]", "[[compression]]\nh264_kbps = [100, 200]\n[picture]", r"size_wh_px must be even where"),
+        (
+            "[picture]",
+            "[picture]\nexposure_ms = [1, 40]",
+            r"exposure_ms must not exceed a frame's 33\.3333 ms at fps 30",
+        ),
     ],
 )
 def test_a_bad_preset_is_named_with_its_key(old: str, new: str, said: str) -> None:
-    text = "sequence_frames = [5, 15]\n" + MINIMAL
+    text = "sequence_frames = [5, 15]\nsize_wh_px = [321, 200]\n" + MINIMAL
     assert parse_preset("mine.toml", text).name == "mine"
     with pytest.raises(InputError, match=said):
         parse_preset("mine.toml", text.replace(old, new, 1))
+
+
+def test_the_ranges_that_a_preset_may_ask_for_are_those_that_are_flown() -> None:
+    low_m, high_m = RANGE_LIMITS_M
+    for range_m in (low_m - 0.1, high_m + 0.1):
+        with pytest.raises(ValueError, match=f"range_m must lie between {low_m:.0f} and {high_m:.0f}"):
+            fly_encounter(EncounterPlan(1, 5, 10.0, range_m, ("light_aircraft",), (0.3, 0.2)))
 
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:

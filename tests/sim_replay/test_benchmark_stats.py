@@ -53,6 +53,9 @@ def dataset(tmp_path: Path) -> Path:
         for file, content in (("camera", cameras), ("gt", poses), ("gt_info", info)):
             (folder / f"scene_{file}.json").write_text(json.dumps(content))
         (folder / "sequence.toml").write_text(f'airframe = "{airframe}"\nflight_seed = {seed}\n')
+    (root / "models").mkdir()
+    names = {1: "male_v_tail", 4: "light_aircraft"}
+    (root / "models" / "models_info.json").write_text(json.dumps({i: {"name": name} for i, name in names.items()}))
     return root
 
 
@@ -74,6 +77,7 @@ def test_every_figure_is_that_of_the_files(dataset: Path, capsys: pytest.Capture
     assert s["below_camera_share"] == pytest.approx(0.5)  # both of scene 2
     assert s["partly_hidden_share"] == pytest.approx(0.25)
     assert s["airframes"]["train"] == {"light_aircraft": 1, "male_v_tail": 1}
+    assert s["airframes"]["test"] == {"male_v_tail": 1, "object 2": 1}  # models_info.json does not name it
     assert s["airframe_flights_in_two_splits"] == 1  # flight 11, on purpose
 
 
@@ -84,6 +88,29 @@ def test_the_table_stands_beside_the_papers(dataset: Path, capsys: pytest.Captur
     said = capsys.readouterr().out
     for words in ("161", "15,325", "2.333 %", "about 1.20 %", "1500–8000 px", "25.0 %", "targets lower than camera"):
         assert words in said
+
+
+def test_objects_of_others_are_not_called_by_our_airframes_names(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (dataset / "models" / "models_info.json").write_text('{"1": {"diameter": 9000}, "4": {"diameter": 8000}}')
+    assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["airframes"]["train"] == {"object 1": 1, "object 4": 1}
+
+
+def test_the_size_is_of_the_first_picture_that_is_there(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (dataset / "train/000000/rgb/000000.jpg").unlink()
+    assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["pictures"] == {"320x180": 3}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"width": "wide", "height": 180}'])
+def test_a_camera_file_that_is_damaged_is_named(dataset: Path, capsys: pytest.CaptureFixture[str], text: str) -> None:
+    scene = dataset / "test/000002"
+    (scene / "rgb/000000.jpg").unlink()
+    (scene / "camera.json").write_text(text)
+    assert main(["stats", "--dataset", str(dataset)]) == 2
+    assert str(scene / "camera.json") in capsys.readouterr().err
 
 
 def test_a_folder_without_scenes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
