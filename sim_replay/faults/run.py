@@ -95,13 +95,14 @@ def run(args: argparse.Namespace) -> int:
     timelines = [load_timeline(_path(name)) for name in args.timeline]
     if not args.model.is_file():
         raise InputError(f"--model {args.model}: is no file")
-    if len({timeline.signed for timeline in timelines}) > 1:
-        raise InputError(f"{args.timeline[0]}: signed and unsigned timelines need a run each")
-    volume = any(timeline.volume for timeline in timelines)
+    for name, timeline in zip(args.timeline, timelines, strict=True):
+        if timeline.signed != timelines[0].signed:
+            raise InputError(f"{name}: signed differs from that of {args.timeline[0]}: they need a run each")
+    on_volume = [name for name, timeline in zip(args.timeline, timelines, strict=True) if timeline.volume]
     args.out.mkdir(parents=True, exist_ok=True)
-    if volume and not can_mount(args.out):
-        raise InputError(f"{args.timeline[0]}: volume = true needs a host that lets a user mount (unshare --mount)")
-    rig = Rig(RigSettings(args.out, args.scene, args.model, volume=volume, signed=timelines[0].signed))
+    if on_volume and not can_mount(args.out):
+        raise InputError(f"{on_volume[0]}: volume = true needs a host that lets a user mount (unshare --mount)")
+    rig = Rig(RigSettings(args.out, args.scene, args.model, volume=bool(on_volume), signed=timelines[0].signed))
     with rig:
         outcomes = [play_timeline(rig, timeline, print) for timeline in timelines]
     wrong = [*(text for outcome in outcomes for text in outcome.wrong), *violations(rig.witness)]

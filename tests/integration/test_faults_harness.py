@@ -86,6 +86,22 @@ def test_the_command_takes_bundled_timelines_by_name_and_refuses_a_missing_one(t
         args.run(args)
 
 
+def test_what_a_timeline_needs_is_told_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parser = argparse.ArgumentParser()
+    run.register(parser.add_subparsers())
+    paths = {}
+    for name in ("plain", "signed", "volume"):
+        paths[name] = tmp_path / f"{name}.toml"
+        key = "" if name == "plain" else f"{name} = true\n"
+        paths[name].write_text(f'title = "x"\n{key}[[step]]\ndo = "hold"\nfor_s = 1\n')
+    monkeypatch.setenv("PATH", str(tmp_path))  # no unshare, as on a host that lets nobody mount
+    for name in ("signed", "volume"):
+        words = ["faults", "--timeline", str(paths["plain"]), "--timeline", str(paths[name]), "--out", str(tmp_path)]
+        args = parser.parse_args(words)
+        with pytest.raises(InputError, match=rf"^{paths[name]}: {name} "):
+            args.run(args)
+
+
 @pytest.fixture
 def udp() -> Iterator[tuple[UdpRelay, socket.socket, socket.socket]]:
     """A relay between two sockets: the autopilot's, and the daemon's, which has heard from the other."""
