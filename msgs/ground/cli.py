@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
 
@@ -30,11 +31,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="uavpose-ground", description="The ground's end: route, watch and record what vehicles tell over zenoh."
+        prog="uavpose-ground",
+        description="The ground's end: route, watch, view and record what vehicles tell over zenoh.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     _add_watch(commands)
+    _add_view(commands)
     _add_record(commands)
     _add_command(commands)
     _add_router(commands)
@@ -50,6 +53,29 @@ def _add_watch(commands: Commands) -> None:
     watch.add_argument("--max-age", type=float, default=2.0, metavar="S", help="older poses are refused (default 2)")
     watch.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     watch.set_defaults(act=_watch)
+
+
+def _add_view(commands: Commands) -> None:
+    view = commands.add_parser(
+        "view",
+        help="pictures, a 3-D scene and plots, live or of recordings (Rerun)",
+        description="Opens Rerun's viewer with what vehicles tell, or with recordings. The box of a target has the "
+        "size that --target-size says: its true size is not told.",
+    )
+    view.add_argument("recordings", type=Path, nargs="*", metavar="MCAP", help="recordings (default: live)")
+    _connection(view)
+    where = view.add_mutually_exclusive_group()
+    where.add_argument(
+        "--web", type=int, nargs="?", const=9090, metavar="PORT", help="serve to a browser on this machine (9090)"
+    )
+    where.add_argument("--save", type=Path, metavar="RRD", help="write a file for the viewer instead")
+    view.add_argument(
+        "--target-size", type=_positive, nargs=3, default=(8.0, 12.0, 2.5), metavar=("LENGTH", "WIDTH", "HEIGHT"),
+        help="metres, of the boxes drawn (default 8 12 2.5)",
+    )  # fmt: skip
+    view.add_argument("--max-age", type=float, default=2.0, metavar="S", help="older poses are refused (default 2)")
+    view.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    view.set_defaults(act=_view)
 
 
 def _add_record(commands: Commands) -> None:
@@ -171,6 +197,27 @@ def _watch(options: argparse.Namespace) -> int:
         options.json,
     )
     return watch(asked, _stop_on_signal(options.seconds), Console(), _say_aside)
+
+
+def _view(options: argparse.Namespace) -> int:
+    if find_spec("rerun") is None:
+        raise InputError("view needs the extra `ground`: pip install '.[ground]'")
+    from msgs.ground.view.command import ViewOptions, view
+
+    if options.web is not None and not 0 < options.web < 65535:
+        raise InputError(f"--web {options.web}: must be a port from 1 to 65534; the next one is taken too")
+    asked = ViewOptions(
+        options.recordings,
+        options.connect,
+        _tls(options),
+        [_uav(name) for name in options.uav],
+        options.domain,
+        options.max_age,
+        tuple(options.target_size),
+        options.save,
+        options.web,
+    )
+    return view(asked, _stop_on_signal(options.seconds), _say_aside)
 
 
 def _record(options: argparse.Namespace) -> int:

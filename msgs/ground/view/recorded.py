@@ -1,0 +1,38 @@
+"""Samples of MCAP recordings in the order in which they were recorded, as if they came just then."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from msgs import topics
+from msgs.ground.errors import InputError
+from msgs.ground.feed import Incoming
+
+_GID = bytes(16)
+
+
+def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
+    """Each sample of a topic of ours, and when it was recorded (UTC ns). Others are passed over.
+
+    Raises InputError if the file cannot be read, or ends in the middle, after what comes before that.
+    """
+    sequences: Counter[str] = Counter()
+    try:
+        with path.open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                key = f"0{channel.topic}"
+                row = topics.parse_any_key(key)
+                if row is None:
+                    continue
+                sequences[key] += 1  # recordings keep no attachment
+                attachment = topics.attachment(sequences[key], message.publish_time, _GID)
+                yield Incoming(*row, key, message.data, attachment), message.log_time
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except McapError as error:
+        raise InputError(f"{path}: is no whole MCAP file ({error}); `mcap recover` may help") from error
