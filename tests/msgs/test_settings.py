@@ -1,0 +1,60 @@
+"""Settings as people get them wrong: every package tells the file, the key and the reason, in an error of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.config import load_config as load_daemon
+from edge.errors import InputError
+from msgs.ground.errors import InputError as GroundError
+from msgs.ground.router import load_router
+from sim_replay.benchmark.preset import load_preset
+from sim_replay.bop import BopError, read_model_frames
+from sim_replay.faults.timeline import load_timeline
+from trainer.config import ConfigError
+from trainer.config import load_config as load_trainer
+
+READERS: list[tuple[Callable[[Path], Any], type[Exception]]] = [
+    (load_daemon, InputError),
+    (load_router, GroundError),
+    (lambda path: load_preset(str(path)), InputError),
+    (load_timeline, InputError),
+    (load_trainer, ConfigError),
+    (lambda path: read_model_frames(path.parent), BopError),
+]
+
+
+@pytest.mark.parametrize(("read", "error"), READERS)
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b'name = "\xff"', "cannot be read: not UTF-8 text"),
+        (b"a = \n", "not valid TOML: "),
+        (b"gremlin = 1", "gremlin"),
+    ],
+)
+def test_what_cannot_be_read_is_told_by_its_file(
+    tmp_path: Path, read: Callable[[Path], Any], error: type[Exception], content: bytes, reason: str
+) -> None:
+    path = tmp_path / "model_frame.toml"
+    path.write_bytes(content)
+    with pytest.raises(error) as told:
+        read(path)
+    lines = str(told.value).splitlines()
+    assert all(line.startswith(f"{path}:") for line in lines)
+    assert any(reason in line for line in lines)
+
+
+def test_each_fault_has_a_line_with_its_key(tmp_path: Path) -> None:
+    path = tmp_path / "router.toml"
+    path.write_text('listen = []\ndomain = "one"\n[access]\nvehicles = ["uav1", "uav/2"]\nreader = []\n')
+    with pytest.raises(GroundError) as told:
+        load_router(path)
+    lines = str(told.value).splitlines()
+    keys = {line.removeprefix(f"{path}: ").partition(":")[0] for line in lines}
+    assert keys == {"listen", "domain", "access.vehicles.1", "access.reader"}
+    assert f"{path}: access.reader: unknown key" in lines
