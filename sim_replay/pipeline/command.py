@@ -1,10 +1,11 @@
-"""The `bench-pipeline` sub-command of `uavpose-replay`."""
+"""The `bench-pipeline` and `soak` sub-commands of `uavpose-replay`."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +17,62 @@ from edge.errors import InputError
 from edge.estimator.model import load_model
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
-from sim_replay.pipeline.flight import FlightSettings, fly
+from sim_replay.pipeline.flight import Flight, FlightSettings, fly
 from sim_replay.pipeline.report import report, table
+from sim_replay.pipeline.soak import table as trend_table
+from sim_replay.pipeline.soak import trends
+
+EXIT_GROWS = 1
 
 
 def register(commands: Any) -> None:
-    """Add it to what argparse's add_subparsers() gave."""
-    parser = commands.add_parser(
+    """Add them to what argparse's add_subparsers() gave."""
+    bench = commands.add_parser(
         "bench-pipeline",
         help="fly a sequence round and round through the daemon and hold it to its budgets",
         description="Start the daemon on a looped sequence with a simulated autopilot (MAVLink over UDP) and a zenoh "
         "subscriber, in real time, and print latency by stage, drops, CPU and memory beside the budgets.",
     )
+    _add_arguments(bench, 2.0, "pipeline")
+    bench.set_defaults(run=run)
+    soak = commands.add_parser(
+        "soak",
+        help="fly a sequence round and round for long, and fail if anything grows",
+        description="Like bench-pipeline, but set early against late: memory, open descriptors, threads, log, dropped "
+        "frames, age of what the autopilot gets. Writes soak.json. Exit code 0 if all is flat, 1 if something grows.",
+    )
+    _add_arguments(soak, 60.0, "soak")
+    soak.set_defaults(run=run_soak)
+
+
+def _add_arguments(parser: argparse.ArgumentParser, minutes: float, out: str) -> None:
     parser.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="scene folder")
-    parser.add_argument("--minutes", type=float, default=2.0, help="how long (default %(default)s)")
+    parser.add_argument("--minutes", type=float, default=minutes, help="how long (default %(default)s)")
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
-    parser.add_argument("--out", type=Path, default=Path("out/pipeline"), metavar="DIR", help="folder to write to")
+    parser.add_argument("--out", type=Path, default=Path("out") / out, metavar="DIR", help="folder to write to")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """0 when it was measured, whatever came out. Raises InputError, PlayError."""
+    result, _ = _measure(args)
+    _write(args.out / "pipeline.json", result)
+    print(json.dumps(result) if args.json else table(result))
+    return 0
+
+
+def run_soak(args: argparse.Namespace) -> int:
+    """0 if nothing grows, else EXIT_GROWS. Raises InputError, PlayError."""
+    result, flight = _measure(args)
+    found = trends(flight, result["fps"])
+    result = {**result, "trends": [asdict(trend) for trend in found]}
+    _write(args.out / "soak.json", result)
+    print(json.dumps(result) if args.json else trend_table(found, args.minutes))
+    return EXIT_GROWS if any(trend.grows for trend in found) else 0
+
+
+def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
+    """Fly, and the report of it."""
     if not 0.0 < args.minutes <= 24 * 60:
         raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most a day")
     model = load_model(args.model, threads=1)
@@ -54,6 +89,8 @@ def run(args: argparse.Namespace) -> int:
         "load_average": [load_before, os.getloadavg()[0]],
         **report(flight, settings.sequence.fps, settings.period_s, args.minutes),
     }
-    (args.out / "pipeline.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    print(json.dumps(result) if args.json else table(result))
-    return 0
+    return result, flight
+
+
+def _write(path: Path, result: dict[str, Any]) -> None:
+    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")

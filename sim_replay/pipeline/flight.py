@@ -58,6 +58,7 @@ class Flight:
     diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
     poses: int = 0  # received over zenoh
     usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
+    logged: list[tuple[int, int]] = field(default_factory=list)  # when a line of its log came, and its bytes
     ended: threading.Event = field(default_factory=threading.Event)  # a process has
     ready_or_ended: threading.Event = field(default_factory=threading.Event)
 
@@ -67,6 +68,7 @@ class Flight:
 
     def hear_daemon(self, line: str, heard_ns: int) -> None:
         self.said.append(line)
+        self.logged.append((heard_ns, len(line.encode()) + 1))
         if self.ready_ns is None and "ready: " in line:
             self.ready_ns = heard_ns
             self.ready_or_ended.set()

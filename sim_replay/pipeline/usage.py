@@ -16,6 +16,8 @@ class Usage:
     cpu_s: float  # of all its threads since it started
     waited_s: float  # ready to run while other work had the cores, all its threads
     rss_mb: float  # 10^6 bytes
+    descriptors: int  # open
+    threads: int
 
 
 def usage_of(pid: int) -> Usage:
@@ -24,8 +26,11 @@ def usage_of(pid: int) -> Usage:
     fields = (proc / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     pages = int((proc / "statm").read_text(encoding="utf-8").split()[1])
     cpu_s = (int(fields[_UTIME]) + int(fields[_STIME])) / os.sysconf("SC_CLK_TCK")
-    waited_ns = sum(_waited_ns(task) for task in (proc / "task").iterdir())
-    return Usage(time.monotonic_ns(), cpu_s, waited_ns * 1e-9, pages * os.sysconf("SC_PAGE_SIZE") / 1e6)
+    tasks = list((proc / "task").iterdir())
+    waited_ns = sum(_waited_ns(task) for task in tasks)
+    rss_mb = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    descriptors = len(list((proc / "fd").iterdir()))
+    return Usage(time.monotonic_ns(), cpu_s, waited_ns * 1e-9, rss_mb, descriptors, len(tasks))
 
 
 def _waited_ns(task: Path) -> int:

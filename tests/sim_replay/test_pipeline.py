@@ -28,6 +28,17 @@ from tests.waiting import until
 PERIOD_S = 5.0
 START_NS = 7_000_000_000
 UTC_NS = 1_700_000_000_000_000_000
+BUSY_CHILD = """
+import os, threading
+kept = bytearray(80_000_000)
+opened = [os.open(os.devnull, os.O_RDONLY) for _ in range(50)]
+for _ in range(3):
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+sum(range(8_000_000))
+print(1, flush=True)
+input()
+os._exit(0)
+"""
 
 
 def heard(captures_s: list[float], latency_ms: list[float]) -> Flight:
@@ -65,7 +76,7 @@ def test_stages_are_of_windows_that_do_not_overlap() -> None:
 def test_growth_is_of_the_second_half() -> None:
     flight = heard([], [])
     rss_mb = [100.0 + 20.0 * second for second in range(10)] + [300.0 + 0.01 * second for second in range(10)]
-    flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb) for second, mb in enumerate(rss_mb)]
+    flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb, 20, 9) for second, mb in enumerate(rss_mb)]
     memory = memory_mb(flight)
     assert memory["max"] == pytest.approx(300.09)
     assert memory["growth_per_hour"] == pytest.approx(36.0)
@@ -73,7 +84,7 @@ def test_growth_is_of_the_second_half() -> None:
 
 def test_processor_time_and_waiting_are_told_apart() -> None:
     flight = heard([], [])
-    flight.usage = [Usage(0, 3.0, 1.0, 100.0), Usage(20_000_000_000, 13.0, 5.0, 100.0)]
+    flight.usage = [Usage(0, 3.0, 1.0, 100.0, 20, 9), Usage(20_000_000_000, 13.0, 5.0, 100.0, 20, 9)]
     found = cpu(flight, captured=500)
     assert found == {"cpu_cores": 0.5, "cpu_cores_waited_for": 0.2, "cpu_ms_per_frame": 20.0}
 
@@ -106,7 +117,7 @@ def test_the_own_ship_flies_round_and_round_with_the_pictures() -> None:
 
 def test_usage_is_of_the_process_that_is_asked_for() -> None:
     child = subprocess.Popen(
-        [sys.executable, "-c", "kept = bytearray(80_000_000)\nsum(range(8_000_000))\nprint(1, flush=True)\ninput()"],
+        [sys.executable, "-c", BUSY_CHILD],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
@@ -116,6 +127,8 @@ def test_usage_is_of_the_process_that_is_asked_for() -> None:
     child.communicate(b"\n")
     assert used.rss_mb > 80.0
     assert used.cpu_s > 0.0
+    assert used.threads == 4
+    assert used.descriptors >= 3 + 50
     with pytest.raises(OSError, match=str(child.pid)):
         usage_of(child.pid)
 

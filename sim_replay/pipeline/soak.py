@@ -1,0 +1,125 @@
+"""Whether a long flight drifts: memory, descriptors, threads, log, drops and age, early against late. Pure functions.
+
+The first quarter is left out: caches fill, allocators grow, links come up. The rest is parted into thirds, and the last
+is set against the first. Medians are compared, so that one odd sample is no trend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msgs.geometry import Array
+from sim_replay.pipeline.flight import Flight
+
+WARM_UP_SHARE = 0.25
+SAMPLES_MIN = 12  # fewer seconds show no trend
+MEMORY_MB = 6.0
+DESCRIPTORS, THREADS = 3.0, 2.0
+LOG_BYTES_PER_MINUTE = 6000.0
+DROPPED_SHARE = 0.01  # of the frames of a third
+AGE_GROWTH, AGE_MS = 0.5, 10.0
+
+
+@dataclass(frozen=True)
+class Trend:
+    """One quantity, early and late; `grows` is None where this flight cannot tell."""
+
+    name: str
+    unit: str
+    early: float | None
+    late: float | None
+    allowed: float | None  # what `late` may be at most
+    grows: bool | None
+
+
+def trends(flight: Flight, fps: float) -> list[Trend]:
+    """All of them. Age and drops are not judged where the daemon waited longer for other work than it ran itself."""
+    samples = flight.usage
+    if len(samples) < SAMPLES_MIN:
+        return [Trend(name, "", None, None, None, None) for name in ("memory", "descriptors", "threads")]
+    times_ns = np.array([sample.time_ns for sample in samples])
+    early, late = _thirds(times_ns)
+    third_min = (early[1] - early[0]) / 60e9
+
+    def medians(values: Sequence[float], times: Array) -> tuple[float | None, float | None]:
+        return _within(np.median, values, times, early), _within(np.median, values, times, late)
+
+    memory = medians([sample.rss_mb for sample in samples], times_ns)
+    descriptors = medians([sample.descriptors for sample in samples], times_ns)
+    threads = medians([sample.threads for sample in samples], times_ns)
+    log_times = np.array([heard_ns for heard_ns, _ in flight.logged])
+    logged = [_within(np.sum, [size for _, size in flight.logged], log_times, part) or 0.0 for part in (early, late)]
+    per_minute = (logged[0] / third_min, logged[1] / third_min)
+    busy = samples[-1].waited_s - samples[0].waited_s > samples[-1].cpu_s - samples[0].cpu_s
+    drops = tuple(_dropped(flight, part) for part in (early, late))
+    ages_ms, age_times = _ages_ms(flight)
+    age = medians(ages_ms, age_times)
+    frames = third_min * 60.0 * fps
+    return [
+        _trend("memory", "MB", memory, lambda value: value + MEMORY_MB),
+        _trend("open descriptors", "", descriptors, lambda value: value + DESCRIPTORS),
+        _trend("threads", "", threads, lambda value: value + THREADS),
+        _trend("log", "bytes/min", per_minute, lambda value: 2.0 * value + LOG_BYTES_PER_MINUTE),
+        _trend("frames dropped", "", drops, lambda value: 2.0 * value + DROPPED_SHARE * frames, judged=not busy),
+        _trend("age at the autopilot, p50", "ms", age, lambda a: (1 + AGE_GROWTH) * a + AGE_MS, judged=not busy),
+    ]
+
+
+def table(found: Sequence[Trend], minutes: float) -> str:
+    """For a person."""
+    words = {True: "GROWS", False: "flat", None: "not judged"}
+    lines = [f"{minutes:g} minutes{'':20} {'early':>10} {'late':>10} {'allowed':>10}"]
+    for trend in found:
+        cells = (("-" if value is None else f"{value:.1f}") for value in (trend.early, trend.late, trend.allowed))
+        lines.append(f"{trend.name:30} {' '.join(f'{cell:>10}' for cell in cells)} {trend.unit:9} {words[trend.grows]}")
+    return "\n".join(lines)
+
+
+def _thirds(times_ns: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The first and the last third of what follows the warm-up, each (from, to)."""
+    first, last = float(times_ns[0]), float(times_ns[-1])
+    first += WARM_UP_SHARE * (last - first)
+    length = (last - first) / 3.0
+    return (first, first + length), (last - length, last)
+
+
+def _within(
+    of: Callable[[Array], np.floating], values: Sequence[float], times: Array, part: tuple[float, float]
+) -> float | None:
+    """`of` the values whose times lie in a part; None if none does."""
+    inside = np.array(values, dtype=np.float64)[(times >= part[0]) & (times <= part[1])] if len(values) else np.zeros(0)
+    return float(of(inside)) if inside.size else None
+
+
+def _dropped(flight: Flight, part: tuple[float, float]) -> float | None:
+    """Frames dropped in a part, by the daemon's own count."""
+    counted = [
+        int(record["values"].get("dropped", 0))
+        for record in flight.diagnostics
+        if part[0] <= record["stamp_utc_ns"] - flight.utc_minus_monotonic_ns <= part[1]
+    ]
+    return float(counted[-1] - counted[0]) if len(counted) > 1 else None
+
+
+def _ages_ms(flight: Flight) -> tuple[list[float], Array]:
+    """Age of each TARGET_RELATIVE on receipt, and when that was."""
+    received = np.array([record["received_ns"] for record in flight.targets], dtype=np.float64)
+    captured = [record["capture_utc_us"] * 1000 - flight.utc_minus_monotonic_ns for record in flight.targets]
+    return [(r["received_ns"] - c) * 1e-6 for r, c in zip(flight.targets, captured, strict=True)], received
+
+
+def _trend(
+    name: str,
+    unit: str,
+    values: Sequence[float | None],
+    allowed: Callable[[float], float],
+    judged: bool = True,
+) -> Trend:
+    early, late = values
+    if early is None or late is None:
+        return Trend(name, unit, early, late, None, None)
+    limit = allowed(early)
+    return Trend(name, unit, early, late, limit, late > limit if judged else None)

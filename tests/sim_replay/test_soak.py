@@ -1,0 +1,102 @@
+"""`soak`: what grows is told from what wavers, and a real flight of seconds is flat."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_replay.cli import main
+from sim_replay.pipeline.flight import Flight
+from sim_replay.pipeline.soak import Trend, trends
+from sim_replay.pipeline.usage import Usage
+
+MINUTES, FPS = 4.0, 30.0
+START_NS, UTC_NS = 7_000_000_000, 1_700_000_000_000_000_000
+SECONDS = np.arange(round(MINUTES * 60))
+
+
+def steady() -> Flight:
+    """Four minutes in which everything wavers and nothing grows; the first half minute warms up."""
+    chance = np.random.default_rng(3)
+    flight = Flight(START_NS - 10**9, START_NS, UTC_NS)
+    for second in SECONDS.tolist():
+        now_ns = START_NS + second * 10**9
+        rss_mb = 180.0 + 40.0 * (1.0 - np.exp(-second / 8.0)) + chance.normal(0.0, 0.7)
+        flight.usage.append(
+            Usage(now_ns, 0.8 * second, 0.1 * second, rss_mb, 40 + int(chance.integers(3)), 14 + second % 2)
+        )
+        flight.logged.append((now_ns, 150))
+        values = {"dropped": str(second // 60)}
+        flight.diagnostics.append({"stamp_utc_ns": now_ns + UTC_NS, "values": values})
+        for frame in range(0, 30, 5):
+            capture_ns = now_ns + frame * 33_000_000
+            age_ns = round(1e6 * (12.0 + chance.gamma(2.0, 3.0)))
+            stamp_us = (capture_ns + UTC_NS) // 1000
+            flight.targets.append({"capture_utc_us": stamp_us, "received_ns": capture_ns + age_ns})
+    return flight
+
+
+def growing(flight: Flight) -> set[str]:
+    return {trend.name for trend in trends(flight, FPS) if trend.grows}
+
+
+def test_what_wavers_does_not_grow() -> None:
+    told = trends(steady(), FPS)
+    assert all(trend.grows is False for trend in told), told
+
+
+def test_a_leak_of_a_kilobyte_a_frame_is_found_in_minutes() -> None:
+    flight = steady()
+    flight.usage = [replace(u, rss_mb=u.rss_mb + 0.1 * k) for k, u in enumerate(flight.usage)]
+    assert growing(flight) == {"memory"}
+
+
+def test_descriptors_and_threads_that_are_never_closed_are_found() -> None:
+    flight = steady()
+    flight.usage = [replace(u, descriptors=u.descriptors + k // 20) for k, u in enumerate(flight.usage)]
+    assert growing(flight) == {"open descriptors"}
+    flight = steady()
+    flight.usage = [replace(u, threads=u.threads + k // 40) for k, u in enumerate(flight.usage)]
+    assert growing(flight) == {"threads"}
+
+
+def test_a_log_that_swells_drops_that_multiply_and_poses_that_age_are_found() -> None:
+    flight = steady()
+    flight.logged = [(at_ns, 150 + 10 * max(k - 120, 0)) for k, (at_ns, _) in enumerate(flight.logged)]
+    assert growing(flight) == {"log"}
+    flight = steady()
+    for k, record in enumerate(flight.diagnostics):
+        record["values"]["dropped"] = str(max(k - 120, 0))
+    assert growing(flight) == {"frames dropped"}
+    flight = steady()
+    flight.targets = [
+        {**record, "received_ns": record["received_ns"] + 30_000 * k} for k, record in enumerate(flight.targets)
+    ]
+    assert growing(flight) == {"age at the autopilot, p50"}
+
+
+def test_age_and_drops_of_a_busy_machine_are_not_judged_and_leaks_still_are() -> None:
+    flight = steady()
+    flight.usage = [replace(u, waited_s=2.0 * u.cpu_s, rss_mb=u.rss_mb + 0.1 * k) for k, u in enumerate(flight.usage)]
+    told = {trend.name: trend.grows for trend in trends(flight, FPS)}
+    assert told["age at the autopilot, p50"] is told["frames dropped"] is None
+    assert told["memory"] is True
+
+
+def test_a_flight_of_moments_is_not_judged() -> None:
+    flight = steady()
+    flight.usage = flight.usage[:5]
+    assert all(isinstance(trend, Trend) and trend.grows is None for trend in trends(flight, FPS))
+
+
+def test_the_daemon_holds_on_to_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["soak", "--minutes", "0.5", "--out", str(tmp_path), "--json"])
+    told = {trend["name"]: trend for trend in json.loads(capsys.readouterr().out)["trends"]}
+    for name in ("memory", "open descriptors", "threads", "log"):
+        assert told[name]["grows"] is False, told[name]
+    assert code == int(any(trend["grows"] is True for trend in told.values()))
+    assert json.loads((tmp_path / "soak.json").read_text())["trends"] == list(told.values())
