@@ -52,6 +52,13 @@ class Outlets:
         if self._zenoh is not None:
             self._zenoh.publish_event(level, text)
 
+    def last_event(self, level: int, text: str) -> None:
+        """An event that nothing follows: returns when each link has sent it and ended."""
+        self.event(level, text)
+        for link in (self._mavlink, self._zenoh, self._recorder):
+            if link is not None:
+                link.stop()
+
     def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
         if self._zenoh is not None:
             self._zenoh.publish_diagnostics(snapshot)

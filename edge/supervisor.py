@@ -113,4 +113,4 @@ class Supervisor:
 
     def _last_words(self, sentence: str) -> None:
         self._notifier.status(sentence)
-        self._outlets.event(logging.ERROR, sentence)
+        self._outlets.last_event(logging.ERROR, sentence)

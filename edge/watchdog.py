@@ -13,7 +13,7 @@ from contextlib import contextmanager
 log = logging.getLogger(__name__)
 
 LOOKS_PER_LIMIT = 10
-LAST_WORDS_S = 0.5
+LAST_WORDS_S = 2.0  # at most; they take as long as the links take to send them
 EXIT_STUCK = 70
 
 
@@ -53,8 +53,9 @@ class Watchdog:
     def _end(self, sentence: str) -> None:
         log.critical("%s", sentence)
         # A link that hangs with the loop must not keep the process from its end.
-        threading.Thread(target=self._last_words, args=(sentence,), daemon=True).start()
-        time.sleep(LAST_WORDS_S)
+        last_words = threading.Thread(target=self._last_words, args=(sentence,), daemon=True)
+        last_words.start()
+        last_words.join(LAST_WORDS_S)
         os._exit(EXIT_STUCK)
 
 

@@ -102,7 +102,7 @@ class MavlinkLink:
         self._counted = self._count()
 
     def stop(self) -> None:
-        """End the thread and close the sockets. May be called twice, or without start."""
+        """Send what waits, end the thread and close the sockets. May be called twice, or without start."""
         self._stopping.set()
         self._poke()
         if self._thread is not None:
@@ -130,8 +130,10 @@ class MavlinkLink:
             self._wake.send(b"\0")
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
+        stopping = False
+        while not stopping:
             self._wait(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e9))
+            stopping = self._stopping.is_set()  # asked before the turn, which so sends all that was told before
             try:
                 self._turn()
             except Exception:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,18 +28,23 @@ from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
 from edge.systemd import Notifier
 from edge.types import CameraInfo, FrameMeta
+from msgs import topics
+from msgs.cdr import Log
+from msgs.client import connect
+from tests.waiting import until
 
 from .flying import flying, free_port, toml, write_swaying_scene
 from .toy_scene import K
 
 STICKS_LATER = """
 import sys, threading
+from pathlib import Path
 from edge import cli
 from edge.estimator.estimator import Estimator
 seen, track = [], Estimator.track
 def stand_still(self, *arguments):
     seen.append(1)
-    if len(seen) > 25:
+    if len(seen) > 25 and Path(sys.argv[-1]).with_name("stick").exists():
         threading.Event().wait()
     return track(self, *arguments)
 Estimator.track = stand_still
@@ -60,11 +66,19 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path:
         manager = threading.Thread(target=hear)
         manager.start()
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
-        text = toml(scene, toy_model, free_port(), "[health]\nloop_stuck_s = 1.5\n")
+        port, heard = free_port(), list[str]()
+        text = toml(scene, toy_model, port, "[health]\nloop_stuck_s = 5.0\n")
         try:
-            with flying(tmp_path, text, environment, program=("-c", STICKS_LATER)) as flight:
+            with (
+                flying(tmp_path, text, environment, program=("-c", STICKS_LATER)) as flight,
+                connect(f"tcp/127.0.0.1:{port}") as ground,
+            ):
+                hear_event = zenoh.handlers.Callback(lambda s: heard.append(Log.decode(s.payload.to_bytes()).msg))
+                ground.declare_subscriber(topics.subscription_key(topics.EVENTS, "uav1"), hear_event)
+                (tmp_path / "stick").touch()
                 said = flight.until("CRITICAL")
-                assert flight.process.wait(timeout=20) == 70
+                assert flight.process.wait(timeout=60) == 70
+                until(lambda: any("stood still" in text for text in heard), what="the last words on the ground")
         finally:
             over.set()
             manager.join()
@@ -75,7 +89,7 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path:
     assert "WATCHDOG=1" in words[ready:]
     assert any(word.startswith("STATUS=the main loop has stood still") for word in words)
     assert "STOPPING=1" not in words
-    # Fed every 0.1 s while it turned, 1.5 s before the end no more: the last word is not that it lives.
+    # Fed every 0.1 s while it turned, 5 s before the end no more: the last word is not that it lives.
     assert words[-1] != "WATCHDOG=1"
 
 

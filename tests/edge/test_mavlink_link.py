@@ -50,6 +50,14 @@ def test_the_full_pose_arrives_as_target_relative() -> None:
     np.testing.assert_allclose(R_ned_cam, R_NED_CAM, atol=1e-6)
 
 
+def test_what_was_told_before_the_end_still_arrives() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.event(3, "the main loop has stood still")
+        link.stop()
+        assert peer.named("STATUSTEXT").text == "the main loop has stood still"
+
+
 def test_box_and_place_on_the_globe_arrive_for_the_ground_station() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
