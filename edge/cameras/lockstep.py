@@ -85,7 +85,10 @@ class LockstepCapture:
             raise InputError(f"the player said {line!r}, neither time NS nor frame INDEX", ("camera", "lockstep"))
         self._owes_answer = True
         if word == "time":
-            clock.step_to(int(number))
+            try:
+                clock.step_to(int(number))
+            except ValueError as error:
+                raise InputError(f"the player's time goes back: {error}", ("camera", "lockstep")) from error
             return None
         frame = self._source.exposed_now(int(number), self._frames)
         self._frames += 1

@@ -59,7 +59,10 @@ TOLERANCES = {
 }
 OTHER = Tolerance(0.005, 0.01)
 QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
-NAMES = ("kind", "t_ns", "frame", "target", "system", "component")  # what a record is known by
+# What a record is known by.
+POSE_NAMES = ("kind", "t_ns", "frame", "target")
+MESSAGE_NAMES = ("kind", "t_ns", "system", "component")
+TARGET_NAMES = (*MESSAGE_NAMES, "id")  # one message a target
 
 
 @dataclass(frozen=True)
@@ -105,22 +108,28 @@ def _keyed(records: Iterable[Record]) -> dict[Key, Record]:
     seen: Counter[Key] = Counter()
     keyed = {}
     for record in records:
-        name = tuple(record.get(part) for part in NAMES)
+        name = tuple(record[part] for part in _names(record))
         seen[name] += 1
         keyed[*name, seen[name]] = record
     return keyed
 
 
+def _names(record: Record) -> tuple[str, ...]:
+    if record["kind"] == "pose":
+        return POSE_NAMES
+    return TARGET_NAMES if record["kind"] == "TARGET_RELATIVE" else MESSAGE_NAMES
+
+
 def _where(record: Record) -> str:
     told = f"{record['t_ns'] / 1e9:+.3f} s {record['kind']}"
-    if "frame" in record:
+    if record["kind"] == "pose":
         return f"{told} frame {record['frame']} {record['target']}"
     return f"{told} from {record['system']}/{record['component']}"
 
 
 def _off(expected: Record, actual: Record) -> list[str]:
     told = []
-    for field in sorted((expected.keys() | actual.keys()) - set(NAMES)):
+    for field in sorted((expected.keys() | actual.keys()) - set(_names(expected))):
         if field not in expected or field not in actual:
             told.append(f"{field} {'is new' if field in actual else 'is gone'}")
             continue
@@ -131,6 +140,8 @@ def _off(expected: Record, actual: Record) -> list[str]:
 
 
 def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
+    if expected == actual:
+        return None
     said = f"{field} is {_short(actual)}, expected {_short(expected)}"
     if isinstance(expected, str) and isinstance(actual, str):
         # Numbers in a sentence are rounded from fields that are held themselves.
@@ -138,14 +149,14 @@ def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
         return None if same else said
     old, new = _numbers(expected), _numbers(actual)
     if old is None or new is None or len(old) != len(new):
-        return None if expected == actual else said
+        return said
     if field in QUATERNIONS:
         angle_deg = math.degrees(2.0 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(old, new, strict=True))))))
         return None if angle_deg <= ROTATION_DEG else f"{said}: {angle_deg:.2f}° apart, {ROTATION_DEG:.0f}° allowed"
     tolerance = TOLERANCES.get((kind, field))
     if tolerance is None:
         if all(isinstance(value, int) for value in (*old, *new)):
-            return None if old == new else said
+            return said
         tolerance = OTHER
     error, allowed = max(abs(a - b) for a, b in zip(old, new, strict=True)), tolerance.allows(old)
     return None if error <= allowed else f"{said}: {error:.4g} off, {allowed:.4g} allowed"

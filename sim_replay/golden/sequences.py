@@ -89,7 +89,7 @@ def _glider() -> Flight:
 
 def scenes(plan: Plan) -> list[Scene]:
     """The frames' scenes, exposed at k / FPS seconds."""
-    t_s = np.arange(plan.frames) / FPS
+    t_s: Array = np.arange(plan.frames) / FPS
     width, height = SIZE_WH
     K = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
     R_ned_own, t_ned_own_m, _ = plan.own.states(t_s)
@@ -108,7 +108,7 @@ def telemetry(plan: Plan) -> Telemetry:
     """The own ship's state at 50 Hz, from a second before the first frame to a second after the last."""
     rows = round((plan.frames / FPS + 2.0) * TELEMETRY_HZ) + 1
     t_ns = np.round((np.arange(rows) / TELEMETRY_HZ - 1.0) * 1e9).astype(np.int64)
-    t_s = t_ns * 1e-9
+    t_s = t_ns.astype(np.float64) * 1e-9
     R_ned_body, position, velocity = plan.own.states(t_s)
     place = [lat_lon_alt_from_ned(ORIGIN_DEG_M, t_ned_m) for t_ned_m in position]
     rates = plan.own.rates_body_radps(t_s)

@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edge.errors import InputError
+from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import free_port
@@ -30,7 +31,6 @@ from sim_replay.telemetry import read_telemetry
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot
 LEAD_NS = 1_000_000_000  # of telemetry before the first frame
 UAV = "uav1"
-EXIT_BAD_INPUT = 2
 ENDING_S = 3.0  # from hanging up to its end
 
 BeforeFrame = Callable[[int], None]
@@ -87,7 +87,7 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
         mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         config = folder / "config.toml"
         config.write_text(_config_toml(settings, control.address, mavlink_port, endpoint), encoding="utf-8")
-        command = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
+        command: list[str | Path] = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
         daemon = Process(command, lambda line, _: said.append(line))
         cleanup.callback(daemon.end)
         try:
