@@ -6,6 +6,7 @@ import argparse
 import json
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -23,6 +24,7 @@ from sim_replay.faults import run as faults
 from sim_replay.golden import run as golden
 from sim_replay.ground_truth import read_sequence
 from sim_replay.lockstep import command as lockstep
+from sim_replay.matrix import command as matrix
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError
@@ -38,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
         "demo",
         help="play the bundled sequence through the daemon and show what it makes of it",
         description="Start the daemon, a simulated autopilot (MAVLink over UDP) and a zenoh subscriber on this host, "
-        "play the bundled sequence in real time, and write score.json, overlay.png and overlay.mp4. "
+        "play the bundled sequence in real time, and write report.html, score.json and overlay.mp4. "
         "Needs no GPU, no display and no network. Exit code 0 only if both peers received poses.",
     )
     play = commands.add_parser(
@@ -56,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     benchmark.register(commands)
     pipeline.register(commands)
     faults.register(commands)
+    matrix.register(commands)
     golden.register(commands)
     radio.register(commands)
 
@@ -63,8 +66,8 @@ def _parser() -> argparse.ArgumentParser:
         "score",
         help="score a recorded flight against the truth, or a model on a dataset frame by frame",
         description="With FLIGHT, a folder that demo or play wrote: set what the subscriber and the autopilot received "
-        "against the truth and write score.json, frames.jsonl and overlay.mp4. With --dataset: run acquire and track "
-        "on every frame by itself, with no tracker, no clock and no daemon.",
+        "against the truth and write report.html, score.json, frames.jsonl and overlay.mp4. With --dataset: run "
+        "acquire and track on every frame by itself, with no tracker, no clock and no daemon.",
     )
     score.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="folder that demo or play wrote")
     score.add_argument("--sequence", type=Path, metavar="DIR", help="scene folder (default: the one that was flown)")
@@ -97,6 +100,7 @@ def _run(args: argparse.Namespace) -> int:
 def _score_flight(args: argparse.Namespace, console: Console) -> int:
     flight = read_flight(args.flight)
     sequence = read_sequence(args.sequence or flight.sequence)
+    sequence = replace(sequence, fps=sequence.fps * flight.speed)
     told = Console(stderr=True, quiet=True) if args.json else console
     score = report_flight(sequence, flight, args.out or args.flight, told)
     if args.json:

@@ -92,7 +92,7 @@ def bundled() -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Play the timelines one after the other on one rig. Raises InputError for a timeline that does not do."""
-    timelines = [load_timeline(_path(name)) for name in args.timeline]
+    timelines = [load_timeline(timeline_path(name)) for name in args.timeline]
     if not args.model.is_file():
         raise InputError(f"--model {args.model}: is no file")
     for name, timeline in zip(args.timeline, timelines, strict=True):
@@ -120,5 +120,6 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_UNMET if wrong else 0
 
 
-def _path(name: str) -> Path:
+def timeline_path(name: str) -> Path:
+    """The file of a timeline: one that comes with the package, or a path."""
     return TIMELINES / f"{name}.toml" if name in bundled() else Path(name)

@@ -21,6 +21,7 @@ class RecordedFlight:
     sequence: Path  # folder of the scene that was flown
     model: dict[str, Any]  # file, sha256, precision
     recording: Recording
+    speed: float = 1.0  # times the sequence's own frame rate
 
 
 def is_flight(folder: Path) -> bool:
@@ -33,6 +34,7 @@ def write_flight(out: Path, flight: RecordedFlight) -> None:
     recording = flight.recording
     about = {
         "sequence": str(flight.sequence.resolve()),
+        "speed": flight.speed,
         "model": flight.model,
         "start_at_ns": recording.start_at_ns,
         "utc_minus_monotonic_ns": recording.utc_minus_monotonic_ns,
@@ -63,7 +65,7 @@ def read_flight(folder: Path) -> RecordedFlight:
             daemon_exit=about["daemon_exit"],
             daemon_counters=dict(about["daemon_counters"]),
         )
-        sequence, model = Path(about["sequence"]), dict(about["model"])
+        sequence, model, speed = Path(about["sequence"]), dict(about["model"]), float(about["speed"])
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}; is {folder} what a replay wrote?") from error
     except KeyError as error:
@@ -71,7 +73,7 @@ def read_flight(folder: Path) -> RecordedFlight:
     except (ValueError, TypeError) as error:
         raise InputError(f"{path}: not as expected: {error}") from error
     _read_received(folder / RECEIVED_JSONL, recording)
-    return RecordedFlight(sequence, model, recording)
+    return RecordedFlight(sequence, model, recording, speed)
 
 
 def _read_received(path: Path, recording: Recording) -> None:

@@ -13,7 +13,6 @@ from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import Image, Overlay, showcase_index, write_video
 from sim_replay.report.flight_files import RecordedFlight
-from sim_replay.report.page import report_html
 from sim_replay.result import PEERS, Result, frame_views, judge, score_json
 
 
@@ -28,6 +27,8 @@ def write_report(
     Raises:
         InputError, OSError.
     """
+    from sim_replay.report.page import report_html  # matplotlib takes its time
+
     out.mkdir(parents=True, exist_ok=True)
     result = judge(sequence, flight.recording)
     score = score_json(sequence, result, flight.model)

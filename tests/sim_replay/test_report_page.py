@@ -69,9 +69,10 @@ def flight(flown: PlayedSequence, tmp_path: Path) -> Path:
 
 def test_a_recorded_flight_reads_back_as_it_was(flown: PlayedSequence, tmp_path: Path) -> None:
     made = recording(flown, {0, 1, 2, 3})
-    write_flight(tmp_path, RecordedFlight(flown.scene.folder, {"file": "m"}, made))
+    write_flight(tmp_path, RecordedFlight(flown.scene.folder, {"file": "m"}, made, speed=0.5))
     back = read_flight(tmp_path)
     assert back.recording == made
+    assert back.speed == 0.5
     assert back.sequence == flown.scene.folder.resolve()
 
 

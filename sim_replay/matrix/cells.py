@@ -1,0 +1,91 @@
+"""One cell of the matrix: a sequence at a speed, flown whole and scored, or broken by a timeline and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from edge.errors import InputError
+from edge.estimator.model import Model
+from sim_replay.faults.judge import ages_ms, violations
+from sim_replay.faults.rig import Rig, RigSettings, can_mount
+from sim_replay.faults.run import play_timeline
+from sim_replay.faults.timeline import Timeline
+from sim_replay.faults.witness import AUTOPILOT
+from sim_replay.ground_truth import PlayedSequence
+from sim_replay.offline import method_of
+from sim_replay.pace import at_speed
+from sim_replay.play import PlayError, PlaySettings, play
+from sim_replay.report.flight_files import RecordedFlight, write_flight
+from sim_replay.report.peer import percentiles
+from sim_replay.result import judge, score_json
+
+NO_FAULT = "none"
+RIG_FPS = 10.0  # of a rig at speed 1, as `faults` has it
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a cell came to; None where it cannot tell. A flight with faults hovers, so its errors are not judged."""
+
+    sequence: str
+    speed: float
+    fault: str
+    wrong: tuple[str, ...]  # empty: as it should be
+    poses: int = 0  # at the autopilot
+    found: float | None = None  # share of the views
+    rotation_error_deg: float | None = None  # median
+    range_error_rel: float | None = None  # mean
+    age_p50_ms: float | None = None  # at the autopilot
+    age_max_ms: float | None = None
+    dropped: int | None = None  # frames, by the daemon
+
+
+def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) -> Cell:
+    """Play it once; what cannot be played is what is wrong. Raises InputError."""
+    name = sequence.scene.name
+    out.mkdir(parents=True, exist_ok=True)
+    flown = at_speed(sequence, speed, out)
+    try:
+        recording = play(PlaySettings(flown, out, model.path), lambda _recording, _record: None)
+    except PlayError as error:
+        return Cell(name, speed, NO_FAULT, (str(error),))
+    facts = method_of(model)
+    write_flight(out, RecordedFlight(sequence.scene.folder, facts, recording, speed))
+    score = score_json(flown, judge(flown, recording), facts)
+    peer = score["peers"]["autopilot"]
+    silent = tuple(f"the {name} received no pose" for name, figures in score["peers"].items() if not figures["poses"])
+    return Cell(
+        name,
+        speed,
+        NO_FAULT,
+        silent,
+        peer["poses"],
+        peer["overall"]["recall"],
+        peer["overall"]["rotation_error_deg"]["median"],
+        peer["range_error_m"]["mean_rel"],
+        peer["age_ms"]["p50"],
+        peer["age_ms"]["max"],
+        score["dropped_frames"],
+    )
+
+
+def break_cell(sequence: PlayedSequence, speed: float, fault: str, timeline: Timeline, model: Path, out: Path) -> Cell:
+    """Play a timeline on a rig that shows the sequence's pictures; what is not as expected is what is wrong."""
+    name = sequence.scene.name
+    out.mkdir(parents=True, exist_ok=True)
+    if timeline.volume and not can_mount(out):
+        raise InputError(f"--fault {fault}: needs a host that lets a user mount (unshare --mount)")
+    settings = RigSettings(
+        out, sequence.scene.folder, model, fps=RIG_FPS * speed, volume=timeline.volume, signed=timeline.signed
+    )
+    try:
+        with Rig(settings) as rig:
+            outcome = play_timeline(rig, timeline, lambda _: None)
+    except PlayError as error:
+        return Cell(name, speed, fault, (str(error),))
+    received = ages_ms(rig.witness, AUTOPILOT)
+    age = percentiles(received)
+    dropped = rig.witness.counters.get("dropped")
+    wrong = (*outcome.wrong, *violations(rig.witness))
+    return Cell(name, speed, fault, wrong, len(received), age_p50_ms=age["p50"], age_max_ms=age["max"], dropped=dropped)

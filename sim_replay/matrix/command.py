@@ -1,0 +1,133 @@
+"""The `matrix` sub-command of `uavpose-replay`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from edge.config import SHIPPED_MODEL
+from edge.errors import InputError
+from edge.estimator.model import Model, load_model
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.faults.run import timeline_path
+from sim_replay.faults.timeline import Timeline, load_timeline
+from sim_replay.ground_truth import PlayedSequence, read_sequence
+from sim_replay.matrix.cells import NO_FAULT, Cell, break_cell, fly_cell
+from sim_replay.matrix.datasets import flyable
+
+EXIT_WRONG = 1
+SPEEDS = (0.25, 4.0)
+
+
+def register(commands: Any) -> None:
+    """Add it to what argparse's add_subparsers() gave."""
+    parser = commands.add_parser(
+        "matrix",
+        help="fly sequences at several speeds, with and without faults, and print one table",
+        description="Every combination of what is asked for, one after the other, through the real daemon. Without a "
+        "fault a flight is scored against the truth; with one it is judged as `faults` does. Writes matrix.json. "
+        "Exit code 0 if all was as it should be, 1 if not.",
+    )
+    parser.add_argument(
+        "--sequence", type=Path, action="append", default=[], metavar="DIR", help="scene folder; may be repeated"
+    )
+    parser.add_argument(
+        "--dataset", type=Path, action="append", default=[], metavar="DIR",
+        help="what `generate --preset` wrote: its first test sequences are flown; may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--take", type=int, default=1, metavar="N", help="sequences of each dataset (default 1)")
+    parser.add_argument(
+        "--fault", action="append", default=[], metavar="NAME",
+        help=f"a timeline of `faults`, or {NO_FAULT}; may be repeated (default: {NO_FAULT})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--speed", type=float, action="append", default=[], metavar="X", help="times real time; may be repeated (1)"
+    )
+    parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
+    parser.add_argument("--out", type=Path, default=Path("out") / "matrix", metavar="DIR", help="folder to write to")
+    parser.add_argument("--json", action="store_true", help="print the cells as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Raises InputError, PlayError."""
+    speeds, faults = args.speed or [1.0], args.fault or [NO_FAULT]
+    for speed in speeds:
+        if not (math.isfinite(speed) and SPEEDS[0] <= speed <= SPEEDS[1]):
+            raise InputError(f"--speed {speed:g}: must be {SPEEDS[0]:g} to {SPEEDS[1]:g}")
+    timelines = {name: load_timeline(timeline_path(name)) for name in faults if name != NO_FAULT}
+    model = load_model(args.model, threads=1)
+    if args.take < 1:
+        raise InputError(f"--take {args.take}: must be at least 1")
+    given = args.sequence or ([] if args.dataset else [BUNDLED_SEQUENCE])
+    taken = [folder for dataset in args.dataset for folder in flyable(dataset, args.take)]
+    sequences = [read_sequence(folder) for folder in (*given, *taken)]
+    args.out.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=args.json)
+    cells = []
+    for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
+        cells.append(cell)
+        told = "; ".join(cell.wrong) or "as it should be"
+        console.print(f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False)
+    records = [asdict(cell) for cell in cells]
+    (args.out / "matrix.json").write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
+    if args.json:
+        print(json.dumps(records))
+    else:
+        console.print(table(cells))
+    return EXIT_WRONG if any(cell.wrong for cell in cells) else 0
+
+
+def _cells(
+    sequences: Sequence[PlayedSequence],
+    speeds: Sequence[float],
+    faults: Sequence[str],
+    timelines: dict[str, Timeline],
+    model: Model,
+    out: Path,
+) -> Iterator[Cell]:
+    """Each combination, in a folder of its own."""
+    for number, sequence in enumerate(sequences):
+        for speed in speeds:
+            for fault in faults:
+                folder = out / f"{number}-{sequence.scene.name}-x{speed:g}-{Path(fault).stem}"
+                if fault == NO_FAULT:
+                    yield fly_cell(sequence, speed, model, folder)
+                else:
+                    yield break_cell(sequence, speed, fault, timelines[fault], model.path, folder)
+
+
+def table(cells: Sequence[Cell]) -> Table:
+    """For a person."""
+    shown = Table(title="matrix", title_justify="left")
+    for name in ("sequence", "speed", "fault", ""):
+        shown.add_column(name)
+    for name in ("poses", "found", "E_r median", "range", "age p50", "age max", "dropped"):
+        shown.add_column(name, justify="right")
+    for cell in cells:
+        shown.add_row(
+            cell.sequence,
+            f"{cell.speed:g}",
+            cell.fault,
+            "[red]WRONG[/red]" if cell.wrong else "ok",
+            str(cell.poses),
+            _text(cell.found, "{:.1%}"),
+            _text(cell.rotation_error_deg, "{:.1f}°"),
+            _text(cell.range_error_rel, "{:+.1%}"),
+            _text(cell.age_p50_ms, "{:.1f} ms"),
+            _text(cell.age_max_ms, "{:.1f} ms"),
+            _text(cell.dropped, "{:d}"),
+        )
+    return shown
+
+
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
