@@ -11,20 +11,15 @@ from pathlib import Path
 from edge.bench import command as bench
 from edge.errors import InputError
 from edge.logs import set_up_logging
+from msgs.command_line import exit_code
 from msgs.signals import on_signals
-
-EXIT_BAD_INPUT = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key."""
     options = _parser().parse_args(arguments)
     set_up_logging()
-    try:
-        return int(options.act(options))
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return exit_code(lambda: int(options.act(options)), InputError)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.errors import InputError
+from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.ground_truth import PlayedSequence
 
 LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
@@ -29,7 +30,6 @@ READY_MARGIN_NS = 100_000_000
 _OVERTIME_S = 20.0
 _STOP_TIMEOUT_S = 5.0
 _SETTLE_S = 0.3
-_EXIT_BAD_INPUT = 2
 
 Record = dict[str, Any]
 
@@ -137,7 +137,7 @@ def _check_exit(code: int | None, log: Path) -> None:
         raise PlayError(f"the daemon did not end {_OVERTIME_S:.0f} s after the last frame; see {log}")
     words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     last = words[-1] if words else "it said nothing"
-    if code == _EXIT_BAD_INPUT:
+    if code == EXIT_BAD_INPUT:
         raise InputError(last)
     raise PlayError(f"the daemon ended with exit code {code}: {last}")
 

@@ -9,12 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
 
+from msgs.command_line import exit_code
 from msgs.ground.errors import InputError
 from msgs.session import TlsFiles
 from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
-
-EXIT_BAD_INPUT = 2
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
@@ -22,11 +21,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 def main(arguments: list[str] | None = None) -> int:
     """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key."""
     options = _parser().parse_args(arguments)
-    try:
-        return int(options.act(options))
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return EXIT_BAD_INPUT
+    return exit_code(lambda: int(options.act(options)), InputError)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -24,6 +24,7 @@ from edge.cameras.sequence import read_scene
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.links.signing_key import write_new_key
+from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.camera import TOPIC
 from sim_replay.faults.processes import Process
@@ -146,7 +147,7 @@ class Rig:
         words = [line for _, line in self.witness.said] if who == "daemon" else self.witness.complaints
         last = words[-1] if words else "it said nothing"
         sentence = f"the {who} ended with exit code {process.exit_code}: {last}"
-        return InputError(sentence) if process.exit_code == 2 else PlayError(sentence)
+        return InputError(sentence) if process.exit_code == EXIT_BAD_INPUT else PlayError(sentence)
 
     def _router_answers(self) -> bool:
         with socket.socket() as probe:

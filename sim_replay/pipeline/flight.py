@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from edge.errors import InputError
+from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.ground_truth import PlayedSequence
@@ -26,7 +27,6 @@ from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
 
 UAV = "uav1"
 SAMPLE_S = 1.0
-EXIT_BAD_INPUT = 2
 
 
 @dataclass(frozen=True)
