@@ -1,8 +1,8 @@
 """A simulated autopilot: tells own-ship state over MAVLink on UDP, and takes what the daemon sends.
 
 It reports a sequence's telemetry as an ArduPilot plane would, on a boot clock of its own: HEARTBEAT,
-ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME; it answers TIMESYNC and
-MAV_CMD_SET_MESSAGE_INTERVAL.
+ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS of a
+gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL.
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
@@ -30,6 +30,7 @@ from edge.links.signing_key import load_key
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.mavlink import MAVLink, dialect, pack
 from msgs.signals import stop_on_signals
+from sim_replay.gimbal import GimbalTrack, read_gimbal
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
 SYSTEM_ID = 1
@@ -43,6 +44,14 @@ DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
+GIMBAL_RATE_HZ = 10.0  # unasked
+GIMBAL_FLAGS = (
+    dialect.GIMBAL_DEVICE_FLAGS_ROLL_LOCK
+    | dialect.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+    | dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+    | dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+)
+GIMBAL_UNKNOWN = ("angular_velocity_x", "angular_velocity_y", "angular_velocity_z", "delta_yaw", "delta_yaw_velocity")
 # Up for an odd while before the first frame: no test may pass by taking boot time for the host's.
 BOOT_BEFORE_START_NS = 734_567_891_234
 INTERVAL_MIN_NS = 1_000_000
@@ -63,15 +72,20 @@ class Autopilot:
         boot_at_ns: int,
         system_id: int = SYSTEM_ID,
         signing: Signing | None = None,
+        gimbal: GimbalTrack | None = None,
     ) -> None:
         self._telemetry = telemetry
+        self._gimbal = gimbal
         self._start_at_ns = start_at_ns
         self._boot_at_ns = boot_at_ns
         self._system_id = system_id
         self._signing = signing
         self._mav = MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
-        self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in DEFAULT_RATES_HZ.items()}
-        self._next_ns = dict.fromkeys(DEFAULT_RATES_HZ, boot_at_ns)
+        self._rates_hz = dict(DEFAULT_RATES_HZ)
+        if gimbal is not None:
+            self._rates_hz[dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] = GIMBAL_RATE_HZ
+        self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in self._rates_hz.items()}
+        self._next_ns = dict.fromkeys(self._rates_hz, boot_at_ns)
         self._last_target_us: dict[int, int] = {}
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
@@ -116,7 +130,7 @@ class Autopilot:
     def _packed(self, message: Any) -> bytes:
         if self._signing is not None:
             self._signing.prepare(self._mav)
-        return pack(self._mav, message)
+        return pack(self._mav, message, unknown=GIMBAL_UNKNOWN)
 
     def _boot_ms(self, now_ns: int) -> int:
         return (now_ns - self._boot_at_ns) // 1_000_000 % 2**32
@@ -129,6 +143,12 @@ class Autopilot:
         boot_ms = self._boot_ms(now_ns)
         if message_id == dialect.MAVLINK_MSG_ID_SYSTEM_TIME:
             return dialect.MAVLink_system_time_message(time.time_ns() // 1000, boot_ms)
+        if self._gimbal is not None and message_id == dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS:
+            q_wxyz = self._gimbal.at(now_ns - self._start_at_ns).tolist()
+            nan = math.nan
+            return dialect.MAVLink_gimbal_device_attitude_status_message(
+                0, 0, boot_ms, GIMBAL_FLAGS, q_wxyz, nan, nan, nan, 0, nan, nan, 1
+            )
         state = self._telemetry.at(now_ns - self._start_at_ns)
         if message_id == dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION:
             q_and_rates = (*state.q_ned_body_wxyz.tolist(), *state.rates_body_radps.tolist())
@@ -186,13 +206,13 @@ class Autopilot:
         numbers = (message.param1, message.param2)
         if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
-        if not all(math.isfinite(value) for value in numbers) or int(message.param1) not in DEFAULT_RATES_HZ:
+        if not all(math.isfinite(value) for value in numbers) or int(message.param1) not in self._rates_hz:
             return int(dialect.MAV_RESULT_DENIED)
         message_id, interval_us = int(message.param1), message.param2
         if interval_us < 0:
             self._next_ns.pop(message_id, None)
             return int(dialect.MAV_RESULT_ACCEPTED)
-        default_ns = round(1e9 / DEFAULT_RATES_HZ[message_id])
+        default_ns = round(1e9 / self._rates_hz[message_id])
         self._interval_ns[message_id] = max(round(interval_us * 1e3), INTERVAL_MIN_NS) if interval_us else default_ns
         self._next_ns[message_id] = now_ns
         return int(dialect.MAV_RESULT_ACCEPTED)
@@ -261,10 +281,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--system-id", type=int, choices=range(1, 256), metavar="ID", default=SYSTEM_ID, help="its own (1)"
     )
+    parser.add_argument("--gimbal", type=Path, metavar="CSV", help="gimbal.csv: how its gimbal turns, same clock")
     parser.add_argument("--signing-key", type=Path, metavar="FILE", help="sign all, and believe nothing unsigned")
     args = parser.parse_args(argv)
     try:
         telemetry = read_telemetry(args.telemetry)
+        gimbal = None if args.gimbal is None else read_gimbal(args.gimbal)
         key = None if args.signing_key is None else load_key(args.signing_key)
     except (TelemetryError, InputError) as error:
         print(error, file=sys.stderr)
@@ -272,7 +294,7 @@ def main(argv: list[str] | None = None) -> int:
     stop = stop_on_signals()
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
     signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
-    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing)
+    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal)
     _fly(autopilot, args.endpoint, stop)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0

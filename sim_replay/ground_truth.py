@@ -16,6 +16,7 @@ from msgs.geometry import Array
 from sim_replay.bop import BopFrame, Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
+from sim_replay.gimbal import R_GIMBAL_CAM, GimbalTrack, track_of
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
 from sim_replay.telemetry import TelemetryError, read_telemetry
@@ -51,6 +52,12 @@ class PlayedSequence:
     mount: Mount
     telemetry_csv: Path
     frame0_ns: int  # exposure of the first frame on the telemetry's clock
+    gimbal: GimbalTrack | None = None  # None: the camera is bolted on; else `mount` says how it sits on the gimbal
+
+    @property
+    def camera_mount(self) -> str:
+        """What the daemon's [camera] mount must say."""
+        return "fixed" if self.gimbal is None else "gimbal"
 
 
 def read_scene_truth(folder: Path) -> SceneTruth:
@@ -103,11 +110,25 @@ def read_sequence(folder: Path) -> PlayedSequence:
         mount = MountSettings(R_body_cam=settings["R_body_cam"], t_body_cam_m=settings["t_body_cam_m"]).mount()
         fps = float(settings["fps"])
         frame0_ns = int(settings["t0_ns"])
+        gimballed = settings.get("mount", "fixed") == "gimbal"
     try:
         read_telemetry(folder / "telemetry.csv")
     except TelemetryError as error:
         raise InputError(str(error)) from error
-    return PlayedSequence(scene, fps, mount, folder / "telemetry.csv", frame0_ns)
+    telemetry_csv, gimbal = folder / "telemetry.csv", None
+    if gimballed:
+        gimbal, mount = _gimbal(folder, frame0_ns, fps), Mount(R_GIMBAL_CAM, mount.t_body_cam_m)
+    return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal)
+
+
+def _gimbal(folder: Path, frame0_ns: int, fps: float) -> GimbalTrack:
+    """What scene_camera.json tells of a camera whose world is local NED. Raises InputError."""
+    R_cam_ned = [frame.R_cam_world for frame in read_scene(folder).pictured]
+    known = [R for R in R_cam_ned if R is not None]
+    if len(known) < max(len(R_cam_ned), 2):
+        path = folder / "scene_camera.json"
+        raise InputError(f"{path}: 'cam_R_w2c' is missing: it says how the gimbal was turned at every frame")
+    return track_of(known, frame0_ns, fps)
 
 
 @contextmanager

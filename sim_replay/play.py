@@ -23,6 +23,7 @@ from typing import Any
 
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
+from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
 
 LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
@@ -174,8 +175,13 @@ def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]
     telemetry = str(settings.sequence.telemetry_csv)
     address = f"127.0.0.1:{recording.mavlink_port}"
     start = str(recording.start_at_ns - settings.sequence.frame0_ns)
+    autopilot = ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start]
+    if settings.sequence.gimbal is not None:
+        gimbal_csv = settings.out / "gimbal.csv"
+        write_gimbal(gimbal_csv, settings.sequence.gimbal)
+        autopilot += ["--gimbal", str(gimbal_csv)]
     return {
-        "autopilot": ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start],
+        "autopilot": autopilot,
         "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav],
     }
 
@@ -251,6 +257,7 @@ def _config_toml(settings: PlaySettings, recording: Recording) -> str:
         f"name = {json.dumps(settings.uav)}",
         "[camera]",
         'type = "sequence"',
+        f"mount = {json.dumps(sequence.camera_mount)}",
         f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
         f"fps = {sequence.fps}",
         f"start_at_ns = {recording.start_at_ns}",

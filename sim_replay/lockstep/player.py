@@ -21,6 +21,7 @@ from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import free_port
+from sim_replay.gimbal import looped as looped_gimbal
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
@@ -122,14 +123,17 @@ class Flight:
         sequence, frames = settings.sequence, settings.frames
         offset_ns = round(settings.start * 1e9 / sequence.fps)
         telemetry, first_ns = read_telemetry(sequence.telemetry_csv), sequence.frame0_ns + offset_ns
+        gimbal = sequence.gimbal
         if settings.rounds > 1:
             round_s = len(frames) / settings.rounds / sequence.fps
+            if gimbal is not None:
+                gimbal = looped_gimbal(gimbal, first_ns, round_s, settings.rounds)
             telemetry, first_ns = looped(telemetry, first_ns, round_s, settings.rounds), 0
         self._fps = sequence.fps
         self._frames = frames
         self._first_ns = BASE_NS + first_ns
         frame0_ns = self._first_ns - offset_ns
-        autopilot = Autopilot(telemetry, BASE_NS, BASE_NS - BOOT_BEFORE_START_NS)
+        autopilot = Autopilot(telemetry, BASE_NS, BASE_NS - BOOT_BEFORE_START_NS, gimbal=gimbal)
         self._subscriber = Subscriber(endpoint, UAV, frame0_ns)
         self._mavlink = MavlinkPeer(autopilot, mavlink_port, frame0_ns)
         self._stepper = Stepper(control, self._mavlink, self._first_ns - LEAD_NS)
@@ -192,6 +196,7 @@ def _config_toml(settings: LockstepSettings, control: str, mavlink_port: int, en
         f"name = {json.dumps(UAV)}",
         "[camera]",
         'type = "sequence"',
+        f"mount = {json.dumps(sequence.camera_mount)}",
         f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
         f"fps = {sequence.fps}",
         f"lockstep = {json.dumps(control)}",
