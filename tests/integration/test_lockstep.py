@@ -1,0 +1,94 @@
+"""Lock-step as a user runs it: the same outputs at any speed, as accepted, and a frame at a time."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sim_replay.cli import main
+from sim_replay.faults.relay import free_port
+from sim_replay.golden.run import CASES
+
+BIN = Path(sys.executable).parent
+LAST_FRAMES = ["--start", "4.6"]  # of 150 at 30 Hz: the last twelve
+
+
+def replay(*arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]:
+    command = [BIN / "uavpose-replay", *arguments]
+    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=200)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_the_same_frames_give_the_same_files_at_any_speed_and_by_hand(tmp_path: Path) -> None:
+    quick = replay("play", "--lockstep", *LAST_FRAMES, "--out", tmp_path / "quick")
+    assert quick.returncode == 0, quick.stderr
+    began_s = time.monotonic()
+    slow = replay("play", "--speed", "0.25", *LAST_FRAMES, "--out", tmp_path / "slow")
+    assert slow.returncode == 0, slow.stderr
+    assert time.monotonic() - began_s > 11 / 30 / 0.25
+    stepped = replay("play", "--step", *LAST_FRAMES, "--out", tmp_path / "stepped", typed="\n\ng\n")
+    assert stepped.returncode == 0, stepped.stderr
+    assert stepped.stdout.count("before frame") == 3
+    assert stepped.stdout.count("t0 at") >= 8
+
+    expected = files(tmp_path / "quick")
+    assert sorted(expected) == ["mavlink.jsonl", "poses.jsonl"]
+    assert files(tmp_path / "slow") == expected
+    assert files(tmp_path / "stepped") == expected
+    poses = [json.loads(line) for line in expected["poses.jsonl"].splitlines()]
+    assert [pose["frame"] for pose in poses if pose["target"] == "t0"] == list(range(poses[0]["frame"], 150))
+    assert all(pose["t_ns"] == round(pose["frame"] * 1e9 / 30) for pose in poses)
+    messages = [json.loads(line) for line in expected["mavlink.jsonl"].splitlines()]
+    told = [message for message in messages if message["message"] == "TARGET_RELATIVE"]
+    assert [message["timestamp"] for message in told] == [pose["t_ns"] // 1000 for pose in poses]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
+    played = replay("golden", case, "--out", tmp_path)
+    assert played.returncode == 0, f"{played.stdout}\n{played.stderr}\naccept it: uavpose-replay golden --accept"
+    assert played.stdout.strip().endswith(f"{case}: as accepted")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["play", "--start", "9"], "--start 9.0: the sequence's frames are from 0 to 4.967 s"),
+        (["play", "--loop", "0"], "--loop 0: must be at least 1"),
+        (["play", "--pause", "150"], "--pause 150: is none of the frames 0 to 149"),
+        (["play", "--speed", "0.1"], "'0.1' is neither a number from 0.25 up nor max"),
+        (["golden", "crosing"], "golden crosing: no such case; there are crossing, away_and_back, two_targets"),
+    ],
+)
+def test_what_cannot_be_played_is_said_in_a_sentence(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(arguments)
+    except SystemExit as refused:  # by argparse
+        code = refused.code
+    said = capsys.readouterr()
+    assert (code, said.out) == (2, "")
+    assert words in said.err
+
+
+def test_without_a_player_the_daemon_says_so_and_names_the_key(small_scene: Path, tmp_path: Path) -> None:
+    config = tmp_path / "config.toml"
+    address = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    config.write_text(f'[camera]\ntype = "sequence"\npath = "{small_scene}"\nlockstep = "{address}"\n')
+    ended = subprocess.run(
+        [BIN / "uavpose-edge", "run", "--config", config], capture_output=True, text=True, timeout=100
+    )
+    assert ended.returncode == 2
+    assert f"no player answers at {address}" in ended.stderr
+    assert "config.toml:4: [camera] lockstep: " in ended.stderr
+    assert "Traceback" not in ended.stderr

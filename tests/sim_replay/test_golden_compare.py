@@ -1,0 +1,123 @@
+"""What golden files hold and what they let pass: differences in fields, in words that name them."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_replay.golden.compare import DEVIATION, POSITION, ROTATION_DEG, differences, reduced
+from sim_replay.golden.run import CASES, read_golden
+from sim_replay.lockstep.player import Outputs
+
+S = math.sqrt(0.5)
+POSE = {
+    "frame": 7,
+    "t_ns": 700_000_000,
+    "target": "t0",
+    "t_cam_target_m": [-12.0, 5.0, 200.0],
+    "q_cam_target_wxyz": [S, 0.0, S, 0.0],
+    "covariance": [[4.0 if row == column else 0.1 for column in range(6)] for row in range(6)],
+}
+STATUSTEXT = {
+    "t_ns": 700_000_000,
+    "message": "STATUSTEXT",
+    "system": 1,
+    "component": 191,
+    "severity": 6,
+    "text": "target 0 acquired at 200 m",
+}
+
+
+def held(**changed: Any) -> list[dict[str, Any]]:
+    pose = {**copy.deepcopy(POSE), **changed}
+    return reduced(Outputs([pose], [STATUSTEXT]))
+
+
+def told(expected: list[dict[str, Any]], actual: list[dict[str, Any]]) -> list[str]:
+    return [str(difference) for difference in differences(expected, actual)]
+
+
+def test_the_same_outputs_do_not_differ_and_a_quaternion_has_two_names() -> None:
+    assert told(held(), held()) == []
+    assert told(held(), held(q_cam_target_wxyz=[-S, 0.0, -S, 0.0])) == []
+
+
+@given(st.floats(0, 20), st.sampled_from([0, 1, 2]), st.sampled_from([-1, 1]))
+def test_a_position_may_be_off_by_its_tolerance_and_no_more(off_m: float, axis: int, sign: int) -> None:
+    t_m = list(POSE["t_cam_target_m"])  # type: ignore[call-overload]
+    t_m[axis] += sign * off_m
+    allowed_m = POSITION.least + POSITION.share * math.hypot(*POSE["t_cam_target_m"])  # type: ignore[misc]
+    found = told(held(), held(t_cam_target_m=t_m))
+    if off_m > allowed_m + 1e-6:
+        assert len(found) == 1
+        assert found[0].startswith("+0.700 s pose frame 7 t0: t_cam_target_m is ")
+        assert f"{allowed_m:.4g} allowed" in found[0]
+    elif off_m < allowed_m - 1e-6:
+        assert found == []
+
+
+@given(st.floats(0, 179))
+def test_a_rotation_is_judged_by_its_angle(angle_deg: float) -> None:
+    turned = math.radians(90.0 + angle_deg) / 2
+    found = told(held(), held(q_cam_target_wxyz=[math.cos(turned), 0.0, math.sin(turned), 0.0]))
+    if abs(angle_deg - ROTATION_DEG) > 1e-3:
+        assert bool(found) == (angle_deg > ROTATION_DEG)
+        assert all(f"{angle_deg:.2f}° apart" in text for text in found)
+
+
+def test_a_covariance_that_says_something_else_is_found() -> None:
+    covariance = copy.deepcopy(POSE["covariance"])
+    covariance[2][2] *= (1 + 8 * DEVIATION.share) ** 2  # type: ignore[index]
+    assert [text.split(" is ")[0] for text in told(held(), held(covariance=covariance))] == [
+        "+0.700 s pose frame 7 t0: std"
+    ]
+
+
+def test_what_is_missing_and_what_is_new_is_named_in_the_order_of_time() -> None:
+    later = held(frame=8, t_ns=800_000_000)
+    assert told([*held(), later[0]], held(target="t1")) == [
+        "+0.700 s pose frame 7 t0: expected, and did not come",
+        "+0.700 s pose frame 7 t1: came, and was not expected",
+        "+0.800 s pose frame 8 t0: expected, and did not come",
+    ]
+
+
+def test_words_are_held_and_the_numbers_in_them_are_not() -> None:
+    expected, other = held(), held()
+    other[1]["text"] = "target 0 acquired at 198 m"
+    assert told(expected, other) == []
+    other[1]["text"] = "target 0 lost"
+    assert told(expected, other) == [
+        "+0.700 s STATUSTEXT from 1/191: text is target 0 lost, expected target 0 acquired at 200 m"
+    ]
+
+
+def test_a_count_is_exact_and_a_field_that_goes_is_told() -> None:
+    expected, other = held(), held()
+    other[1]["severity"] = 4
+    del other[0]["std"]
+    assert told(expected, other) == [
+        "+0.700 s STATUSTEXT from 1/191: severity is 4, expected 6",
+        "+0.700 s pose frame 7 t0: std is gone",
+    ]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_golden_files_show_what_their_cases_are_for(case: str) -> None:
+    poses = [record for record in read_golden(case)[1] if record["kind"] == "pose"]
+    seen = {name: [pose["frame"] for pose in poses if pose["target"] == name] for name in ("t0", "t1")}
+    if case == "crossing":
+        assert len(seen["t0"]) > 40
+    elif case == "away_and_back":  # the picture is empty from frame 11 to 35
+        frames = sorted({pose["frame"] for pose in poses})
+        assert frames[0] < 8
+        assert frames[-1] > 45
+        assert max(b - a for a, b in itertools.pairwise(frames)) > 15
+    else:
+        assert min(len(frames) for frames in seen.values()) > 20
