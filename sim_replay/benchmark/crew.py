@@ -35,10 +35,10 @@ class CrewError(RuntimeError):
 
 @dataclass(frozen=True)
 class Said:
-    """What a worker says of its task: news on the way, or what came of it."""
+    """What a worker says of its task: news on the way, or what came of it; refused: what it was given does not do."""
 
     task: int  # its place among the tasks
-    kind: Literal["news", "done", "failed"]
+    kind: Literal["news", "done", "failed", "refused"]
     value: Any  # picklable
 
 
@@ -58,7 +58,8 @@ def crew(do: Callable[[T, Tell, Stopped], Any], tasks: Sequence[T], workers: int
     """Do all tasks, and yield what is said of them as it comes.
 
     `do` runs in the workers, so it must be picklable: it may tell news, and returns soon once it is stopped. Closing
-    the iterator, or an exception in the parent, stops every worker first. Raises CrewError.
+    the iterator, or an exception in the parent, stops every worker first. Raises CrewError, and InputError for what a
+    person must correct before it is tried again.
     """
     waiting = deque(range(len(tasks)))
 
@@ -76,6 +77,8 @@ def crew(do: Callable[[T, Tell, Stopped], Any], tasks: Sequence[T], workers: int
                 said = _heard(worker)
                 if said.kind == "failed":
                     raise CrewError(said.value)
+                if said.kind == "refused":
+                    raise InputError(said.value)
                 yield said
                 if said.kind == "done":
                     hand_out(worker)
@@ -128,7 +131,11 @@ def _work(pipe: Connection, do: Callable[..., Any], threads: int) -> None:
 def _done(pipe: Connection, do: Callable[..., Any], number: int, task: Any) -> Said:
     try:
         value = do(task, lambda news: _tell(pipe, Said(number, "news", news)), lambda: pipe.closed or pipe.poll())
-    except (OSError, InputError, FlightError, BackdropError) as error:
+    except FlightError as error:
+        return Said(number, "refused", f"{error}; shorter sequences or another --seed may do")
+    except (InputError, BackdropError) as error:
+        return Said(number, "refused", str(error))
+    except OSError as error:
         return Said(number, "failed", str(error))
     return Said(number, "done", value)
 

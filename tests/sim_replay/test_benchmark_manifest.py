@@ -1,4 +1,4 @@
-"""A dataset says how it was made in TOML that any reader takes, whatever the preset's file is called."""
+"""What a dataset says of itself any reader of TOML takes; what a worker is given and cannot use is told by its name."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ import shlex
 import tomllib
 from pathlib import Path
 
+import pytest
+
+from sim_replay.benchmark.plan import plan_dataset
+from sim_replay.benchmark.preset import parse_preset
 from sim_replay.cli import main
 
 PRESET = """
@@ -31,3 +35,20 @@ def test_the_command_is_told_as_it_was_given(tmp_path: Path) -> None:
     for path in (out / "dataset.toml", out / "test" / "000000" / "sequence.toml"):
         told = tomllib.loads(path.read_text(encoding="utf-8"))["command"]
         assert shlex.split(told) == ["uavpose-replay", *words, "--labels-only"]
+
+
+def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text(PRESET)
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    (photographs / "torn.jpg").write_bytes(b"\xff\xd8 no more")
+    preset = parse_preset("mine.toml", PRESET)
+    # Half of the sequences take a photograph; here is a seed of one that does.
+    seed = next(s for s in range(20) if plan_dataset(preset, s)[0].environment_seed // 2 % 2)
+    words = ["generate", "--preset", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "data")]
+    assert main([*words, "--seed", str(seed), "--backdrops", str(photographs), "--workers", "1"]) == 2
+    told = capsys.readouterr().err
+    assert "torn.jpg is not a readable picture" in told
+    assert "--resume" not in told
