@@ -49,6 +49,7 @@ _STYLE: Any = {
     "lines.linewidth": 1.6,
     "svg.fonttype": "path",
 }
+MARKED_MAX = 1500  # of more poses no browser likes to draw each as an element of its own
 _SIGMAS = 2.0
 _JUMP_DEG = 180.0
 _BEARING_SPAN_DEG = 0.05  # at least: below it all is noise
@@ -105,7 +106,8 @@ def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], frames: int
     for k, axes in enumerate(panels):
         wrapped = k >= 3
         axes.plot(t_s, _unjoined(true[:, k], wrapped), color=TRUTH_COLOR, lw=2.4, alpha=0.85)
-        axes.plot(t_s, _unjoined(estimated[:, k], wrapped), color=ESTIMATE_COLOR, marker=".", ms=2.5, lw=1.1)
+        marker = "." if frames <= MARKED_MAX else ""
+        axes.plot(t_s, _unjoined(estimated[:, k], wrapped), color=ESTIMATE_COLOR, marker=marker, ms=2.5, lw=1.1)
         if np.isfinite(sigma[:, k]).any():
             low, high = estimated[:, k] - _SIGMAS * sigma[:, k], estimated[:, k] + _SIGMAS * sigma[:, k]
             axes.fill_between(t_s, low, high, color=ESTIMATE_COLOR, alpha=0.18, lw=0)
@@ -130,7 +132,7 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
             style: dict[str, Any] = {
                 "color": color,
                 "label": label,
-                "marker": marker,
+                "marker": marker if len(points) <= MARKED_MAX else "",
                 "ms": 2.5,
                 "lw": 1.2 if marker else 2.4,
             }
@@ -179,7 +181,8 @@ def ages(peers: Mapping[str, Sequence[tuple[int, float]]], fps: float) -> str:
             frames, age_ms = np.array(received).T
             p50, p99 = np.percentile(age_ms, [50, 99])
             label = f"{name}: p50 {p50:.1f} ms, p99 {p99:.1f} ms"
-            over_time.plot(frames / fps, age_ms, ".", ms=4, color=colors[name], label=label)
+            many = len(age_ms) > MARKED_MAX
+            over_time.plot(frames / fps, age_ms, ".", ms=4, color=colors[name], label=label, rasterized=many)
             share = 100.0 * np.arange(1, len(age_ms) + 1) / len(age_ms)
             spread.step(np.sort(age_ms), share, where="post", color=colors[name])
         over_time.set(xlabel="time, s", ylabel="age on receipt, ms", ylim=(0, None))
@@ -246,7 +249,8 @@ def errors_over_range(matches: Sequence[Match]) -> str:
             (bearing, "bearing error, °", [match.bearing_error_deg for match in seen]),
         )
         for axes, label, values in panels:
-            axes.plot(range_m, values, ".", ms=4, color=ESTIMATE_COLOR, alpha=0.6)
+            many = len(found) > MARKED_MAX
+            axes.plot(range_m, values, ".", ms=4, color=ESTIMATE_COLOR, alpha=0.6, rasterized=many)
             axes.set_title(label)
             axes.set_xlabel("true range, m")
         distance.axhspan(-5.0, 5.0, color=TRUTH_COLOR, alpha=0.12, lw=0)
@@ -290,7 +294,7 @@ def _svg(figure: Figure, name: str) -> str:
     """The figure as an <svg> element; ids are its own in a page that holds several."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        figure.savefig(text, format="svg", dpi=150, transparent=True, metadata={"Date": None, "Creator": None})
     svg = text.getvalue()
     svg = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", svg[svg.index("<svg") :])
     head, rest = svg.split(">", 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import Image, Overlay, showcase_index, write_video
 from sim_replay.report.flight_files import RecordedFlight
-from sim_replay.result import PEERS, Result, frame_views, judge, score_json
+from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, score_json
 
 
 def write_report(
@@ -43,26 +44,24 @@ def write_report(
 
 def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:
     """One a frame: each visible target with what each peer received of it, its errors, and that pose's age."""
-    scene = sequence.scene
     peers = dict(zip(PEERS, (result.subscriber, result.autopilot), strict=True))
-    for frame, image in enumerate(scene.images):
-        yield {
-            "frame": frame,
-            "t_s": round(frame / sequence.fps, 6),
-            "image": image.name,
-            **{
-                name: {
-                    "targets": [
-                        {**target_record(match), "track": None if match.estimate is None else match.estimate.track}
-                        for match in peer.matches
-                        if match.truth.frame == frame
-                    ],
-                    "false_poses": sum(pose.frame == frame for pose in peer.false_poses),
-                    "age_ms": [round(age_ms, 3) for at, age_ms in peer.ages if at == frame],
-                }
-                for name, peer in peers.items()
-            },
-        }
+    told = {name: _by_frame(peer) for name, peer in peers.items()}
+    for frame, image in enumerate(sequence.scene.images):
+        at_peers = {name: frames[frame] for name, frames in told.items()}
+        yield {"frame": frame, "t_s": round(frame / sequence.fps, 6), "image": image.name, **at_peers}
+
+
+def _by_frame(peer: PeerResult) -> defaultdict[int, dict[str, Any]]:
+    """What a peer had of each frame; of one that nothing is known of, empty lists."""
+    told: defaultdict[int, dict[str, Any]] = defaultdict(lambda: {"targets": [], "false_poses": 0, "age_ms": []})
+    for match in peer.matches:
+        track = None if match.estimate is None else match.estimate.track
+        told[match.truth.frame]["targets"].append({**target_record(match), "track": track})
+    for pose in peer.false_poses:
+        told[pose.frame]["false_poses"] += 1
+    for frame, age_ms in peer.ages:
+        told[frame]["age_ms"].append(round(age_ms, 3))
+    return told
 
 
 def _draw(sequence: PlayedSequence, result: Result, out: Path, on_frame: Callable[[], None]) -> None:
