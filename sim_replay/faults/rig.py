@@ -117,10 +117,15 @@ class Rig:
     def start(self, step: Start) -> None:
         """Start a process and wait until it is ready; one of that name that still runs is then killed.
 
+        An autopilot that comes back with another clock is killed first: of two that speak in turn, each would seem to
+        start again when the other has spoken.
+
         Raises InputError if the daemon refuses its configuration, PlayError if anything else does not start.
         """
         who = step.who
         before = self.processes.get(who)
+        if before is not None and (step.rebooted or step.clock_ahead_s):
+            before.end(signal.SIGKILL)
         self.witness.forget_ready(who)
         said_before = len(self.witness.said)
         if who == "daemon":
