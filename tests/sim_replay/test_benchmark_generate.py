@@ -7,9 +7,8 @@ import json
 import signal
 import subprocess
 import sys
-import time
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -21,6 +20,7 @@ from sim_replay.bop import BopFrame, BopScene, read_ply_vertices_m, read_scene
 from sim_replay.cli import main
 from sim_replay.ground_truth import read_sequence
 from sim_replay.telemetry import read_telemetry
+from tests.waiting import until
 
 PRESET = """
 name = "tiny"
@@ -50,6 +50,7 @@ h264_kbps = [400, 400]
 """
 PROGRAM = (sys.executable, "-m", "sim_replay.cli", "generate")
 SCENES = ("train/000000", "train/000001", "test/000002")
+WITHIN_S = 150.0  # a dataset is drawn in software, by a machine that may be busy
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +78,8 @@ def _digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _wait_until(true: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 150
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
 def _wait_for(path: Path, process: subprocess.Popen[bytes]) -> None:
-    _wait_until(lambda: path.exists() or process.poll() is not None)
+    until(lambda: path.exists() or process.poll() is not None, what=str(path), within_s=WITHIN_S)
     assert process.poll() is None, "it ended before it was stopped"
 
 
@@ -210,10 +204,10 @@ def test_interrupted_it_ends_its_frames_and_leaves_no_process(preset: Path, tmp_
     _wait_for(out / "train" / "000000" / "rgb" / "000000.jpg", process)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.send_signal(signal.SIGTERM)
-    assert b"--resume goes on" in process.communicate(timeout=150)[1]
+    assert b"--resume goes on" in process.communicate(timeout=WITHIN_S)[1]
     assert process.returncode == 130
     assert children
-    _wait_until(lambda: not any(_runs(int(child)) for child in children))
+    until(lambda: not any(_runs(int(child)) for child in children), what="its workers to end")
     assert tomllib.loads((out / "dataset.toml").read_text())["complete"] is False
     scene = read_scene(out / "train" / "000000")
     assert len(list((out / "train" / "000000" / "rgb").iterdir())) == len(scene.frames) < 4
