@@ -46,15 +46,21 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
     rec.set_log_tick_enabled(False)
     rec.set_log_time_enabled(False)
     fleet = Fleet(domain=0 if options.recordings else options.domain, max_age_s=options.max_age_s)
-    scene = Scene(rec, fleet, options.size_m, lambda uavs: rec.send_blueprint(blueprint(uavs)))
+
+    def arrange(uavs: Sequence[str]) -> None:
+        rec.send_blueprint(blueprint(uavs, live=not options.recordings))
+
+    scene = Scene(rec, fleet, options.size_m, arrange)
     _open(rec, options, say)
     if options.recordings:
         _play(options, scene, say)
+        scene.finish()
         rec.flush()
         if options.web_port is not None:
             stop.wait()
     else:
         _listen(options, scene, stop, say)
+        scene.finish()
     rec.flush()
     rec.disconnect()
     say(f"{scene.drawn} poses drawn" + (f" into {options.save}" if options.save is not None else ""))

@@ -22,12 +22,19 @@ from msgs.wire import Array
 OWN_RGB = (90, 200, 250)
 TARGET_RGB = ((255, 90, 180), (255, 190, 60), (140, 230, 90), (190, 140, 255))
 DOUBT_RGB = (150, 150, 160)
+GRID_RGB = (70, 74, 82)
+AXES_RGB = ((240, 70, 70), (80, 220, 80), (90, 140, 255))  # nose, right, down
+RINGS_M = (100, 200, 300, 400, 500)
 SHIP_SIZE_M = (3.0, 3.0, 0.8)
 FRUSTUM_M = 40.0
+LABEL_BELOW_PX = 25.0
 _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 _HEALTH_LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR"}
 _MEDIA_TYPES = {"jpeg": "image/jpeg", "png": "image/png"}
-_PLOTTED_LATENCIES = {"latency_ms/total/p50": "total_p50", "latency_ms/total/p99": "total_p99"}
+_LATENCIES = {
+    "total_p50": ("exposure to links p50", (110, 160, 220)),
+    "total_p99": ("exposure to links p99", (220, 120, 90)),
+}
 
 
 def rgb(target: str) -> tuple[int, int, int]:
@@ -42,9 +49,47 @@ def target_paths(uav: str, target: str) -> tuple[str, ...]:
 
 def prepare(rec: rr.RecordingStream, uav: str) -> None:
     """What does not change."""
-    rec.log(f"{uav}/ned", rr.ViewCoordinates.FRD, static=True)
-    rec.log(f"{uav}/ned/ship/body", rr.Boxes3D(sizes=[SHIP_SIZE_M], colors=[OWN_RGB]), static=True)
-    rec.log(f"{uav}/ned/ship/nose", rr.Arrows3D(vectors=[[8.0, 0.0, 0.0]], colors=[OWN_RGB], radii=[0.3]), static=True)
+    for where in ("ned", "ned/place"):
+        rec.log(f"{uav}/{where}", rr.ViewCoordinates.FRD, static=True)
+    ship = f"{uav}/ned/place/ship"
+    rec.log(f"{ship}/body", rr.Boxes3D(sizes=[SHIP_SIZE_M], colors=[OWN_RGB]), static=True)
+    rec.log(f"{ship}/nose", rr.Arrows3D(vectors=[[8.0, 0.0, 0.0]], colors=[OWN_RGB], radii=[0.3]), static=True)
+    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    circle = np.stack([np.sin(turn), -np.cos(turn)], axis=1)
+    rings = rr.LineStrips2D([radius_m * circle for radius_m in RINGS_M], colors=[GRID_RGB])
+    rec.log(f"{uav}/map/rings", rings, static=True)
+    names = rr.Points2D(
+        [[0.0, -radius_m] for radius_m in RINGS_M], labels=[f"{radius_m} m" for radius_m in RINGS_M],
+        colors=[GRID_RGB], radii=[1.0],
+    )  # fmt: skip
+    rec.log(f"{uav}/map/rings/names", names, static=True)
+    for name, (label, color) in _LATENCIES.items():
+        rec.log(f"{uav}/plots/latency/{name}", rr.SeriesLines(names=[label], colors=[color]), static=True)
+
+
+def prepare_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
+    """The lines of one target's plots."""
+    color = rgb(target)
+    lines = {
+        "range": (target, color),
+        "range/minus_2_sigma": (f"{target} −2σ", DOUBT_RGB),
+        "range/plus_2_sigma": (f"{target} +2σ", DOUBT_RGB),
+        "attitude/roll": (f"{target} roll", AXES_RGB[0]),
+        "attitude/pitch": (f"{target} pitch", AXES_RGB[1]),
+        "attitude/heading": (f"{target} heading", AXES_RGB[2]),
+        "closing": (target, color),
+        "score": (target, color),
+        "age": (f"{target} age on arrival", color),
+    }
+    for path, (name, line_rgb) in lines.items():
+        rec.log(plot_path(uav, target, path), rr.SeriesLines(names=[name], colors=[line_rgb]), static=True)
+
+
+def plot_path(uav: str, target: str, path: str) -> str:
+    """Of one line: `range`, `range/plus_2_sigma`, `attitude/roll`, …"""
+    plot, _, line = path.partition("/")
+    within = {"age": "latency"}.get(plot, plot)
+    return f"{uav}/plots/{within}/{target}" + (f"/{line}" if line else "")
 
 
 def log_camera(rec: rr.RecordingStream, uav: str, info: CameraInfo) -> None:
@@ -64,13 +109,13 @@ def log_image(rec: rr.RecordingStream, uav: str, image: CompressedImage) -> None
 
 
 def log_ship(rec: rr.RecordingStream, uav: str, R_ned_body: Array, t_ned_m: Array, R_ned_cam: Array) -> None:
-    """The own ship and its camera, which is drawn at the ship's place."""
-    rec.log(f"{uav}/ned/ship", rr.Transform3D(translation=t_ned_m, mat3x3=R_ned_body))
+    """The own ship and its camera, which is drawn at the ship's place; on the map it is in the middle."""
+    rec.log(f"{uav}/ned/place", rr.Transform3D(translation=t_ned_m))
+    rec.log(f"{uav}/ned/place/ship", rr.Transform3D(mat3x3=R_ned_body))
     rec.log(f"{uav}/ned/camera", rr.Transform3D(translation=t_ned_m, mat3x3=R_ned_cam))
     rec.log(f"{uav}/ned/trail/ship", rr.Points3D([t_ned_m], colors=[OWN_RGB], radii=[0.6]))
-    here, ahead = _on_map(t_ned_m), _on_map(R_ned_body[:, 0])
-    rec.log(f"{uav}/map/ship", rr.Arrows2D(origins=[here], vectors=[20.0 * ahead], colors=[OWN_RGB], labels=[uav]))
-    rec.log(f"{uav}/map/trail/ship", rr.Points2D([here], colors=[OWN_RGB], radii=[1.0]))
+    ahead = rr.Arrows2D(vectors=[30.0 * _on_map(R_ned_body[:, 0])], colors=[OWN_RGB], radii=[2.0])
+    rec.log(f"{uav}/map/ship", ahead)
 
 
 def log_seen(
@@ -97,7 +142,9 @@ def log_seen(
     center = project(t_m, camera.K, camera.distortion)
     if center is not None:
         doubt = ellipse(center, pixel_covariance(t_m, covariance[:3, :3], camera.K))
-        rec.log(f"{where}/sigma", rr.LineStrips2D([doubt], colors=[rgb(row.target)], labels=[label]))
+        rec.log(f"{where}/sigma", rr.LineStrips2D([doubt], colors=[rgb(row.target)]))
+        below = [center[0], max(box[..., 1].max(), doubt[:, 1].max()) + LABEL_BELOW_PX]
+        rec.log(f"{where}/label", rr.Points2D([below], colors=[rgb(row.target)], labels=[label], radii=[0.0]))
 
 
 def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, size_m: Sequence[float]) -> None:
@@ -108,9 +155,7 @@ def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, size
     where = f"{row.uav}/zoom/target/{row.target}"
     rec.log(f"{where}/box", rr.LineStrips2D(list(strips), colors=[rgb(row.target)]))
     axes = (0.8 * R_cam_target.T)[:, :2]
-    colors = [(240, 70, 70), (80, 220, 80), (90, 140, 255)]
-    arrows = rr.Arrows2D(origins=[aside] * 3, vectors=axes, colors=colors, labels=["nose", "right", "down"])
-    rec.log(f"{where}/axes", arrows)
+    rec.log(f"{where}/axes", rr.Arrows2D(origins=[aside] * 3, vectors=axes, colors=AXES_RGB))
     below = np.array([0.0, 0.95])
     text = f"{row.target}  ±{row.sigma_rotation_deg:.0f}°"
     rec.log(f"{where}/label", rr.Points2D([aside + below], colors=[rgb(row.target)], labels=[text], radii=[0.01]))
@@ -138,31 +183,34 @@ def log_placed(
     rec.log(f"{where}/sigma", doubt)
     rec.log(f"{where}/line_of_sight", rr.LineStrips3D([[t_ned_own_m, t_m]], colors=[DOUBT_RGB]))
     rec.log(f"{uav}/ned/trail/targets", rr.Points3D([t_m], colors=[color], radii=[0.8]))
-    place = _on_map(t_m)
+    place = _on_map(t_m - t_ned_own_m)
     above = f"{uav}/map/target/{name}"
-    rec.log(
-        f"{above}/heading",
-        rr.Arrows2D(origins=[place], vectors=[20.0 * _on_map(R[:, 0])], colors=[color], labels=[label]),
+    heading = rr.Arrows2D(
+        origins=[place], vectors=[30.0 * _on_map(R[:, 0])], colors=[color], labels=[label], radii=[2.0]
     )
+    rec.log(f"{above}/heading", heading)
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    rec.log(f"{above}/sigma", rr.LineStrips2D([ellipse(place, turned @ covariance[:2, :2] @ turned.T)], colors=[color]))
-    rec.log(f"{uav}/map/trail/targets", rr.Points2D([place], colors=[color], radii=[1.0]))
-    roll, pitch, heading = np.degrees(euler_from_R(R))
-    for what, value in (("roll", roll), ("pitch", pitch), ("heading", heading % 360.0)):
-        rec.log(f"{uav}/plots/attitude/{name}/{what}", rr.Scalars(float(value)))
+    doubt_line = ellipse(place, turned @ covariance[:2, :2] @ turned.T)
+    rec.log(f"{above}/sigma", rr.LineStrips2D([doubt_line], colors=[color]))
+    rec.log(f"{uav}/map/trail/targets", rr.Points2D([place], colors=[color], radii=[1.5]))
+    roll, pitch, heading_deg = np.degrees(euler_from_R(R))
+    for what, value in (("roll", roll), ("pitch", pitch), ("heading", heading_deg % 360.0)):
+        rec.log(plot_path(uav, name, f"attitude/{what}"), rr.Scalars(float(value)))
 
 
 def log_plots(rec: rr.RecordingStream, row: TargetRow, age_s: float) -> None:
-    uav, name = row.uav, row.target
-    plots = f"{uav}/plots"
-    rec.log(f"{plots}/range/{name}", rr.Scalars(row.range_m))
-    rec.log(f"{plots}/range/{name}/minus_2_sigma", rr.Scalars(row.range_m - SIGMAS * row.sigma_range_m))
-    rec.log(f"{plots}/range/{name}/plus_2_sigma", rr.Scalars(row.range_m + SIGMAS * row.sigma_range_m))
-    if row.closing_mps is not None:
-        rec.log(f"{plots}/closing/{name}", rr.Scalars(row.closing_mps))
-    if row.score is not None:
-        rec.log(f"{plots}/score/{name}", rr.Scalars(row.score))
-    rec.log(f"{plots}/latency/{name}_age", rr.Scalars(1e3 * age_s))
+    """Range with its doubt, closing speed, score, and the age when it came."""
+    values = {
+        "range": row.range_m,
+        "range/minus_2_sigma": row.range_m - SIGMAS * row.sigma_range_m,
+        "range/plus_2_sigma": row.range_m + SIGMAS * row.sigma_range_m,
+        "closing": row.closing_mps,
+        "score": row.score,
+        "age": 1e3 * age_s,
+    }
+    for path, value in values.items():
+        if value is not None:
+            rec.log(plot_path(row.uav, row.target, path), rr.Scalars(value))
 
 
 def log_event(rec: rr.RecordingStream, uav: str, level: int, text: str) -> None:
@@ -177,8 +225,8 @@ def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, n
     rec.log(f"{uav}/health", rr.TextDocument(health_text(status), media_type="text/markdown"))
     if news:
         rec.log(f"{uav}/events", rr.TextLog(status.message, level=_HEALTH_LEVELS.get(status.level, "WARN")))
-    for key, name in _PLOTTED_LATENCIES.items():
-        value = _number(values.get(key, ""))
+    for name in _LATENCIES:
+        value = _number(values.get(f"latency_ms/{name.replace('_', '/')}", ""))
         if value is not None:
             rec.log(f"{uav}/plots/latency/{name}", rr.Scalars(value))
 

@@ -34,6 +34,7 @@ class _Vehicle:
     own_stamp_ns: int = 0
     waiting: dict[str, tuple[TargetRow, TargetPose]] = field(default_factory=dict)  # for the own ship at their stamp
     seen_ns: dict[str, int] = field(default_factory=dict)  # stamp of each target that is drawn
+    prepared: set[str] = field(default_factory=set)  # targets whose plots have their names
     health: str = ""
     told_no_attitude: bool = False
 
@@ -90,6 +91,13 @@ class Scene:
                             self._rec.log(path, rr.Clear(recursive=True))
                         del vehicle.seen_ns[target]
 
+    def finish(self) -> None:
+        """Draw what still waits: no more will come."""
+        with self._lock:
+            for uav, vehicle in self._vehicles.items():
+                for target in list(vehicle.waiting):
+                    self._place(uav, vehicle, target)
+
     def _vehicle(self, uav: str) -> _Vehicle | None:
         """None for the names, made up no doubt, that are one too many."""
         if uav not in self._vehicles:
@@ -113,6 +121,9 @@ class Scene:
         self._at(row.stamp_ns)
         entities.log_seen(self._rec, row, pose, vehicle.camera, self._size_m)
         entities.log_plots(self._rec, row, pose.age_s)
+        if row.target not in vehicle.prepared:
+            vehicle.prepared.add(row.target)
+            entities.prepare_target(self._rec, row.uav, row.target)
         vehicle.waiting[row.target] = (row, pose)
         vehicle.seen_ns[row.target] = row.stamp_ns
         self.drawn += 1

@@ -1,0 +1,194 @@
+"""`uavpose-ground view`: recordings and live vehicles as Rerun has them, read back by its own reader."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
+
+from msgs import topics
+from msgs.ground.cli import main
+from msgs.ground.view.drawing import SIGMAS, box_edges_m, ellipse, ellipsoid, pixel_covariance, posed, project
+from msgs.mcap_file import McapFile
+from msgs.publish import Node
+from tests.waiting import until
+
+from ..conftest import Network, free_endpoint
+from .flight import PERIOD_NS, START_NS, UAV, K, attitude, frame, places_m, record, samples, stamps_ns, target_attitude
+
+FRAMES = 30
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of three seconds, viewed into a file."""
+    folder = tmp_path_factory.mktemp("view")
+    record(folder / "flight.mcap", FRAMES)
+    assert main(["view", str(folder / "flight.mcap"), "--save", str(folder / "flight.rrd")]) == 0
+    return folder / "flight.rrd"
+
+
+def rows(path: Path, entity: str) -> Iterator[tuple[int, dict[str, object]]]:
+    """Stamp (UTC ns) and components of each row of an entity, in their order; static ones are left out."""
+    found = []
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path != f"/{UAV}/{entity}" or chunk.is_static:
+            continue
+        batch = pa.record_batch(chunk.to_record_batch())
+        stamps = batch.column("utc").cast(pa.int64()).to_pylist()
+        found += list(zip(stamps, batch.drop_columns(["utc"]).to_pylist(), strict=True))
+    return iter(sorted(found, key=lambda one: one[0]))
+
+
+def component(row: dict[str, object], name: str) -> np.ndarray:
+    (value,) = (value for key, value in row.items() if key.endswith(name) and value is not None)
+    return np.array(value, dtype=np.float64)
+
+
+def test_every_part_of_a_recorded_flight_is_there_at_its_time(saved: Path) -> None:
+    each_frame = [
+        "ned/camera/target/t0/box", "ned/camera/target/t0/sigma", "ned/camera/target/t0/range_sigma",
+        "ned/target/t0/body", "ned/target/t0/sigma", "ned/place/ship", "ned/trail/ship", "ned/trail/targets",
+        "map/target/t0/heading", "map/target/t0/sigma", "zoom/target/t0/box", "plots/range/t0",
+        "plots/attitude/t0/roll", "plots/latency/t0",
+    ]  # fmt: skip
+    for entity in each_frame:
+        assert [stamp_ns for stamp_ns, _ in rows(saved, entity)] == stamps_ns(FRAMES), entity
+    for entity in ("health", "ned/camera/image", "plots/latency/total_p50"):
+        assert len(list(rows(saved, entity))) == FRAMES // 10, entity
+    assert {component_text(row) for _, row in rows(saved, "events")} == {"tracking t0", "tracking"}
+    assert len(RrdReader(saved).blueprints()) == 1
+
+
+def component_text(row: dict[str, object]) -> str:
+    (text,) = (value for key, value in row.items() if key.endswith("TextLog:text"))
+    assert isinstance(text, list)
+    return str(text[0])
+
+
+def test_targets_stand_in_space_where_they_were_at_the_own_ship_s_attitude_of_that_instant(saved: Path) -> None:
+    for stamp_ns, row in rows(saved, "ned/target/t0/body"):
+        _, target_m = places_m(stamp_ns)
+        np.testing.assert_allclose(component(row, "translation")[0], target_m, atol=1e-3)
+        R = component(row, "mat3x3")[0].reshape(3, 3, order="F")
+        np.testing.assert_allclose(R, target_attitude(stamp_ns).as_matrix(), atol=1e-5)
+    for stamp_ns, row in rows(saved, "plots/attitude/t0/heading"):
+        heading_deg = target_attitude(stamp_ns).as_euler("ZYX", degrees=True)[0] % 360.0
+        assert component(row, "scalars")[0] == pytest.approx(heading_deg, abs=1e-3)
+
+
+def test_the_box_on_the_picture_is_the_projection_of_the_target_s_box(saved: Path) -> None:
+    stamp_ns, row = next(rows(saved, "ned/camera/target/t0/box"))
+    own_m, target_m = places_m(stamp_ns)
+    corner_m = target_m + target_attitude(stamp_ns).as_matrix() @ np.array([4.0, 6.0, 1.25])
+    R_cam_ned = (attitude(stamp_ns) * Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])).inv().as_matrix()
+    x, y, z = R_cam_ned @ (corner_m - own_m)
+    expected = [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]
+    strips = component(row, "strips").reshape(-1, 2)
+    assert np.abs(strips - expected).max(axis=1).min() < 0.05
+
+
+def test_a_target_that_is_not_told_again_is_taken_away_after_a_second(tmp_path: Path) -> None:
+    file = McapFile(tmp_path / "lost.mcap")
+    for topic, target, payload, log_ns in samples(40):
+        if topic is topics.POSE and log_ns > START_NS + 10 * PERIOD_NS:
+            continue
+        file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.close()
+    assert main(["view", str(tmp_path / "lost.mcap"), "--save", str(tmp_path / "lost.rrd")]) == 0
+    for where in ("ned", "ned/camera", "map", "zoom"):
+        cleared = [stamp_ns for stamp_ns, _ in rows(tmp_path / "lost.rrd", f"{where}/target/t0")]
+        assert cleared == [stamps_ns(10)[-1] + 1_000_000_000], where
+
+
+def test_what_is_told_live_is_drawn_until_told_to_stop(network: Network, tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    command = [sys.executable, "-m", "msgs.ground.cli", "view", "-e", network.endpoint, "--save", str(path)]
+    viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert viewer.stderr is not None
+    line = ""
+    while "showing" not in line:
+        line = viewer.stderr.readline()
+        assert line, "the viewer ended early"
+    with Node(network.daemon, UAV) as node:
+        publishers = {topic.name: node.publisher(topic, target) for topic, target, _, _ in samples(1)}
+
+        def put() -> None:
+            now_ns = time.time_ns()
+            for topic, _, payload, _ in frame(now_ns, now_ns):
+                publishers[topic.name].put(payload)
+            time.sleep(0.02)
+
+        until(lambda: path.exists() and publishers[topics.POSE.name].sequence >= 100, put)
+    viewer.terminate()
+    _, said = viewer.communicate(timeout=60)
+    assert viewer.returncode == 0
+    drawn = int(said.split(" poses drawn")[0].split()[-1])
+    assert drawn > 50
+    assert len(list(rows(path, "ned/target/t0/body"))) == drawn
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["missing.mcap", "--save", "out.rrd"], "missing.mcap: cannot be read: No such file or directory"),
+        (["torn.mcap", "--save", "out.rrd"], "torn.mcap: is no whole MCAP file"),
+        (["--save", "no/folder/out.rrd"], "--save no/folder/out.rrd: cannot be written: No such file or directory"),
+        (["--web", "65535", "-e", free_endpoint()], "--web 65535: must be a port"),
+    ],
+)
+def test_what_cannot_be_viewed_is_a_sentence(
+    arguments: list[str],
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n and then nothing of the kind")
+    assert main(["view", *arguments]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(50.0, 500.0), st.integers(0, 2**32 - 1))
+def test_the_ellipse_on_the_picture_holds_what_two_sigmas_hold(
+    right: float, down: float, ahead_m: float, seed: int
+) -> None:
+    """Against points drawn from the covariance and projected one by one: 86.5 % of a plane lies within two sigmas."""
+    t_m = np.array([right * ahead_m, down * ahead_m, ahead_m])
+    chance = np.random.default_rng(seed)
+    root = chance.normal(size=(3, 3)) * 0.003 * ahead_m
+    drawn = project(t_m + chance.normal(size=(4000, 3)) @ root.T, K)
+    center = project(t_m, K)
+    assert drawn is not None
+    assert center is not None
+    covariance = pixel_covariance(t_m, root @ root.T, K)
+    distance = np.einsum("ni,ij,nj->n", drawn - center, np.linalg.inv(covariance), drawn - center)
+    assert (distance < SIGMAS**2).mean() == pytest.approx(1.0 - np.exp(-2.0), abs=0.03)
+    line = ellipse(center, covariance) - center
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", line, np.linalg.inv(covariance), line), SIGMAS**2, rtol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_an_ellipsoid_s_axes_give_its_covariance_again(seed: int) -> None:
+    root = np.random.default_rng(seed).normal(size=(3, 3))
+    half_m, q_xyzw = ellipsoid(root @ root.T)
+    R = Rotation.from_quat(q_xyzw).as_matrix()
+    np.testing.assert_allclose(R @ np.diag((half_m / SIGMAS) ** 2) @ R.T, root @ root.T, atol=1e-9)
+
+
+def test_a_box_has_twelve_edges_of_its_three_lengths_and_what_is_behind_is_not_drawn() -> None:
+    edges = box_edges_m((8.0, 12.0, 2.5))
+    lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    assert sorted(lengths) == sorted([8.0, 12.0, 2.5] * 4)
+    assert project(posed(edges, np.eye(3), [0.0, 0.0, -50.0]), K) is None
