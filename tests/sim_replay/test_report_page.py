@@ -14,10 +14,13 @@ from playwright.sync_api import sync_playwright
 from sim_replay.cli import main
 from sim_replay.ground_truth import PlayedSequence, read_sequence
 from sim_replay.play import Recording
+from sim_replay.report import moments
 from sim_replay.report.flight_files import RecordedFlight, read_flight, write_flight
+from sim_replay.report.write import write_report
 from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
 
 START_NS, UTC_NS, FPS = 50_000_000_000, 1_700_000_000_000_000_000, 30.0
+MODEL = {"file": "<b>model</b>.onnx", "sha256": "ab" * 32, "precision": "int8"}
 PLOTS = {"pose", "trajectory", "timeline", "ages", "range"}
 BROWSER = next((path for name in ("chromium", "google-chrome") if (path := shutil.which(name))), None)
 
@@ -62,8 +65,7 @@ def flight(flown: PlayedSequence, tmp_path: Path) -> Path:
     """A recorded flight that lost its target in frame 1."""
     folder = tmp_path / "flight"
     folder.mkdir()
-    model = {"file": "<b>model</b>.onnx", "sha256": "ab" * 32, "precision": "int8"}
-    write_flight(folder, RecordedFlight(flown.scene.folder, model, recording(flown, {0, 2, 3})))
+    write_flight(folder, RecordedFlight(flown.scene.folder, MODEL, recording(flown, {0, 2, 3})))
     return folder
 
 
@@ -113,7 +115,7 @@ def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:
         drawn = [page.locator(f"svg[data-plot={name}] path").count() for name in PLOTS]
         broken = page.evaluate("[...document.images].filter(image => !image.complete || !image.naturalWidth).length")
         sideways = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-        moments, text = page.locator(".moments figure").count(), page.inner_text("body")
+        shown, text = page.locator(".moments figure").count(), page.inner_text("body")
         page.screenshot(path=flight / "report.png", full_page=True)
         browser.close()
     assert complaints == []
@@ -122,10 +124,25 @@ def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:
     assert all(box is not None and box["width"] > 800 and box["height"] > 150 for box in boxes.values()), boxes
     assert min(drawn) > 20
     assert (broken, sideways) == (0, 0)
-    assert moments == 1  # five frames last a sixth of a second
+    assert shown == 1  # five frames last a sixth of a second
     assert "<b>model</b>.onnx" in text
     assert "waiting for the camera" in text
     assert "75.0 %" in text
+
+
+def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_film(
+    flown: PlayedSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(moments, "VIDEO_MAX_BYTES", 0)
+    silent = Recording(START_NS, UTC_NS, 14550, "tcp/127.0.0.1:7448", 0, {})
+    score, files = write_report(flown, RecordedFlight(flown.scene.folder, MODEL, silent), tmp_path, lambda: None)
+    page = (tmp_path / "report.html").read_text()
+    assert "report.html" in files
+    assert score["overall"]["recall"] == 0.0
+    assert "<video" not in page
+    assert page.count('alt="still ') == moments.STILLS
+    assert "nothing received" in page
+    assert "nan" not in page.split("<details>")[0].split("</svg>")[-1].lower()
 
 
 def test_a_flight_that_is_none_or_is_damaged_is_named(

@@ -94,7 +94,7 @@ def test_a_flight_of_moments_is_not_judged() -> None:
 
 
 def test_the_daemon_holds_on_to_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["soak", "--minutes", "0.5", "--out", str(tmp_path), "--json"])
+    code = main(["soak", "--minutes", "0.35", "--out", str(tmp_path), "--json"])
     told = {trend["name"]: trend for trend in json.loads(capsys.readouterr().out)["trends"]}
     for name in ("memory", "open descriptors", "threads", "log"):
         assert told[name]["grows"] is False, told[name]

@@ -1,0 +1,81 @@
+"""`matrix`: every combination in one table, wrong ones in the exit code; at another speed a flight is the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msgs.geometry import R_from_q_wxyz, rotation_angle
+from sim_replay.cli import main
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.ground_truth import read_sequence
+from sim_replay.pace import at_speed
+from sim_replay.telemetry import read_telemetry
+
+IMPOSSIBLE = """
+title = "A state that there is not"
+
+[[step]]
+do = "expect_state"
+pattern = "euphoric"
+within_s = 1.0
+"""
+
+
+@pytest.mark.parametrize("speed", [0.5, 3.0])
+def test_at_another_speed_each_frame_is_taken_from_the_same_place(speed: float, tmp_path: Path) -> None:
+    sequence = read_sequence(BUNDLED_SEQUENCE)
+    faster = at_speed(sequence, speed, tmp_path)
+    once, again = read_telemetry(sequence.telemetry_csv), read_telemetry(faster.telemetry_csv)
+    for frame in range(5, 145, 20):
+        before = once.at(sequence.frame0_ns + round(frame * 1e9 / sequence.fps))
+        after = again.at(faster.frame0_ns + round(frame * 1e9 / faster.fps))
+        np.testing.assert_allclose(after.t_ned_body_m, before.t_ned_body_m, atol=2e-3)
+        assert rotation_angle(R_from_q_wxyz(after.q_ned_body_wxyz), R_from_q_wxyz(before.q_ned_body_wxyz)) < 1e-5
+        np.testing.assert_allclose(after.v_ned_body_mps, speed * before.v_ned_body_mps, atol=2e-2)
+
+
+def test_velocity_at_another_speed_is_how_the_place_changes(tmp_path: Path) -> None:
+    flown = read_telemetry(at_speed(read_sequence(BUNDLED_SEQUENCE), 2.0, tmp_path).telemetry_csv)
+    step_ns = 200_000_000
+    for t_ns in (500_000_000, 1_500_000_000):
+        moved_m = flown.at(t_ns + step_ns).t_ned_body_m - flown.at(t_ns - step_ns).t_ned_body_m
+        np.testing.assert_allclose(moved_m / (2e-9 * step_ns), flown.at(t_ns).v_ned_body_mps, atol=0.5)
+
+
+def test_a_flight_is_scored_and_a_fault_that_is_not_met_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timeline = tmp_path / "impossible.toml"
+    timeline.write_text(IMPOSSIBLE)
+    code = main(["matrix", "--fault", "none", "--fault", str(timeline), "--out", str(tmp_path / "out"), "--json"])
+    flight, fault = json.loads(capsys.readouterr().out)
+    assert (flight["sequence"], flight["fault"], fault["fault"]) == ("crossing", "none", str(timeline))
+    assert 0.0 <= flight["found"] <= 1.0
+    # A machine under load may carry no pose in time; the table must then say so.
+    assert (flight["poses"] == 0) == ("the autopilot received no pose" in flight["wrong"])
+    assert fault["poses"] > 0
+    assert fault["found"] is None
+    assert "euphoric" in fault["wrong"][0]
+    assert code == 1
+    assert json.loads((tmp_path / "out" / "matrix.json").read_text()) == [flight, fault]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--speed", "9"], "--speed 9"),
+        (["--fault", "no-such-thing"], "no-such-thing"),
+        (["--take", "0"], "--take 0"),
+        (["--sequence", "nowhere"], "nowhere"),
+        (["--dataset", str(BUNDLED_SEQUENCE), "--take", "2"], "holds 1 sequences"),
+    ],
+)
+def test_what_cannot_be_flown_is_named(
+    arguments: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["matrix", *arguments, "--out", str(tmp_path)]) == 2
+    assert named in capsys.readouterr().err
