@@ -1,4 +1,4 @@
-"""Settings that a person writes in TOML: read, held against a pydantic model, faults told by file and key.
+"""Settings in TOML: read, held against a pydantic model, faults told by file and key to the person who wrote them.
 
 Each package raises an error of its own, so every reader here takes the type to raise: one made from one sentence.
 Subscribers need none of this: msgs.client works without pydantic.
@@ -6,6 +6,7 @@ Subscribers need none of this: msgs.client works without pydantic.
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -99,3 +100,8 @@ def load_settings(
 ) -> SomeSection:
     """A TOML file as `model`. Raises `raising`, as `parse_settings` does and where the file cannot be read."""
     return parse_settings(read_text(path, raising), path, model, raising, name_key)
+
+
+def toml_value(value: object) -> str:
+    """A string, number, boolean or list of these as TOML of one line: JSON writes them as TOML does."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -23,6 +23,8 @@ from typing import Any
 
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
+from sim_replay.daemon_config import sequence_config
+from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
 
@@ -96,10 +98,18 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
     """One run with frame 0 `lead_s` from now; None if the daemon was ready only after that."""
     start_at_ns = time.monotonic_ns() + round(lead_s * 1e9)
     utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
-    endpoint = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
-    recording = Recording(start_at_ns, utc_minus_monotonic_ns, _free_port(socket.SOCK_DGRAM), endpoint)
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    recording = Recording(start_at_ns, utc_minus_monotonic_ns, free_port(socket.SOCK_DGRAM), endpoint)
     config = settings.out / "config.toml"
-    config.write_text(_config_toml(settings, recording), encoding="utf-8")
+    text = sequence_config(
+        settings.sequence,
+        settings.uav,
+        settings.model,
+        recording.zenoh_endpoint,
+        recording.mavlink_port,
+        {"start_at_ns": recording.start_at_ns},
+    )
+    config.write_text(text, encoding="utf-8")
     records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()
     with ExitStack() as stack:
         daemon = stack.enter_context(_daemon(config, settings.out / "daemon.log"))
@@ -240,35 +250,3 @@ def _stop(process: subprocess.Popen[Any]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def _free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _config_toml(settings: PlaySettings, recording: Recording) -> str:
-    """The daemon's configuration for one replay: loopback only."""
-    sequence = settings.sequence
-    # JSON's strings and nested lists are TOML's too.
-    lines = [
-        "[vehicle]",
-        f"name = {json.dumps(settings.uav)}",
-        "[camera]",
-        'type = "sequence"',
-        f"mount = {json.dumps(sequence.camera_mount)}",
-        f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
-        f"fps = {sequence.fps}",
-        f"start_at_ns = {recording.start_at_ns}",
-        "[mount]",
-        f"R_body_cam = {json.dumps(sequence.mount.R_body_cam.tolist())}",
-        f"t_body_cam_m = {json.dumps(sequence.mount.t_body_cam_m.tolist())}",
-        "[zenoh]",
-        f"listen = {json.dumps([recording.zenoh_endpoint])}",
-        "[mavlink]",
-        f'endpoints = ["udpin:127.0.0.1:{recording.mavlink_port}"]',
-    ]
-    if settings.model is not None:
-        lines += ["[model]", f"path = {json.dumps(str(settings.model.resolve()))}"]
-    return "\n".join(lines) + "\n"

@@ -8,10 +8,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from edge.errors import InputError
-from msgs.settings import read_text, read_toml
+from msgs.settings import read_text, read_toml, toml_value
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import SPLITS
-from sim_replay.benchmark.scene_store import is_finished, replace_text, toml_string
+from sim_replay.benchmark.scene_store import is_finished, replace_text
 from sim_replay.benchmark.sequence_files import Job
 
 FILE = "dataset.toml"
@@ -66,7 +66,7 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
     """Write dataset.toml: recipe, packages, and what is finished of all planned sequences."""
     there = [plan for plan in plans if is_finished(job.folder(plan))]
     lines = [
-        f"command = {toml_string(job.command)}  # makes it again",
+        f"command = {toml_value(job.command)}  # makes it again",
         *recipe.lines(),
         f"complete = {str(len(there) == len(plans)).lower()}  # every sequence of the preset is there",
         f"sequences = {len(there)}",

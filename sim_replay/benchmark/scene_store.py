@@ -134,11 +134,6 @@ def replace_text(path: Path, text: str) -> None:
     os.replace(fresh, path)
 
 
-def toml_string(text: str) -> str:
-    """The text as a TOML string of one line: JSON's escapes are TOML's too."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _only_entry(path: Path) -> str:
     (entry,) = json.loads(path.read_text(encoding="utf-8")).values()
     return json.dumps(entry)

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from msgs.geometry import Array
+from msgs.settings import toml_value
 from sim_replay.benchmark.crew import Stopped, Tell
 from sim_replay.benchmark.exposure import metered
 from sim_replay.benchmark.filming import Film, bop_frame, fly, outline_labels
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import Preset
-from sim_replay.benchmark.scene_store import SceneStore, is_finished, toml_string
+from sim_replay.benchmark.scene_store import SceneStore, is_finished
 from sim_replay.benchmark.video import through_h264
 from sim_replay.bop import BopTarget, write_camera
 from sim_replay.flight.encounter import ORIGIN_DEG_M
@@ -134,7 +135,7 @@ def sequence_toml(job: Job, film: Film) -> str:
     codec = [] if plan.h264_kbps is None else [f"h264_kbps = {plan.h264_kbps}"]
     return "\n".join(
         [
-            f"command = {toml_string(job.command)}  # makes the dataset again",
+            f"command = {toml_value(job.command)}  # makes the dataset again",
             f"sequence = {plan.index}",
             f'split = "{plan.split}"',
             f"fps = {plan.fps / job.every}",

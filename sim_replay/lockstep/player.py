@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
+from sim_replay.daemon_config import sequence_config
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import looped as looped_gimbal
@@ -87,7 +88,9 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
         control = cleanup.enter_context(closing(Control()))
         mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         config = folder / "config.toml"
-        config.write_text(_config_toml(settings, control.address, mavlink_port, endpoint), encoding="utf-8")
+        camera = {"lockstep": control.address}
+        text = sequence_config(settings.sequence, UAV, settings.model, endpoint, mavlink_port, camera)
+        config.write_text(text, encoding="utf-8")
         command: list[str | Path] = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
         daemon = Process(command, lambda line, _: said.append(line))
         cleanup.callback(daemon.end)
@@ -186,28 +189,3 @@ class Stepper:
         # What the autopilot answers is heard in the same instant: the link of a replay has no delay.
         while self._mavlink.listen(self._now_ns):
             self._control.step("time", self._now_ns)
-
-
-def _config_toml(settings: LockstepSettings, control: str, mavlink_port: int, endpoint: str) -> str:
-    """The daemon's configuration: loopback only. JSON's strings and nested lists are TOML's too."""
-    sequence = settings.sequence
-    lines = [
-        "[vehicle]",
-        f"name = {json.dumps(UAV)}",
-        "[camera]",
-        'type = "sequence"',
-        f"mount = {json.dumps(sequence.camera_mount)}",
-        f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
-        f"fps = {sequence.fps}",
-        f"lockstep = {json.dumps(control)}",
-        "[mount]",
-        f"R_body_cam = {json.dumps(sequence.mount.R_body_cam.tolist())}",
-        f"t_body_cam_m = {json.dumps(sequence.mount.t_body_cam_m.tolist())}",
-        "[model]",
-        f"path = {json.dumps(str(settings.model.resolve()))}",
-        "[zenoh]",
-        f"listen = {json.dumps([endpoint])}",
-        "[mavlink]",
-        f'endpoints = ["udpin:127.0.0.1:{mavlink_port}"]',
-    ]
-    return "\n".join(lines) + "\n"

@@ -18,6 +18,7 @@ import numpy as np
 
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
+from sim_replay.daemon_config import sequence_config
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.ground_truth import PlayedSequence
@@ -123,7 +124,9 @@ def _attempt(
     flight = Flight(now_ns, now_ns + round(lead_s * 1e9), time.time_ns() - now_ns)
     mavlink_port, zenoh_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     config = settings.out / "config.toml"
-    config.write_text(_config_toml(settings, flight.start_at_ns, mavlink_port, zenoh_port), encoding="utf-8")
+    endpoint, camera = f"tcp/{LOOPBACK}:{zenoh_port}", {"start_at_ns": flight.start_at_ns, "loop": True}
+    text = sequence_config(settings.sequence, UAV, settings.model, endpoint, mavlink_port, camera)
+    config.write_text(text, encoding="utf-8")
     command = Path(sys.executable).parent / "uavpose-edge"
     log = settings.out / "daemon.log"
     with ExitStack() as cleanup:
@@ -185,29 +188,3 @@ def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, zenoh_port: i
     autopilot += ["--endpoint", f"{LOOPBACK}:{mavlink_port}", "--start-at-ns", str(flight.start_at_ns)]
     subscriber = [*python, "sim_replay.subscriber", "--connect", f"tcp/{LOOPBACK}:{zenoh_port}", "--uav", UAV]
     return tuple(Process(command, flight.hear_peer, flight.hear_end) for command in (autopilot, subscriber))
-
-
-def _config_toml(settings: FlightSettings, start_at_ns: int, mavlink_port: int, zenoh_port: int) -> str:
-    """The daemon's configuration: loopback only. JSON's strings and nested lists are TOML's too."""
-    sequence = settings.sequence
-    lines = [
-        "[vehicle]",
-        f"name = {json.dumps(UAV)}",
-        "[camera]",
-        'type = "sequence"',
-        f"mount = {json.dumps(sequence.camera_mount)}",
-        f"path = {json.dumps(str(sequence.scene.folder.resolve()))}",
-        f"fps = {sequence.fps}",
-        f"start_at_ns = {start_at_ns}",
-        "loop = true",
-        "[mount]",
-        f"R_body_cam = {json.dumps(sequence.mount.R_body_cam.tolist())}",
-        f"t_body_cam_m = {json.dumps(sequence.mount.t_body_cam_m.tolist())}",
-        "[model]",
-        f"path = {json.dumps(str(settings.model.resolve()))}",
-        "[zenoh]",
-        f'listen = ["tcp/{LOOPBACK}:{zenoh_port}"]',
-        "[mavlink]",
-        f'endpoints = ["udpin:{LOOPBACK}:{mavlink_port}"]',
-    ]
-    return "\n".join(lines) + "\n"

@@ -1,0 +1,46 @@
+"""The configuration of a daemon that plays a sequence: on loopback alone, its camera on the sequence's own mount."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from msgs.settings import toml_value
+from sim_replay.ground_truth import PlayedSequence
+
+
+def sequence_config(
+    sequence: PlayedSequence,
+    uav: str,
+    model: Path | None,
+    zenoh_endpoint: str,
+    mavlink_port: int,
+    camera: Mapping[str, object],
+) -> str:
+    """The text of its TOML file.
+
+    Args:
+        model: ONNX file; None: the daemon's own choice.
+        camera: What else [camera] holds: when, how often or by whose leave the sequence is played.
+    """
+    tables: dict[str, dict[str, object]] = {
+        "vehicle": {"name": uav},
+        "camera": {
+            "type": "sequence",
+            "mount": sequence.camera_mount,
+            "path": str(sequence.scene.folder.resolve()),
+            "fps": sequence.fps,
+            **camera,
+        },
+        "mount": {
+            "R_body_cam": sequence.mount.R_body_cam.tolist(),
+            "t_body_cam_m": sequence.mount.t_body_cam_m.tolist(),
+        },
+        "model": {} if model is None else {"path": str(model.resolve())},
+        "zenoh": {"listen": [zenoh_endpoint]},
+        "mavlink": {"endpoints": [f"udpin:127.0.0.1:{mavlink_port}"]},
+    }
+    lines = []
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(f"{key} = {toml_value(value)}" for key, value in table.items())]
+    return "\n".join(lines) + "\n"

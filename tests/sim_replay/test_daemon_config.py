@@ -1,0 +1,36 @@
+"""What a replay writes for the daemon is what the daemon reads, wherever the files lie."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from edge.config import load_config
+from edge.config_camera import SequenceCamera
+from sim_replay.daemon_config import sequence_config
+from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.ground_truth import read_sequence
+
+ODD = 'Müller\'s "\U0001f6e9" \\new'
+
+
+def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
+    bundled = read_sequence(BUNDLED_SEQUENCE)
+    folder = tmp_path / ODD
+    sequence = replace(bundled, scene=replace(bundled.scene, folder=folder))
+    path = tmp_path / "config.toml"
+    camera = {"start_at_ns": 12, "loop": True}
+    path.write_text(
+        sequence_config(sequence, "uav7", folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera), encoding="utf-8"
+    )
+    config = load_config(path).config
+    assert isinstance(config.camera, SequenceCamera)
+    assert (config.camera.path, config.camera.fps) == (folder, sequence.fps)
+    assert (config.camera.start_at_ns, config.camera.loop) == (12, True)
+    assert config.model.path == folder / "a.onnx"
+    assert (config.vehicle.name, config.zenoh.listen) == ("uav7", ["tcp/127.0.0.1:7001"])
+    assert config.mavlink.endpoints == ["udpin:127.0.0.1:14001"]
+    np.testing.assert_allclose(config.mount.mount().R_body_cam, sequence.mount.R_body_cam, atol=1e-9)
+    np.testing.assert_allclose(config.mount.mount().t_body_cam_m, sequence.mount.t_body_cam_m)
