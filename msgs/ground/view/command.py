@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import socket
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 import rerun as rr
 
@@ -22,6 +27,8 @@ from msgs.session import TlsFiles
 APPLICATION = "uavpose"
 DRAWN = (*TAKEN, topics.CAMERA_INFO, topics.IMAGE)
 TICK_S = 0.2
+_LOOPBACK = "127.0.0.1"
+_START_S = 60.0
 _SERVER_MEMORY = "1GiB"  # older data goes first when a browser joins a long flight
 
 
@@ -51,38 +58,69 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
         rec.send_blueprint(blueprint(uavs, live=not options.recordings))
 
     scene = Scene(rec, fleet, options.size_m, arrange)
-    _open(rec, options, say)
-    if options.recordings:
-        _play(options, scene, say)
+    with _opened(rec, options, say):
+        if options.recordings:
+            _play(options, scene, say)
+        else:
+            _listen(options, scene, stop, say)
         scene.finish()
         rec.flush()
-        if options.web_port is not None:
+        if options.recordings and options.web_port is not None:
             stop.wait()
-    else:
-        _listen(options, scene, stop, say)
-        scene.finish()
-    rec.flush()
-    rec.disconnect()
+        rec.disconnect()
     say(f"{scene.drawn} poses drawn" + (f" into {options.save}" if options.save is not None else ""))
     return 0
 
 
-def _open(rec: rr.RecordingStream, options: ViewOptions, say: Callable[[str], None]) -> None:
+@contextmanager
+def _opened(rec: rr.RecordingStream, options: ViewOptions, say: Callable[[str], None]) -> Iterator[None]:
+    """Where the recording goes: a file, a server for browsers on this machine, or a window that stays."""
     if options.save is not None:
         try:
             options.save.touch()
         except OSError as error:
             raise InputError(f"--save {options.save}: cannot be written: {error.strerror}") from error
         rec.save(options.save)
+        yield
     elif options.web_port is not None:
-        try:
-            address = rec.serve_grpc(grpc_port=options.web_port + 1, server_memory_limit=_SERVER_MEMORY)
-            rr.serve_web_viewer(web_port=options.web_port, open_browser=False, connect_to=address)
-        except (RuntimeError, OSError) as error:
-            raise InputError(f"--web {options.web_port}: cannot be served there: {error}") from error
-        say(f"open http://127.0.0.1:{options.web_port}/?url={address.replace('+', '%2B')}")
+        with _server(options.web_port) as address:
+            rec.connect_grpc(address)
+            say(f"open http://{_LOOPBACK}:{options.web_port}/?url={quote(address, safe=':/')}")
+            yield
     else:
         rec.spawn()
+        yield
+
+
+@contextmanager
+def _server(web_port: int) -> Iterator[str]:
+    """Rerun's server as a process, bound to this machine alone (the one in its library is open to every network); its
+    address for data. Raises InputError if the ports are not to be had."""
+    ports = (web_port, web_port + 1)
+    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", _LOOPBACK, "--web-viewer-port", str(ports[0])]
+    for port in ports:
+        if _answers(port):
+            raise InputError(f"--web {web_port}: port {port} is taken")
+    server = subprocess.Popen(
+        [*command, "--port", str(ports[1]), "--server-memory-limit", _SERVER_MEMORY],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline_s = time.monotonic() + _START_S
+        while not all(_answers(port) for port in ports):
+            if server.poll() is not None or time.monotonic() > deadline_s:
+                raise InputError(f"--web {web_port}: Rerun's server does not start there")
+            time.sleep(0.05)
+        yield f"rerun+http://{_LOOPBACK}:{ports[1]}/proxy"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((_LOOPBACK, port)) == 0
 
 
 def _play(options: ViewOptions, scene: Scene, say: Callable[[str], None]) -> None:

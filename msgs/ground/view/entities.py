@@ -60,7 +60,7 @@ def prepare(rec: rr.RecordingStream, uav: str) -> None:
     rec.log(f"{uav}/map/rings", rings, static=True)
     names = rr.Points2D(
         [[0.0, -radius_m] for radius_m in RINGS_M], labels=[f"{radius_m} m" for radius_m in RINGS_M],
-        colors=[GRID_RGB], radii=[1.0],
+        colors=[DOUBT_RGB], radii=[1.0],
     )  # fmt: skip
     rec.log(f"{uav}/map/rings/names", names, static=True)
     for name, (label, color) in _LATENCIES.items():
