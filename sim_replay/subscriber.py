@@ -30,7 +30,8 @@ _POLL_S = 0.2
 _RETRY_S = 0.1
 
 
-def _pose_record(pose: TargetPose) -> dict[str, Any]:
+def pose_record(pose: TargetPose) -> dict[str, Any]:
+    """The `pose` line of one that was taken."""
     x, y, z, w = pose.pose.q_cam_target_xyzw.tolist()
     return {
         "event": "pose",
@@ -75,7 +76,7 @@ def _listen(session: zenoh.Session, uav: str, stop: threading.Event) -> dict[str
         if record is not None:
             records.put(record)
 
-    counts = subscribe_all(session, uav, lambda pose: records.put(_pose_record(pose)))
+    counts = subscribe_all(session, uav, lambda pose: records.put(pose_record(pose)))
     handler = zenoh.handlers.Callback(on_diagnostics, indirect=False)
     diagnostics = session.declare_subscriber(topics.subscription_key(topics.DIAGNOSTICS, uav), handler)
     _emit({"event": "ready"})

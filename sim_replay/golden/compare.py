@@ -59,6 +59,8 @@ TOLERANCES = {
 }
 OTHER = Tolerance(0.005, 0.01)
 QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
+# What is taken of a pose as it is.
+POSE_FIELDS = ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
 # What a record is known by.
 POSE_NAMES = ("kind", "t_ns", "frame", "target")
 MESSAGE_NAMES = ("kind", "t_ns", "system", "component")
@@ -81,7 +83,10 @@ def reduced(outputs: Outputs) -> list[Record]:
     records = []
     for pose in outputs.poses:
         std = [math.sqrt(max(pose["covariance"][k][k], 0.0)) for k in range(6)]
-        kept = {name: pose[name] for name in ("t_ns", "frame", "target", "t_cam_target_m", "q_cam_target_wxyz")}
+        kept = {
+            name: pose[name]
+            for name in ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
+        }
         records.append({"kind": "pose", **kept, "std": std})
     for message in outputs.mavlink:
         fields = {name: value for name, value in message.items() if name != "message"}

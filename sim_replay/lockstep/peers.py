@@ -21,6 +21,7 @@ from msgs.mavlink import MAVLink
 from msgs.receive import PoseReceiver, TargetPose
 from sim_replay.autopilot import Autopilot
 from sim_replay.play import PlayError
+from sim_replay.subscriber import pose_record
 
 Record = dict[str, Any]
 
@@ -41,6 +42,7 @@ class MavlinkPeer:
     def __init__(self, autopilot: Autopilot, port: int, frame0_ns: int) -> None:
         """`port` is the daemon's, `frame0_ns` the exposure of the first frame on the stepped clock."""
         self.records: list[Record] = []
+        self.targets: list[Record] = []  # sim_replay.autopilot's `target_relative`
         self._autopilot = autopilot
         self._frame0_ns = frame0_ns
         self._parser = MAVLink(None)
@@ -67,7 +69,8 @@ class MavlinkPeer:
             except (BlockingIOError, ConnectionRefusedError):
                 return answered
             self._record(datagram, now_ns)
-            replies, _ = self._autopilot.take(datagram, now_ns)
+            replies, targets = self._autopilot.take(datagram, now_ns)
+            self.targets += targets
             for reply in replies:
                 answered = True
                 self._socket.send(reply)
@@ -102,6 +105,7 @@ class Subscriber:
     def __init__(self, endpoint: str, uav: str, frame0_ns: int) -> None:
         """Raises PlayError if the daemon does not answer at `endpoint`."""
         self.records: list[Record] = []
+        self.received: list[Record] = []  # the same as sim_replay.subscriber tells them
         self._frame0_ns = frame0_ns
         self._receiver = PoseReceiver(uav)
         self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
@@ -149,15 +153,10 @@ class Subscriber:
         self._poses[pose.stamp_ns, pose.target] = pose
 
     def _record(self, frame: int, taken: TargetPose) -> Record:
-        x, y, z, w = taken.pose.q_cam_target_xyzw.tolist()
-        return {
-            "frame": frame,
-            "t_ns": taken.stamp_ns - self._frame0_ns,
-            "target": taken.target,
-            "t_cam_target_m": taken.pose.t_cam_target_m.tolist(),
-            "q_cam_target_wxyz": [w, x, y, z],
-            "covariance": taken.pose.covariance.tolist(),
-        }
+        told = pose_record(taken)
+        self.received.append(told)
+        values = {name: told[name] for name in told.keys() - {"event", "capture_utc_ns", "age_ms"}}
+        return {"frame": frame, "t_ns": taken.stamp_ns - self._frame0_ns, **dict(sorted(values.items()))}
 
     def _wait_until_known(self, uav: str) -> None:
         # An answer to a question asked after them says that the declarations have reached the daemon.

@@ -27,7 +27,7 @@ from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
 from sim_replay.pipeline.flight import looped
-from sim_replay.play import PlayError
+from sim_replay.play import PlayError, Recording
 from sim_replay.telemetry import read_telemetry
 
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot
@@ -65,6 +65,7 @@ class Outputs:
 
     poses: list[Record]  # as the subscriber took them
     mavlink: list[Record]  # as the autopilot got them, by field
+    recording: Recording  # the same as `sim_replay.score` takes it; its monotonic clock and UTC are the stepped one
 
     def write(self, folder: Path) -> None:
         """poses.jsonl and mavlink.jsonl."""
@@ -135,7 +136,7 @@ class Flight:
         self._fps = sequence.fps
         self._frames = frames
         self._first_ns = BASE_NS + first_ns
-        frame0_ns = self._first_ns - offset_ns
+        self._frame0_ns = frame0_ns = self._first_ns - offset_ns
         autopilot = Autopilot(telemetry, BASE_NS, BASE_NS - BOOT_BEFORE_START_NS, gimbal=gimbal)
         self._subscriber = Subscriber(endpoint, UAV, frame0_ns)
         self._mavlink = MavlinkPeer(autopilot, mavlink_port, frame0_ns)
@@ -143,7 +144,9 @@ class Flight:
 
     @property
     def outputs(self) -> Outputs:
-        return Outputs(self._subscriber.records, self._mavlink.records)
+        recording = Recording(self._frame0_ns, 0, 0, "", 0)
+        recording.poses, recording.targets = self._subscriber.received, self._mavlink.targets
+        return Outputs(self._subscriber.records, self._mavlink.records, recording)
 
     def fly(self, before_frame: BeforeFrame, after_frame: AfterFrame) -> None:
         """All frames, one after the other. Raises PlayError."""

@@ -14,12 +14,14 @@ from hypothesis import strategies as st
 from sim_replay.golden.compare import DEVIATION, POSITION, ROTATION_DEG, differences, reduced
 from sim_replay.golden.run import CASES, read_golden
 from sim_replay.lockstep.player import Outputs
+from sim_replay.play import Recording
 
 S = math.sqrt(0.5)
 POSE = {
     "frame": 7,
     "t_ns": 700_000_000,
     "target": "t0",
+    "rotation_known": True,
     "t_cam_target_m": [-12.0, 5.0, 200.0],
     "q_cam_target_wxyz": [S, 0.0, S, 0.0],
     "covariance": [[4.0 if row == column else 0.1 for column in range(6)] for row in range(6)],
@@ -36,7 +38,7 @@ STATUSTEXT = {
 
 def held(**changed: Any) -> list[dict[str, Any]]:
     pose = {**copy.deepcopy(POSE), **changed}
-    return reduced(Outputs([pose], [STATUSTEXT]))
+    return reduced(Outputs([pose], [STATUSTEXT], Recording(0, 0, 0, "")))
 
 
 def told(expected: list[dict[str, Any]], actual: list[dict[str, Any]]) -> list[str]:
