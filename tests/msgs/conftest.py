@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -25,15 +25,6 @@ def pose_now(z_m: float = 300.0, age_s: float = 0.0) -> cdr.PoseWithCovarianceSt
     stamp_ns = time.time_ns() - round(age_s * 1e9)
     t, q = np.array([1.0, 2.0, z_m]), np.array([0.0, 0.0, 0.0, 1.0])
     return cdr.PoseWithCovarianceStamped(stamp_ns, "camera_optical_frame", t, q, np.eye(6))
-
-
-def until(done: Callable[[], bool], act: Callable[[], object] = lambda: None, timeout_s: float = 20.0) -> None:
-    """Act until it is done; fail after the timeout."""
-    deadline = time.monotonic() + timeout_s
-    while not done():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        act()
-        time.sleep(0.01)
 
 
 @dataclass(frozen=True)

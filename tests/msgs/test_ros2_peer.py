@@ -19,6 +19,7 @@ from .conftest import Network, pose_now
 from .ros2_peer import POSE_TYPE
 
 SECONDS = 60.0
+POSE_PERIOD_S = 0.05
 # As docs/ground.md says: between two peers a router of ours carries nothing.
 CLIENT = {**os.environ, "ZENOH_CONFIG_OVERRIDE": 'mode="client"'}
 NEEDED = (
@@ -53,7 +54,7 @@ def test_an_independent_peer_lists_the_node_and_its_topics_and_receives_poses(ne
         )
         while peer.poll() is None:
             poses.put(pose_now(321.0).encode())
-            time.sleep(0.05)
+            time.sleep(POSE_PERIOD_S)
         said, complaints = peer.communicate()
     assert peer.returncode == 0, said + complaints
     found = json.loads(said)

@@ -24,10 +24,12 @@ from msgs import cdr, topics
 from msgs.ground.router import load_router, open_router
 from msgs.publish import Node, TopicPublisher
 from msgs.session import TlsFiles, peer_config, router_config
+from tests.waiting import until
 
-from ..conftest import Network, free_endpoint, until
+from ..conftest import Network, free_endpoint
 from .conftest import write_router_config
 
+FRAME_PERIOD_S = 0.01
 R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
 R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 R_NED_TARGET = Rotation.from_euler("ZYX", [200.0, 12.0, 33.0], degrees=True)
@@ -64,7 +66,7 @@ class Vehicle:
         self.put(topics.DETECTIONS, cdr.Detection3DArray(stamp_ns, "camera_optical_frame", (one,)))
         pose = cdr.PoseWithCovarianceStamped(stamp_ns, "camera_optical_frame", t, R.as_quat(), covariance)
         self.put(topics.POSE, pose, "t0")
-        time.sleep(0.01)
+        time.sleep(FRAME_PERIOD_S)
 
     def tell_health(self) -> None:
         status = cdr.DiagnosticStatus(1, "uavpose_edge", "degraded; no own attitude", "uav", (("dropped", "3"),))
@@ -139,7 +141,7 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
         uav2.token.undeclare()
         until(lambda: lines.objects("vehicle")[-1] == {"type": "vehicle", "uav": "uav2", "alive": False})
         process.terminate()
-        assert process.wait(20.0) == 0
+        assert process.wait(60.0) == 0
 
 
 def test_the_table_shows_vehicles_and_targets_and_junk_is_refused(network: Network) -> None:
@@ -194,7 +196,7 @@ def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_
 
         until(lambda: any(path.stat().st_size > 20_000 for path in tmp_path.iterdir()), tell)
         process.terminate()
-        assert process.wait(20.0) == 0
+        assert process.wait(60.0) == 0
     (path,) = tmp_path.iterdir()
     with open(path, "rb") as file:
         came = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
@@ -254,7 +256,7 @@ def test_over_a_radio_that_loses_a_fifth_poses_come_in_order_and_fresh(
         far = f"quic/127.0.0.1:{relay.port}?mixed_rel=1"
         uav1 = Vehicle(stack.enter_context(zenoh.open(peer_config([], [far], tls=keys["uav1"]))), "uav1", stack)
         _, lines = stack.enter_context(ground("watch", "--json", "-e", loopback))
-        until(lambda: len(lines.objects("pose")) >= 60, uav1.tell, timeout_s=60.0)
+        until(lambda: len(lines.objects("pose")) >= 60, uav1.tell)
         poses = lines.objects("pose")
     stamps = [one["stamp_ns"] for one in poses]
     assert stamps == sorted(stamps)  # type: ignore[type-var]
