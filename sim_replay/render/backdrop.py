@@ -51,9 +51,9 @@ def load_backdrop(path: Path) -> Backdrop:
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     linear = image.astype(np.float32)
-    if image.dtype == np.uint8:
-        # Files hold sRGB; the renderer works with gamma 2.
-        linear = (linear / 255.0) ** 2.2
+    if np.issubdtype(image.dtype, np.integer):
+        # Files of 8 or 16 bits hold sRGB; the renderer works with gamma 2.
+        linear = (linear / np.iinfo(image.dtype).max) ** 2.2
     else:
         # Exposed for the middle, but so that all fits save the sun and its like.
         middle, bright = np.percentile(linear, [50.0, 98.0])

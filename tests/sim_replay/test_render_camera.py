@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from msgs.geometry import R_from_euler, so3_exp
-from sim_replay.render.backdrop import BackdropError
+from sim_replay.render.backdrop import BackdropError, load_backdrop
 from sim_replay.render.frame import render_frame
 from sim_replay.render.placing import looking_along
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed, rays_ned
@@ -152,6 +152,16 @@ def test_a_photograph_fills_the_view_and_turns_with_the_world(tmp_path: Path) ->
     seen = cv2.warpPerspective(np.ones((HEIGHT, WIDTH), np.uint8), homography, (WIDTH, HEIGHT)) > 0
     assert np.corrcoef(warped[seen].ravel(), b[seen].ravel())[0, 1] > 0.95
     assert a.std() > 20
+
+
+def test_a_photograph_of_16_bits_looks_as_it_does_in_8(tmp_path: Path) -> None:
+    image = np.random.default_rng(6).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    image[:20] //= 8  # a dark half, which exposing for the middle would lift
+    for name, picture in (("8.png", image), ("16.png", image.astype(np.uint16) * 257)):
+        assert cv2.imwrite(str(tmp_path / name), picture)
+    np.testing.assert_array_equal(
+        load_backdrop(tmp_path / "16.png").image_rgb, load_backdrop(tmp_path / "8.png").image_rgb
+    )
 
 
 def test_a_backdrop_that_is_no_picture_is_named(tmp_path: Path) -> None:
