@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -105,6 +107,7 @@ def _server(web_port: int) -> Iterator[str]:
         [*command, "--port", str(ports[1]), "--server-memory-limit", _SERVER_MEMORY],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        start_new_session=True,  # the command starts the server as a child of its own: both have to be ended
     )
     try:
         deadline_s = time.monotonic() + _START_S
@@ -114,7 +117,7 @@ def _server(web_port: int) -> Iterator[str]:
             time.sleep(0.05)
         yield f"rerun+http://{_LOOPBACK}:{ports[1]}/proxy"
     finally:
-        server.terminate()
+        os.killpg(server.pid, signal.SIGTERM)
         server.wait()
 
 

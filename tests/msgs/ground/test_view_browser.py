@@ -1,0 +1,96 @@
+"""The view in a browser: a recorded flight, served, opened in headless Chromium, and looked at."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from urllib.request import urlopen
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import sync_playwright
+
+from msgs.ground.view.entities import TARGET_RGB
+from tests.waiting import until
+
+from .flight import record
+
+BROWSER = next((path for name in ("chromium", "google-chrome") if (path := shutil.which(name))), None)
+SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WITHIN_S = 400.0  # the viewer is compiled and drawn without a GPU, on a machine that may be busy
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def two_free_ports() -> int:
+    """The first of two that follow each other."""
+    while True:
+        with socket.socket() as first, socket.socket() as second:
+            first.bind(("127.0.0.1", 0))
+            port = int(first.getsockname()[1])
+            try:
+                second.bind(("127.0.0.1", port + 1))
+            except OSError:
+                continue
+            return port
+
+
+def test_the_page_is_served_until_told_to_stop_and_nothing_stays_behind(tmp_path: Path) -> None:
+    record(tmp_path / "flight.mcap", 5)
+    port = two_free_ports()
+    command = [sys.executable, "-m", "msgs.ground.cli", "view", str(tmp_path / "flight.mcap"), "--web", str(port)]
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert server.stderr is not None
+    assert server.stderr.readline().startswith(f"open http://127.0.0.1:{port}/")
+    with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
+        assert b"rerun" in page.read().lower()
+    server.terminate()
+    assert "5 poses drawn" in server.communicate(timeout=60)[1]
+    assert server.returncode == 0
+    assert not answers(port)
+    assert not answers(port + 1)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+@pytest.mark.timeout(500)
+def test_a_recorded_flight_is_drawn_in_a_browser(tmp_path: Path) -> None:
+    record(tmp_path / "flight.mcap", 100)
+    port = two_free_ports()
+    command = [sys.executable, "-m", "msgs.ground.cli", "view", str(tmp_path / "flight.mcap"), "--web", str(port)]
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert server.stderr is not None
+    address = server.stderr.readline().strip().removeprefix("open ")
+    shot = tmp_path / "view.png"
+    try:
+        with sync_playwright() as play:
+            browser = play.chromium.launch(executable_path=BROWSER, args=SOFTWARE)
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            page.goto(f"{address}&renderer=webgl", timeout=WITHIN_S * 1e3)
+
+            def look() -> None:
+                page.screenshot(path=shot, timeout=WITHIN_S * 1e3)
+
+            until(lambda: drawn_parts(shot) >= 3, look, what="the target in three views", within_s=WITHIN_S)
+            browser.close()
+    finally:
+        server.terminate()
+        server.communicate(timeout=60)
+    assert server.returncode == 0
+
+
+def drawn_parts(shot: Path) -> int:
+    """In how many quarters of the picture there is the first target's colour."""
+    if not shot.exists():
+        return 0
+    picture = cv2.cvtColor(cv2.imread(str(shot)), cv2.COLOR_BGR2RGB).astype(int)
+    close = (np.abs(picture - np.array(TARGET_RGB[0])) < 12).all(axis=2)
+    height, width = close.shape
+    quarters = [close[y : y + height // 2, x : x + width // 2] for y in (0, height // 2) for x in (0, width // 2)]
+    return sum(bool(quarter.any()) for quarter in quarters)
