@@ -112,7 +112,7 @@ def _cases(model: Model, threads: int, others: Mapping[str, Engine]) -> dict[Cas
     for stage, (width, height) in stages(model.contract).items():
         image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), dtype=np.uint8)
         K: NDArray[np.float32] = np.array([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]], np.float32)
-        calls[Case(str(model.path), stage, threads, "onnxruntime")] = partial(model.run, image, K)
+        calls[Case(str(model.path), stage, threads, "onnxruntime")] = partial(model.run, image, K.astype(np.float64))
         for name, engine in others.items():
             call = engine(model.path, model.contract, image, K, threads)
             if call is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sim_replay.render.scene import Camera
 
 LARGEST_PX = 4096
+INTEGER_WHITE = {"uint8": 255.0, "uint16": 65535.0}
 WIDEST_PHOTOGRAPH_RAD = np.radians(60.0)
 _GOLDEN = 0.6180339887
 
@@ -51,9 +52,10 @@ def load_backdrop(path: Path) -> Backdrop:
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     linear = image.astype(np.float32)
-    if np.issubdtype(image.dtype, np.integer):
-        # Files of 8 or 16 bits hold sRGB; the renderer works with gamma 2.
-        linear = (linear / np.iinfo(image.dtype).max) ** 2.2
+    white = INTEGER_WHITE.get(image.dtype.name)
+    if white is not None:
+        # Files of integers hold sRGB; the renderer works with gamma 2.
+        linear = (linear / white) ** 2.2
     else:
         # Exposed for the middle, but so that all fits save the sun and its like.
         middle, bright = np.percentile(linear, [50.0, 98.0])
