@@ -44,6 +44,12 @@ class ZenohSettings(Section):
         le=240,
         description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
     )
+    image_max_hz: float = Field(
+        default=1.0,
+        ge=0,
+        le=10,
+        description="upper bound for live pictures, sent while somebody looks, never on tls/ and quic/ links; 0: none",
+    )
     commands: bool = Field(default=True, description="obey commands: track, stop, record, rate")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
@@ -69,6 +75,9 @@ class RecorderSettings(Section):
 
     enabled: bool = Field(default=False, description="record from the start on")
     folder: ConfigPath = Field(default=Path("recordings"), validate_default=True, description="made if it is not there")
+    image_max_hz: float = Field(
+        default=0.0, ge=0, le=240, description="pictures recorded a second, so that the recording can be flown again"
+    )
     file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="then the next file begins")
     file_max_minutes: float = Field(default=10.0, gt=0, le=1440, description="then the next file begins")
     total_max_mb: float | None = Field(

@@ -182,6 +182,7 @@ class Pipeline:
         chosen_id = self._by_hand.chosen_id
         report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, sha256, chosen_id, frame.distortion)
         self._outlets.publish(report)
+        self._outlets.show(frame)
 
     def _take_reload(self) -> None:
         """Between two frames: a new model behind the same tracks."""

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 from edge.health import Condition, HealthSnapshot, HealthState
 from edge.requests import AskReload, RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import Report
+from edge.types import Frame, Report
 
 if TYPE_CHECKING:
     from edge.links.mavlink_link import MavlinkLink
     from edge.links.zenoh_link import ZenohLink
+    from edge.pictures import Pictures
     from edge.status_board import StatusBoard
     from msgs.recording import Recorder
 
@@ -25,16 +26,28 @@ MAV_SEVERITY = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3}
 class Outlets:
     """The enabled links, running. Peers may come and go; only our own endpoints must be free."""
 
-    def __init__(self, zenoh: ZenohLink | None, mavlink: MavlinkLink | None, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self,
+        zenoh: ZenohLink | None,
+        mavlink: MavlinkLink | None,
+        recorder: Recorder | None = None,
+        pictures: Pictures | None = None,
+    ) -> None:
         self._zenoh = zenoh
         self._mavlink = mavlink
         self._recorder = recorder
+        self._pictures = pictures
 
     def publish(self, report: Report) -> None:
         if self._mavlink is not None:
             self._mavlink.publish(report)
         if self._zenoh is not None:
             self._zenoh.publish(report)
+
+    def show(self, frame: Frame) -> None:
+        """The picture itself, for who looks and for recordings."""
+        if self._pictures is not None:
+            self._pictures.show(frame)
 
     def set_health(self, condition: Condition) -> None:
         """Told at every turn of the loop: what follows from it (HEARTBEAT) stops when the loop is stuck."""
@@ -55,7 +68,7 @@ class Outlets:
     def last_event(self, level: int, text: str) -> None:
         """An event that nothing follows: returns when each link has sent it and ended."""
         self.event(level, text)
-        for link in (self._mavlink, self._zenoh, self._recorder):
+        for link in (self._pictures, self._mavlink, self._zenoh, self._recorder):
             if link is not None:
                 link.stop()
 
@@ -71,7 +84,12 @@ class Outlets:
             self._zenoh.settle()
 
     def counters(self) -> dict[str, int]:
-        links = {"zenoh": self._zenoh, "mavlink": self._mavlink, "recorder": self._recorder}
+        links = {
+            "zenoh": self._zenoh,
+            "mavlink": self._mavlink,
+            "recorder": self._recorder,
+            "pictures": self._pictures,
+        }
         return {f"{name}_{key}": n for name, link in links.items() if link for key, n in link.counters().items()}
 
 
@@ -88,6 +106,7 @@ def start_outlets(
     zenoh: ZenohLink | None = None
     mavlink: MavlinkLink | None = None
     recorder: Recorder | None = None
+    pictures: Pictures | None = None
     if config.zenoh.enabled or config.recorder.enabled:
         from edge.links.zenoh_link import ZenohLink
         from msgs.recording import Recorder
@@ -104,6 +123,11 @@ def start_outlets(
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)
             zenoh.start()
+        from edge.pictures import Pictures
+
+        pictures = Pictures(zenoh, config.zenoh.image_max_hz, config.recorder.image_max_hz)
+        cleanup.callback(pictures.stop)
+        pictures.start()
         if zenoh.session is not None:
             from edge.status_board import declare_status
 
@@ -117,7 +141,7 @@ def start_outlets(
             mavlink = MavlinkLink(config.mavlink, own_ship, board.camera, requests, signing)
             cleanup.callback(mavlink.stop)
             mavlink.start()
-    outlets = Outlets(zenoh, mavlink, recorder)
+    outlets = Outlets(zenoh, mavlink, recorder, pictures)
     if recorder is not None:
         recorder.start()
     if config.health.prometheus_port is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import zenoh
 from zenoh import ext
@@ -35,6 +36,13 @@ class TopicPublisher:
         """Put one CDR payload. Raises zenoh.ZError once the session is closed."""
         self.sequence += 1
         self._publisher.put(payload, attachment=topics.attachment(self.sequence, time.time_ns(), self._gid))
+
+    def matching(self) -> bool:
+        """Whether anybody subscribes; one with a cache cannot tell. Raises zenoh.ZError once the session is closed."""
+        if not isinstance(self._publisher, zenoh.Publisher):
+            return True
+        status: Any = self._publisher.matching_status
+        return bool(status.matching)
 
     def close(self) -> None:
         if self._token is not None:

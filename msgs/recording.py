@@ -25,6 +25,7 @@ from msgs.topics import Topic
 log = logging.getLogger(__name__)
 
 WAITING_MAX = 4096  # samples, for a disk that stalls
+WAITING_BYTES_MAX = 64 * 1024**2  # pictures are large
 STANDING_MAX = 256  # so that made-up names cannot grow it without bound
 FLUSH_S = 1.0
 RETRY_S = 3.0
@@ -68,6 +69,7 @@ class Recorder:
         self._tell = tell
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
+        self._waiting_bytes = 0
         self._standing: dict[str, Sample] = {}
         self._counters: Counter[str] = Counter()
         self._wanted = on
@@ -97,11 +99,13 @@ class Recorder:
                 self._standing[sample.name] = sample
             if not self._wanted or self._stopping:
                 return
-            if self._failure is not None or len(self._waiting) >= WAITING_MAX:
+            full = len(self._waiting) >= WAITING_MAX or self._waiting_bytes + len(payload) > WAITING_BYTES_MAX
+            if self._failure is not None or full:
                 self._counters["lost"] += 1
             else:
                 # Nobody is woken: the writer comes by each second.
                 self._waiting.append(sample)
+                self._waiting_bytes += len(payload)
 
     def switch(self, on: bool) -> None:
         """Go on with a new file, or end the present one; returns at once."""
@@ -128,7 +132,7 @@ class Recorder:
             with self._changed:
                 self._changed.wait_for(lambda: self._woken, FLUSH_S)
                 self._woken = False
-                samples, self._waiting = self._waiting, deque()
+                samples, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
                 go_on, stopping = self._wanted and not self._stopping, self._stopping
             try:
                 self._turn(samples, go_on)
@@ -196,6 +200,7 @@ class Recorder:
                 self._counters["failures"] += 1
                 self._counters["lost"] += lost + len(self._waiting)
                 self._waiting.clear()
+                self._waiting_bytes = 0
 
 
 class Store:

@@ -96,6 +96,7 @@ def peer_config(
         rules = [{"key_expr": f"*/*/{name}/**", "freq": rate_hz} for name, rate_hz in rates_hz.items()]
         rule_set = {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}
         _insert(config, "downsampling", [rule_set])
+    _insert(config, "access_control", _no_pictures_by_radio())
     return config
 
 
@@ -112,6 +113,26 @@ def router_config(
 def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
     """A tool's session. Opening it raises zenoh.ZError at once if none of the endpoints answers."""
     return _config("client", [], connect, False, tls)
+
+
+def _no_pictures_by_radio() -> dict[str, Any]:
+    """zenoh's section that keeps pictures off tls and quic links; all else passes."""
+    rule = {
+        "id": "pictures",
+        "permission": "deny",
+        "flows": ["egress"],
+        "messages": ["put"],
+        "key_exprs": ["*/*/image/compressed/**"],
+    }
+    radio = {"id": "radio", "link_protocols": list(SECURE)}
+    policy = {"rules": [rule["id"]], "subjects": [radio["id"]]}
+    return {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [rule],
+        "subjects": [radio],
+        "policies": [policy],
+    }
 
 
 def _config(

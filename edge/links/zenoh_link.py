@@ -24,10 +24,11 @@ from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
 from edge.links.outgoing import sendable
 from edge.links.zenoh_commands import Actions, declare_commands
+from edge.pictures import Picture
 from edge.requests import AskReload, RequestQueue
 from edge.types import Mount, Report
 from msgs import topics
-from msgs.cdr import Log, Payload
+from msgs.cdr import CompressedImage, Log, Payload
 from msgs.publish import Node, TopicPublisher
 from msgs.recording import Recorder
 from msgs.session import peer_config
@@ -36,21 +37,23 @@ from msgs.topics import Topic
 log = logging.getLogger(__name__)
 
 EVENTS_WAITING = 64
+PICTURES_WAITING = 4
 STOP_TIMEOUT_S = 5.0
 SETTLE_TIMEOUT_S = 60.0
 
 
 @dataclass
 class Mailbox:
-    """What waits for the worker: the newest of each kind, and events in their order."""
+    """What waits for the worker: the newest of each kind, and events and pictures in their order."""
 
     report: Report | None = None
     snapshot: HealthSnapshot | None = None
     events: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=EVENTS_WAITING))
+    pictures: deque[Picture] = field(default_factory=lambda: deque(maxlen=PICTURES_WAITING))
     stopping: bool = False
 
     def empty(self) -> bool:
-        return self.report is None and self.snapshot is None and not self.events
+        return self.report is None and self.snapshot is None and not self.events and not self.pictures
 
 
 class ZenohLink:
@@ -76,6 +79,7 @@ class ZenohLink:
         self._counters: Counter[str] = Counter()
         self._delivering = False
         self._links = 0  # routers and peers connected just now
+        self._picture_publisher: TopicPublisher | None = None
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
 
@@ -118,6 +122,22 @@ class ZenohLink:
         with self._waiting:
             self._counters["events_lost"] += len(self._mailbox.events) == EVENTS_WAITING
             self._mailbox.events.append((clock.monotonic_ns(), level, text))
+            self._waiting.notify()
+
+    def wants_picture(self) -> bool:
+        """Whether anybody looks at pictures just now."""
+        publisher = self._picture_publisher
+        return publisher is not None and publisher.matching()
+
+    def records_picture(self) -> bool:
+        """Whether what goes out is recorded just now."""
+        return self._recorder is not None and self._recorder.recording
+
+    def publish_picture(self, picture: Picture) -> None:
+        """Leave one for the worker; the oldest of too many is dropped and counted."""
+        with self._waiting:
+            self._counters["pictures_replaced"] += len(self._mailbox.pictures) == PICTURES_WAITING
+            self._mailbox.pictures.append(picture)
             self._waiting.notify()
 
     def settle(self) -> None:
@@ -165,6 +185,8 @@ class ZenohLink:
                 token = session.liveliness().declare_token(topics.alive_token(self._vehicle_name))
                 stack.enter_context(token)
             desk = Desk(node, self._recorder, self._vehicle_name, self._mount, self._settings.max_age_ms)
+            if self._settings.image_max_hz > 0:
+                self._picture_publisher = desk.open_pictures()
             if session is not None and self._settings.commands:
                 request = self._requests.put if self._requests is not None else None
                 actions = Actions(request, self._recorder, desk.set_pose_rate, self._reload)
@@ -189,6 +211,8 @@ class ZenohLink:
                 desk.put_diagnostics(mail.snapshot)
             for time_ns, level, text in mail.events:
                 desk.put_event(time_ns, level, text)
+            for picture in mail.pictures:
+                desk.put_picture(picture)
         except Exception as error:
             # One message that cannot go out, whatever is wrong with it, must not silently end the link.
             desk.counted["failed"] += 1
@@ -246,6 +270,19 @@ class Desk:
     def put_diagnostics(self, snapshot: HealthSnapshot) -> None:
         stamp_ns = self._clock.utc_ns(snapshot.time_ns)
         self._put(topics.DIAGNOSTICS, ros.diagnostics(snapshot, self._vehicle_name, stamp_ns))
+
+    def open_pictures(self) -> TopicPublisher | None:
+        """Announce them; None without a node."""
+        return None if self._node is None else self._publisher(self._node, topics.IMAGE, None)
+
+    def put_picture(self, picture: Picture) -> None:
+        stamp_ns = self._clock.utc_ns(picture.capture_ns)
+        payload = CompressedImage(stamp_ns, topics.FRAME_CAMERA, "jpeg", picture.jpeg).encode()
+        if picture.recorded and self._recorder is not None:
+            self._recorder.record(topics.IMAGE, self._vehicle_name, None, payload, clock.utc_ns())
+        if picture.live and self._node is not None:
+            self._publisher(self._node, topics.IMAGE, None).put(payload)
+            self.counted["sent_image"] += 1
 
     def put_event(self, time_ns: int, level: int, text: str) -> None:
         self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))

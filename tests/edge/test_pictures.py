@@ -1,0 +1,167 @@
+"""Pictures as who looks, the disk and the ground behind a radio have them: real sessions on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zenoh
+from mcap.reader import make_reader
+
+from edge.config import RecorderSettings, ZenohSettings
+from edge.config_ground import ZenohTlsSettings
+from edge.links.zenoh_link import ZenohLink
+from edge.pictures import LIVE_BYTES_MAX, Pictures, Rate
+from edge.types import Frame, FrameMeta, Mount
+from msgs.cdr import CompressedImage, PoseWithCovarianceStamped
+from msgs.client import connect
+from msgs.recording import Recorder
+from msgs.session import TlsFiles, router_config
+from tests.waiting import until
+
+from .reports import K, make_report, make_track
+from .test_zenoh_config import make_keys
+from .test_zenoh_link import MOUNT, free_endpoint
+
+
+def frame(sequence: int, capture_ns: int, seed: int | None = None) -> Frame:
+    """A smooth picture whose brightness tells its number; with a seed, noise that no JPEG makes small."""
+    if seed is None:
+        image = np.full((270, 480, 3), 20 * sequence % 240, dtype=np.uint8)
+    else:
+        image = np.random.default_rng(seed).integers(0, 256, (1080, 1920, 3), dtype=np.uint8)
+    return Frame(FrameMeta(sequence, capture_ns, capture_ns), image, K)
+
+
+def decoded(payload: bytes) -> tuple[CompressedImage, np.ndarray]:
+    message = CompressedImage.decode(payload)
+    image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return message, np.asarray(image)
+
+
+@contextlib.contextmanager
+def shown(link: ZenohLink, live_hz: float, recorded_hz: float = 0.0) -> Iterator[Pictures]:
+    link.start()
+    pictures = Pictures(link, live_hz, recorded_hz)
+    pictures.start()
+    try:
+        yield pictures
+    finally:
+        pictures.stop()
+        link.stop()
+
+
+def test_who_looks_sees_the_picture_with_the_stamp_of_its_poses_and_nothing_is_sent_before() -> None:
+    endpoint = free_endpoint()
+    link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", Mount(MOUNT.R_body_cam, MOUNT.t_body_cam_m))
+    pictures_of: dict[int, np.ndarray] = {}
+    poses: set[int] = set()
+
+    def look(sample: zenoh.Sample) -> None:
+        message, image = decoded(sample.payload.to_bytes())
+        pictures_of[message.stamp_ns] = image
+
+    def hear(sample: zenoh.Sample) -> None:
+        poses.add(PoseWithCovarianceStamped.decode(sample.payload.to_bytes()).stamp_ns)
+
+    with shown(link, 10.0) as pictures, connect(endpoint) as session:
+        pictures.show(frame(1, time.monotonic_ns()))
+        assert not link.wants_picture()
+        session.declare_subscriber("0/uav1/target/*/pose/**", zenoh.handlers.Callback(hear, indirect=False))
+        session.declare_subscriber("0/uav1/image/**", zenoh.handlers.Callback(look, indirect=False))
+        numbers = iter(range(1, 10_000))
+
+        def fly() -> None:
+            now_ns = time.monotonic_ns()
+            link.publish(make_report(make_track(now_ns), now_ns=now_ns))
+            pictures.show(frame(next(numbers), now_ns))
+
+        until(lambda: len(pictures_of) >= 3 and len(poses) >= 3, fly, what="three pictures")
+    # A picture of a report that was overtaken has no pose; UTC is measured anew each second.
+    assert sum(min(abs(stamp_ns - pose_ns) for pose_ns in poses) < 100_000 for stamp_ns in pictures_of) >= 2
+    assert all(image.shape == (270, 480, 3) and np.ptp(image) <= 2 for image in pictures_of.values())
+    stamps = np.array(sorted(pictures_of))
+    # Ten a second on the frames' own clock: never closer than a period, but for where frames came late.
+    assert (np.diff(stamps) > 0).all()
+    assert stamps[-1] - stamps[0] >= (len(stamps) - 2) * 100_000_000
+
+
+def test_a_picture_that_is_too_large_for_the_wire_is_sent_worse_or_counted() -> None:
+    endpoint = free_endpoint()
+    link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
+    sizes: list[int] = []
+    with shown(link, 10.0) as pictures, connect(endpoint) as session:
+        take = zenoh.handlers.Callback(lambda s: sizes.append(len(s.payload.to_bytes())), indirect=False)
+        session.declare_subscriber("0/uav1/image/**", take)
+        until(lambda: pictures.counters().get("not_encoded"), lambda: pictures.show(frame(1, now(), seed=1)))
+        until(lambda: bool(sizes), lambda: pictures.show(frame(1, now())), what="one that fits")
+    assert max(sizes) < LIVE_BYTES_MAX + 200
+
+
+def now() -> int:
+    return time.monotonic_ns()
+
+
+def test_a_recording_holds_as_many_pictures_a_second_as_was_asked_for(tmp_path: Path) -> None:
+    settings = RecorderSettings(enabled=True, folder=tmp_path, free_min_mb=0.0, image_max_hz=5.0)
+    recorder = Recorder(tmp_path, "uav1", settings.limits(), lambda *_: None)
+    link = ZenohLink(ZenohSettings(enabled=False, listen=[]), "uav1", MOUNT, recorder)
+    recorder.start()
+    began_ns, handled = now(), threading.Event()
+    with shown(link, 0.0, settings.image_max_hz) as pictures:
+        for k in range(21):  # 30 frames a second for 0.67 s: 0, 0.2, 0.4, 0.6
+            pictures.show(frame(k, began_ns + round(k * 1e9 / 30)))
+            handled.wait(0.01)
+    recorder.stop()
+    (path,) = tmp_path.glob("*.mcap")
+    with path.open("rb") as file:
+        kept = [decoded(message.data) for _, _, message in make_reader(file).iter_messages("/uav1/image/compressed")]
+    assert [int(np.median(image)) for _, image in kept] == pytest.approx([0, 120, 0, 120], abs=2)
+    stamps_s = np.array([message.stamp_ns - kept[0][0].stamp_ns for message, _ in kept]) * 1e-9
+    np.testing.assert_allclose(stamps_s, [0.0, 0.2, 0.4, 0.6], atol=0.002)
+
+
+@pytest.mark.parametrize("hz", [1.0, 7.0, 30.0])
+def test_the_rate_is_met_on_average_by_frames_that_come_at_their_own_times(hz: float) -> None:
+    rate, chance = Rate(hz), np.random.default_rng(5)
+    times_ns = np.cumsum(chance.integers(10_000_000, 25_000_000, 3000))
+    taken = sum(rate.due(int(t)) for t in times_ns)
+    assert taken == pytest.approx(hz * (times_ns[-1] - times_ns[0]) * 1e-9, rel=0.02, abs=2)
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_pictures_stay_off_the_radio(tmp_path: Path, protocol: str) -> None:
+    files: TlsFiles = make_keys(tmp_path)
+    secure, on_board = free_endpoint().replace("tcp/", f"{protocol}/"), free_endpoint()
+    tls = ZenohTlsSettings(**{key: getattr(files, key) for key in ("root_ca", "certificate", "private_key")})
+    link = ZenohLink(ZenohSettings(listen=[on_board], connect=[secure], tls=tls), "uav1", MOUNT)
+    ground_heard: list[str] = []
+    board_heard: list[str] = []
+
+    def note(into: list[str]) -> Any:
+        return zenoh.handlers.Callback(lambda sample: into.append(str(sample.key_expr)), indirect=False)
+
+    with zenoh.open(router_config([secure], tls=files)) as ground, shown(link, 10.0) as pictures:
+        ground.declare_subscriber("0/uav1/**", note(ground_heard))
+        with connect(on_board) as board:
+            board.declare_subscriber("0/uav1/**", note(board_heard))
+
+            def fly() -> None:
+                now_ns = now()
+                link.publish(make_report(make_track(now_ns), now_ns=now_ns))
+                pictures.show(frame(1, now_ns))
+
+            def both() -> bool:
+                pictured = sum("/image/" in key for key in board_heard)
+                return pictured >= 3 and sum("/pose/" in key for key in ground_heard) >= 30
+
+            until(both, fly, what="pictures on board, poses on the ground")
+    assert not [key for key in ground_heard if "/image/" in key]
