@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import logging
 import threading
+from collections import Counter
 from contextlib import ExitStack
 
 from edge.cameras import FrameSupply, open_capture
@@ -20,6 +21,7 @@ from edge.health import HealthSnapshot
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
+from edge.search import Search
 from edge.stages import StageClock
 from edge.status_board import StatusBoard, no_password
 from edge.supervisor import Supervisor
@@ -47,6 +49,8 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         outlets = start_outlets(board, own_ship, requests, reloader.ask_for, cleanup)
         estimator = warm_estimator(model, config.estimator.max_targets, camera_info)
         pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader)
+        cleanup.callback(pipeline.search.stop)
+        pipeline.search.start()
         # What lives by now lives to the end: the collector need not walk it between frames.
         gc.collect()
         gc.freeze()
@@ -87,6 +91,7 @@ class Pipeline:
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, capture.reasons)
+        self.search = Search()  # to be started; until then each search is made where it is asked for
         self._since_acquire = 0
         self._out_of_order = 0
 
@@ -117,10 +122,12 @@ class Pipeline:
         return self.supervisor.snapshot()
 
     def _counters(self) -> dict[str, int]:
+        searched = Counter(self.search.counters())
+        searched.update({f"refused_{reason}": count for reason, count in self._estimator.refused.items()})
         return {
             **self._capture.counters(),
             "out_of_order": self._out_of_order,
-            **{f"refused_{reason}": count for reason, count in self._estimator.refused.items()},
+            **searched,
             "refused_by_tracker": self._tracker.not_finite,
             **self._outlets.counters(),
         }
@@ -156,24 +163,40 @@ class Pipeline:
     def _estimate(
         self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock
     ) -> list[Estimate]:
-        found: list[Estimate] = []
-        boxes = [track.box_xyxy_px for track in expected]
-        if self._estimator.has_track_stage and (expected or pointed_at is not None):
-            seen = self._estimator.track(frame, boxes if pointed_at is None else [*boxes, pointed_at])
-            if pointed_at is not None and (there := seen[-1]) is not None:
-                self._by_hand.found(there)
-                self._tracker.make_room()
-            found = [estimate for estimate in seen if estimate is not None]
-            clock.estimated(self._estimator.model.take_runs_ns())
+        capture_ns = frame.meta.capture_ns
+        searches = self._by_hand.searches(capture_ns)
+        held = [track.box_xyxy_px for track in expected]
+        places = self.search.places(capture_ns, held, self._max_targets - len(held)) if searches else []
+        found = self._look_into([*held, *places], frame, pointed_at, clock)
         self._since_acquire += 1
         nothing_tracked = all(track.state is TrackState.COASTING for track in expected)
-        another_due = self._since_acquire >= self._acquire_every_n and len(expected) < self._max_targets
-        wanted = nothing_tracked or another_due or not self._estimator.has_track_stage
-        if wanted and self._by_hand.searches(frame.meta.capture_ns):
+        if not searches:
+            return found
+        if nothing_tracked or not self._estimator.has_track_stage:
             found += self._estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found])
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
+        elif (
+            self._since_acquire >= self._acquire_every_n
+            and len(held) < self._max_targets
+            and self.search.begin(self._estimator, frame, [*held, *places])
+        ):
+            self._since_acquire = 0
         return found
+
+    def _look_into(
+        self, boxes: list[Array], frame: Frame, pointed_at: Array | None, clock: StageClock
+    ) -> list[Estimate]:
+        if pointed_at is not None:
+            boxes = [*boxes, pointed_at]
+        if not boxes or not self._estimator.has_track_stage:
+            return []
+        seen = self._estimator.track(frame, boxes)
+        if pointed_at is not None and (there := seen[-1]) is not None:
+            self._by_hand.found(there)
+            self._tracker.make_room()
+        clock.estimated(self._estimator.model.take_runs_ns())
+        return [estimate for estimate in seen if estimate is not None]
 
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None

@@ -18,6 +18,7 @@ THREADS = (
     ThreadRow("main", "the loop of `edge/daemon.py`", "links, camera"),
     ThreadRow("capture", "reads the camera, keeps the newest frame", "the loop"),
     ThreadRow("decode", "reads a sequence's pictures ahead", "the loop"),
+    ThreadRow("search", "looks over the whole frame for more targets, at a lower priority", "the loop", watched=True),
     ThreadRow("zenoh", "sends the newest report, events, diagnostics, pictures", "the loop", watched=True),
     ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),
     ThreadRow("pictures", "makes JPEG of frames for who looks and for recordings", "the loop, the links"),

@@ -90,10 +90,15 @@ def distinct(estimates: Sequence[Estimate], known_boxes: Sequence[Array] = ()) -
     boxes = list(known_boxes)
     kept = []
     for estimate in estimates:
-        if all(overlap(estimate.box_xyxy_px, box) < SAME_TARGET_OVERLAP for box in boxes):
+        if not lies_on(estimate.box_xyxy_px, boxes):
             kept.append(estimate)
             boxes.append(estimate.box_xyxy_px)
     return kept
+
+
+def lies_on(box_xyxy: ArrayLike, known_boxes: Sequence[Array]) -> bool:
+    """Whether a box is of the same target as one of `known_boxes`."""
+    return any(overlap(box_xyxy, known) >= SAME_TARGET_OVERLAP for known in known_boxes)
 
 
 def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:

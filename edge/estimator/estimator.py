@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.estimator.decode import decode, distinct, nearest_expected
 from edge.estimator.lens import lens_of
-from edge.estimator.model import Model
+from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, window_around
 from edge.types import Array, Estimate, Frame
 
@@ -39,19 +40,34 @@ class Estimator:
 
         Each is refined in a track window of the same frame; one the window does not confirm is no target.
         """
-        contract = self.model.contract
-        lens = lens_of(frame.K, frame.distortion)
-        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
-        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
-        K = pixel_map.intrinsics(frame.K)
-        peaks = self.model.run(image[None], K[None])
-        found = decode(peaks, 0, pixel_map, K, contract, "acquire", self.refused, frame_wh)
-        found = distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
+        found = self._whole(frame, known_boxes, self.model.run, self.refused)
         if not self.has_track_stage:
             return found
         refined = [estimate for estimate in self.track(frame, [f.box_xyxy_px for f in found]) if estimate is not None]
         self.refused["unconfirmed"] += len(found) - len(refined)
         return distinct(refined, known_boxes)
+
+    def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
+        """The same as far as the whole frame alone tells, unconfirmed; refusals are added to `refused`.
+
+        It touches nothing of the estimator's own, so another thread than the loop's may call it.
+        """
+        return self._whole(frame, known_boxes, self.model.infer, refused)
+
+    def _whole(
+        self,
+        frame: Frame,
+        known_boxes: Sequence[Array],
+        run: Callable[[NDArray[np.uint8], Array], Peaks],
+        refused: Counter[str],
+    ) -> list[Estimate]:
+        contract = self.model.contract
+        lens = lens_of(frame.K, frame.distortion)
+        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
+        K = pixel_map.intrinsics(frame.K)
+        found = decode(run(image[None], K[None]), 0, pixel_map, K, contract, "acquire", refused, frame_wh)
+        return distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array]) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows."""

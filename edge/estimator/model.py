@@ -51,7 +51,10 @@ class Peaks:
 
 
 class Model:
-    """A loaded file: a session that takes any size, and others for one size each. One thread at a time calls `run`."""
+    """A loaded file: a session that takes any size, and others for one size each.
+
+    `run` belongs to the loop's thread and is timed; `infer` may be called from any.
+    """
 
     def __init__(
         self,
@@ -74,12 +77,16 @@ class Model:
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
-        feeds = {"image": images_bgr, "K": K.astype(np.float32)}
-        session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
         begin_ns = clock.monotonic_ns()
-        peaks = Peaks(*session.run(list(OUTPUT_NAMES), feeds))
+        peaks = self.infer(images_bgr, K)
         self._runs_ns.append((begin_ns, clock.monotonic_ns()))
         return peaks
+
+    def infer(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
+        """The same, untimed."""
+        feeds = {"image": images_bgr, "K": K.astype(np.float32)}
+        session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
+        return Peaks(*session.run(list(OUTPUT_NAMES), feeds))
 
     def take_runs_ns(self) -> list[tuple[int, int]]:
         """Begin and end (monotonic) of the inferences since the last call, oldest first."""

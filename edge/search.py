@@ -1,0 +1,114 @@
+"""The whole frame looked over beside the loop: a search for more targets must not make the poses of those held late.
+
+What it finds is only a place. The loop looks into it through a window of the next frame, as it does where a person
+points, and only what is seen there is a target.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from edge import clock
+from edge.estimator.decode import lies_on
+from edge.estimator.estimator import Estimator
+from edge.types import Array, Frame
+
+log = logging.getLogger(__name__)
+
+YIELDS = 10  # how much nicer than the loop its thread is
+PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
+
+
+@dataclass(frozen=True)
+class _Asked:
+    estimator: Estimator
+    frame: Frame
+    known_boxes: tuple[Array, ...]
+
+
+class Search:
+    """One search at a time, in a thread of its own; in lock-step on the caller's. Used by the loop."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._asked: _Asked | None = None
+        self._busy = False
+        self._places: list[Array] = []
+        self._seen_ns = 0  # exposure of the frame that they were seen in
+        self._counts: Counter[str] = Counter(searches=0)
+        self._stopping = False
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        if not clock.stepped():
+            self._thread = threading.Thread(target=self._run, name="search", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, after the search under way. May be called without start."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(timeout=1.0)
+
+    def begin(self, estimator: Estimator, frame: Frame, known_boxes: Sequence[Array]) -> bool:
+        """Look for targets that lie on none of `known_boxes` [4] px; False while another search is under way."""
+        with self._changed:
+            if self._busy:
+                return False
+            self._busy = True
+            self._asked = _Asked(estimator, frame, tuple(known_boxes))
+            self._changed.notify()
+        if self._thread is None:
+            self._look()
+        return True
+
+    def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Array]:
+        """Boxes [4] px, best first, of what was found since the last call and may still be there at `capture_ns`
+        (monotonic), off `known_boxes`."""
+        with self._changed:
+            found, self._places = self._places, []
+            if capture_ns - self._seen_ns > PLACE_AGE_MAX_NS:
+                return []
+        return [box for box in found if not lies_on(box, known_boxes)][: max(at_most, 0)]
+
+    def counters(self) -> dict[str, int]:
+        """searches made, search_failed, and refused_REASON of what they saw."""
+        with self._changed:
+            return dict(self._counts)
+
+    def _run(self) -> None:
+        with suppress(OSError):  # where a sandbox forbids it, it competes with the loop and no more
+            os.nice(YIELDS)
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._asked is not None or self._stopping)
+                if self._stopping:
+                    return
+            self._look()
+
+    def _look(self) -> None:
+        with self._changed:
+            asked, self._asked = self._asked, None
+        assert asked is not None
+        refused: Counter[str] = Counter()
+        places: list[Array] = []
+        failed = False
+        try:
+            places = [found.box_xyxy_px for found in asked.estimator.anywhere(asked.frame, asked.known_boxes, refused)]
+        except Exception:
+            # One search is lost; tracking goes on, and the next may do.
+            failed = True
+            log.exception("a search of the whole frame failed")
+        with self._changed:
+            self._counts.update(searches=1, search_failed=int(failed))
+            self._counts.update({f"refused_{reason}": n for reason, n in refused.items()})
+            self._places, self._seen_ns = places, asked.frame.meta.capture_ns
+            self._busy = False

@@ -1,0 +1,226 @@
+"""The search for more targets: beside the loop, never in its way, and nothing but a place to look into."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge import threads
+from edge.config import Config, ConfigFile
+from edge.daemon import Pipeline
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import load_model
+from edge.health import Reason
+from edge.outlets import Outlets
+from edge.reload import Reloader
+from edge.requests import RequestQueue, StopTracking
+from edge.search import PLACE_AGE_MAX_NS, Search
+from edge.status_board import StatusBoard
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, Report
+from tests.waiting import until
+
+from .toy_scene import SIZE_WH, TARGET_WH, K, draw
+
+HELD, OTHER = (500.5, 420.5), (1400.5, 700.5)
+PERIOD_NS = 33_000_000
+
+
+def box_around(center_px: tuple[float, float]) -> Array:
+    half = (np.array(TARGET_WH) - 1) / 2 + 0.5
+    return np.array([*(np.array(center_px) - half), *(np.array(center_px) + half)])
+
+
+def frame(index: int, *centers_px: tuple[float, float]) -> Frame:
+    picture = np.maximum.reduce([draw(center) for center in centers_px])
+    time_ns = 1_000_000_000 + index * PERIOD_NS
+    return Frame(FrameMeta(index, time_ns, time_ns), picture, K)
+
+
+@pytest.fixture
+def search() -> Iterator[Search]:
+    search = Search()
+    search.start()
+    yield search
+    search.stop()
+
+
+@pytest.fixture
+def estimator(toy_model: Path) -> Estimator:
+    return Estimator(load_model(toy_model, 1))
+
+
+def test_what_it_finds_is_a_place_off_the_targets_held(search: Search, estimator: Estimator) -> None:
+    seen = frame(0, OTHER)
+    assert search.begin(estimator, seen, [])
+    until(lambda: search.counters()["searches"] == 1)
+    (place,) = search.places(seen.meta.capture_ns, [], 4)
+    np.testing.assert_allclose(place, box_around(OTHER), atol=3.0)  # a third of the frame's resolution
+    assert search.places(seen.meta.capture_ns, [], 4) == []  # told once
+
+    assert search.begin(estimator, seen, [])
+    until(lambda: search.counters()["searches"] == 2)
+    assert search.places(seen.meta.capture_ns, [box_around(OTHER)], 4) == []  # held by now
+    assert search.begin(estimator, seen, [box_around(OTHER)])
+    until(lambda: search.counters()["searches"] == 3)
+    assert search.places(seen.meta.capture_ns, [], 4) == []  # held when it began
+
+
+def test_a_place_seen_too_long_ago_is_not_looked_into(search: Search, estimator: Estimator) -> None:
+    seen = frame(0, OTHER)
+    for late_ns, places in ((PLACE_AGE_MAX_NS, 1), (PLACE_AGE_MAX_NS + 1, 0)):
+        before = search.counters()["searches"]
+        assert search.begin(estimator, seen, [])
+        until(lambda before=before: search.counters()["searches"] > before)  # type: ignore[misc]
+        assert len(search.places(seen.meta.capture_ns + late_ns, [], 4)) == places
+
+
+class Gated(Estimator):
+    """Its search of the whole frame ends when it is let, with what it is told."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.gate, self.begun = threading.Event(), threading.Event()
+        self.sees: list[Estimate] | Exception = []
+
+    def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
+        self.begun.set()
+        assert self.gate.wait(60)
+        if isinstance(self.sees, Exception):
+            raise self.sees
+        return self.sees
+
+
+@pytest.fixture
+def gated(toy_model: Path) -> Gated:
+    return Gated(load_model(toy_model, 1))
+
+
+def test_a_search_that_fails_is_counted_and_the_next_one_does(search: Search, gated: Gated) -> None:
+    gated.sees = RuntimeError("out of memory")
+    gated.gate.set()
+    assert search.begin(gated, frame(0, OTHER), [])
+    until(lambda: search.counters().get("search_failed") == 1)
+    assert "search" in threads.running()
+    gated.sees = []
+    until(lambda: search.begin(gated, frame(1, OTHER), []))
+    until(lambda: search.counters()["searches"] == 2)
+    assert search.counters()["search_failed"] == 1
+
+
+def test_one_search_at_a_time(search: Search, gated: Gated) -> None:
+    assert search.begin(gated, frame(0, OTHER), [])
+    assert gated.begun.wait(60)
+    assert not search.begin(gated, frame(1, OTHER), [])
+    gated.gate.set()
+    until(lambda: search.begin(gated, frame(2, OTHER), []))
+
+
+class Ear(Outlets):
+    """Keeps what the loop tells."""
+
+    def __init__(self) -> None:
+        super().__init__(None, None)
+        self.reports: list[Report] = []
+
+    def publish(self, report: Report) -> None:
+        self.reports.append(report)
+
+
+class Supply:
+    """Frames one after the other."""
+
+    def start(self, settle: Any) -> None: ...
+
+    def newest(self, timeout_s: float) -> Frame | None:
+        return None
+
+    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        return ()
+
+    def counters(self) -> dict[str, int]:
+        return {"captured": 0, "dropped": 0}
+
+    def stop(self) -> None: ...
+
+
+@pytest.fixture
+def pipeline(gated: Gated) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
+    config = Config.model_validate({
+        "camera": {"type": "sequence", "path": "/scene"}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
+        "estimator": {"acquire_every_n": 5},
+    })  # fmt: skip
+    board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))
+    ear, requests = Ear(), RequestQueue()
+    pipeline = Pipeline(board, gated, OwnShipBuffer(), ear, Supply(), requests, Reloader())
+    pipeline.search.start()
+    yield pipeline, ear, requests
+    gated.gate.set()
+    pipeline.search.stop()
+
+
+def test_poses_go_out_while_the_search_is_under_way_and_what_it_finds_becomes_a_track(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
+) -> None:
+    loop, ear, _ = pipeline
+    for index in range(20):
+        loop._process(frame(index, HELD))
+    assert gated.begun.is_set()
+    assert loop.search.counters()["searches"] == 0  # still at it
+    assert [len(report.tracks) for report in ear.reports] == [1] * 20
+
+    (estimate,) = [e for e in gated.track(frame(20, HELD, OTHER), [box_around(OTHER)]) if e]
+    gated.sees = [estimate]
+    gated.gate.set()
+    until(lambda: loop.search.counters()["searches"] == 1)
+    gated.sees = []
+    for index in range(20, 24):
+        loop._process(frame(index, HELD, OTHER))
+    assert len(ear.reports[-1].tracks) == 2
+    np.testing.assert_allclose(ear.reports[-1].tracks[1].box_xyxy_px, box_around(OTHER), atol=3.0)
+
+
+def test_a_place_where_the_window_sees_nothing_is_no_target(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
+) -> None:
+    loop, ear, _ = pipeline
+    (estimate,) = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+    gated.sees = [estimate]
+    gated.gate.set()
+    for index in range(8):
+        loop._process(frame(index, HELD))
+    until(lambda: loop.search.counters()["searches"] == 1)
+    loop._process(frame(8, HELD))
+    assert [len(report.tracks) for report in ear.reports] == [1] * 9
+
+
+def test_a_person_s_stop_holds_against_a_search_under_way(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
+) -> None:
+    loop, ear, requests = pipeline
+    for index in range(8):
+        loop._process(frame(index, HELD))
+    assert gated.begun.wait(60)
+    (estimate,) = [e for e in gated.track(frame(8, HELD), [box_around(HELD)]) if e]
+    requests.put(StopTracking())
+    loop._process(frame(8, HELD))
+    gated.sees = [estimate]
+    gated.gate.set()
+    until(lambda: loop.search.counters()["searches"] == 1)
+    for index in range(9, 14):
+        loop._process(frame(index, HELD))
+    assert [len(report.tracks) for report in ear.reports[8:]] == [0] * 6
+
+
+def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated) -> None:
+    loop, _, _ = pipeline
+    gated.gate.set()
+    for index in range(12):
+        loop._process(frame(index, HELD))
+    until(lambda: loop.snapshot().counters["searches"] >= 1)
