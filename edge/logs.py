@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import sys
 from dataclasses import dataclass
@@ -11,6 +12,9 @@ from typing import TextIO
 REPEAT_S = 60.0
 FAULTS_REMEMBERED = 64
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+# OpenCV and ffmpeg write lines of their own, past any counting: one for each try to open a camera, many for each
+# picture that a radio spoiled. Whoever looks into a fault sets these variables otherwise.
+QUIET = {"OPENCV_LOG_LEVEL": "ERROR", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -59,6 +63,8 @@ class CountingHandler(logging.StreamHandler[TextIO]):
 
 
 def set_up_logging() -> None:
-    """Everything from INFO on to standard error."""
+    """Everything from INFO on to standard error. To be called before OpenCV is imported."""
+    for variable, level in QUIET.items():
+        os.environ.setdefault(variable, level)
     handler = CountingHandler(sys.stderr)
     logging.basicConfig(level=logging.INFO, format=FORMAT, handlers=[handler])

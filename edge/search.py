@@ -22,6 +22,7 @@ from edge.types import Array, Frame
 log = logging.getLogger(__name__)
 
 YIELDS = 10  # how much nicer than the loop its thread is
+STOP_TIMEOUT_S = 5.0  # a process that ends during an inference is aborted; on a busy machine one takes long
 PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
 
 
@@ -56,7 +57,7 @@ class Search:
             self._stopping = True
             self._changed.notify()
         if self._thread is not None:
-            self._thread.join(timeout=1.0)
+            self._thread.join(STOP_TIMEOUT_S)
 
     def begin(self, estimator: Estimator, frame: Frame, known_boxes: Sequence[Array]) -> bool:
         """Look for targets that lie on none of `known_boxes` [4] px; False while another search is under way."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 
 import cv2
 
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
+from edge.cameras.stamps import StampCheck
 from edge.config_camera import DeviceCamera
 
 log = logging.getLogger(__name__)
@@ -17,6 +19,11 @@ STAMP_AGE_MAX_NS = 1_000_000_000
 EXPOSURE_MANUAL = 1
 EXPOSURE_UNITS_PER_MS = 10
 FPS_TOLERANCE = 0.05
+# OpenCV gives the buffer of a frame back when the next one is asked for: with one alone the driver would have nowhere
+# to put the next picture while this one is decoded, and lose every other one. A third would only hold stale ones.
+BUFFERS = 2
+# How long OpenCV waits for a frame that does not come; its own 10 s would be that long without a word or a retry.
+TIMEOUT_VARIABLE, TIMEOUT_S = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", 3
 
 
 class DeviceSource(LiveSource):
@@ -26,9 +33,11 @@ class DeviceSource(LiveSource):
         super().__init__(settings.device, load_intrinsics(settings.intrinsics))
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
+        self._stamps = StampCheck(STAMP_AGE_MAX_NS)
 
     def _connect(self) -> cv2.VideoCapture:
         settings = self._settings
+        os.environ.setdefault(TIMEOUT_VARIABLE, str(TIMEOUT_S))
         capture = cv2.VideoCapture(settings.device, cv2.CAP_V4L2)
         if not capture.isOpened():
             return capture
@@ -36,8 +45,7 @@ class DeviceSource(LiveSource):
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
         capture.set(cv2.CAP_PROP_FPS, settings.fps)
-        # One buffer deep, so that no stale frame waits in the driver.
-        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, BUFFERS)
         if settings.exposure_ms is not None:
             manual = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, EXPOSURE_MANUAL)
             if not (capture.set(cv2.CAP_PROP_EXPOSURE, settings.exposure_ms * EXPOSURE_UNITS_PER_MS) and manual):
@@ -47,21 +55,13 @@ class DeviceSource(LiveSource):
         return capture
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
-        stamped_ns = driver_stamp_ns(arrival_ns, position_ms)
-        if stamped_ns is None:
+        # OpenCV hands the V4L2 buffer's timestamp over as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC where the driver
+        # sets V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not tell; a driver without stamps gives 0.
+        stamp_ns = round(position_ms * 1e6)
+        if not self._stamps.believes(stamp_ns, arrival_ns):
             self.counts["unstamped"] += 1
-        return (arrival_ns if stamped_ns is None else stamped_ns) - self._latency_ns
-
-
-def driver_stamp_ns(arrival_ns: int, position_ms: float) -> int | None:
-    """The driver's stamp on the monotonic clock, ns, or None if it gives none that can be.
-
-    OpenCV hands the V4L2 buffer's timestamp over as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC where the driver sets
-    V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not tell; a driver without stamps gives 0, one with another
-    clock a time far from now.
-    """
-    stamp_ns = round(position_ms * 1e6)
-    return stamp_ns if 0 <= arrival_ns - stamp_ns <= STAMP_AGE_MAX_NS else None
+            stamp_ns = arrival_ns
+        return stamp_ns - self._latency_ns
 
 
 def complaints(settings: DeviceCamera, fourcc: str, fps: float) -> list[str]:

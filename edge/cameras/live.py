@@ -12,6 +12,7 @@ import numpy as np
 
 from edge.cameras.intrinsics import Intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
+from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
 
@@ -63,7 +64,7 @@ class LiveSource(ABC):
             raise SourceLost("the camera gives no more frames")
         size_wh = (image_bgr.shape[1], image_bgr.shape[0])
         if size_wh != self._fitted.image_size_wh:
-            self._fitted = self._intrinsics.scaled_to(size_wh)
+            self._fitted = self._refitted(size_wh)
         meta = FrameMeta(self._sequence, self._exposure_ns(arrival_ns, position_ms), arrival_ns)
         self._sequence += 1
         return Frame(meta, np.asarray(image_bgr, dtype=np.uint8), self._fitted.K, self._fitted.distortion)
@@ -72,6 +73,13 @@ class LiveSource(ABC):
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _refitted(self, size_wh: tuple[int, int]) -> Intrinsics:
+        """Raises SourceLost: whether the camera has changed for good shows when it is opened again."""
+        try:
+            return self._intrinsics.scaled_to(size_wh)
+        except InputError as error:
+            raise SourceLost(f"a picture of another shape: {error}") from error
 
     @abstractmethod
     def _connect(self) -> cv2.VideoCapture:

@@ -14,6 +14,7 @@ from zenoh import handlers
 
 from edge.cameras.intrinsics import Intrinsics, load_intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
+from edge.cameras.stamps import StampCheck
 from edge.clock import UtcClock
 from edge.config_camera import ZenohCamera
 from edge.types import CameraInfo, Frame, FrameMeta
@@ -43,6 +44,7 @@ class ZenohSource:
         self._arrived = threading.Condition()
         self._sample: tuple[int, bytes, bytes] | None = None  # arrival_ns, payload, attachment
         self._clock = UtcClock()
+        self._stamps = StampCheck(STAMP_AGE_MAX_NS)
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # the publisher and its number of the last picture
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0)
@@ -102,7 +104,7 @@ class ZenohSource:
             self.counts["misfit"] += 1
             return None
         stamp_ns = self._clock.monotonic_ns(message.stamp_ns)
-        if not 0 <= arrival_ns - stamp_ns <= STAMP_AGE_MAX_NS:
+        if not self._stamps.believes(stamp_ns, arrival_ns):
             self.counts["unstamped"] += 1
             stamp_ns = arrival_ns
         meta = FrameMeta(self._number(attachment), stamp_ns - self._latency_ns, arrival_ns)

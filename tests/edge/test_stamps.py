@@ -1,0 +1,151 @@
+"""When a frame was exposed: an old one must never be told as a new one, whatever held it up."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.cameras.device import DeviceSource
+from edge.cameras.source import SourceLost
+from edge.cameras.stamps import DOUBTED_FRAMES, StampCheck, StreamClock
+from edge.cameras.stream import BEHIND_MAX_NS, StreamSource
+from edge.config_camera import DeviceCamera, IntrinsicsSettings, StreamCamera
+
+S = 1_000_000_000
+PERIOD_NS = S // 30
+AGE_MAX_NS = 1 * S
+INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=320, height=180)
+
+
+@given(
+    st.lists(st.integers(0, 400_000_000), min_size=2, max_size=80),
+    st.integers(0, 10**15),
+    st.integers(-(10**12), 10**12),
+    st.floats(-100, 100),
+)
+def test_a_streams_stamps_are_its_exposures_and_the_least_delay(
+    delays_ns: list[int], boot_ns: int, origin_ns: int, drift_ppm: float
+) -> None:
+    clock = StreamClock()
+    for k, delay_ns in enumerate(delays_ns):
+        exposed_ns = boot_ns + PERIOD_NS * k
+        drifted_ns = round(PERIOD_NS * k * (1 + drift_ppm * 1e-6))
+        stamp_ns = clock.monotonic_ns(drifted_ns + origin_ns, exposed_ns + delay_ns)
+        assert stamp_ns is not None
+        assert stamp_ns <= exposed_ns + delay_ns
+        drift_max_ns = 600e-6 * (PERIOD_NS * k + 400_000_000)
+        assert abs(stamp_ns - (exposed_ns + min(delays_ns[: k + 1]))) <= drift_max_ns + 1
+
+
+def test_a_stream_that_starts_over_is_laid_on_our_clock_anew() -> None:
+    clock, step_ns = StreamClock(), 40_000_000
+    assert clock.monotonic_ns(0, 10**12) == 10**12
+    late = clock.monotonic_ns(step_ns, 10**12 + step_ns + 7_000_000)
+    assert late == pytest.approx(10**12 + step_ns, abs=100_000)
+    assert clock.monotonic_ns(0, 2 * 10**12) is None  # back to its beginning
+    assert clock.monotonic_ns(step_ns, 2 * 10**12 + step_ns) == 2 * 10**12 + step_ns
+    ahead_ns = 3 * 10**12  # a gap in its clock that ours does not have
+    assert clock.monotonic_ns(ahead_ns, 2 * 10**12 + 2 * step_ns) == 2 * 10**12 + 2 * step_ns
+
+
+@given(st.floats(0.3, 2.9), st.floats(0.001, 0.02))
+def test_what_a_stalled_stream_held_back_keeps_its_age(stall_s: float, drain_s: float) -> None:
+    clock = StreamClock()
+    held_from, now_ns = 200, 0
+    for k in range(400):
+        exposed_ns = 10 * S + k * PERIOD_NS
+        release_ns = 10 * S + held_from * PERIOD_NS + round(stall_s * S)
+        now_ns = max(exposed_ns, now_ns + round(drain_s * S), release_ns if k >= held_from else 0)
+        stamp_ns = clock.monotonic_ns(k * PERIOD_NS, now_ns)
+        assert stamp_ns is not None
+        assert abs(stamp_ns - exposed_ns) < 10_000_000
+
+
+def test_a_stream_that_stays_behind_says_so_and_one_that_jitters_or_drifts_does_not() -> None:
+    rng = np.random.default_rng(3)
+    clock, behind_s = StreamClock(), []
+    for k in range(3000):
+        exposed_ns = 10 * S + k * PERIOD_NS
+        backlog_ns = 400_000_000 if k >= 2000 else 0
+        arrival_ns = exposed_ns + backlog_ns + int(rng.exponential(40e6))
+        clock.monotonic_ns(round(k * PERIOD_NS * (1 - 100e-6)), arrival_ns)
+        behind_s.append(clock.behind_ns(arrival_ns) / S)
+    assert max(behind_s[:2000]) < 0.05
+    assert behind_s[-1] == pytest.approx(0.4, abs=0.05)
+
+
+@given(st.integers(0, 10**15), st.integers(0, AGE_MAX_NS), st.integers(AGE_MAX_NS + 1, 10**12))
+def test_once_a_drivers_stamp_has_fitted_an_old_one_is_an_old_frame(boot_ns: int, fresh_ns: int, old_ns: int) -> None:
+    stamps = StampCheck(AGE_MAX_NS)
+    assert not stamps.believes(boot_ns - old_ns, boot_ns)  # never seen to fit: another clock
+    assert stamps.believes(boot_ns - fresh_ns, boot_ns)
+    assert stamps.believes(boot_ns - old_ns, boot_ns)
+    assert not stamps.believes(boot_ns + 1, boot_ns)  # of the future
+    believed = [stamps.believes(boot_ns - old_ns, boot_ns) for _ in range(DOUBTED_FRAMES + 1)]
+    assert believed[0]
+    assert not believed[-1]  # no backlog is that long
+    assert stamps.believes(boot_ns - fresh_ns, boot_ns)
+
+
+class Fed:
+    """In place of cv2.VideoCapture: frames with given stamps."""
+
+    def __init__(self, stamps_ms: list[float], shapes: list[tuple[int, int]] | None = None) -> None:
+        self._stamps_ms, self._shapes = stamps_ms, shapes or [(180, 320)] * len(stamps_ms)
+        self._at = -1
+
+    def isOpened(self) -> bool:
+        return True
+
+    def grab(self) -> bool:
+        self._at += 1
+        return self._at < len(self._stamps_ms)
+
+    def get(self, prop: int) -> float:
+        known = {cv2.CAP_PROP_FRAME_WIDTH: 320.0, cv2.CAP_PROP_FRAME_HEIGHT: 180.0, cv2.CAP_PROP_FPS: 30.0}
+        return known[prop] if prop in known else self._stamps_ms[self._at]
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((*self._shapes[self._at], 3), np.uint8)
+
+
+def test_a_picture_of_another_shape_in_flight_is_a_camera_to_be_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = StreamSource(StreamCamera(type="stream", url="udp://127.0.0.1:9", intrinsics=INTRINSICS))
+    monkeypatch.setattr(source, "_connect", lambda: Fed([0, 33, 66], [(180, 320), (360, 640), (1, 4711)]))
+    source.open()
+    assert source.read(threading.Event()).K[0, 0] == 300
+    assert source.read(threading.Event()).K[0, 0] == 600  # the same picture, larger
+    with pytest.raises(SourceLost, match="another shape"):
+        source.read(threading.Event())
+
+
+def test_a_device_s_frame_from_before_a_stall_keeps_the_driver_s_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_ns = iter([100 * S, 104 * S, 104 * S + PERIOD_NS])
+    monkeypatch.setattr("edge.cameras.live.time", SimpleNamespace(monotonic_ns=lambda: next(times_ns)))
+    source = DeviceSource(DeviceCamera(type="device", width=320, height=180, latency_ms=5, intrinsics=INTRINSICS))
+    monkeypatch.setattr(source, "_connect", lambda: Fed([99_990, 100_023, 104_030]))
+    source.open()
+    exposed_ms = [source.read(threading.Event()).meta.capture_ns / 1e6 for _ in range(3)]
+    np.testing.assert_allclose(exposed_ms, [99_985, 100_018, 104_025])
+    assert source.counts["unstamped"] == 0
+
+
+def test_a_stream_that_stays_behind_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = 600
+    late_ns = BEHIND_MAX_NS + 50_000_000
+    times_ns = iter([k * PERIOD_NS + (late_ns if k >= 200 else 0) for k in range(frames)])
+    monkeypatch.setattr("edge.cameras.live.time", SimpleNamespace(monotonic_ns=lambda: next(times_ns)))
+    source = StreamSource(StreamCamera(type="stream", url="udp://127.0.0.1:9", intrinsics=INTRINSICS))
+    monkeypatch.setattr(source, "_connect", lambda: Fed([k * PERIOD_NS / 1e6 for k in range(frames)]))
+    source.open()
+    stop = threading.Event()
+    for _ in range(200 + 4 * 30):
+        source.read(stop)
+    with pytest.raises(SourceLost, match="behind itself"):  # after five seconds of it, not after one late burst
+        [source.read(stop) for _ in range(2 * 30)]
