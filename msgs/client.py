@@ -151,6 +151,8 @@ class TopicCounts:
         # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
         handler = handlers.Callback(self._on_sample, indirect=False)
         for topic in topics.TOPICS:
+            if topic is topics.IMAGE:
+                continue
             key = topics.subscription_key(topic, self._uav, domain=self._domain)
             if not topic.cache:
                 self._subscribers.append(session.declare_subscriber(key, handler))
@@ -169,7 +171,8 @@ def subscribe_all(
     domain: int = 0,
     max_age_s: float = 1.0,
 ) -> TopicCounts:
-    """Every topic of the table for one UAV; what is cached comes with its history.
+    """Every topic of the table for one UAV but pictures, which are made only while somebody looks; what is cached comes
+    with its history.
 
     `on_pose` gets each validated pose on zenoh's receiving thread: let it be quick. Close it, or use it as a context.
     """

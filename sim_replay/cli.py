@@ -29,6 +29,7 @@ from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError
 from sim_replay.radio import run as radio
+from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
 
 
@@ -46,10 +47,17 @@ def _parser() -> argparse.ArgumentParser:
     play = commands.add_parser(
         "play",
         help="the same with a sequence of your own, or in lock-step",
-        description="Like demo, with a BOP scene folder that also holds sequence.toml and telemetry.csv.",
+        description="Like demo, with a BOP scene folder that also holds sequence.toml and telemetry.csv, with an MCAP "
+        "recording that the daemon made ([recorder] image_max_hz), or with a video and its telemetry. Of these two "
+        "no truth is known: nothing is scored.",
     )
-    bundled = "scene folder (default: the bundled sequence)"
-    play.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help=bundled)
+    taken = f"{WHAT} (default: the bundled sequence)"
+    play.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="PATH", help=taken)
+    play.add_argument(
+        "--record",
+        action="store_true",
+        help="have the daemon record what it sees and tells into OUT/recordings, for `uavpose-ground view` and `play`",
+    )
     lockstep.add_options(play)
     for name, command in (("demo", demo), ("play", play)):
         command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="folder to write to")
@@ -89,9 +97,12 @@ def _run(args: argparse.Namespace) -> int:
             raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
         return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
     if args.command == "play" and lockstep.asked_for(args):
+        if args.record:
+            raise InputError("--record: goes with real time alone, not with lock-step and its options")
         return lockstep.run(args, console)
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
-    if show(read_sequence(folder), args.out, args.model, console):
+    record = args.command == "play" and args.record
+    if show(open_sequence(folder, args.out, console), args.out, args.model, console, record):
         return 0
     print("a peer received no pose", file=sys.stderr)
     return 1
@@ -100,6 +111,8 @@ def _run(args: argparse.Namespace) -> int:
 def _score_flight(args: argparse.Namespace, console: Console) -> int:
     flight = read_flight(args.flight)
     sequence = read_sequence(args.sequence or flight.sequence)
+    if not sequence.scene.truths:
+        raise InputError(f"{sequence.scene.folder}: no truth is known: there is nothing to score against")
     sequence = replace(sequence, fps=sequence.fps * flight.speed)
     told = Console(stderr=True, quiet=True) if args.json else console
     score = report_flight(sequence, flight, args.out or args.flight, told)

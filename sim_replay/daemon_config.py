@@ -16,12 +16,14 @@ def sequence_config(
     zenoh_endpoint: str,
     mavlink_port: int,
     camera: Mapping[str, object],
+    recordings: Path | None = None,
 ) -> str:
     """The text of its TOML file.
 
     Args:
         model: ONNX file; None: the daemon's own choice.
         camera: What else [camera] holds: when, how often or by whose leave the sequence is played.
+        recordings: Folder for the daemon's own recordings, pictures and all; None: it makes none.
     """
     tables: dict[str, dict[str, object]] = {
         "vehicle": {"name": uav},
@@ -40,6 +42,9 @@ def sequence_config(
         "zenoh": {"listen": [zenoh_endpoint]},
         "mavlink": {"endpoints": [f"udpin:127.0.0.1:{mavlink_port}"]},
     }
+    if recordings is not None:
+        recorder = {"enabled": True, "folder": str(recordings.resolve()), "image_max_hz": sequence.fps}
+        tables["recorder"] = {**recorder, "free_min_mb": 0.0}
     lines = []
     for name, table in tables.items():
         lines += [f"[{name}]", *(f"{key} = {toml_value(value)}" for key, value in table.items())]

@@ -121,8 +121,10 @@ class LiveView:
         return table
 
 
-def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> bool:
+def show(sequence: PlayedSequence, out: Path, model: Path, console: Console, record: bool = False) -> bool:
     """Play a sequence, keep what the peers received in `out`, and write the report of it there.
+
+    With `record` the daemon records itself too, pictures and all, into `out`/recordings.
 
     Returns:
         Whether both peers received poses.
@@ -135,10 +137,14 @@ def show(sequence: PlayedSequence, out: Path, model: Path, console: Console) -> 
     say(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}")
     figures = LiveFigures(sequence)
     with LiveView(console, figures) as view:
-        recording = play(PlaySettings(sequence, out, model), view.on_record)
+        recording = play(PlaySettings(sequence, out, model, record=record), view.on_record)
     flight = RecordedFlight(sequence.scene.folder, method_of(loaded), recording)
     write_flight(out, flight)
-    report_flight(sequence, flight, out, console)
+    if sequence.scene.truths:
+        report_flight(sequence, flight, out, console)
+    else:
+        told = f"{len(recording.poses)} poses over zenoh, {len(recording.targets)} by MAVLink"
+        say(f"{told}, written to {out}; not scored: no truth is known")
     return bool(recording.poses) and bool(recording.targets)
 
 

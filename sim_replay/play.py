@@ -30,6 +30,7 @@ from sim_replay.ground_truth import PlayedSequence
 
 LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
 READY_MARGIN_NS = 100_000_000
+RECORDINGS = "recordings"  # folder in `out`
 _OVERTIME_S = 20.0
 _STOP_TIMEOUT_S = 5.0
 _SETTLE_S = 0.3
@@ -79,6 +80,7 @@ class PlaySettings:
     out: Path
     model: Path | None = None  # None: the one the daemon ships with
     uav: str = "uav1"
+    record: bool = False  # into out/recordings, by the daemon
 
 
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
@@ -108,6 +110,7 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
         recording.zenoh_endpoint,
         recording.mavlink_port,
         {"start_at_ns": recording.start_at_ns},
+        settings.out / RECORDINGS if settings.record else None,
     )
     config.write_text(text, encoding="utf-8")
     records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()

@@ -64,6 +64,11 @@ class SceneWriter:
             self._write_mask("mask", frame.image_id, index, mask)
         self._frames.append(frame)
 
+    def add_encoded(self, frame: BopFrame, data: bytes, suffix: str) -> None:
+        """Write one picture without targets as it is, byte for byte; `suffix` is jpg or png."""
+        (self.folder / "rgb" / f"{frame.image_id:06d}.{suffix}").write_bytes(data)
+        self._frames.append(frame)
+
     def _write_mask(self, kind: str, image_id: int, index: int, mask: NDArray[np.bool_]) -> None:
         path = self.folder / kind / f"{image_id:06d}_{index:06d}.png"
         if not cv2.imwrite(str(path), mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 9]):

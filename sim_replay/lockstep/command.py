@@ -12,10 +12,11 @@ from rich.progress import Progress
 
 from edge.errors import InputError
 from edge.estimator.model import load_model
-from sim_replay.ground_truth import PlayedSequence, read_sequence
+from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.peers import Record
 from sim_replay.lockstep.player import LockstepSettings, play_lockstep
 from sim_replay.offline import method_of
+from sim_replay.recorded.opened import open_sequence
 from sim_replay.report.flight_files import RecordedFlight, write_flight
 
 SLOWEST = 0.25
@@ -45,7 +46,7 @@ def asked_for(args: argparse.Namespace) -> bool:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Play, and write what came out. Raises InputError, PlayError."""
-    sequence = read_sequence(args.sequence)
+    sequence = open_sequence(args.sequence, args.out, console)
     settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=_rounds(args.loop))
     if args.pause is not None and args.pause not in settings.frames:
         raise InputError(f"--pause {args.pause}: is none of the frames {settings.frames[0]} to {settings.frames[-1]}")
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if settings.frames == list(range(len(sequence.scene.images))):  # of a part, the rest would count as missed
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
-        files += "; uavpose-replay score takes it"
+        files += "; uavpose-replay score takes it" if sequence.scene.truths else ""
     text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.mavlink)} MAVLink messages"
     console.print(f"{text}; written to {args.out}: {files}", highlight=False, soft_wrap=True)
     return 0

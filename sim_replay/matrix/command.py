@@ -25,6 +25,7 @@ from sim_replay.matrix.datasets import flyable
 
 EXIT_WRONG = 1
 SPEEDS = (0.25, 4.0)
+WIDTH = 130  # of the table where there is no terminal to ask
 
 
 def register(commands: Any) -> None:
@@ -72,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
     sequences = [read_sequence(folder) for folder in (*given, *taken)]
     args.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=args.json)
+    if not console.is_terminal:
+        console.width = WIDTH
     cells = []
     for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
         cells.append(cell)

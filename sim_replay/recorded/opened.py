@@ -1,0 +1,44 @@
+"""What `play --sequence` takes: a scene folder as it is, and what becomes one first."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from edge.errors import InputError
+from sim_replay.ground_truth import PlayedSequence, read_sequence
+
+SCENE = "sequence"  # folder in `out` that pictures are unpacked into
+WHAT = "a scene folder, an .mcap recording or a folder of them, or a .toml that names a video and its telemetry"
+
+
+def open_sequence(path: Path, out: Path, console: Console) -> PlayedSequence:
+    """The sequence at `path`; of a video or a recording a scene is made in `out`/sequence, which can be played again.
+
+    Raises InputError, naming file and key; OSError.
+    """
+    recordings = [path] if path.suffix == ".mcap" else sorted(path.glob("*.mcap")) if path.is_dir() else []
+    if not recordings and path.suffix != ".toml":
+        if not (path / "scene_camera.json").is_file():
+            raise InputError(f"{path}: is not {WHAT}")
+        return read_sequence(path)
+    scene = out / SCENE
+    if scene.exists():
+        if not (scene / "sequence.toml").is_file():
+            raise InputError(f"{scene}: is in the way: pictures would be unpacked there")
+        shutil.rmtree(scene)
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("unpacking pictures", total=None)
+        if recordings:
+            from sim_replay.recorded.recording import unpack_recordings
+
+            unpack_recordings(recordings, scene, lambda: progress.advance(task))
+        else:
+            from sim_replay.recorded.video import unpack_video
+
+            unpack_video(path, scene, lambda: progress.advance(task))
+    console.print(f"pictures unpacked into {scene}", highlight=False, soft_wrap=True)
+    return read_sequence(scene)

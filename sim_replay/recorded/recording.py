@@ -1,0 +1,178 @@
+"""A recording of the daemon (`[recorder] image_max_hz`) as a scene: its pictures, and the own ship from its transforms.
+
+Pictures are played at a constant rate, each in the slot nearest its exposure, and the telemetry is bent so that the
+attitude at every picture's exposure is the one that was recorded. A slot whose picture was not recorded shows the one
+before again, which the daemon takes for a frozen camera and drops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge.errors import InputError
+from edge.tracking.geodesy import lat_lon_alt_from_ned
+from edge.types import Array, Mount
+from msgs import topics
+from msgs.cdr import CameraInfo, CompressedImage, TFMessage, TransformStamped
+from msgs.geometry import R_from_q_wxyz, q_wxyz_from_R, so3_log
+from msgs.ground.errors import InputError as RecordingError
+from msgs.ground.view.recorded import samples
+from msgs.wire import PayloadError
+from sim_replay.bop.records import BopFrame
+from sim_replay.bop.write import SceneWriter
+from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, scene_distortion, write_sequence_toml
+from sim_replay.telemetry import Telemetry, write_telemetry
+
+ORIGIN_DEG_M = (0.0, 0.0, 0.0)  # of ned: recordings do not tell where on Earth it is
+GAP_S_MAX = 10.0  # between two pictures of one flight
+FPS_MAX = 240.0
+_FIXED_RAD = 1e-4  # a mount that moves no more is a fixed one
+
+
+@dataclass(eq=False)
+class Recorded:
+    """What a flight's files hold, in order; stamps are UTC ns of the exposure."""
+
+    uav: str | None = None
+    picture_ns: list[int] = field(default_factory=list)
+    lens: list[CameraInfo] = field(default_factory=list)  # of each picture
+    own: dict[int, dict[str, TransformStamped]] = field(default_factory=dict)  # by stamp, transforms by child frame
+
+
+def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[[], None]) -> None:
+    """Make a scene of a flight's recordings, given in their order. Raises InputError, OSError."""
+    recorded = _read(paths, lambda _index, _image: None)
+    _check(paths, recorded)
+    picture_ns = np.array(recorded.picture_ns)
+    fps = _rate_hz(picture_ns)
+    slots = np.round((picture_ns - picture_ns[0]) * 1e-9 * fps).astype(np.int64)
+    slots, kept = np.unique(slots, return_index=True)
+    own_ns, mounts = _own_ship(recorded)
+    gimballed = any(np.linalg.norm(so3_log(mounts[0].R_body_cam.T @ m.R_body_cam)) > _FIXED_RAD for m in mounts)
+    with SceneWriter(folder, JPEG_QUALITY) as writer:
+        of_picture = dict(zip(kept.tolist(), slots.tolist(), strict=True))
+        after = dict(pairwise(slots.tolist())) | {int(slots[-1]): int(slots[-1]) + 1}
+
+        def write(index: int, image: CompressedImage) -> None:
+            if index not in of_picture:
+                return
+            R_ned_cam, t_ned_cam_m = _camera_at(recorded, own_ns, recorded.picture_ns[index])
+            for slot in range(of_picture[index], after[of_picture[index]]):
+                _add(writer, slot, image, recorded.lens[index], R_ned_cam, t_ned_cam_m)
+                on_picture()
+
+        _read(paths, write)
+    bent_ns = _bend(own_ns, picture_ns[kept], slots, fps)
+    write_telemetry(folder / "telemetry.csv", _telemetry(recorded, own_ns, bent_ns))
+    write_sequence_toml(folder, paths[0], fps, 0, mounts[0], gimballed)
+
+
+def _read(paths: Sequence[Path], on_picture: Callable[[int, CompressedImage], None]) -> Recorded:
+    """Go through the files once. Raises InputError."""
+    recorded, camera = Recorded(), dict[str, CameraInfo]()
+    for path in paths:
+        try:
+            for one, _ in samples(path):
+                if one.topic is topics.CAMERA_INFO:
+                    camera[one.uav] = CameraInfo.decode(one.payload)
+                elif one.topic is topics.IMAGE and one.uav in camera:
+                    if recorded.uav not in (None, one.uav):
+                        raise InputError(f"{path}: holds pictures of both {recorded.uav} and {one.uav}")
+                    recorded.uav = one.uav
+                    image = CompressedImage.decode(one.payload)
+                    if not recorded.picture_ns or image.stamp_ns > recorded.picture_ns[-1]:
+                        on_picture(len(recorded.picture_ns), image)
+                        recorded.picture_ns.append(image.stamp_ns)
+                        recorded.lens.append(camera[one.uav])
+                elif one.topic is topics.TF:
+                    links = {link.child_frame_id: link for link in TFMessage.decode(one.payload).transforms}
+                    if topics.FRAME_BODY in links and topics.FRAME_CAMERA in links:
+                        recorded.own[links[topics.FRAME_BODY].stamp_ns] = links
+        except (RecordingError, PayloadError) as error:
+            raise InputError(str(error) if isinstance(error, RecordingError) else f"{path}: {error}") from error
+    return recorded
+
+
+def _check(paths: Sequence[Path], recorded: Recorded) -> None:
+    path = paths[0] if len(paths) == 1 else paths[0].parent
+    if len(recorded.picture_ns) < 2:
+        raise InputError(f"{path}: holds no pictures: set [recorder] image_max_hz where it is recorded")
+    if len(recorded.own) < 2:
+        raise InputError(f"{path}: holds no attitude of the own ship (/{recorded.uav}/tf): no autopilot was heard")
+    gap_s = float(np.diff(recorded.picture_ns).max()) * 1e-9
+    if gap_s > GAP_S_MAX:
+        raise InputError(f"{path}: is more than one flight: no picture for {gap_s:.0f} s; give its files one by one")
+
+
+def _rate_hz(picture_ns: Array) -> float:
+    """Of the camera: by the middle one of the times between two pictures."""
+    return min(round(1e9 / float(np.median(np.diff(picture_ns))), 3), FPS_MAX)
+
+
+def _add(
+    writer: SceneWriter, slot: int, image: CompressedImage, lens: CameraInfo, R_ned_cam: Array, t_ned_cam_m: Array
+) -> None:
+    """The picture as it was recorded, byte for byte, unless its lens is one that scenes do not know."""
+    distortion = tuple(float(value) for value in lens.distortion)
+    if len(distortion) > 5:
+        pixels = cv2.imdecode(np.frombuffer(image.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise InputError(f"the picture of {image.stamp_ns} ns is damaged")
+        add_picture(writer, slot, np.asarray(pixels, dtype=np.uint8), lens.K, distortion)
+        return
+    R_cam_ned = R_ned_cam.T
+    frame = BopFrame(slot, lens.K, (), R_cam_ned, -R_cam_ned @ t_ned_cam_m, scene_distortion(distortion))
+    writer.add_encoded(frame, image.data, "png" if "png" in image.format else "jpg")
+
+
+def _own_ship(recorded: Recorded) -> tuple[Array, list[Mount]]:
+    """Stamps [N] int64 of the transforms, rising, and how the camera sat on the body at each."""
+    stamps = sorted(recorded.own)
+    cameras = [recorded.own[stamp][topics.FRAME_CAMERA] for stamp in stamps]
+    mounts = [Mount(_R(one), np.asarray(one.t_frame_child_m)) for one in cameras]
+    return np.array(stamps, dtype=np.int64), mounts
+
+
+def _R(link: TransformStamped) -> Array:
+    return R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1))
+
+
+def _place_m(links: dict[str, TransformStamped]) -> Array:
+    """Of the own ship in ned; the origin where its position was not known."""
+    place = links.get(topics.FRAME_BODY_NED)
+    return np.zeros(3) if place is None else np.asarray(place.t_frame_child_m)
+
+
+def _camera_at(recorded: Recorded, own_ns: Array, at_ns: int) -> tuple[Array, Array]:
+    """R_ned_cam [3, 3] and t_ned_cam_m [3] by the transforms nearest in time."""
+    links = recorded.own[int(own_ns[np.argmin(np.abs(own_ns - at_ns))])]
+    R_ned_body, camera = _R(links[topics.FRAME_BODY]), links[topics.FRAME_CAMERA]
+    return R_ned_body @ _R(camera), _place_m(links) + R_ned_body @ np.asarray(camera.t_frame_child_m)
+
+
+def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
+    """Stamps [N] moved as the pictures are moved into their slots; t = 0 at the first picture."""
+    slot_ns = slots * 1e9 / fps
+    inside = np.interp(own_ns - picture_ns[0], picture_ns - picture_ns[0], slot_ns)
+    inside += np.minimum(own_ns - picture_ns[0], 0) + np.maximum(own_ns - picture_ns[-1], 0)
+    return np.round(inside).astype(np.int64)
+
+
+def _telemetry(recorded: Recorded, own_ns: Array, t_ns: Array) -> Telemetry:
+    """Of the attitudes and places told; rates and velocities are their differences."""
+    t_ns, kept = np.unique(t_ns, return_index=True)
+    links = [recorded.own[int(stamp)] for stamp in own_ns[kept]]
+    R_ned_body = np.array([_R(one[topics.FRAME_BODY]) for one in links])
+    t_ned_m = np.array([_place_m(one) for one in links])
+    t_s = t_ns * 1e-9
+    velocity = np.gradient(t_ned_m, t_s, axis=0)
+    rates = so3_log(np.swapaxes(R_ned_body[:-1], -1, -2) @ R_ned_body[1:]) / np.diff(t_s)[:, None]
+    rates = np.vstack([rates, rates[-1]])
+    place = np.array([lat_lon_alt_from_ned(ORIGIN_DEG_M, p) for p in t_ned_m])
+    return Telemetry(t_ns, np.hstack([q_wxyz_from_R(R_ned_body), rates, t_ned_m, velocity, place]))

@@ -1,0 +1,55 @@
+"""The files of a scene of which no truth is known: pictures, their camera, rate, mount and telemetry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.types import Array, Mount
+from msgs.settings import toml_value
+from sim_replay.bop import Distortion
+from sim_replay.bop.records import BopFrame
+from sim_replay.bop.write import SceneWriter
+
+JPEG_QUALITY = 95
+
+
+def add_picture(
+    writer: SceneWriter,
+    index: int,
+    image_bgr: NDArray[np.uint8],
+    K: Array,
+    distortion: tuple[float, ...],
+) -> None:
+    """One picture [H, W, 3] through a lens of 0, 4, 5 or 8 plumb-bob coefficients.
+
+    Scenes know five: a lens of eight has its distortion taken out.
+    """
+    if len(distortion) > 5:
+        image_bgr = np.asarray(cv2.undistort(image_bgr, K, np.array(distortion)), dtype=np.uint8)
+    writer.add(BopFrame(index, K, distortion=scene_distortion(distortion)), image_bgr)
+
+
+def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
+    """What is left for the reader of the scene to take out."""
+    if len(distortion) > 5 or not any(distortion):
+        return None
+    k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
+    return k1, k2, p1, p2, k3
+
+
+def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
+    """sequence.toml; `source` is where the pictures are from."""
+    entries = {
+        "source": str(source),
+        "fps": fps,
+        "t0_ns": frame0_ns,
+        "R_body_cam": mount.R_body_cam.tolist(),
+        "t_body_cam_m": mount.t_body_cam_m.tolist(),
+        "mount": "gimbal" if gimballed else "fixed",
+    }
+    lines = [f"{key} = {toml_value(value)}\n" for key, value in entries.items()]
+    (folder / "sequence.toml").write_text("".join(lines), encoding="utf-8")

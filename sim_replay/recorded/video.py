@@ -1,0 +1,88 @@
+"""A video with telemetry as a scene: what it is a TOML file says."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pydantic import Field, ValidationError
+
+from edge.cameras.intrinsics import load_intrinsics
+from edge.config import MountSettings
+from edge.config_camera import IntrinsicsSettings
+from edge.config_path import ConfigPath
+from edge.errors import InputError
+from msgs.settings import Section, dotted, faults_of, read_toml
+from sim_replay.bop.write import SceneWriter
+from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_sequence_toml
+from sim_replay.telemetry import TelemetryError, read_telemetry
+
+FPS_MAX = 240.0  # of the daemon's camera
+
+
+class FilmedFlight(Section):
+    """A video, and how its camera was carried; paths are taken from the folder that the file lies in."""
+
+    video: ConfigPath = Field(description="what ffmpeg reads, of a constant rate")
+    telemetry: ConfigPath = Field(description="CSV of the own ship, as telemetry.csv has it")
+    t0_ns: int = Field(default=0, description="exposure of the first picture on the telemetry's clock")
+    fps: float | None = Field(default=None, gt=0, le=FPS_MAX, description="pictures a second; default: the video's own")
+    intrinsics: IntrinsicsSettings
+    mount: MountSettings = Field(default_factory=MountSettings)
+
+
+def read_filmed_flight(path: Path) -> FilmedFlight:
+    """Raises InputError: a line a fault, each naming file and key."""
+    try:
+        return FilmedFlight.model_validate(read_toml(path, InputError), context={"folder": path.parent})
+    except ValidationError as error:
+        told = (f"{path}: {dotted(fault.location)}: {fault.reason}" for fault in faults_of(error))
+        raise InputError("\n".join(told)) from error
+
+
+def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> None:
+    """Make a scene of the flight that the TOML file at `path` tells of. Raises InputError, OSError."""
+    flight = read_filmed_flight(path)
+    try:
+        read_telemetry(flight.telemetry)
+    except TelemetryError as error:
+        raise InputError(str(error)) from error
+    if not flight.video.is_file():
+        raise InputError(f"{path}: video: {flight.video} does not exist")
+    capture = cv2.VideoCapture(str(flight.video), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise InputError(f"{path}: video: {flight.video} is not a readable video")
+        fps = flight.fps or capture.get(cv2.CAP_PROP_FPS)
+        if not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
+            raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
+        _unpack(capture, path, flight, folder, on_picture)
+    finally:
+        capture.release()
+    shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
+    write_sequence_toml(folder, flight.video, fps, flight.t0_ns, flight.mount.mount(), gimballed=False)
+
+
+def _unpack(
+    capture: cv2.VideoCapture, path: Path, flight: FilmedFlight, folder: Path, on_picture: Callable[[], None]
+) -> None:
+    size_wh = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    try:
+        lens = load_intrinsics(flight.intrinsics).scaled_to(size_wh)
+    except InputError as error:
+        raise InputError(f"{path}: intrinsics: {error}") from error
+    count = 0
+    with SceneWriter(folder, JPEG_QUALITY) as writer:
+        while True:
+            read, image_bgr = capture.read()
+            if not read:
+                break
+            add_picture(writer, count, np.asarray(image_bgr, dtype=np.uint8), lens.K, lens.distortion)
+            count += 1
+            on_picture()
+    if count == 0:
+        raise InputError(f"{path}: video: {flight.video} has no readable picture")

@@ -1,0 +1,179 @@
+"""What was filmed or recorded is flown again: a video with telemetry, and the daemon's own recording."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from msgs.cdr import CompressedImage
+from msgs.geometry import R_from_euler, R_from_q_wxyz, q_wxyz_from_R, so3_log
+from sim_replay.cli import main
+from sim_replay.ground_truth import read_sequence
+from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+
+BIN = Path(sys.executable).parent
+FPS, FRAMES = 10.0, 40
+R_BODY_CAM = R_from_euler(0.0, np.radians(5.0), 0.0) @ np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+LEVER_M = (0.4, 0.1, -0.2)
+LENS = "{ fx = 2000.0, fy = 2000.0, cx = 319.5, cy = 191.5, width = 640, height = 384 }"
+
+
+def replay(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([BIN / "uavpose-replay", *arguments], capture_output=True, text=True, timeout=220)
+
+
+def own_flight() -> Telemetry:
+    """Three degrees of roll a second in a climb to the north-east, from a second before the first picture."""
+    t_s = np.arange(-1.0, FRAMES / FPS + 1.0, 0.02)
+    R_ned_body = R_from_euler(np.radians(3.0 * t_s), np.full_like(t_s, 0.1), np.full_like(t_s, 0.7))
+    velocity = np.tile([12.0, 9.0, -1.0], (len(t_s), 1))
+    place = np.tile([47.0, 8.0, 400.0], (len(t_s), 1))
+    rates = np.tile([np.radians(3.0), 0.0, 0.0], (len(t_s), 1))
+    values = np.hstack([q_wxyz_from_R(R_ned_body), rates, velocity * t_s[:, None], velocity, place])
+    return Telemetry(np.round(t_s * 1e9).astype(np.int64), values)
+
+
+@pytest.fixture(scope="module")
+def flown(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene with what it takes to fly it; nobody knows its truth."""
+    folder = tmp_path_factory.mktemp("flown") / "000001"
+    shutil.copytree(small_scene, folder)
+    write_telemetry(folder / "telemetry.csv", own_flight())
+    settings = {"fps": FPS, "t0_ns": 0, "R_body_cam": R_BODY_CAM.tolist(), "t_body_cam_m": LEVER_M}
+    (folder / "sequence.toml").write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
+    return folder
+
+
+def poses_of(out: Path) -> dict[int, dict[str, Any]]:
+    return {pose["frame"]: pose for pose in map(json.loads, (out / "poses.jsonl").read_text().splitlines())}
+
+
+@pytest.fixture(scope="module")
+def as_it_was(flown: Path, toy_model: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("scene")
+    played = replay("play", "--lockstep", "--sequence", flown, "--model", toy_model, "--out", out)
+    assert played.returncode == 0, played.stderr
+    return poses_of(out)
+
+
+def test_a_video_with_telemetry_flies_as_its_pictures_do(
+    flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
+) -> None:
+    film = cv2.VideoWriter(str(tmp_path / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (640, 384))
+    for path in sorted((flown / "rgb").iterdir()):
+        film.write(cv2.imread(str(path)))
+    film.release()
+    shutil.copyfile(flown / "telemetry.csv", tmp_path / "own.csv")
+    (tmp_path / "flight.toml").write_text(
+        f'video = "film.mp4"\ntelemetry = "own.csv"\nintrinsics = {LENS}\n'
+        f"[mount]\nR_body_cam = {R_BODY_CAM.tolist()}\nt_body_cam_m = {list(LEVER_M)}\n"
+    )
+    played = replay(
+        "play", "--lockstep", "--sequence", tmp_path / "flight.toml", "--model", toy_model, "--out", tmp_path / "out"
+    )
+    assert played.returncode == 0, played.stderr
+    poses = poses_of(tmp_path / "out")
+    assert sorted(poses) == sorted(as_it_was)
+    for frame, pose in poses.items():
+        np.testing.assert_allclose(pose["t_cam_target_m"], as_it_was[frame]["t_cam_target_m"], rtol=0.03, atol=0.3)
+    # What it was unpacked into is a sequence of its own: the same again.
+    again = replay(
+        "play", "--lockstep", "--sequence", tmp_path / "out/sequence", "--model", toy_model, "--out", tmp_path / "again"
+    )
+    assert again.returncode == 0, again.stderr
+    assert poses_of(tmp_path / "again") == poses
+
+
+def test_the_daemons_own_recording_flies_again(
+    flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
+) -> None:
+    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
+    assert recorded.returncode == 0, recorded.stderr
+    assert "not scored: no truth is known" in recorded.stdout.replace("\n", " ")
+    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
+    with path.open("rb") as file:
+        kept = make_reader(file).iter_messages("/uav1/image/compressed")
+        pictures = [CompressedImage.decode(message.data).data for _, _, message in kept]
+    assert len(pictures) > FRAMES // 2
+
+    again = replay("play", "--lockstep", "--sequence", path, "--model", toy_model, "--out", tmp_path / "again")
+    assert again.returncode == 0, again.stderr
+    sequence = read_sequence(tmp_path / "again/sequence")
+    assert sequence.fps == pytest.approx(FPS, rel=0.02)
+    assert sequence.scene.images[0].read_bytes() == pictures[0]
+    np.testing.assert_allclose(sequence.mount.R_body_cam, R_BODY_CAM, atol=1e-9)
+    np.testing.assert_allclose(sequence.mount.t_body_cam_m, LEVER_M, atol=1e-9)
+
+    # A busy host may have let the first pictures pass.
+    first, poses = frame_of(pictures[0]), poses_of(tmp_path / "again")
+    both = [frame for frame in poses if frame + first in as_it_was]
+    assert len(both) > FRAMES // 3
+    for frame in both:
+        was = as_it_was[frame + first]["t_cam_target_m"]
+        np.testing.assert_allclose(poses[frame]["t_cam_target_m"], was, rtol=0.05, atol=0.5)
+    _attitude_as_flown(read_telemetry(tmp_path / "again/sequence/telemetry.csv"))
+
+
+def frame_of(jpeg: bytes) -> int:
+    """Which of the scene's pictures it is: its rectangle moves by 4 pixels from one to the next."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return round((np.flatnonzero((image > 128).any(axis=0)).mean() - 200.5) / 4)
+
+
+def _attitude_as_flown(telemetry: Telemetry) -> None:
+    """It rolls as the own ship did, and climbs as it did, whatever picture came first."""
+    flown, seconds = own_flight(), (telemetry.t_ns[-1] - telemetry.t_ns[0]) * 1e-9
+    R_first, R_last = R_from_q_wxyz(telemetry.values[[0, -1], :4])
+    turned_deg = np.degrees(so3_log(R_first.T @ R_last))
+    np.testing.assert_allclose(turned_deg, [3.0 * seconds, 0.0, 0.0], atol=0.3)
+    np.testing.assert_allclose(np.median(telemetry.values[:, 10:13], axis=0), flown.values[0, 10:13], atol=0.5)
+    np.testing.assert_allclose(np.median(telemetry.values[:, 4:7], axis=0), flown.values[0, 4:7], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("film.mp4", "gone.mp4"), "gone.mp4 does not exist"),
+        (("own.csv", "gone.csv"), "gone.csv: cannot be read"),
+        (("fx = 2000.0", "fx = -1.0"), "intrinsics.fx: Input should be greater than 0"),
+        (("height = 384", "height = 400"), "intrinsics: these intrinsics are for 640x400 pixels"),
+        (("telemetry", "telemetri"), "telemetri: "),
+    ],
+)
+def test_what_is_wrong_with_a_filmed_flight_is_said(
+    flown: Path, change: tuple[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    film = cv2.VideoWriter(str(tmp_path / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (640, 384))
+    film.write(cv2.imread(str(flown / "rgb/000000.png")))
+    film.release()
+    shutil.copyfile(flown / "telemetry.csv", tmp_path / "own.csv")
+    text = f'video = "film.mp4"\ntelemetry = "own.csv"\nintrinsics = {LENS}\n'
+    (tmp_path / "flight.toml").write_text(text.replace(*change))
+    code = main(["play", "--sequence", str(tmp_path / "flight.toml"), "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().err
+    assert code == 2, said
+    assert words in said
+    assert "flight.toml" in said or "gone.csv" in said
+
+
+def test_what_holds_nothing_to_fly_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "torn.mcap").write_bytes(b"no MCAP at all")
+    assert main(["play", "--sequence", str(tmp_path / "torn.mcap"), "--out", str(tmp_path / "out")]) == 2
+    assert "torn.mcap" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert main(["play", "--sequence", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
+    assert "is not a scene folder" in capsys.readouterr().err
+    (tmp_path / "out/sequence").mkdir(parents=True)
+    shutil.move(tmp_path / "torn.mcap", tmp_path / "empty/torn.mcap")
+    assert main(["play", "--sequence", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
+    assert "is in the way" in capsys.readouterr().err
