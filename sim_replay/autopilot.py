@@ -1,8 +1,9 @@
 """A simulated autopilot: tells own-ship state over MAVLink on UDP, and takes what the daemon sends.
 
-It reports a sequence's telemetry as an ArduPilot plane would, on a boot clock of its own: HEARTBEAT,
-ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS of a
-gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL.
+It reports a sequence's telemetry as an ArduPilot plane would, or one that PX4 flies, on a boot clock of its own:
+HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS
+of a gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. PX4 denies a command with parameters that
+it does not know, and asks for TIMESYNC itself, ten times a second, believing answers of at most 10 ms.
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
@@ -21,6 +22,8 @@ import sys
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,9 @@ from edge.links.signing_key import load_key
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.mavlink import MAVLink, dialect, pack
 from msgs.signals import stop_on_signals
+from sim_replay.bad_link import Lane, LinkFaults, add_options, link_faults
 from sim_replay.gimbal import GimbalTrack, read_gimbal
+from sim_replay.mavlink_record import message_record
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
 SYSTEM_ID = 1
@@ -45,6 +50,9 @@ DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
 GIMBAL_RATE_HZ = 10.0  # unasked
+FIRMWARES = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
+PX4_TIMESYNC_HZ = 10.0
+PX4_TIMESYNC_RTT_MAX_NS = 10_000_000
 GIMBAL_FLAGS = (
     dialect.GIMBAL_DEVICE_FLAGS_ROLL_LOCK
     | dialect.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
@@ -73,17 +81,24 @@ class Autopilot:
         system_id: int = SYSTEM_ID,
         signing: Signing | None = None,
         gimbal: GimbalTrack | None = None,
+        firmware: str = "ardupilot",
+        on_message: Callable[[Any, int], None] = lambda _message, _now_ns: None,
     ) -> None:
+        """`firmware` is one of FIRMWARES; `on_message` hears each message that is taken, and when it came."""
         self._telemetry = telemetry
         self._gimbal = gimbal
         self._start_at_ns = start_at_ns
         self._boot_at_ns = boot_at_ns
         self._system_id = system_id
         self._signing = signing
+        self._firmware = firmware
+        self._on_message = on_message
         self._mav = MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_ID)
         self._rates_hz = dict(DEFAULT_RATES_HZ)
         if gimbal is not None:
             self._rates_hz[dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] = GIMBAL_RATE_HZ
+        if firmware == "px4":
+            self._rates_hz[dialect.MAVLINK_MSG_ID_TIMESYNC] = PX4_TIMESYNC_HZ
         self._interval_ns = {message_id: round(1e9 / rate_hz) for message_id, rate_hz in self._rates_hz.items()}
         self._next_ns = dict.fromkeys(self._rates_hz, boot_at_ns)
         self._last_target_us: dict[int, int] = {}
@@ -115,11 +130,12 @@ class Autopilot:
         parser.robust_parsing = True
         replies, records = [], []
         for message in parser.parse_buffer(datagram) or []:
-            reason = self._refusal(message)
+            reason = self._refusal(message, now_ns)
             if reason is not None:
                 self.refused[reason] += 1
                 continue
             self.received[message.get_type()] += 1
+            self._on_message(message, now_ns)
             reply = self._reply(message, now_ns)
             if reply is not None:
                 replies.append(self._packed(reply))
@@ -137,9 +153,11 @@ class Autopilot:
 
     def _telemetry_message(self, message_id: int, now_ns: int) -> Any:
         if message_id == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            kind, autopilot = dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+            kind, autopilot = dialect.MAV_TYPE_FIXED_WING, FIRMWARES[self._firmware]
             armed = dialect.MAV_MODE_FLAG_SAFETY_ARMED | dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             return dialect.MAVLink_heartbeat_message(kind, autopilot, armed, 0, dialect.MAV_STATE_ACTIVE, 3)
+        if message_id == dialect.MAVLINK_MSG_ID_TIMESYNC:
+            return dialect.MAVLink_timesync_message(0, now_ns - self._boot_at_ns)
         boot_ms = self._boot_ms(now_ns)
         if message_id == dialect.MAVLINK_MSG_ID_SYSTEM_TIME:
             return dialect.MAVLink_system_time_message(time.time_ns() // 1000, boot_ms)
@@ -167,7 +185,14 @@ class Autopilot:
             round(math.degrees(float(yaw_rad)) * 100.0) % 36000,
         )
 
-    def _refusal(self, message: Any) -> str | None:
+    def _timesync_refusal(self, answer: Any, now_ns: int) -> str | None:
+        """What this autopilot asked, answered in time?"""
+        if self._firmware != "px4":
+            return None
+        round_trip_ns = now_ns - self._boot_at_ns - answer.ts1
+        return None if 0 <= round_trip_ns <= PX4_TIMESYNC_RTT_MAX_NS else "TIMESYNC took too long"
+
+    def _refusal(self, message: Any, now_ns: int) -> str | None:
         """Why a parsed message is not taken, or None."""
         kind = message.get_type()
         if kind == "BAD_DATA":
@@ -178,6 +203,8 @@ class Autopilot:
             return "not from a component of this vehicle"
         if self._signing is not None and (unproven := self._signing.refusal(message)) is not None:
             return f"signing: {unproven}"
+        if message.get_msgId() == dialect.MAVLINK_MSG_ID_TIMESYNC and message.tc1 != 0:
+            return self._timesync_refusal(message, now_ns)
         if message.get_msgId() != TARGET_RELATIVE_ID:
             return None
         numbers = (message.x, message.y, message.z, *message.pos_std, message.yaw_std, *message.q_target)
@@ -206,6 +233,8 @@ class Autopilot:
         numbers = (message.param1, message.param2)
         if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
+        if self._firmware == "px4" and any((message.param3, message.param4, message.param7)):
+            return int(dialect.MAV_RESULT_DENIED)
         if not all(math.isfinite(value) for value in numbers) or int(message.param1) not in self._rates_hz:
             return int(dialect.MAV_RESULT_DENIED)
         message_id, interval_us = int(message.param1), message.param2
@@ -237,30 +266,47 @@ def _emit(record: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _fly(autopilot: Autopilot, address: tuple[str, int], stop: threading.Event) -> None:
+def _fly(autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event) -> None:
     """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process is gone."""
     parent = os.getppid()
+    outward, inward = Lane(faults), Lane(faults, seed=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((address[0] if address[0].startswith("127.") else "0.0.0.0", 0))
         _emit({"event": "ready", "port": link.getsockname()[1]})
         while not stop.is_set() and os.getppid() == parent:
-            next_ns = autopilot.next_due_ns()
+            times_ns = (autopilot.next_due_ns(), outward.next_due_ns(), inward.next_due_ns())
+            next_ns = min((t_ns for t_ns in times_ns if t_ns is not None), default=None)
             wait_s = _POLL_S if next_ns is None else min((next_ns - time.monotonic_ns()) * 1e-9, _POLL_S)
             link.settimeout(max(wait_s, 1e-4))
-            outgoing: list[bytes] = []
             try:
                 datagram, sender = link.recvfrom(_DATAGRAM_BYTES)
             except TimeoutError:
                 pass
             else:
                 if sender == address:
-                    outgoing, records = autopilot.take(datagram, time.monotonic_ns())
-                    for record in records:
-                        _emit(record)
+                    inward.put(datagram, time.monotonic_ns())
                 else:
                     autopilot.refused["sender is not the daemon"] += 1
-            for packed in outgoing + autopilot.due(time.monotonic_ns()):
+            for arrived in inward.due(time.monotonic_ns()):
+                replies, records = autopilot.take(arrived, time.monotonic_ns())
+                for record in records:
+                    _emit(record)
+                for packed in replies:
+                    outward.put(packed, time.monotonic_ns())
+            for packed in autopilot.due(time.monotonic_ns()):
+                outward.put(packed, time.monotonic_ns())
+            for packed in outward.due(time.monotonic_ns()):
                 link.sendto(packed, address)
+
+
+def _writer(args: argparse.Namespace, stack: ExitStack) -> Callable[[Any, int], None]:
+    """Writes each message to --messages; `t_ns` counts on the telemetry's clock."""
+    file = stack.enter_context(args.messages.open("w", encoding="utf-8"))
+
+    def write(message: Any, now_ns: int) -> None:
+        file.write(json.dumps(message_record(message, now_ns - args.start_at_ns)) + "\n")
+
+    return write
 
 
 def _address(text: str) -> tuple[str, int]:
@@ -283,6 +329,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--gimbal", type=Path, metavar="CSV", help="gimbal.csv: how its gimbal turns, same clock")
     parser.add_argument("--signing-key", type=Path, metavar="FILE", help="sign all, and believe nothing unsigned")
+    parser.add_argument(
+        "--firmware", choices=FIRMWARES, default="ardupilot", help="whose peculiarities it has (ardupilot)"
+    )
+    parser.add_argument("--messages", type=Path, metavar="FILE", help="write each message that it takes, JSON lines")
+    add_options(parser)
     args = parser.parse_args(argv)
     try:
         telemetry = read_telemetry(args.telemetry)
@@ -294,8 +345,12 @@ def main(argv: list[str] | None = None) -> int:
     stop = stop_on_signals()
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
     signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
-    autopilot = Autopilot(telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal)
-    _fly(autopilot, args.endpoint, stop)
+    with ExitStack() as stack:
+        write = (lambda _message, _now_ns: None) if args.messages is None else _writer(args, stack)
+        autopilot = Autopilot(
+            telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
+        )
+        _fly(autopilot, args.endpoint, link_faults(args), stop)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0
 

@@ -15,6 +15,8 @@ from rich.progress import Progress
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.estimator.model import load_model
+from sim_replay import bad_link
+from sim_replay.autopilot import FIRMWARES
 from sim_replay.benchmark import commands as benchmark
 from sim_replay.datasets import open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE, report_flight, show
@@ -27,7 +29,7 @@ from sim_replay.lockstep import command as lockstep
 from sim_replay.matrix import command as matrix
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
-from sim_replay.play import PlayError
+from sim_replay.play import PlayError, PlaySettings
 from sim_replay.radio import run as radio
 from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
@@ -58,6 +60,9 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="have the daemon record what it sees and tells into OUT/recordings, for `uavpose-ground view` and `play`",
     )
+    link = play.add_argument_group("the autopilot and its link, in real time")
+    link.add_argument("--autopilot", choices=FIRMWARES, default="ardupilot", help="whose peculiarities (ardupilot)")
+    bad_link.add_options(link)
     lockstep.add_options(play)
     for name, command in (("demo", demo), ("play", play)):
         command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="folder to write to")
@@ -97,12 +102,15 @@ def _run(args: argparse.Namespace) -> int:
             raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
         return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
     if args.command == "play" and lockstep.asked_for(args):
-        if args.record:
-            raise InputError("--record: goes with real time alone, not with lock-step and its options")
+        if args.record or args.autopilot != "ardupilot" or bad_link.link_faults(args) != bad_link.LinkFaults():
+            raise InputError("--record, --autopilot, --link-…: go with real time alone, not with lock-step")
         return lockstep.run(args, console)
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
-    record = args.command == "play" and args.record
-    if show(open_sequence(folder, args.out, console), args.out, args.model, console, record):
+    settings = PlaySettings(open_sequence(folder, args.out, console), args.out, args.model)
+    if args.command == "play":
+        chosen = {"record": args.record, "firmware": args.autopilot, "link": bad_link.link_faults(args)}
+        settings = replace(settings, **chosen)
+    if show(settings, args.model, console):
         return 0
     print("a peer received no pose", file=sys.stderr)
     return 1

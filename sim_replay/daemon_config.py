@@ -17,6 +17,8 @@ def sequence_config(
     mavlink_port: int,
     camera: Mapping[str, object],
     recordings: Path | None = None,
+    *,
+    to_px4: bool = False,
 ) -> str:
     """The text of its TOML file.
 
@@ -24,6 +26,7 @@ def sequence_config(
         model: ONNX file; None: the daemon's own choice.
         camera: What else [camera] holds: when, how often or by whose leave the sequence is played.
         recordings: Folder for the daemon's own recordings, pictures and all; None: it makes none.
+        to_px4: Send TARGET_RELATIVE to PX4 too, which takes it for a landing target.
     """
     tables: dict[str, dict[str, object]] = {
         "vehicle": {"name": uav},
@@ -42,6 +45,8 @@ def sequence_config(
         "zenoh": {"listen": [zenoh_endpoint]},
         "mavlink": {"endpoints": [f"udpin:127.0.0.1:{mavlink_port}"]},
     }
+    if to_px4:
+        tables["mavlink"]["target_relative_to_px4"] = True
     if recordings is not None:
         recorder = {"enabled": True, "folder": str(recordings.resolve()), "image_max_hz": sequence.fps}
         tables["recorder"] = {**recorder, "free_min_mb": 0.0}

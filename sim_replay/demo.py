@@ -121,10 +121,8 @@ class LiveView:
         return table
 
 
-def show(sequence: PlayedSequence, out: Path, model: Path, console: Console, record: bool = False) -> bool:
-    """Play a sequence, keep what the peers received in `out`, and write the report of it there.
-
-    With `record` the daemon records itself too, pictures and all, into `out`/recordings.
+def show(settings: PlaySettings, model: Path, console: Console) -> bool:
+    """Play a sequence, keep what the peers received in its folder, and write the report of it there.
 
     Returns:
         Whether both peers received poses.
@@ -132,12 +130,12 @@ def show(sequence: PlayedSequence, out: Path, model: Path, console: Console, rec
     Raises:
         InputError, PlayError, OSError.
     """
-    loaded = load_model(model, threads=1)
+    sequence, out, loaded = settings.sequence, settings.out, load_model(model, threads=1)
     say = partial(console.print, highlight=False, soft_wrap=True)
     say(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}")
     figures = LiveFigures(sequence)
     with LiveView(console, figures) as view:
-        recording = play(PlaySettings(sequence, out, model, record=record), view.on_record)
+        recording = play(settings, view.on_record)
     flight = RecordedFlight(sequence.scene.folder, method_of(loaded), recording)
     write_flight(out, flight)
     if sequence.scene.truths:

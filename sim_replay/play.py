@@ -23,6 +23,7 @@ from typing import Any
 
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
+from sim_replay.bad_link import LinkFaults
 from sim_replay.daemon_config import sequence_config
 from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import write_gimbal
@@ -31,6 +32,7 @@ from sim_replay.ground_truth import PlayedSequence
 LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
 READY_MARGIN_NS = 100_000_000
 RECORDINGS = "recordings"  # folder in `out`
+MESSAGES_JSONL = "mavlink.jsonl"
 _OVERTIME_S = 20.0
 _STOP_TIMEOUT_S = 5.0
 _SETTLE_S = 0.3
@@ -81,6 +83,8 @@ class PlaySettings:
     model: Path | None = None  # None: the one the daemon ships with
     uav: str = "uav1"
     record: bool = False  # into out/recordings, by the daemon
+    firmware: str = "ardupilot"  # one of sim_replay.autopilot.FIRMWARES
+    link: LinkFaults = field(default_factory=LinkFaults)  # between daemon and autopilot
 
 
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
@@ -111,6 +115,7 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
         recording.mavlink_port,
         {"start_at_ns": recording.start_at_ns},
         settings.out / RECORDINGS if settings.record else None,
+        to_px4=settings.firmware == "px4",
     )
     config.write_text(text, encoding="utf-8")
     records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()
@@ -189,6 +194,8 @@ def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]
     address = f"127.0.0.1:{recording.mavlink_port}"
     start = str(recording.start_at_ns - settings.sequence.frame0_ns)
     autopilot = ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start]
+    autopilot += ["--firmware", settings.firmware, *settings.link.arguments()]
+    autopilot += ["--messages", str(settings.out / MESSAGES_JSONL)]
     if settings.sequence.gimbal is not None:
         gimbal_csv = settings.out / "gimbal.csv"
         write_gimbal(gimbal_csv, settings.sequence.gimbal)

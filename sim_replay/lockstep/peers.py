@@ -5,7 +5,6 @@ What they record holds no time but the sequence's: stamps count from the exposur
 
 from __future__ import annotations
 
-import math
 import queue
 import socket
 import time
@@ -20,6 +19,7 @@ from msgs.client import connect
 from msgs.mavlink import MAVLink
 from msgs.receive import PoseReceiver, TargetPose
 from sim_replay.autopilot import Autopilot
+from sim_replay.mavlink_record import message_record
 from sim_replay.play import PlayError
 from sim_replay.subscriber import pose_record
 
@@ -80,23 +80,12 @@ class MavlinkPeer:
 
     def _record(self, datagram: bytes, now_ns: int) -> None:
         for message in self._parser.parse_buffer(datagram) or []:
-            name = message.get_type()
-            fields = {field: _plain(getattr(message, field)) for field in message.get_fieldnames()}
+            record = message_record(message, now_ns - self._frame0_ns)
             for (stamped, field), unit_ns in STAMPS_NS.items():
                 # An unset stamp is 0 and stays it.
-                if name == stamped and fields[field]:
-                    fields[field] -= self._frame0_ns // unit_ns
-            sender = {"system": message.get_srcSystem(), "component": message.get_srcComponent()}
-            self.records.append({"t_ns": now_ns - self._frame0_ns, "message": name, **sender, **fields})
-
-
-def _plain(value: Any) -> Any:
-    """A field as JSON has it: text, numbers, lists; null for what is not a number."""
-    if isinstance(value, bytes | bytearray):
-        return bytes(value).rstrip(b"\0").decode("utf-8", "replace")
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+                if message.get_type() == stamped and record[field]:
+                    record[field] -= self._frame0_ns // unit_ns
+            self.records.append(record)
 
 
 class Subscriber:

@@ -140,6 +140,25 @@ def _attitude_as_flown(telemetry: Telemetry) -> None:
     np.testing.assert_allclose(np.median(telemetry.values[:, 4:7], axis=0), flown.values[0, 4:7], atol=0.01)
 
 
+def test_px4_behind_a_bad_link_is_flown_with_and_every_message_it_gets_is_kept(
+    flown: Path, toy_model: Path, tmp_path: Path
+) -> None:
+    link = ["--link-delay-ms", "15", "--link-jitter-ms", "10", "--link-loss", "0.05", "--link-reorder", "0.05"]
+    played = replay(
+        "play", "--autopilot", "px4", *link, "--sequence", flown, "--model", toy_model, "--out", tmp_path / "out"
+    )
+    assert played.returncode == 0, played.stdout + played.stderr
+    messages = [json.loads(line) for line in (tmp_path / "out/mavlink.jsonl").read_text().splitlines()]
+    kinds = {one["message"] for one in messages}
+    assert {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG", "TARGET_RELATIVE", "CAMERA_TRACKING_IMAGE_STATUS"} <= kinds
+    intervals = [one for one in messages if one["message"] == "COMMAND_LONG"]
+    # What PX4 does not know must be zero, or it denies the rate.
+    assert all((one["param3"], one["param4"], one["param7"]) == (0.0, 0.0, 0.0) for one in intervals)
+    summary = [json.loads(line) for line in (tmp_path / "out/received.jsonl").read_text().splitlines()][-2]
+    assert sum(summary["received"].values()) == len(messages)
+    assert summary["received"]["TARGET_RELATIVE"] > FRAMES // 4
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
