@@ -18,6 +18,7 @@ H and W are free multiples of 32; M = `max_peaks`.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -26,6 +27,35 @@ METADATA_KEY = "uavpose_contract"
 CONTRACT_VERSION = 1
 INPUT_NAMES = ("image", "K")
 OUTPUT_NAMES = ("score", "center_px", "size_px", "origin_px", "t_cam_target_m", "R_cam_target", "sigma")
+
+
+class ScoreCalibration(BaseModel):
+    """From a heatmap peak to the probability that it is a target: one peak says more of a large box than of a speck.
+
+    logit p = offset + slope logit(peak) + size_slope ln(min(shown, size_cap)), where `shown` is the geometric mean of
+    the box's sides in pixels that show the target: the network's, or the frame's where those are fewer. As it stands
+    it leaves the peak as it is.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    offset: float = 0.0
+    slope: float = Field(default=1.0, gt=0)
+    size_slope: float = 0.0
+    size_cap_px: float = Field(default=1.0, gt=0)
+
+    def probability(self, peak: float, shown_px: float) -> float:
+        """Of a peak in 0..1 of a box of `shown_px`; 0 for one that is not finite."""
+        if not (math.isfinite(peak) and math.isfinite(shown_px)):
+            return 0.0
+        peak = min(max(peak, _PEAK_LEAST), 1.0 - _PEAK_LEAST)
+        size = math.log(min(max(shown_px, 1.0), self.size_cap_px))
+        logit = self.offset + self.slope * math.log(peak / (1.0 - peak)) + self.size_slope * size
+        return 1.0 / (1.0 + math.exp(-min(max(logit, -_LOGIT_MOST), _LOGIT_MOST)))
+
+
+_PEAK_LEAST = 1e-6
+_LOGIT_MOST = 30.0
 
 
 class ModelContract(BaseModel):
@@ -45,8 +75,10 @@ class ModelContract(BaseModel):
     track_window_scale: float = Field(
         gt=1.0, description="side of the window on the frame / longer side of the target's box"
     )
-    acquire_score_min: float = Field(ge=0, le=1, description="below it a whole-frame peak is no target")
-    track_score_min: float = Field(ge=0, le=1, description="below it a window's peak is no target")
+    acquire_score: ScoreCalibration = ScoreCalibration()
+    track_score: ScoreCalibration = ScoreCalibration()
+    acquire_score_min: float = Field(ge=0, le=1, description="a whole-frame peak of lower probability is no target")
+    track_score_min: float = Field(ge=0, le=1, description="a window's peak of lower probability is no target")
     trained_range_m: tuple[float, float]
     trained_focal_px: tuple[float, float]
     trained_box_px: tuple[float, float] = Field(

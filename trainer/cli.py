@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-from trainer import evaluate_command, results
+from trainer import evaluate_command, results, score_command
 from trainer.config import ConfigError, RenderingError, load_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     results.register(commands)
     _add_ablate(commands)
     _add_export(commands)
+    score_command.register(commands)
     return parser
 
 

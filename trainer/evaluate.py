@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from msgs.contract import ScoreCalibration
 from sim_replay import metrics
 from trainer.data import TrainingBatch
 from trainer.model import PoseNet
@@ -47,6 +48,13 @@ def predict_all(predict: Predictor, batches: Iterable[TrainingBatch]) -> Predict
     """Predictions of all batches, concatenated."""
     parts = [predict(np.ascontiguousarray(b.image_bgr), np.ascontiguousarray(b.K)) for b in batches]
     return Predictions(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def calibrated(predicted: Predictions, calibration: ScoreCalibration) -> Predictions:
+    """The same with the peaks' probabilities for scores, of boxes that show all their pixels."""
+    shown_px = np.sqrt(np.prod(np.maximum(predicted.size_px, 0.0), axis=-1))
+    told = [calibration.probability(float(p), float(s)) for p, s in zip(predicted.score, shown_px, strict=True)]
+    return predicted._replace(score=np.array(told, dtype=np.float32))
 
 
 def box_iou(center_a: NDArray, size_a: NDArray, center_b: NDArray, size_b: NDArray) -> NDArray:

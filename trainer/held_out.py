@@ -6,10 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from msgs.contract import ScoreCalibration
 from trainer.checkpoint import load_model
 from trainer.config import ConfigError, DataConfig
 from trainer.data import render_once
-from trainer.evaluate import SCORE_THRESHOLD, Predictor, constant_guess, measure, predict_all, torch_predictor
+from trainer.evaluate import (
+    SCORE_THRESHOLD,
+    Predictor,
+    calibrated,
+    constant_guess,
+    measure,
+    predict_all,
+    torch_predictor,
+)
 from trainer.export import ACQUIRE_CROP_PX, OpenView, airframe_names, stage_sampler
 from trainer.graph import onnx_predictor, read_contract
 
@@ -33,6 +42,7 @@ class _Subject(NamedTuple):
     track_px: int | None
     acquire_px: int
     thresholds: dict[str, float]
+    calibrations: dict[str, ScoreCalibration]
 
 
 def _checkpoint(path: Path) -> _Subject:
@@ -40,7 +50,7 @@ def _checkpoint(path: Path) -> _Subject:
     track, acquire = config.contract.track_size_wh, config.contract.acquire_size_wh
     thresholds = {"track": SCORE_THRESHOLD, "acquire": SCORE_THRESHOLD}
     return _Subject(
-        torch_predictor(model), config.data, config.data.seed, track[0] if track else None, min(acquire), thresholds
+        torch_predictor(model), config.data, config.data.seed, track[0] if track else None, min(acquire), thresholds, {}
     )
 
 
@@ -53,7 +63,9 @@ def _model_file(path: Path, seed: int) -> _Subject:
     thresholds = {"track": contract.track_score_min, "acquire": contract.acquire_score_min}
     track = contract.track_size_wh[0] if contract.track_size_wh else None
     training_seed = trained if isinstance(trained, int) else None
-    return _Subject(onnx_predictor(path), data, training_seed, track, min(contract.acquire_size_wh), thresholds)
+    calibrations = {"track": contract.track_score, "acquire": contract.acquire_score}
+    acquire_px = min(contract.acquire_size_wh)
+    return _Subject(onnx_predictor(path), data, training_seed, track, acquire_px, thresholds, calibrations)
 
 
 def evaluate_file(
@@ -73,6 +85,9 @@ def evaluate_file(
     view = open_view or (lambda seed, size, share: stage_sampler(subject.data, seed, size, share))
     opener = view(request.seed, size_px, 0.0 if request.stage == "track" else 1.0)
     batches = render_once(opener, request.samples, rendered=rendered)
-    measured = measure(predict_all(subject.predict, batches), batches, subject.thresholds[request.stage])
+    predicted = predict_all(subject.predict, batches)
+    if request.stage in subject.calibrations:
+        predicted = calibrated(predicted, subject.calibrations[request.stage])
+    measured = measure(predicted, batches, subject.thresholds[request.stage])
     settings = {"size_px": float(size_px), "score_min": subject.thresholds[request.stage]}
     return {**settings, **measured, **constant_guess(batches)}

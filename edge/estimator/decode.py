@@ -43,10 +43,13 @@ def decode(
     A target cut by the frame's edge or of a size that was not trained is told with a covariance that says so; one
     whose origin lies off the frame, or too small to show a shape, is not told.
     """
-    score_min = contract.acquire_score_min if stage == "acquire" else contract.track_score_min
+    acquiring = stage == "acquire"
+    score_min = contract.acquire_score_min if acquiring else contract.track_score_min
+    calibration = contract.acquire_score if acquiring else contract.track_score
     found = []
     for peak in range(peaks.score.shape[1]):
-        score = float(peaks.score[image, peak])
+        shown_px = shown_size_px(peaks.size_px[image, peak], pixel_map)
+        score = calibration.probability(float(peaks.score[image, peak]), shown_px)
         if not score >= score_min:
             continue
         R = peaks.R_cam_target[image, peak].astype(np.float64)
@@ -65,6 +68,13 @@ def decode(
         box = np.clip(box, -0.5, np.tile(frame_wh, 2) - 0.5)
         found.append(Estimate(score, box, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
+
+
+def shown_size_px(size_px: ArrayLike, pixel_map: PixelMap) -> float:
+    """Geometric mean of a box's sides [2] in network pixels, or in the frame's where those are fewer; 0: no size."""
+    width, height = np.nan_to_num(np.asarray(size_px, dtype=np.float64).clip(min=0.0), posinf=0.0)
+    enlarged = max(1.0, pixel_map.scale_xy[0] * pixel_map.scale_xy[1])
+    return float(np.sqrt(width * height / enlarged))
 
 
 def pose_covariance(

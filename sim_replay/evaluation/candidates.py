@@ -1,0 +1,76 @@
+"""What the two stages take for targets in whole frames, before any threshold, and which of it is one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from edge.estimator.decode import shown_size_px
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import Model
+from edge.estimator.window import PixelMap, fit_frame, window_around
+from edge.tracking.boxes import iou
+from edge.types import Array, Estimate, Frame, FrameMeta
+from msgs.contract import ScoreCalibration
+from sim_replay.datasets import DatasetFrame
+
+PEAK_LEAST = 0.08  # below it lies the noise between the peaks
+PEAKS_MOST = 8
+ON_TARGET, OFF_TARGET = 0.2, 0.05  # intersection over union with a truth's box; between them it is neither
+
+
+class Candidate(NamedTuple):
+    """One peak of one stage in one frame."""
+
+    stage: Literal["acquire", "track"]
+    peak: float  # of the heatmap, 0..1
+    shown_px: float  # as edge.estimator.decode.shown_size_px
+    is_target: bool
+
+
+def candidates(
+    model: Model, pictures: Sequence[DatasetFrame], on_frame: Callable[[], None] = lambda: None
+) -> Iterator[Candidate]:
+    """Every peak of the whole frames, and what the track stage sees in a window around each.
+
+    Whatever calibration and thresholds the model has are left aside. Raises InputError if the model does not run,
+    BopError for a picture that cannot be read.
+    """
+    estimator = Estimator(_bare(model), PEAKS_MOST)
+    model.warm_up()
+    for picture in pictures:
+        frame = Frame(FrameMeta(picture.image_id, 0, 0), picture.undistorted_bgr(), picture.K)
+        boxes = [t.box_visible_xyxy_px for t in picture.targets if t.box_visible_xyxy_px is not None]
+        yield from _in_frame(estimator, frame, boxes)
+        on_frame()
+
+
+def _bare(model: Model) -> Model:
+    as_it_is = {"acquire_score": ScoreCalibration(), "track_score": ScoreCalibration()}
+    least = {"acquire_score_min": PEAK_LEAST, "track_score_min": PEAK_LEAST}
+    model.contract = model.contract.model_copy(update=as_it_is | least)
+    return model
+
+
+def _in_frame(estimator: Estimator, frame: Frame, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:
+    contract = estimator.model.contract
+    frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+    whole_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit)[1]
+    for found in estimator.anywhere(frame, (), Counter()):
+        yield from _labelled(found, whole_map, truth_boxes)
+        if contract.track_size_wh is None:
+            continue
+        window = window_around(found.box_xyxy_px, contract.track_window_scale, contract.track_size_wh, frame_wh)
+        for seen in estimator.track(frame, [found.box_xyxy_px]):
+            if seen is not None:
+                yield from _labelled(seen, window.pixel_map(contract.track_size_wh), truth_boxes)
+
+
+def _labelled(found: Estimate, pixel_map: PixelMap, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:
+    lies_on = max((iou(found.box_xyxy_px, box) for box in truth_boxes), default=0.0)
+    if lies_on >= ON_TARGET or lies_on <= OFF_TARGET:
+        size_px = (found.box_xyxy_px[2:] - found.box_xyxy_px[:2]) * np.array(pixel_map.scale_xy)
+        yield Candidate(found.stage, found.score, shown_size_px(size_px, pixel_map), lies_on >= ON_TARGET)

@@ -1,0 +1,151 @@
+"""From peaks to probabilities: the fit against a law that is known, and a file calibrated by command."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msgs.contract import ScoreCalibration
+from sim_replay.datasets import open_dataset
+from sim_replay.evaluation.candidates import Candidate
+from sim_replay.evaluation.judge import judge_frames
+from sim_replay.offline import estimator_answers, load_model
+from tests.sim_replay.conftest import CX_PX, CY_PX, FOCAL_PX, SPOT_Z_M, dark_spot_model
+from trainer.cli import main
+from trainer.graph import read_contract
+from trainer.score_calibration import TooFewCandidates, expected_calibration_error, fit
+
+__all__ = ["dark_spot_model"]
+
+TRUE = ScoreCalibration(offset=-6.0, slope=3.0, size_slope=1.5, size_cap_px=45.0)
+peaks = st.floats(0.0, 1.0)
+sizes = st.floats(0.0, 3000.0)
+
+
+def drawn(law: ScoreCalibration, count: int, seed: int) -> list[Candidate]:
+    rng = np.random.default_rng(seed)
+    seen = []
+    for peak, shown in zip(rng.uniform(0.1, 0.95, count), np.exp(rng.uniform(1.5, 5.5, count)), strict=True):
+        on = bool(rng.random() < law.probability(float(peak), float(shown)))
+        seen.append(Candidate("acquire", float(peak), float(shown), on))
+    return seen
+
+
+def test_the_law_that_the_peaks_were_drawn_by_is_found() -> None:
+    found = fit(drawn(TRUE, 20_000, seed=1))
+    assert found.size_cap_px == TRUE.size_cap_px
+    assert (found.offset, found.slope, found.size_slope) == pytest.approx(
+        (TRUE.offset, TRUE.slope, TRUE.size_slope), rel=0.1
+    )
+
+
+def test_what_is_told_comes_true_as_often_as_told_on_peaks_not_seen_before() -> None:
+    found, later = fit(drawn(TRUE, 2000, seed=2)), drawn(TRUE, 20_000, seed=3)
+    assert expected_calibration_error(found, later) < 0.02
+    assert expected_calibration_error(ScoreCalibration(), later) > 0.1
+
+
+def test_peaks_that_part_perfectly_have_a_finite_answer() -> None:
+    seen = [Candidate("track", 0.7, 50.0, True)] * 30 + [Candidate("track", 0.2, 50.0, False)] * 30
+    found = fit(seen)
+    assert found.probability(0.7, 50.0) > 0.9
+    assert found.probability(0.2, 50.0) < 0.1
+    assert all(math.isfinite(value) for value in (found.offset, found.slope, found.size_slope))
+
+
+def test_too_few_peaks_are_refused_with_their_number() -> None:
+    with pytest.raises(TooFewCandidates, match=r"^7 peaks on targets and 30 beside them"):
+        fit([Candidate("track", 0.7, 50.0, True)] * 7 + [Candidate("track", 0.2, 50.0, False)] * 30)
+
+
+@given(peaks, peaks, sizes)
+def test_a_higher_peak_of_the_same_size_is_never_less_probable(a: float, b: float, shown_px: float) -> None:
+    low, high = TRUE.probability(min(a, b), shown_px), TRUE.probability(max(a, b), shown_px)
+    assert 0.0 <= low <= high <= 1.0
+
+
+@given(peaks, sizes)
+def test_as_it_stands_it_leaves_the_peak_as_it_is(peak: float, shown_px: float) -> None:
+    assert ScoreCalibration().probability(peak, shown_px) == pytest.approx(peak, abs=2e-6)
+
+
+@pytest.mark.parametrize("peak", [math.nan, math.inf])
+def test_a_peak_that_is_not_finite_is_no_target(peak: float) -> None:
+    assert TRUE.probability(peak, 50.0) == 0.0
+
+
+def write_scene(scene: Path, spots: int, specks: int) -> None:
+    """Targets that are nearly black; then pictures of none, with a grey speck that the network takes for one."""
+    (scene / "rgb").mkdir(parents=True)
+    rng = np.random.default_rng(5)
+    cameras, poses = {}, {}
+    for frame in range(spots + specks):
+        x_m, y_m = rng.uniform((-50.0, -25.0), (50.0, 25.0))
+        center = (round(CX_PX + FOCAL_PX * x_m / SPOT_Z_M), round(CY_PX + FOCAL_PX * y_m / SPOT_Z_M))
+        grey = int(rng.integers(20, 90) if frame < spots else rng.integers(110, 160))
+        image = np.full((1080, 1920, 3), 240, np.uint8)
+        cv2.ellipse(image, center, (70, 65), 0, 0, 360, (grey, grey, grey), -1, cv2.LINE_AA)
+        cv2.imwrite(str(scene / "rgb" / f"{frame:06d}.png"), image)
+        cameras[str(frame)] = {"cam_K": [FOCAL_PX, 0, CX_PX, 0, FOCAL_PX, CY_PX, 0, 0, 1], "depth_scale": 1.0}
+        if frame < spots:
+            t_mm = [x_m * 1e3, y_m * 1e3, SPOT_Z_M * 1e3]
+            poses[str(frame)] = [{"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": t_mm}]
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    (scene / "scene_gt.json").write_text(json.dumps(poses))
+    boxes = {
+        frame: [{"bbox_visib": [*_corner(target["cam_t_m2c"]), 140, 130], "px_count_visib": 14000, "visib_fract": 1.0}]
+        for frame, (target,) in poses.items()
+    }
+    (scene / "scene_gt_info.json").write_text(json.dumps(boxes))
+    models = scene.parents[1] / "models"
+    models.mkdir(exist_ok=True)
+    size_mm = {"min_x": -6e3, "min_y": -6e3, "min_z": -1e3, "size_x": 12e3, "size_y": 12e3, "size_z": 2e3}
+    (models / "models_info.json").write_text(json.dumps({"1": {"diameter": 12e3, **size_mm}}))
+
+
+def _corner(t_mm: list[float]) -> tuple[int, int]:
+    return round(CX_PX + FOCAL_PX * t_mm[0] / t_mm[2]) - 70, round(CY_PX + FOCAL_PX * t_mm[1] / t_mm[2]) - 65
+
+
+def test_a_calibrated_file_tells_targets_from_what_fooled_it(
+    tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "dataset" / "val" / "000000"
+    write_scene(scene, spots=24, specks=24)
+    model = tmp_path / "model.onnx"
+    shutil.copy(dark_spot_model, model)
+    before = read_contract(model)
+
+    assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 0
+    assert capsys.readouterr().out.startswith("acquire")
+    after = read_contract(model)
+    assert (after.acquire_score_min, after.track_score_min) == (0.5, 0.3)
+    assert after.training["score_frames"] == 48
+    same = before.model_dump(exclude={"acquire_score", "track_score", "acquire_score_min", "track_score_min"})
+    assert {**after.model_dump(exclude=set(before.model_dump()) - set(same)), "training": {}, "metrics": {}} == same
+
+    dataset = open_dataset(tmp_path / "dataset")
+    judged = judge_frames(list(dataset.frames()), dataset.models, estimator_answers(load_model(model, threads=1)))
+    found = [match.estimate for frame in judged for match in frame.matches if match.estimate is not None]
+    assert len(found) >= 22
+    assert sum(len(frame.false_poses) for frame in judged) <= 2
+
+
+def test_a_dataset_without_false_peaks_is_refused_and_the_file_left(
+    tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(tmp_path / "dataset" / "val" / "000000", spots=2, specks=0)
+    model = tmp_path / "model.onnx"
+    shutil.copy(dark_spot_model, model)
+    content = model.read_bytes()
+    assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 2
+    assert "--dataset: acquire: 2 peaks on targets and 0 beside them" in capsys.readouterr().err
+    assert model.read_bytes() == content

@@ -1,0 +1,63 @@
+"""From peaks to probabilities: a logistic regression on whole frames, one for each stage. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msgs.contract import ScoreCalibration
+from sim_replay.evaluation.candidates import Candidate
+
+SIZE_CAPS_PX = (20.0, 30.0, 45.0, 70.0, 100.0)
+LEAST_OF_EACH = 20
+_PRIOR = 1e-3  # so that peaks that part perfectly have an answer
+_STEPS = 50
+
+
+class TooFewCandidates(ValueError):
+    """Not enough peaks on or off targets to tell them apart by."""
+
+
+def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
+    """The calibration of highest likelihood. Raises TooFewCandidates, and ValueError where a higher peak says less."""
+    seen = list(candidates)
+    on = np.array([candidate.is_target for candidate in seen], dtype=bool)
+    if min(on.sum(), (~on).sum()) < LEAST_OF_EACH:
+        raise TooFewCandidates(
+            f"{on.sum()} peaks on targets and {(~on).sum()} beside them: at least {LEAST_OF_EACH} of each are needed"
+        )
+    peak = np.clip([candidate.peak for candidate in seen], 1e-6, 1.0 - 1e-6)
+    logit = np.log(peak / (1.0 - peak))
+    shown = np.maximum([candidate.shown_px for candidate in seen], 1.0)
+    fits = []
+    for cap in SIZE_CAPS_PX:
+        weights, deviance = _logistic(np.column_stack([np.ones(len(on)), logit, np.log(np.minimum(shown, cap))]), on)
+        fits.append((deviance, cap, weights))
+    _, cap, (offset, slope, size_slope) = min(fits, key=lambda one: one[0])
+    return ScoreCalibration(
+        offset=round(float(offset), 4),
+        slope=round(float(slope), 4),
+        size_slope=round(float(size_slope), 4),
+        size_cap_px=cap,
+    )
+
+
+def _logistic(X: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+    """Weights and deviance of logistic regression by Newton's method."""
+    weights = np.zeros(X.shape[1])
+    prior = _PRIOR * np.eye(X.shape[1])
+    for _ in range(_STEPS):
+        p = 1.0 / (1.0 + np.exp(-np.clip(X @ weights, -30.0, 30.0)))
+        weights += np.linalg.solve(X.T @ (X * (p * (1.0 - p))[:, None]) + prior, X.T @ (y - p) - prior @ weights)
+    p = np.clip(1.0 / (1.0 + np.exp(-np.clip(X @ weights, -30.0, 30.0))), 1e-12, 1.0 - 1e-12)
+    return weights, float(-2.0 * np.sum(np.log(np.where(y, p, 1.0 - p))))
+
+
+def expected_calibration_error(calibration: ScoreCalibration, candidates: Sequence[Candidate], bins: int = 10) -> float:
+    """Mean distance between told probability and the share that were targets, over bins of told probability."""
+    told = np.array([calibration.probability(one.peak, one.shown_px) for one in candidates])
+    on = np.array([one.is_target for one in candidates], dtype=float)
+    which = np.minimum((told * bins).astype(int), bins - 1)
+    return float(sum(abs(np.sum(told[which == b] - on[which == b])) for b in range(bins)) / len(on))

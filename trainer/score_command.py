@@ -1,0 +1,94 @@
+"""`uavpose-trainer calibrate-score`: make a model file's scores probabilities, by whole frames it is shown."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from msgs.contract import ModelContract
+from trainer.config import ConfigError
+
+# A sight of a target begins where the whole frame shows one more likely than not and a window does not gainsay it; a
+# target in hand is let go sooner than it is replaced by a wrong one.
+ACQUIRE_PROBABILITY_MIN, TRACK_PROBABILITY_MIN = 0.5, 0.3
+THRESHOLD_METRICS = ("recall", "false_alarms")  # of windows at the thresholds that were
+
+
+def register(commands: argparse._SubParsersAction) -> None:
+    """Add the sub-command."""
+    command = commands.add_parser(
+        "calibrate-score",
+        help="fit what a heatmap peak's height and size say of its being a target",
+        description="Show the model the pictures of the datasets, fit for each stage the probability that a peak is a "
+        "target (logistic in the peak and the size shown), and write it into the file with the thresholds "
+        f"{ACQUIRE_PROBABILITY_MIN:g} (acquire) and {TRACK_PROBABILITY_MIN:g} (track). Take pictures that neither "
+        "training nor the test sees, some of them without a target.",
+    )
+    command.add_argument("--model", type=Path, required=True, metavar="ONNX", help="the file to calibrate, in place")
+    command.add_argument("--dataset", type=Path, required=True, nargs="+", metavar="DIR", help="BOP datasets")
+    command.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Calibrate as asked and say what came of it. Raises ConfigError."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task("looking", total=None)
+        contract = calibrate_file(
+            arguments.model,
+            arguments.dataset,
+            on_start=lambda total: progress.update(task, total=total),
+            on_frame=lambda: progress.advance(task),
+        )
+    for stage, fitted in (("acquire", contract.acquire_score), ("track", contract.track_score)):
+        error = contract.metrics.get(f"{stage}_calibration_error")
+        print(f"{stage:8} {fitted}  calibration error {error}")
+
+
+def calibrate_file(
+    path: Path,
+    datasets: Sequence[Path],
+    *,
+    on_start: Callable[[int], None] = lambda _: None,
+    on_frame: Callable[[], None] = lambda: None,
+) -> ModelContract:
+    """Fit both stages' scores and write them into the file; returns the contract. Raises ConfigError."""
+    from sim_replay.datasets import open_dataset
+    from sim_replay.evaluation.candidates import candidates
+    from sim_replay.offline import DEFAULT_THREADS, InputError, load_model
+    from trainer.graph import read_contract, write_contract
+    from trainer.score_calibration import TooFewCandidates, expected_calibration_error, fit
+
+    contract = read_contract(path)
+    try:
+        pictures = [picture for folder in datasets for picture in open_dataset(folder).frames()]
+        on_start(len(pictures))
+        seen = list(candidates(load_model(path, DEFAULT_THREADS), pictures, on_frame))
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    stages = ("acquire",) if contract.track_size_wh is None else ("acquire", "track")
+    metrics = {
+        name: value
+        for name, value in contract.metrics.items()
+        if name.removeprefix("acquire_").removeprefix("track_") not in THRESHOLD_METRICS
+    }
+    changes: dict[str, object] = {}
+    for stage in stages:
+        of_stage = [candidate for candidate in seen if candidate.stage == stage]
+        try:
+            changes[f"{stage}_score"] = fitted = fit(of_stage)
+        except TooFewCandidates as error:
+            raise ConfigError(f"--dataset: {stage}: {error}") from error
+        metrics[f"{stage}_calibration_error"] = round(expected_calibration_error(fitted, of_stage), 4)
+    changes |= {"acquire_score_min": ACQUIRE_PROBABILITY_MIN, "track_score_min": TRACK_PROBABILITY_MIN}
+    training = contract.training | {
+        "score_frames": len(pictures),
+        "score_datasets": ", ".join(d.name for d in datasets),
+    }
+    contract = contract.model_copy(update=changes | {"metrics": metrics, "training": training})
+    write_contract(path, contract)
+    return contract
