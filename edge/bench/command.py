@@ -30,6 +30,7 @@ def register(commands: argparse._SubParsersAction) -> None:
     bench.add_argument("--pipeline", action="store_true", help=f"run `{PIPELINE} bench-pipeline`")
     bench.add_argument("--sequence", type=Path, metavar="DIR", help="with --pipeline: scene folder that is replayed")
     bench.add_argument("--minutes", type=float, help="with --pipeline: how long")
+    bench.add_argument("--fps", type=float, help="with --pipeline: pictures a second (default: the sequence's rate)")
     bench.set_defaults(act=run)
 
 
@@ -37,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     """0, or what the pipeline's command returns. Raises InputError."""
     if options.pipeline:
         return _pipeline(options)
-    for name in ("sequence", "minutes"):
+    for name in ("sequence", "minutes", "fps"):
         if getattr(options, name) is not None:
             raise InputError(f"--{name} needs --pipeline")
     threads = _threads(options.threads)
@@ -73,10 +74,9 @@ def _pipeline(options: argparse.Namespace) -> int:
     if not command.exists():
         raise InputError(f"--pipeline needs {PIPELINE}, which is not installed beside {sys.executable}")
     arguments = ["bench-pipeline"]
-    if options.sequence is not None:
-        arguments += ["--sequence", str(options.sequence)]
-    if options.minutes is not None:
-        arguments += ["--minutes", str(options.minutes)]
+    for name in ("sequence", "minutes", "fps"):
+        if (value := getattr(options, name)) is not None:
+            arguments += [f"--{name}", str(value)]
     if options.models:
         arguments += ["--model", str(options.models[0])]
     if options.json:

@@ -23,6 +23,7 @@ from sim_replay.pipeline.soak import table as trend_table
 from sim_replay.pipeline.soak import trends
 
 EXIT_GROWS = 1
+FPS_MAX = 240.0
 
 
 def register(commands: Any) -> None:
@@ -48,6 +49,7 @@ def register(commands: Any) -> None:
 def _add_arguments(parser: argparse.ArgumentParser, minutes: float, out: str) -> None:
     parser.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="scene folder")
     parser.add_argument("--minutes", type=float, default=minutes, help="how long (default %(default)s)")
+    parser.add_argument("--fps", type=float, help="pictures a second (default: the sequence's own rate)")
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
     parser.add_argument("--out", type=Path, default=Path("out") / out, metavar="DIR", help="folder to write to")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
@@ -76,7 +78,13 @@ def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
     if not 0.0 < args.minutes <= 24 * 60:
         raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most a day")
     model = load_model(args.model, threads=1)
-    settings = FlightSettings(read_sequence(args.sequence), args.out, args.minutes, args.model)
+    sequence = read_sequence(args.sequence)
+    fps = sequence.fps if args.fps is None else args.fps
+    if not 1.0 <= fps <= FPS_MAX:
+        raise InputError(f"--fps {fps:g}: must be from 1 to {FPS_MAX:g}")
+    if sequence.gimbal is not None and fps != sequence.fps:
+        raise InputError(f"--fps {fps:g}: {args.sequence} was filmed from a gimbal, whose turning is of its own rate")
+    settings = FlightSettings(sequence, args.out, args.minutes, args.model, fps)
     load_before = os.getloadavg()[0]
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -87,7 +95,7 @@ def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
         "model": {"file": str(model.path), "sha256": model.sha256, "precision": model.contract.precision},
         "cores": os.cpu_count(),
         "load_average": [load_before, os.getloadavg()[0]],
-        **report(flight, settings.sequence.fps, settings.period_s, args.minutes),
+        **report(flight, settings.fps, settings.period_s, args.minutes),
     }
     return result, flight
 

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
 
 UAV = "uav1"
 SAMPLE_S = 1.0
+RATES_AND_VELOCITIES = [4, 5, 6, 10, 11, 12]  # columns of Telemetry.values
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,12 @@ class FlightSettings:
     out: Path
     minutes: float
     model: Path
+    fps: float  # how many pictures a second; all that flies flies faster or slower with them
 
     @property
     def period_s(self) -> float:
         """One time through the sequence."""
-        return len(self.sequence.scene.images) / self.sequence.fps
+        return len(self.sequence.scene.images) / self.fps
 
 
 @dataclass
@@ -95,14 +97,22 @@ def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     rounds = math.ceil(settings.minutes * 60 / settings.period_s) + 1
-    telemetry = read_telemetry(settings.sequence.telemetry_csv)
+    sequence = settings.sequence
+    telemetry = sped_up(read_telemetry(sequence.telemetry_csv), sequence.frame0_ns, settings.fps / sequence.fps)
     looped_csv = settings.out / "telemetry.csv"
-    write_telemetry(looped_csv, looped(telemetry, settings.sequence.frame0_ns, settings.period_s, rounds))
+    write_telemetry(looped_csv, looped(telemetry, sequence.frame0_ns, settings.period_s, rounds))
     for lead_s in LEADS_S:
         flight = _attempt(settings, looped_csv, lead_s, on_second)
         if flight is not None:
             return flight
     raise PlayError(f"the daemon was not ready within {LEADS_S[-1]:.0f} s; see {settings.out / 'daemon.log'}")
+
+
+def sped_up(telemetry: Telemetry, frame0_ns: int, factor: float) -> Telemetry:
+    """The same way flown `factor` times as fast; the exposure of the first frame stays where it was."""
+    values = telemetry.values.copy()
+    values[:, RATES_AND_VELOCITIES] *= factor
+    return Telemetry(frame0_ns + np.round((telemetry.t_ns - frame0_ns) / factor).astype(np.int64), values)
 
 
 def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -> Telemetry:
@@ -125,7 +135,9 @@ def _attempt(
     mavlink_port, zenoh_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     config = settings.out / "config.toml"
     endpoint, camera = f"tcp/{LOOPBACK}:{zenoh_port}", {"start_at_ns": flight.start_at_ns, "loop": True}
-    text = sequence_config(settings.sequence, UAV, settings.model, endpoint, mavlink_port, camera)
+    text = sequence_config(
+        replace(settings.sequence, fps=settings.fps), UAV, settings.model, endpoint, mavlink_port, camera
+    )
     config.write_text(text, encoding="utf-8")
     command = Path(sys.executable).parent / "uavpose-edge"
     log = settings.out / "daemon.log"

@@ -18,7 +18,7 @@ from edge.errors import InputError
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
 from sim_replay.pipeline import flight as pipeline_flight
-from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped
+from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped, sped_up
 from sim_replay.pipeline.report import WINDOW_FRAMES, cpu, mavlink_latency_ms, memory_mb, report, stage_latency_ms
 from sim_replay.pipeline.usage import Usage, usage_of
 from sim_replay.play import PlayError
@@ -100,6 +100,29 @@ def test_budgets_are_met_missed_or_not_judged() -> None:
     assert judged["resident memory, largest"] is None
 
 
+def test_sixty_frames_a_second_have_a_budget_of_their_own() -> None:
+    for p99_ms, met in ((32.0, True), (34.0, False)):
+        judged = report(heard([2.0, 3.0], [p99_ms, p99_ms]), 60.0, PERIOD_S, 2.0)["budgets"]
+        budgets = {budget["name"]: budget["met"] for budget in judged}
+        assert budgets["capture to MAVLink, tracking, p99"] is met
+        assert "capture to MAVLink, tracking, p50" not in budgets
+
+
+def test_what_is_played_faster_flies_the_same_way_faster() -> None:
+    sequence = read_sequence(BUNDLED_SEQUENCE)
+    telemetry = read_telemetry(sequence.telemetry_csv)
+    fast = sped_up(telemetry, sequence.frame0_ns, 2.0)
+    for t_ns in np.arange(0, 2_000_000_000, 170_000_000):
+        once = telemetry.at(sequence.frame0_ns + 2 * int(t_ns))
+        again = fast.at(sequence.frame0_ns + int(t_ns))
+        np.testing.assert_allclose(again.t_ned_body_m, once.t_ned_body_m, atol=1e-6)
+        np.testing.assert_allclose(again.q_ned_body_wxyz, once.q_ned_body_wxyz, atol=1e-6)
+        np.testing.assert_allclose(again.v_ned_body_mps, 2.0 * once.v_ned_body_mps, atol=1e-6)
+        later = fast.at(sequence.frame0_ns + int(t_ns) + 1_000_000)
+        flown_m = (later.t_ned_body_m - again.t_ned_body_m) / 1e-3
+        np.testing.assert_allclose(flown_m, again.v_ned_body_mps, atol=1.0)
+
+
 def test_the_own_ship_flies_round_and_round_with_the_pictures() -> None:
     sequence = read_sequence(BUNDLED_SEQUENCE)
     telemetry = read_telemetry(sequence.telemetry_csv)
@@ -134,10 +157,11 @@ def test_usage_is_of_the_process_that_is_asked_for() -> None:
 
 
 def test_the_daemon_is_flown_for_seconds(tmp_path: Path) -> None:
-    done = run(tmp_path, "--minutes", "0.1", "--json")
+    done = run(tmp_path, "--minutes", "0.1", "--fps", "15", "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    assert result["captured"] > 0
+    assert 0 < result["captured"] <= 0.1 * 60 * 15 + 2
+    assert result["fps"] == 15.0
     assert result["cpu_cores"] > 0
     assert 50.0 < result["memory_mb"]["max"] < 2000.0
     assert {"capture", "inference", "total"} <= set(result["stages_ms"])
@@ -148,7 +172,7 @@ LONG_S = 3600.0  # until frame 0: a test that waited for it would never end
 
 
 def settings(out: Path, model: Path) -> FlightSettings:
-    return FlightSettings(read_sequence(BUNDLED_SEQUENCE), out, 0.1, model)
+    return FlightSettings(read_sequence(BUNDLED_SEQUENCE), out, 0.1, model, 30.0)
 
 
 def test_a_daemon_that_refuses_its_model_is_noticed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +202,8 @@ def test_a_peer_that_ends_is_noticed_at_once(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("arguments", "named"), [(["--minutes", "0"], "--minutes 0"), (["--sequence", "nowhere"], "nowhere")]
+    ("arguments", "named"),
+    [(["--minutes", "0"], "--minutes 0"), (["--fps", "0"], "--fps 0"), (["--sequence", "nowhere"], "nowhere")],
 )
 def test_what_cannot_be_flown_is_named(tmp_path: Path, arguments: list[str], named: str) -> None:
     done = run(tmp_path, *arguments)
