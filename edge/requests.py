@@ -17,11 +17,18 @@ class TrackBox:
 
 
 @dataclass(frozen=True)
+class SelectTarget:
+    """Choose a target that is tracked."""
+
+    track_id: int
+
+
+@dataclass(frozen=True)
 class StopTracking:
     """Drop all targets."""
 
 
-Request = TrackBox | StopTracking
+Request = TrackBox | SelectTarget | StopTracking
 
 
 @dataclass(frozen=True)

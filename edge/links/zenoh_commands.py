@@ -3,6 +3,7 @@
 | command  | body                              | done                                                             |
 |----------|-----------------------------------|------------------------------------------------------------------|
 | `track`  | `{"box": [x0, y0, x1, y1]}`       | look for a target there; shares of the picture's width and height |
+| `select` | `{"target": "t1"}`                | choose a target that is tracked, by its name                     |
 | `stop`   | `{}`                              | drop all targets                                                 |
 | `record` | `{"on": true}` or `{"on": false}` | begin a recording, or end it                                     |
 | `reload` | `{}`                              | read the configuration and the model again; answered when it is done |
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -23,7 +24,7 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from zenoh import handlers
 
-from edge.requests import AskReload, ReloadOutcome, Request, StopTracking, TrackBox
+from edge.requests import AskReload, ReloadOutcome, Request, SelectTarget, StopTracking, TrackBox
 from msgs.recording import Recorder
 from msgs.settings import dotted, faults_of
 
@@ -48,6 +49,10 @@ class Track(_Body):
         return self
 
 
+class Select(_Body):
+    target: Annotated[str, Field(pattern=r"^t[0-9]{1,3}$")]
+
+
 class Stop(_Body):
     pass
 
@@ -64,8 +69,15 @@ class Reload(_Body):
     pass
 
 
-Command = Track | Stop | Record | Rate | Reload
-COMMANDS: dict[str, type[Command]] = {"track": Track, "stop": Stop, "reload": Reload, "record": Record, "rate": Rate}
+Command = Track | Select | Stop | Record | Rate | Reload
+COMMANDS: dict[str, type[Command]] = {
+    "track": Track,
+    "select": Select,
+    "stop": Stop,
+    "reload": Reload,
+    "record": Record,
+    "rate": Rate,
+}
 
 
 class Refused(Exception):
@@ -80,6 +92,7 @@ class Actions:
     recorder: Recorder | None
     set_rate: Callable[[float | None], None]
     reload: AskReload | None
+    targets: Callable[[], Mapping[str, int]] = dict  # those that are tracked just now: name and track id
 
 
 def commands_key(uav: str) -> str:
@@ -100,7 +113,7 @@ def parse(name: str, body: bytes) -> Command:
         raise Refused(f"{key}: {first.reason}" if key else first.reason) from error
 
 
-def carry_out(command: Track | Stop | Record | Rate, actions: Actions) -> dict[str, Any]:
+def carry_out(command: Track | Select | Stop | Record | Rate, actions: Actions) -> dict[str, Any]:
     """Do it and say what was done, or raise Refused. Never waits."""
     match command:
         case Record(on=on):
@@ -113,16 +126,25 @@ def carry_out(command: Track | Stop | Record | Rate, actions: Actions) -> dict[s
         case Rate(max_hz=max_hz):
             actions.set_rate(max_hz)
             return {"max_hz": max_hz}
-        case Track() | Stop():
+        case Track() | Select() | Stop():
             if actions.request is None:
                 raise Refused("this vehicle does not take requests")
             asked: Request = StopTracking()
-            if isinstance(command, Track):
+            if isinstance(command, Select):
+                asked = SelectTarget(_track_id(command.target, actions.targets()))
+            elif isinstance(command, Track):
                 x0, y0, x1, y1 = command.box
                 asked = TrackBox((x0, y0, x1, y1))
             if not actions.request(asked):
                 raise Refused("too many requests wait; try again")
             return command.model_dump()
+
+
+def _track_id(name: str, targets: Mapping[str, int]) -> int:
+    """Raises Refused for one that is not tracked."""
+    if name not in targets:
+        raise Refused(f"no target {name}; there {'are ' + ', '.join(sorted(targets)) if targets else 'is none'}")
+    return targets[name]
 
 
 def answer(name: str, body: bytes, actions: Actions, reply: Callable[[dict[str, Any]], None]) -> None:

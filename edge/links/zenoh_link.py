@@ -78,6 +78,7 @@ class ZenohLink:
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
         self._delivering = False
+        self._targets: dict[str, int] = {}  # of the newest report: name and track id
         self._links = 0  # routers and peers connected just now
         self._picture_publisher: TopicPublisher | None = None
         self._worker: threading.Thread | None = None
@@ -110,6 +111,7 @@ class ZenohLink:
         with self._waiting:
             self._counters["reports_replaced"] += self._mailbox.report is not None
             self._mailbox.report = report
+            self._targets = {ros.target_name(track): track.track_id for track in report.tracks}
             self._waiting.notify()
 
     def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
@@ -189,7 +191,7 @@ class ZenohLink:
                 self._picture_publisher = desk.open_pictures()
             if session is not None and self._settings.commands:
                 request = self._requests.put if self._requests is not None else None
-                actions = Actions(request, self._recorder, desk.set_pose_rate, self._reload)
+                actions = Actions(request, self._recorder, desk.set_pose_rate, self._reload, lambda: self._targets)
                 stack.enter_context(declare_commands(session, self._vehicle_name, actions))
             while True:
                 mail = self._take()

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from edge.requests import Request, TrackBox
+from edge.requests import Request, SelectTarget, TrackBox
 from edge.types import Array, Estimate, Track
 
 LOOK_NS = 1_000_000_000
@@ -21,6 +21,7 @@ class ByHand:
     def __init__(self) -> None:
         self.chosen_id: int | None = None
         self._box_share: Array | None = None
+        self._wanted_id: int | None = None  # of a target that was chosen by its name
         self._look_until_ns = 0
         self._rest_until_ns = 0
         self._found: Array | None = None  # [4] box_xyxy_px of the estimate that is to become the chosen track
@@ -28,8 +29,10 @@ class ByHand:
 
     def take(self, request: Request, now_ns: int) -> None:
         """Take a request that came before the frame of `now_ns`."""
-        self.chosen_id = None
-        if isinstance(request, TrackBox):
+        self.chosen_id = self._wanted_id = None
+        if isinstance(request, SelectTarget):
+            self._box_share, self._wanted_id, self._rest_until_ns = None, request.track_id, now_ns
+        elif isinstance(request, TrackBox):
             self._box_share = np.array(request.box_xyxy_share)
             self._look_until_ns, self._rest_until_ns = now_ns + LOOK_NS, now_ns
         else:
@@ -62,6 +65,9 @@ class ByHand:
     def settle(self, tracks: Iterable[Track]) -> None:
         """After the tracks' update: which of them is the chosen one, or that it is gone."""
         tracks = list(tracks)
+        if self._wanted_id is not None:
+            self._choose_by_id(tracks, self._wanted_id)
+            self._wanted_id = None
         if self._found is not None and tracks:
             center = 0.5 * (self._found[:2] + self._found[2:])
             nearest = min(tracks, key=lambda t: float(np.linalg.norm(_center(t.box_xyxy_px) - center)))
@@ -74,6 +80,13 @@ class ByHand:
         """What the person should hear of it since the last call."""
         told, self._news = self._news, []
         return told
+
+    def _choose_by_id(self, tracks: Iterable[Track], track_id: int) -> None:
+        for track in tracks:
+            if track.track_id == track_id:
+                return self._choose(track)
+        self._news.append(f"target {track_id} is gone: not chosen")
+        return None
 
     def _choose(self, track: Track) -> None:
         self.chosen_id = track.track_id

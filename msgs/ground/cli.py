@@ -87,12 +87,14 @@ def _add_record(commands: Commands) -> None:
 
 
 def _add_command(commands: Commands) -> None:
-    command = commands.add_parser("command", help="tell one vehicle to track, stop, record or send less")
+    command = commands.add_parser(
+        "command", help="tell one vehicle to track, select, stop, reload, record or send less"
+    )
     _endpoint(command)
     command.add_argument("uav", help="the vehicle's name")
-    command.add_argument("name", metavar="command", help="track, stop, record or rate")
+    command.add_argument("name", metavar="command", help="track, select, stop, reload, record or rate")
     command.add_argument(
-        "words", nargs="*", help="track: LEFT TOP RIGHT BOTTOM, 0 to 1; record: on, off; rate: HZ, all"
+        "words", nargs="*", help="track: LEFT TOP RIGHT BOTTOM, 0 to 1; select: t0; record: on, off; rate: HZ, all"
     )
     command.set_defaults(act=_command)
 

@@ -1,4 +1,4 @@
-"""`uavpose-ground command`: tell one vehicle to track, stop, reload, record or send less, and print its answer."""
+"""`uavpose-ground command`: tell one vehicle what to track, to stop, reload, record or send less; prints its answer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXIT_REFUSED = 1
 
 
 def body(name: str, words: Sequence[str]) -> dict[str, Any]:
-    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `stop`, `reload`,
+    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `select TARGET`, `stop`, `reload`,
     `record on|off`, `rate HZ|all`.
 
     Raises InputError.
@@ -28,6 +28,8 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
         match name, *words:
             case ["track", _, _, _, _]:
                 return {"box": [float(word) for word in words]}
+            case ["select", target]:
+                return {"target": target}
             case ["stop" | "reload"]:
                 return {}
             case ["record", ("on" | "off") as state]:
@@ -36,8 +38,8 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
                 return {"max_hz": None if rate == "all" else float(rate)}
     except ValueError as error:
         raise InputError(f"{name}: {error}") from error
-    raise InputError("a command is one of: track LEFT TOP RIGHT BOTTOM (shares of the picture, 0 to 1); stop; "
-                     "reload; record on|off; rate HZ|all")  # fmt: skip
+    raise InputError("a command is one of: track LEFT TOP RIGHT BOTTOM (shares of the picture, 0 to 1); "
+                     "select TARGET; stop; reload; record on|off; rate HZ|all")  # fmt: skip
 
 
 def ask(

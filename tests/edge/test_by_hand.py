@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.requests import StopTracking, TrackBox
+from edge.requests import SelectTarget, StopTracking, TrackBox
 from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount
@@ -102,6 +102,19 @@ def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends()
     by_hand.settle([elsewhere])
     by_hand.settle([elsewhere, there])
     assert by_hand.chosen_id is None, "its number may be another target's by now"
+
+
+def test_a_target_selected_by_its_name_is_chosen_unless_it_is_gone() -> None:
+    hand, both = ByHand(), [track(0), track(0, track_id=1)]
+    hand.take(SelectTarget(1), 0)
+    assert hand.box_xyxy_px(0, SIZE_WH, both) is None
+    hand.settle(both)
+    assert (hand.chosen_id, hand.news()) == (1, ["target 1 chosen"])
+    hand.take(SelectTarget(3), 0)
+    hand.settle(both)
+    assert (hand.chosen_id, hand.news()) == (None, ["target 3 is gone: not chosen"])
+    hand.settle(both)
+    assert hand.news() == []
 
 
 def test_the_search_rests_after_stopping_until_the_next_box_or_ten_seconds() -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from edge.config_ground import ZenohSettings
 from edge.links.zenoh_commands import COMMANDS, Actions, answer
 from edge.links.zenoh_link import ZenohLink
-from edge.requests import WAITING_MAX, RequestQueue, StopTracking, TrackBox
+from edge.requests import WAITING_MAX, RequestQueue, SelectTarget, StopTracking, TrackBox
 from msgs.client import connect
 from msgs.ground.command import ask
 from msgs.recording import Recorder, RecordingLimits
@@ -83,6 +83,17 @@ def test_requests_reach_the_loop_in_order(tmp_path: Path) -> None:
         assert answered(one, "stop", {})["error"] == "too many requests wait; try again"
 
 
+def test_a_target_is_selected_by_its_name_if_it_is_tracked(tmp_path: Path) -> None:
+    with vehicle(tmp_path) as one:
+        assert answered(one, "select", {"target": "t0"})["error"] == "no target t0; there is none"
+        now_ns = time.monotonic_ns()
+        one.link.publish(make_report(make_track(now_ns), make_track(now_ns, track_id=2)))
+        assert answered(one, "select", {"target": "t2"})["done"] == {"target": "t2"}
+        assert answered(one, "select", {"target": "t1"})["error"] == "no target t1; there are t0, t2"
+        assert answered(one, "select", {"target": "../t1"})["error"].startswith("target: String should match")
+        assert one.requests.take() == [SelectTarget(2)]
+
+
 def test_recording_is_switched_by_command(tmp_path: Path) -> None:
     with vehicle(tmp_path / "r") as one:
         put(one)
@@ -128,7 +139,7 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
         ("stop", b"[]", "Input should be an object"),
         ("stop", b"\xff\x00", "Invalid JSON"),
         ("stop", b" " * 5000, "a body of 5000 bytes is too long"),
-        ("self_destruct", b"{}", "no such command; there are track, stop, reload, record, rate"),
+        ("self_destruct", b"{}", "no such command; there are track, select, stop, reload, record, rate"),
     ],
 )
 def test_what_makes_no_sense_is_refused(tmp_path: Path, name: str, body: bytes, error: str) -> None:
