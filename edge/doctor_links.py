@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.findings import Finding, device_fault, good, poor, wrong
-from edge.links.mavlink_link import MavlinkLink, signing_of
+from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.requests import RequestQueue
 from edge.status import ask
 from edge.tracking.own_ship import OwnShipBuffer
@@ -63,7 +65,9 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
 
 
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
-    """Listens as the daemon does, until an attitude is heard."""
+    """Listens as the daemon does, until a heartbeat is heard."""
+    if settings.signing_key is not None:
+        yield signing_finding(signing_state_of(settings, settings.signing_key))
     for endpoint in settings.endpoints:
         kind, _, rest = endpoint.partition(":")
         if kind == "serial" and (fault := device_fault(Path(rest.rpartition(":")[0]), "dialout")) is not None:
@@ -92,6 +96,14 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
     yield wrong(
         "mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{f' ({refused})' if refused else ''}", advice
     )
+
+
+def signing_finding(state: Path) -> Finding:
+    """Whether the daemon can keep the last timestamp that it signed with."""
+    with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
+        return good("signing", f"the last timestamp is kept in {state}")
+    advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
+    return wrong("signing", f"{state} cannot be written: after a restart old messages would pass as new", advice)
 
 
 def _wait(look: Callable[[], dict[str, int]], done: Callable[[dict[str, int]], bool]) -> dict[str, int]:

@@ -35,8 +35,12 @@ def signing_of(settings: MavlinkSettings) -> Signing | None:
     """As the settings ask. Raises InputError for a key file that does not do."""
     if settings.signing_key is None:
         return None
-    state = settings.signing_state or Path(f"{settings.signing_key}.timestamp")
-    return open_signing(settings.signing_key, state, clock.utc_ns)
+    return open_signing(settings.signing_key, signing_state_of(settings, settings.signing_key), clock.utc_ns)
+
+
+def signing_state_of(settings: MavlinkSettings, signing_key: Path) -> Path:
+    """Where the last timestamp used with the key is kept."""
+    return settings.signing_state or Path(f"{signing_key}.timestamp")
 
 
 class MavlinkLink:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 
 from .conftest import Cli
@@ -132,3 +133,14 @@ def test_a_device_without_permission_names_the_group(tmp_path: Path, mode: int, 
     command = [sys.executable, "-c", NO_ROOT_LOOKS]
     said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
     assert words in said
+
+
+def test_a_signing_timestamp_that_cannot_be_kept_is_a_fault(tmp_path: Path) -> None:
+    kept = tmp_path / "mavlink.timestamp"
+    assert signing_finding(kept).verdict == "good"
+    kept.write_text("5")
+    assert signing_finding(kept).verdict == "good"
+    for lost in (tmp_path / "none" / "mavlink.timestamp", Path("/proc/mavlink.timestamp")):
+        found = signing_finding(lost)
+        assert (found.verdict, str(lost) in found.says) == ("wrong", True)
+        assert "signing_state" in found.advice
