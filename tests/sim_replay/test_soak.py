@@ -93,8 +93,9 @@ def test_a_flight_of_moments_is_not_judged() -> None:
     assert all(isinstance(trend, Trend) and trend.grows is None for trend in trends(flight, FPS))
 
 
-def test_the_daemon_holds_on_to_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["soak", "--minutes", "0.35", "--out", str(tmp_path), "--json"])
+@pytest.mark.timeout(420)
+def test_the_daemon_holds_on_to_nothing_in_two_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["soak", "--minutes", "2", "--out", str(tmp_path), "--json"])
     told = {trend["name"]: trend for trend in json.loads(capsys.readouterr().out)["trends"]}
     for name in ("memory", "open descriptors", "threads", "log"):
         assert told[name]["grows"] is False, told[name]
