@@ -1,4 +1,4 @@
-"""Where one target is and how it moves: an EKF over position, velocity, turn rate and range bias. Pure.
+"""Where one target is and how it moves: an EKF over position, velocity and turn rate. Pure.
 
 The state lives in one of three frames, by what is known of the own ship:
     ned           attitude and position: coordinated turn about the vertical
@@ -7,10 +7,11 @@ The state lives in one of three frames, by what is known of the own ship:
 Measurements are always compared in `cam`, where their covariance is given. The rotation has a filter of its own
 (`rotation.py`): while it may be the depth reversal of the true one, nothing of it may reach the turn rate.
 
-Noise. A network that misjudges range in one frame misjudges it alike in the next, so range noise is split: a share is
-a bias b, t_measured = (1 + b) t, first-order Gauss-Markov; only the rest is white. The variance of range therefore does
-not shrink with the number of frames, as it would if each were independent. The constants below are tuning choices for
-fixed-wing aircraft at 100-500 m, not measurements.
+A network misjudges the range of one target by much the same factor in all frames (`range_scale.py`), which no number of
+frames shrinks. The filter lives in ranges as they are seen, so P holds what the frames leave open; the common factor is
+added where a track is told (`covariance`). Range is compared by its logarithm: else frames that read short would pull
+more than frames that read far. The constants below are tuning choices for fixed-wing aircraft at 100-500 m, not
+measurements.
 """
 
 from __future__ import annotations
@@ -20,24 +21,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.tracking import so3
+from edge.tracking.range_scale import RangeScale
 from edge.tracking.view import NS_PER_S, FrameKind, View
 from edge.types import Array, Estimate
 
 POSITION, VELOCITY = slice(0, 3), slice(3, 6)
-TURN_RATE, RANGE_BIAS = 6, 7
-DIMENSION = 8
+TURN_RATE = 6
+DIMENSION = 7
 
 # Process noise, square roots of spectral densities.
 ACCELERATION = {"ned": 3.0, "ned_relative": 6.0}  # m/s^1.5; relative: the own ship manoeuvres too
 VERTICAL_SHARE = 0.5  # of that, up and down
 APPARENT_ACCELERATION = 0.3  # rad/s^1.5 times range: the camera's own turning, which `cam` cannot tell apart
 TURN_RATE_WALK = 0.1  # rad/s^1.5
-BIAS_TIME_S = 4.0  # correlation time of the range bias
-BIAS_SHARE = 0.8  # of the network's log-range variance
 
 # Initial uncertainty of what one measurement does not tell.
-SPEED_STD_MPS = 40.0
-CLIMB_STD_MPS = 6.0
+SPEED_STD_MPS = 80.0  # wide: a narrow one draws ranges towards those at which the target would be slow
+CLIMB_STD_MPS = 12.0
 APPARENT_RATE_STD = 0.5  # rad/s times range
 TURN_RATE_STD = 0.2  # rad/s
 TURN_RATE_MAX = 1.0  # rad/s
@@ -45,9 +45,12 @@ TURN_RATE_MAX = 1.0  # rad/s
 # Added to each measurement: what a network's own sigma does not know of.
 MODEL_BEARING_PX = 1.0
 MODEL_LOG_RANGE = 0.01
+FIRST_SHARE = 0.2  # of the network's log-range variance, left open by a first frame
 
 # A change of frame uses the last attitude known, this uncertain for each second since.
 STALE_ATTITUDE_RADPS = 0.5
+
+SHORTEST_S = 1e-3  # between measurements
 
 SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is raised to meet it
 
@@ -58,49 +61,38 @@ class Motion:
 
     kind: FrameKind
     time_ns: int
+    seen_ns: int  # of the last measurement
     t_m: Array  # [3] target origin in the frame
     v_mps: Array  # [3]
     turn_rate_radps: float  # about ned's down axis, right turns positive; 0 outside `ned`
-    range_bias: float  # measured range / range - 1
-    bias_variance: float  # stationary
-    P: Array  # [8, 8], order (t, v, turn rate, range bias)
+    P: Array  # [7, 7], order (t, v, turn rate), without the error of range that all frames share
+    scale: RangeScale
 
 
 @dataclass(frozen=True)
 class Innovation:
     """What a measured position says beyond the prediction, in `cam`."""
 
-    residual_m: Array  # [3]
-    H: Array  # [3, 8]
-    noise: Array  # [3, 3] white part
-    bias_variance: float
-    d2: float  # squared Mahalanobis distance, 3 degrees of freedom
-
-
-def measurement_noise(estimate: Estimate, K: Array, view: View) -> tuple[Array, float]:
-    """The white covariance [3, 3] in `cam` of an estimate's position, and the variance of its log-range bias."""
-    t = estimate.t_cam_target_m
-    bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2 + view.attitude_variance
-    C = symmetric(estimate.covariance[:3, :3])
-    C += bearing_variance * (t @ t) * so3.IDENTITY + MODEL_LOG_RANGE**2 * np.outer(t, t)
-    # Marginal along the ray with all else held: taking a share of it away leaves C positive semi-definite.
-    bias_variance = BIAS_SHARE / float(t @ np.linalg.solve(C, t))
-    return C - bias_variance * np.outer(t, t), bias_variance
+    residual_m: Array  # [3]; along the ray it is range times the difference of log ranges
+    predicted_m: Array  # [3]
+    predicted_covariance: Array  # [3, 3]
+    across: Array  # [3, 3], the measurement's covariance but for that of its range
+    log_range_variance: float  # the network's own
+    d2: float  # squared Mahalanobis distance, 3 degrees of freedom, as the network's own variances have it
 
 
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
     """The state after a first measurement."""
-    noise, bias_variance = measurement_noise(estimate, K, view)
+    across, log_range_variance = _measurement_noise(estimate, K, view)
     R = view.R_frame_cam
     ray = R @ estimate.t_cam_target_m
+    scale = RangeScale.begin(view.time_ns, 0.5 * float(np.log(ray @ ray)), log_range_variance)
     P = np.zeros((DIMENSION, DIMENSION))
-    P[POSITION, POSITION] = R @ noise @ R.T + bias_variance * np.outer(ray, ray)
-    P[POSITION, RANGE_BIAS] = P[RANGE_BIAS, POSITION] = -bias_variance * ray
+    P[POSITION, POSITION] = R @ across @ R.T + FIRST_SHARE * log_range_variance * np.outer(ray, ray)
     P[VELOCITY, VELOCITY] = _first_velocity(view.kind, float(np.linalg.norm(ray)))
     P[TURN_RATE, TURN_RATE] = TURN_RATE_STD**2 if view.kind == "ned" else 0.0
-    P[RANGE_BIAS, RANGE_BIAS] = bias_variance
     t_m = view.t_frame_cam_m + ray
-    return Motion(view.kind, view.time_ns, t_m, np.zeros(3), 0.0, 0.0, bias_variance, symmetric(P))
+    return Motion(view.kind, view.time_ns, view.time_ns, t_m, np.zeros(3), 0.0, symmetric(P), scale)
 
 
 def turning(motion: Motion, time_ns: int) -> Array:
@@ -115,7 +107,6 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
         return motion
     turn = turning(motion, time_ns)
     v = turn @ motion.v_mps
-    decay = float(np.exp(-dt / BIAS_TIME_S))
 
     F = np.eye(DIMENSION)
     F[POSITION, VELOCITY] = 0.5 * dt * (so3.IDENTITY + turn)
@@ -124,7 +115,6 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
         v_by_turn = dt * np.array([-v[1], v[0], 0.0])
         F[VELOCITY, TURN_RATE] = v_by_turn
         F[POSITION, TURN_RATE] = 0.5 * dt * v_by_turn
-    F[RANGE_BIAS, RANGE_BIAS] = decay
 
     Q = np.zeros((DIMENSION, DIMENSION))
     density = _acceleration_density(motion)
@@ -132,13 +122,11 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
     Q[POSITION, VELOCITY] = Q[VELOCITY, POSITION] = dt**2 / 2.0 * density
     Q[VELOCITY, VELOCITY] = dt * density
     Q[TURN_RATE, TURN_RATE] = TURN_RATE_WALK**2 * dt if motion.kind == "ned" else 0.0
-    Q[RANGE_BIAS, RANGE_BIAS] = (1.0 - decay**2) * motion.bias_variance
     return replace(
         motion,
         time_ns=time_ns,
         t_m=motion.t_m + 0.5 * dt * (motion.v_mps + v),
         v_mps=v,
-        range_bias=decay * motion.range_bias,
         P=symmetric(F @ motion.P @ F.T + Q),
     )
 
@@ -182,24 +170,60 @@ def between(old: View, new: View) -> Array:
     return so3.IDENTITY
 
 
+def untangled(motion: Motion, view: View) -> Motion:
+    """The same with range and its rate uncorrelated with all else: no bearing may tell a range.
+
+    It could only by parallax, which needs the target's speed, own position to decimetres, and a filter that is linear
+    over all ranges that are possible; a Cartesian one infers ranges from noise.
+    """
+    ray = motion.t_m - view.t_frame_cam_m
+    along = ray / np.linalg.norm(ray)
+    A = np.zeros((DIMENSION, DIMENSION))
+    A[POSITION, POSITION] = A[VELOCITY, VELOCITY] = np.outer(along, along)
+    B = np.eye(DIMENSION) - A
+    return replace(motion, P=symmetric(A @ motion.P @ A + B @ motion.P @ B))
+
+
 def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Innovation:
     """Compare an estimate with the prediction; `motion` is in the frame and at the time of `view`."""
     R_cam_frame = view.R_frame_cam.T
-    t_cam = R_cam_frame @ (motion.t_m - view.t_frame_cam_m)
+    predicted_m = R_cam_frame @ (motion.t_m - view.t_frame_cam_m)
+    range_m, measured_m = float(np.linalg.norm(predicted_m)), float(np.linalg.norm(estimate.t_cam_target_m))
+    at_predicted_range = range_m / measured_m
+    residual_m = at_predicted_range * estimate.t_cam_target_m - predicted_m
+    residual_m -= float(np.log(at_predicted_range)) * predicted_m
+    across, log_range_variance = _measurement_noise(estimate, K, view)
+    across *= at_predicted_range**2
+    predicted_covariance = symmetric(R_cam_frame @ motion.P[POSITION, POSITION] @ R_cam_frame.T)
+    S = predicted_covariance + across + log_range_variance * np.outer(predicted_m, predicted_m)
+    d2 = float(residual_m @ np.linalg.solve(S, residual_m))
+    return Innovation(residual_m, predicted_m, predicted_covariance, across, log_range_variance, d2)
+
+
+def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
+    """The state after a measurement; `view` as for its innovation."""
+    dt_s = max((motion.time_ns - motion.seen_ns) / NS_PER_S, SHORTEST_S)
+    range_m2 = float(seen.predicted_m @ seen.predicted_m)
+    log_residual = float(seen.residual_m @ seen.predicted_m) / range_m2
+    log_variance = float(seen.predicted_m @ seen.predicted_covariance @ seen.predicted_m) / range_m2**2
+    predicted = 0.5 * float(np.log(range_m2))
+    rate_per_s = _relative_velocity(motion, view) @ view.R_frame_cam @ seen.predicted_m / range_m2
+    scale = motion.scale.seen(
+        motion.time_ns, predicted + log_residual, seen.log_range_variance, predicted, float(rate_per_s)
+    )
+    away = scale.away(log_variance)
+    if away:
+        motion, seen = _rescaled(motion, away, view), _rescaled_innovation(seen, away)
+    ray = seen.predicted_m
+    noise = seen.across + scale.noise(dt_s) * np.outer(ray, ray)
+    S = seen.predicted_covariance + noise
+    d2 = float(seen.residual_m @ np.linalg.solve(S, seen.residual_m))
+    if d2 > SOFT_GATE:
+        noise = noise * (d2 / SOFT_GATE)
+        S = seen.predicted_covariance + noise
     H = np.zeros((3, DIMENSION))
-    H[:, POSITION] = (1.0 + motion.range_bias) * R_cam_frame
-    H[:, RANGE_BIAS] = t_cam
-    noise, bias_variance = measurement_noise(estimate, K, view)
-    residual_m = estimate.t_cam_target_m - (1.0 + motion.range_bias) * t_cam
-    d2 = float(residual_m @ np.linalg.solve(H @ motion.P @ H.T + noise, residual_m))
-    return Innovation(residual_m, H, noise, bias_variance, d2)
-
-
-def correct(motion: Motion, seen: Innovation) -> Motion:
-    """The state after a measurement."""
-    H = seen.H
-    noise = seen.noise * max(1.0, seen.d2 / SOFT_GATE)
-    gain = np.linalg.solve(H @ motion.P @ H.T + noise, H @ motion.P).T
+    H[:, POSITION] = view.R_frame_cam.T
+    gain = np.linalg.solve(S, H @ motion.P).T
     change = gain @ seen.residual_m
     # Joseph's form keeps P positive semi-definite whatever the gain.
     keep = np.eye(DIMENSION) - gain @ H
@@ -209,13 +233,22 @@ def correct(motion: Motion, seen: Innovation) -> Motion:
     turn_rate = float(np.clip(motion.turn_rate_radps + change[TURN_RATE], -TURN_RATE_MAX, TURN_RATE_MAX))
     return replace(
         motion,
+        seen_ns=motion.time_ns,
         t_m=motion.t_m + change[POSITION],
         v_mps=motion.v_mps + change[VELOCITY],
         turn_rate_radps=turn_rate,
-        range_bias=motion.range_bias + float(change[RANGE_BIAS]),
-        bias_variance=seen.bias_variance,
         P=P,
+        scale=scale,
     )
+
+
+def covariance(motion: Motion, view: View) -> Array:
+    """[6, 6] of position and velocity in the frame, with the error of range that all frames share.
+
+    A target further away by a share is so in all its relative motion too.
+    """
+    per_share = np.concatenate([motion.t_m - view.t_frame_cam_m, _relative_velocity(motion, view)])
+    return symmetric(motion.P[:TURN_RATE, :TURN_RATE] + motion.scale.common_variance * np.outer(per_share, per_share))
 
 
 def t_in_cam(motion: Motion, view: View) -> Array:
@@ -227,12 +260,52 @@ def covariance_in_cam(motion: Motion, view: View) -> Array:
     """[3, 3] of t_in_cam, m^2: with how far this frame's own attitude may be off what the track was made with."""
     R = view.R_frame_cam.T
     across = so3.skew(t_in_cam(motion, view))
-    return symmetric(R @ motion.P[POSITION, POSITION] @ R.T + view.attitude_variance * across @ across.T)
+    inside = covariance(motion, view)[POSITION, POSITION]
+    return symmetric(R @ inside @ R.T + view.attitude_variance * across @ across.T)
 
 
 def symmetric(P: Array) -> Array:
     """P without the rounding that makes it differ from its transpose."""
     return 0.5 * (P + P.T)
+
+
+def _relative_velocity(motion: Motion, view: View) -> Array:
+    """[3], of the target against the camera as far as that is known."""
+    return motion.v_mps if view.v_frame_cam_mps is None else motion.v_mps - view.v_frame_cam_mps
+
+
+def _rescaled(motion: Motion, log_factor: float, view: View) -> Motion:
+    """The target at exp(log_factor) of its range. How fast it is there is less sure; that it jumped is no speed."""
+    factor = float(np.exp(log_factor))
+    relative_m = motion.t_m - view.t_frame_cam_m
+    P = motion.P.copy()
+    P[POSITION] *= factor
+    P[:, POSITION] *= factor
+    P[VELOCITY, VELOCITY] += log_factor**2 * _first_velocity(motion.kind, float(np.linalg.norm(relative_m)))
+    return replace(motion, t_m=view.t_frame_cam_m + factor * relative_m, P=P)
+
+
+def _rescaled_innovation(seen: Innovation, log_factor: float) -> Innovation:
+    """The same measurement against the rescaled target."""
+    factor = float(np.exp(log_factor))
+    return replace(
+        seen,
+        residual_m=factor * (seen.residual_m - log_factor * seen.predicted_m),
+        predicted_m=factor * seen.predicted_m,
+        predicted_covariance=factor**2 * seen.predicted_covariance,
+        across=factor**2 * seen.across,
+    )
+
+
+def _measurement_noise(estimate: Estimate, K: Array, view: View) -> tuple[Array, float]:
+    """Covariance [3, 3] in `cam` of an estimate's position but for its range, and the variance of its log range."""
+    t = estimate.t_cam_target_m
+    bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2 + view.attitude_variance
+    C = symmetric(estimate.covariance[:3, :3])
+    C += bearing_variance * (t @ t) * so3.IDENTITY + MODEL_LOG_RANGE**2 * np.outer(t, t)
+    # Marginal along the ray with all else held: taking it away leaves C positive semi-definite.
+    log_range_variance = 1.0 / float(t @ np.linalg.solve(C, t))
+    return C - log_range_variance * np.outer(t, t), log_range_variance
 
 
 def _turning_radps(motion: Motion) -> Array:

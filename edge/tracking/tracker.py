@@ -123,13 +123,13 @@ class Tracker:
         motion = ekf.propagate(target.motion, view.time_ns)
         attitude = rotation.propagate(target.attitude, turn, (view.time_ns - target.motion.time_ns) / NS_PER_S)
         if motion.kind == view.kind:
-            return motion, attitude
+            return ekf.untangled(motion, view), attitude
         old = self._view.moved_to(view.time_ns)
         # Leaving ned, the attitude is the last one known; entering it, the new one belongs to this very frame.
         stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if view.kind == "cam" else 0.0
         through_cam = "cam" in (motion.kind, view.kind)
         return (
-            ekf.reframe(motion, old, view, stale_s),
+            ekf.untangled(ekf.reframe(motion, old, view, stale_s), view),
             rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
         )
 
@@ -148,7 +148,7 @@ class Tracker:
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:
     dt_s = (view.time_ns - target.measured_ns) / NS_PER_S
-    target.motion = ekf.correct(target.motion, seen)
+    target.motion = ekf.correct(target.motion, seen, view)
     attitude = rotation.correct(target.attitude, estimate, view, dt_s)
     settled = target.state is not TrackState.TENTATIVE
     target.attitude = rotation.weighed(
@@ -159,7 +159,7 @@ def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: V
 
 def _flight(motion: Motion, view: View) -> Flight | None:
     """What the motion tells of how the target flies; nothing in `cam`, where the way is mostly the camera's own."""
-    P_v = motion.P[ekf.VELOCITY, ekf.VELOCITY]
+    P_v = ekf.covariance(motion, view)[ekf.VELOCITY, ekf.VELOCITY]
     if motion.kind == "ned":
         return Flight(motion.v_mps, P_v, motion.turn_rate_radps, float(motion.P[ekf.TURN_RATE, ekf.TURN_RATE]), None)
     return None if motion.kind == "cam" else Flight(motion.v_mps, P_v, None, 0.0, view.nose_frame)
@@ -239,7 +239,7 @@ def _track(target: Target, motion: Motion, attitude: Attitude, view: View, K: Ar
 def _covariance_ned(motion: Motion, spread: Array, view: View) -> Array:
     """[9, 9] (position, velocity, rotation), with the own ship's errors."""
     covariance = view.own_ship_covariance(motion.t_m, motion.v_mps)
-    covariance[:6, :6] += motion.P[:6, :6]
+    covariance[:6, :6] += ekf.covariance(motion, view)
     covariance[6:, 6:] += spread
     return ekf.symmetric(covariance)
 

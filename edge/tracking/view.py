@@ -52,7 +52,10 @@ class View:
         if own_ship.t_ned_body_m is None:
             return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning)
         t_m = own_ship.t_ned_body_m + lever_ned_m
-        return cls("ned", time_ns, R_ned_cam, t_m, own_ship.v_ned_body_mps, nose, turning)
+        v_mps = own_ship.v_ned_body_mps
+        if v_mps is None and before is not None and before.kind == "ned":
+            v_mps = _moved_mps(before, time_ns, t_m)
+        return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning)
 
     @property
     def attitude_variance(self) -> float:
@@ -91,3 +94,9 @@ def _turning_radps(before: View | None, time_ns: int, R_ned_cam: Array) -> float
     if not 0.0 < dt_s <= RATE_GAP_MAX_S:
         return 0.0
     return float(np.linalg.norm(so3.log(R_ned_cam @ before.R_frame_cam.T))) / dt_s
+
+
+def _moved_mps(before: View, time_ns: int, t_frame_cam_m: Array) -> Array | None:
+    """Velocity [3] by which the camera came here from an earlier view; None after a gap."""
+    dt_s = (time_ns - before.time_ns) / NS_PER_S
+    return (t_frame_cam_m - before.t_frame_cam_m) / dt_s if 0.0 < dt_s <= RATE_GAP_MAX_S else None
