@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable, Mapping
 
 from edge import clock, threads
-from edge.config import HealthSettings
+from edge.config import HealthSettings, MavlinkSettings
+from edge.config_ground import ZenohSettings
 from edge.health import Announcer, Health, HealthSnapshot, Reason
 from edge.outlets import LEVELS, Outlets
 from edge.status_board import StatusBoard
@@ -38,6 +39,9 @@ class Supervisor:
         self._board = board
         self._count = count
         self._camera_reasons = camera_reasons
+        config = board.file.config
+        links: dict[str, MavlinkSettings | ZenohSettings] = {"mavlink": config.mavlink, "zenoh": config.zenoh}
+        self._age_max_ms = {name: link.max_age_ms for name, link in links.items() if link.enabled}
         self._faults: tuple[Reason, ...] = ()
         self._health = Health(wants_attitude)
         self._announcer = Announcer()
@@ -109,6 +113,13 @@ class Supervisor:
         total = self._health.recent_total_ms(now_ns)
         if self._latency_max_ms is not None and total is not None and total.p95 > self._latency_max_ms:
             found.append(Reason("slow", f"slow: p95 {total.p95:.0f} ms from exposure to the links"))
+        for link, limit_ms in self._age_max_ms.items():
+            if total is not None and total.p50 > limit_ms:
+                # Not one of two goes out: all else may look well, and a peer would wait in vain.
+                text = (
+                    f"poses too old to be sent: {total.p50:.0f} ms from the exposure, [{link}] max_age_ms {limit_ms:g}"
+                )
+                found.append(Reason(f"{link}_too_old", text))
         return tuple(found)
 
     def _last_words(self, sentence: str) -> None:
