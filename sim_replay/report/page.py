@@ -66,14 +66,15 @@ def health_of(recording: Recording) -> list[HealthSample]:
     """The daemon's diagnostics as it sent them, seconds since frame 0."""
     samples = []
     for record in recording.diagnostics:
-        state, _, reasons = str(record["message"]).partition("; ")
+        headline, _, reasons = str(record["message"]).partition("; ")
         stamp_ns = int(record["stamp_utc_ns"]) - recording.utc_minus_monotonic_ns - recording.start_at_ns
         values = record["values"]
         rate, dropped = values.get("frame_rate_hz"), values.get("dropped")
         samples.append(
             HealthSample(
                 stamp_ns * 1e-9,
-                state,
+                str(values.get("state", headline)),
+                headline,
                 reasons,
                 None if rate is None else float(rate),
                 None if dropped is None else int(dropped),
@@ -83,10 +84,9 @@ def health_of(recording: Recording) -> list[HealthSample]:
 
 
 def spoken(health: Sequence[HealthSample]) -> list[HealthSample]:
-    """Those of which state or reasons are not as they were a second before."""
-    changed = [
-        after for before, after in pairwise(health) if (after.state, after.reasons) != (before.state, before.reasons)
-    ]
+    """Those of which headline or reasons are not as they were a second before."""
+    told = [(sample.headline, sample.reasons) for sample in health]
+    changed = [sample for sample, (before, now) in zip(health[1:], pairwise(told), strict=True) if before != now]
     return [*health[:1], *changed]
 
 

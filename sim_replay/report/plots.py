@@ -61,6 +61,7 @@ class HealthSample:
 
     t_s: float
     state: str  # edge.health.HealthState's value
+    headline: str  # state, and what the daemon does all the same
     reasons: str
     frame_rate_hz: float | None
     dropped: int | None

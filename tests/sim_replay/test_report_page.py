@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 
+from edge.health import Activity, Condition, HealthState
 from sim_replay.cli import main
 from sim_replay.ground_truth import PlayedSequence, read_sequence
 from sim_replay.play import Recording
 from sim_replay.report import moments
 from sim_replay.report.flight_files import RecordedFlight, read_flight, write_flight
+from sim_replay.report.page import health_of
+from sim_replay.report.plots import STATE_COLORS
 from sim_replay.report.write import write_report
 from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
 
@@ -161,3 +164,18 @@ def test_a_flight_that_is_none_or_is_damaged_is_named(
     ):
         assert main(["score", *map(str, arguments)]) == 2
         assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("state", list(HealthState))
+@pytest.mark.parametrize("activity", list(Activity))
+def test_every_state_that_the_daemon_tells_has_its_colour_in_the_timeline(
+    flown: PlayedSequence, state: HealthState, activity: Activity
+) -> None:
+    made = recording(flown, set())
+    condition = Condition(state, activity)
+    message, values = f"{condition.headline}; no frame", {"state": state.value, "activity": activity.value}
+    record = {"event": "diagnostics", "stamp_utc_ns": START_NS + UTC_NS, "message": message, "values": values}
+    made.take("subscriber", record)
+    sample = health_of(made)[-1]
+    assert sample.state in STATE_COLORS
+    assert (sample.headline, sample.reasons) == (condition.headline, "no frame")

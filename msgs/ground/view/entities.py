@@ -22,12 +22,15 @@ from msgs.wire import Array
 OWN_RGB = (90, 200, 250)
 TARGET_RGB = ((255, 90, 180), (255, 190, 60), (140, 230, 90), (190, 140, 255))
 DOUBT_RGB = (150, 150, 160)
+NAMES_RGB = (245, 245, 250)  # the viewer writes on grey labels
 GRID_RGB = (70, 74, 82)
 AXES_RGB = ((240, 70, 70), (80, 220, 80), (90, 140, 255))  # nose, right, down
 RINGS_M = (100, 200, 300, 400, 500)
 SHIP_SIZE_M = (3.0, 3.0, 0.8)
 FRUSTUM_M = 40.0
 LABEL_BELOW_PX = 25.0
+RING_NAMES_TOWARDS = np.array([-0.707, 0.707])  # north, east; a target's name often stands ahead: not there
+VALUE_CHARS_MAX = 24  # hashes are told by their beginning
 _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 _HEALTH_LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR"}
 _MEDIA_TYPES = {"jpeg": "image/jpeg", "png": "image/png"}
@@ -59,8 +62,8 @@ def prepare(rec: rr.RecordingStream, uav: str) -> None:
     rings = rr.LineStrips2D([radius_m * circle for radius_m in RINGS_M], colors=[GRID_RGB])
     rec.log(f"{uav}/map/rings", rings, static=True)
     names = rr.Points2D(
-        [[0.0, -radius_m] for radius_m in RINGS_M], labels=[f"{radius_m} m" for radius_m in RINGS_M],
-        colors=[DOUBT_RGB], radii=[1.0],
+        [radius_m * _on_map(RING_NAMES_TOWARDS) for radius_m in RINGS_M],
+        labels=[f"{radius_m} m" for radius_m in RINGS_M], colors=[NAMES_RGB], radii=[1.0],
     )  # fmt: skip
     rec.log(f"{uav}/map/rings/names", names, static=True)
     for name, (label, color) in _LATENCIES.items():
@@ -240,8 +243,9 @@ def health_text(status: DiagnosticStatus) -> str:
         if key.startswith("latency_ms/") and key.count("/") == 2:
             _, stage, percentile = key.split("/")
             latencies.setdefault(stage, {})[percentile] = value
-    lines = [f"## {status.message.replace('|', '¦')}", "", "| | |", "|---|---|"]
-    lines += [f"| {key} | {value} |" for key, value in rest]
+    # No table: in a narrow panel a long value pushes all of its column out of sight.
+    lines = [f"## {status.message.replace('|', '¦')}", ""]
+    lines += [f"- {key}: **{value[:VALUE_CHARS_MAX]}**" for key, value in rest]
     if latencies:
         lines += ["", "| ms | p50 | p95 | p99 |", "|---|---|---|---|"]
         lines += [
