@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import socket
-from collections.abc import Iterator, Sequence
+import sys
+import termios
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
@@ -16,6 +20,7 @@ Address = tuple[Any, ...]  # as the socket family writes it; of a serial port it
 DATAGRAM_MAX = 65_536  # bytes
 CHUNK_MAX = 4096  # bytes of a stream at once
 PENDING_MAX = 32_768  # bytes a byte stream may fall behind by, before whole messages are left out
+WAITING_MAX_NS = 200_000_000  # and how long a message may wait
 
 
 class Received(NamedTuple):
@@ -86,24 +91,49 @@ def local_port(bound: socket.socket) -> int:
 
 
 class Outbox:
-    """Bytes of a stream that the medium has not taken yet. A message goes in whole or not at all."""
+    """Messages for a stream that the medium has not taken yet.
+
+    One goes in whole or not at all, and comes out soon or never: on a line that is too slow, or was cut for a while,
+    poses would pile up and arrive when they are true no more.
+    """
 
     def __init__(self) -> None:
-        self._pending = bytearray()
+        self.expired = 0  # messages left out because they had waited too long
+        self._waiting: deque[tuple[int, bytes]] = deque()  # put ns, message
+        self._pending_bytes = 0
+        self._begun = b""  # what is left of a message that is partly handed on: it must be ended
 
-    def put(self, data: bytes) -> bool:
-        if len(self._pending) + len(data) > PENDING_MAX:
+    def put(self, data: bytes, now_ns: int) -> bool:
+        self._forget(now_ns)
+        if self._pending_bytes + len(data) > PENDING_MAX:
             return False
-        self._pending += data
+        self._waiting.append((now_ns, data))
+        self._pending_bytes += len(data)
         return True
 
-    def flush(self, write: Any) -> None:
-        """Hand on what `write(bytes) -> count` takes. Raises its OSError but for "would block"."""
-        while self._pending:
+    def flush(self, write: Callable[[bytes], int], room_bytes: int, now_ns: int) -> None:
+        """Hand on what `write(bytes) -> count` takes, until `room_bytes` are passed. Raises its OSError but for "would
+        block"."""
+        self._forget(now_ns)
+        while room_bytes > 0 and (self._begun or self._waiting):
+            if not self._begun:
+                self._begun = self._waiting.popleft()[1]
+                self._pending_bytes -= len(self._begun)
             try:
-                count = write(bytes(self._pending[:4096]))
+                count = write(self._begun)
             except BlockingIOError:
                 return
-            del self._pending[:count]
+            self._begun = self._begun[count:]
+            room_bytes -= count
             if count == 0:
                 return
+
+    def _forget(self, now_ns: int) -> None:
+        while self._waiting and now_ns - self._waiting[0][0] > WAITING_MAX_NS:
+            self._pending_bytes -= len(self._waiting.popleft()[1])
+            self.expired += 1
+
+
+def unsent_bytes(fileno: int) -> int:
+    """What the kernel still holds of what was written to a tty, or of a TCP connection is not acknowledged."""
+    return int.from_bytes(fcntl.ioctl(fileno, termios.TIOCOUTQ, bytes(4)), sys.byteorder)

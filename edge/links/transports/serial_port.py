@@ -11,12 +11,17 @@ from collections.abc import Sequence
 
 import serial
 
+from edge import clock
 from edge.links.mavlink_endpoints import SerialEndpoint
 from edge.links.transports.backoff import Backoff
-from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received
+from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received, unsent_bytes
 from msgs.mavlink import FrameReader
 
 log = logging.getLogger(__name__)
+
+BITS_PER_BYTE = 10  # with start and stop
+QUEUES_PER_S = 10  # the kernel is given no more than goes out in a tenth of a second
+QUEUE_MIN = 280  # bytes: the longest message
 
 
 class SerialPort:
@@ -62,9 +67,12 @@ class SerialPort:
         return Received(data, (self._device,), self._reader)
 
     def send(self, data: bytes, peer: Address) -> bool:
-        fits = self._port is not None and self._outbox.put(data)
+        if self._port is None:
+            return False
+        expired = self._outbox.expired
+        fits = self._outbox.put(data, clock.monotonic_ns())
         self._flush()
-        return fits and self._port is not None
+        return fits and self._port is not None and self._outbox.expired == expired
 
     def reaches(self, peer: Address) -> bool:
         return self._port is not None
@@ -93,7 +101,8 @@ class SerialPort:
             return
         fileno = self._port.fileno()
         try:
-            self._outbox.flush(lambda data: os.write(fileno, data))
+            room_bytes = max(self._baud // BITS_PER_BYTE // QUEUES_PER_S, QUEUE_MIN) - unsent_bytes(fileno)
+            self._outbox.flush(lambda data: os.write(fileno, data), room_bytes, clock.monotonic_ns())
         except OSError as error:
             self._lost(error)
 

@@ -5,18 +5,31 @@ from __future__ import annotations
 import errno
 import logging
 import socket
+import struct
 import time
 from collections.abc import Sequence
 
+from edge import clock
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.transports.backoff import Backoff
-from edge.links.transports.medium import CHUNK_MAX, Address, Outbox, Received, local_port, opening, resolve
+from edge.links.transports.medium import (
+    CHUNK_MAX,
+    Address,
+    Outbox,
+    Received,
+    local_port,
+    opening,
+    resolve,
+    unsent_bytes,
+)
 from msgs.mavlink import FrameReader
 
 log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_NS = 5_000_000_000
 CALLERS_MAX = 8
+UNANSWERED_MAX_NS = 1_000_000_000
+UNANSWERED_MAX_BYTES = 4096  # about half a second of what is said of one target
 
 
 class Connection:
@@ -28,6 +41,8 @@ class Connection:
         self._socket = connected
         self._reader = FrameReader(datagram=False)
         self._outbox = Outbox()
+        self._written = self._acknowledged = 0  # bytes
+        self._answered_ns = clock.monotonic_ns()
         connected.setblocking(False)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -47,17 +62,37 @@ class Connection:
         return Received(data, self.address, self._reader)
 
     def send(self, data: bytes) -> bool:
-        fits = self.open and self._outbox.put(data)
+        if not self.open:
+            return False
+        expired = self._outbox.expired
+        fits = self._outbox.put(data, clock.monotonic_ns())
         self.flush()
-        return fits and self.open
+        return fits and self.open and self._outbox.expired == expired
 
     def flush(self) -> None:
         if not self.open:
             return
         try:
-            self._outbox.flush(self._socket.send)
+            now_ns, unanswered = clock.monotonic_ns(), unsent_bytes(self._socket.fileno())
+            if unanswered == 0 or self._written - unanswered > self._acknowledged:
+                self._acknowledged, self._answered_ns = self._written - unanswered, now_ns
+            elif now_ns - self._answered_ns > UNANSWERED_MAX_NS:
+                self._abort()
+                return
+            self._outbox.flush(self._write, UNANSWERED_MAX_BYTES - unanswered, now_ns)
         except OSError:
             self.close()
+
+    def _write(self, data: bytes) -> int:
+        count = self._socket.send(data)
+        self._written += count
+        return count
+
+    def _abort(self) -> None:
+        """Part with what the connection holds: it would come out when the link is whole again, however old."""
+        log.warning("mavlink: %s does not answer", self.address)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.close()
 
     def close(self) -> None:
         self.open = False

@@ -1,0 +1,119 @@
+"""Slow, cut and standing lines: what could not go out in time does not go out later."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.links.mavlink_endpoints import NetworkEndpoint
+from edge.links.transports.medium import PENDING_MAX, WAITING_MAX_NS, Outbox, Received
+from edge.links.transports.tcp import TcpServer
+from tests.waiting import until
+
+TICK_NS = 10_000_000
+
+
+class Line:
+    """Takes so many bytes a tick, and none while it is cut."""
+
+    def __init__(self, per_tick: int) -> None:
+        self.per_tick, self.room, self.out = per_tick, 0, bytearray()
+
+    def write(self, data: bytes) -> int:
+        if not self.room:
+            raise BlockingIOError
+        count = min(self.room, len(data))
+        self.out += data[:count]
+        self.room -= count
+        return count
+
+
+def message(number: int, length: int) -> bytes:
+    return number.to_bytes(4, "big") + length.to_bytes(2, "big") + bytes(length - 6)
+
+
+@given(
+    st.integers(1, 400),
+    st.lists(st.lists(st.integers(12, 280), max_size=4), min_size=1, max_size=120),
+    st.integers(0, 60),
+    st.integers(0, 60),
+)
+def test_what_comes_out_is_whole_in_order_and_not_old(
+    per_tick: int, puts: list[list[int]], cut_from: int, cut_for: int
+) -> None:
+    outbox, line, put_ns, refused, number = Outbox(), Line(per_tick), {}, 0, 0
+    begun_ns: dict[int, int] = {}
+    read = 0
+    for tick in range(len(puts) + 120):
+        now_ns = tick * TICK_NS
+        for length in puts[tick] if tick < len(puts) else []:
+            put_ns[number] = now_ns
+            refused += not outbox.put(message(number, length), now_ns)
+            number += 1
+        line.room = 0 if cut_from <= tick < cut_from + cut_for else line.per_tick
+        outbox.flush(line.write, 10**9, now_ns)
+        while len(line.out) - read >= 6:
+            known = int.from_bytes(line.out[read : read + 4], "big")
+            begun_ns.setdefault(known, now_ns)
+            length = int.from_bytes(line.out[read + 4 : read + 6], "big")
+            if len(line.out) - read < length:
+                break
+            read += length
+    numbers = list(begun_ns)
+    assert numbers == sorted(numbers)
+    # Six bytes of a message are its number, and may themselves take a few ticks, or wait for the end of a cut.
+    slack_ns = (6 // per_tick + 1 + cut_for) * TICK_NS
+    assert all(begun_ns[n] - put_ns[n] <= WAITING_MAX_NS + slack_ns for n in numbers)
+    after_cut = [n for n in numbers if put_ns[n] >= (cut_from + cut_for) * TICK_NS]
+    assert all(begun_ns[n] - put_ns[n] <= WAITING_MAX_NS + (6 // per_tick + 1) * TICK_NS for n in after_cut)
+    assert len(numbers) + outbox.expired + refused == number
+
+
+def test_after_a_cut_nothing_of_what_was_said_meanwhile_comes_out() -> None:
+    outbox, line = Outbox(), Line(10**6)
+    for tick in range(500):
+        outbox.put(message(tick, 60), tick * TICK_NS)
+        outbox.flush(line.write, 10**9, tick * TICK_NS)
+    line.room = line.per_tick
+    outbox.flush(line.write, 10**9, 499 * TICK_NS)
+    first = int.from_bytes(line.out[:4], "big")
+    # The first may have been begun before the line stood still; a message that is begun is ended.
+    second = int.from_bytes(line.out[60:64], "big")
+    assert first == 0
+    assert second >= 499 - WAITING_MAX_NS // TICK_NS
+    assert len(line.out) + 60 * outbox.expired == 500 * 60
+
+
+def test_no_more_is_handed_on_than_there_is_room_for() -> None:
+    outbox, line = Outbox(), Line(10**6)
+    line.room = line.per_tick
+    while outbox.put(message(0, 100), 0):
+        pass
+    outbox.flush(line.write, 450, 0)
+    assert len(line.out) == 500  # a message is not cut for it
+    outbox.flush(line.write, -5, 0)
+    assert len(line.out) == 500
+    outbox.flush(line.write, 10**9, 0)
+    assert len(line.out) == PENDING_MAX // 100 * 100
+
+
+def test_a_connection_whose_far_end_does_not_answer_is_parted_with_what_it_holds() -> None:
+    server = TcpServer(NetworkEndpoint("tcpin", "127.0.0.1", 0, "tcpin:127.0.0.1:0"))
+    with contextlib.closing(server), socket.socket() as caller:
+        caller.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)  # full soon: nothing more is acknowledged
+        caller.connect(("127.0.0.1", server.port))
+        caller.send(b"hello")
+        heard: list[Received] = []
+        until(lambda: heard, lambda: heard.extend(filter(None, [server.receive()])), what="the caller")
+        peer = heard[0].sender
+        assert server.send(bytes(100), peer)
+
+        def tell() -> None:
+            server.send(bytes(250), peer)
+            server.tick(time.monotonic_ns())
+
+        until(lambda: not server.reaches(peer), tell, what="the end of the connection")
