@@ -49,13 +49,12 @@ def best_pairs(cost: Array) -> list[tuple[int, int]]:
     Looks at every way, which is quick for the few targets that there are, after taking what nobody contests.
     """
     possible = np.isfinite(cost)
-    alone = [
-        (i, int(j))
-        for i in range(len(cost))
-        for j in np.flatnonzero(possible[i])
-        if possible[i].sum() == 1 and possible[:, j].sum() == 1
-    ]
-    rows = [i for i in range(len(cost)) if possible[i].any() and all(i != pair[0] for pair in alone)]
+    choices, rivals = possible.sum(axis=1), possible.sum(axis=0)
+    alone = [(int(i), int(j)) for i, j in np.argwhere(possible) if choices[i] == 1 and rivals[j] == 1]
+    settled = {i for i, _ in alone}
+    if len(settled) == np.count_nonzero(choices):
+        return alone
+    rows = [i for i in range(len(cost)) if choices[i] and i not in settled]
     _, _, rest = _best(cost, rows, frozenset())
     return sorted([*alone, *rest])
 

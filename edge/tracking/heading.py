@@ -8,6 +8,7 @@ what the network says, where the target flies, and that it flies upright and ban
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,7 +98,7 @@ def _log_along_nose(nose: Array, P: Array, flight: Flight) -> float:
 
 def _log_upright(R: Array, P: Array, flight: Flight) -> float:
     """Log density, but for a constant, of bank and pitch of R [3, 3] in ned axes."""
-    pitch, bank = -np.arcsin(np.clip(R[2, 0], -1.0, 1.0)), np.arctan2(R[2, 1], R[2, 2])
+    pitch, bank = -math.asin(min(max(R[2, 0], -1.0), 1.0)), math.atan2(R[2, 1], R[2, 2])
     rotation_variance = float(np.trace(P)) / 3.0
     if flight.turn_rate_radps is None:
         climb, turned = 0.0, 0.0
@@ -105,12 +106,12 @@ def _log_upright(R: Array, P: Array, flight: Flight) -> float:
     else:
         known = float(flight.v_mps @ flight.v_mps)
         # A velocity not yet known is no slow flight.
-        speed = float(np.clip(np.sqrt(known + np.trace(flight.P_v) / 3.0), SPEED_MIN_MPS, SPEED_MAX_MPS))
+        speed = min(max(math.sqrt(known + np.trace(flight.P_v) / 3.0), SPEED_MIN_MPS), SPEED_MAX_MPS)
         climb_variance = float(flight.P_v[2, 2]) / speed**2
         believed = PITCH_STD_RAD**2 / (PITCH_STD_RAD**2 + climb_variance)
-        climb = -believed * float(np.clip(flight.v_mps[2] / speed, -0.5, 0.5))
+        climb = -believed * min(max(float(flight.v_mps[2]) / speed, -0.5), 0.5)
         per_rate = speed / GRAVITY_MPS2
-        turned = float(np.arctan(per_rate * flight.turn_rate_radps))
+        turned = math.atan(per_rate * flight.turn_rate_radps)
         slope = per_rate / (1.0 + (per_rate * flight.turn_rate_radps) ** 2)
         pitch_variance = PITCH_STD_RAD**2 + believed * climb_variance
         bank_variance = BANK_STD_RAD**2 + slope**2 * flight.turn_rate_variance
@@ -120,8 +121,8 @@ def _log_upright(R: Array, P: Array, flight: Flight) -> float:
 
 
 def _log_tailed(d2: float, dimensions: float) -> float:
-    return -0.5 * (TAIL_DOF + dimensions) * float(np.log1p(d2 / TAIL_DOF))
+    return -0.5 * (TAIL_DOF + dimensions) * math.log1p(d2 / TAIL_DOF)
 
 
 def _limited(log_odds: float) -> float:
-    return float(np.clip(log_odds, -LOG_ODDS_MAX, LOG_ODDS_MAX))
+    return min(max(log_odds, -LOG_ODDS_MAX), LOG_ODDS_MAX)
