@@ -10,9 +10,9 @@ from pathlib import Path
 from msgs.contract import ModelContract
 from trainer.config import ConfigError
 
-# A sight of a target begins where the whole frame shows one more likely than not and a window does not gainsay it; a
-# target in hand is let go sooner than it is replaced by a wrong one.
-ACQUIRE_PROBABILITY_MIN, TRACK_PROBABILITY_MIN = 0.5, 0.3
+# A target that is none costs more than one met a few frames later, so much must speak for a new one; one in hand is let
+# go only when little does.
+ACQUIRE_PROBABILITY_MIN, TRACK_PROBABILITY_MIN = 0.7, 0.3
 THRESHOLD_METRICS = ("recall", "false_alarms")  # of windows at the thresholds that were
 
 

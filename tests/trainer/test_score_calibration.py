@@ -127,7 +127,7 @@ def test_a_calibrated_file_tells_targets_from_what_fooled_it(
     assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 0
     assert capsys.readouterr().out.startswith("acquire")
     after = read_contract(model)
-    assert (after.acquire_score_min, after.track_score_min) == (0.5, 0.3)
+    assert (after.acquire_score_min, after.track_score_min) == (0.7, 0.3)
     assert after.training["score_frames"] == 48
     same = before.model_dump(exclude={"acquire_score", "track_score", "acquire_score_min", "track_score_min"})
     assert {**after.model_dump(exclude=set(before.model_dump()) - set(same)), "training": {}, "metrics": {}} == same
