@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,9 @@ def run(args: argparse.Namespace) -> int:
     if args.take < 1:
         raise InputError(f"--take {args.take}: must be at least 1")
     given = args.sequence or ([] if args.dataset else [BUNDLED_SEQUENCE])
-    taken = [folder for dataset in args.dataset for folder in flyable(dataset, args.take)]
-    sequences = [read_sequence(folder) for folder in (*given, *taken)]
+    named = [(folder, folder.name) for folder in given]
+    named += [(f, f"{dataset.name}/{f.name}") for dataset in args.dataset for f in flyable(dataset, args.take)]
+    sequences = [(read_sequence(folder), name) for folder, name in named]
     args.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=args.json)
     if not console.is_terminal:
@@ -90,22 +91,23 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _cells(
-    sequences: Sequence[PlayedSequence],
+    sequences: Sequence[tuple[PlayedSequence, str]],
     speeds: Sequence[float],
     faults: Sequence[str],
     timelines: dict[str, Timeline],
     model: Model,
     out: Path,
 ) -> Iterator[Cell]:
-    """Each combination, in a folder of its own."""
-    for number, sequence in enumerate(sequences):
+    """Each combination of the sequences with their names, in a folder of its own."""
+    for number, (sequence, name) in enumerate(sequences):
         for speed in speeds:
             for fault in faults:
                 folder = out / f"{number}-{sequence.scene.name}-x{speed:g}-{Path(fault).stem}"
                 if fault == NO_FAULT:
-                    yield fly_cell(sequence, speed, model, folder)
+                    cell = fly_cell(sequence, speed, model, folder)
                 else:
-                    yield break_cell(sequence, speed, fault, timelines[fault], model.path, folder)
+                    cell = break_cell(sequence, speed, fault, timelines[fault], model.path, folder)
+                yield replace(cell, sequence=name)
 
 
 def table(cells: Sequence[Cell]) -> Table:
