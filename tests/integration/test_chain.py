@@ -85,16 +85,19 @@ def send_junk_in_flight(out: Path, process: subprocess.Popen[str]) -> None:
     while True:
         config, session = meet(out, process)
         with session:
-            if reaches_frame_0(config, out, process):
+            if plays(session, config, out, process):
                 send_junk(session, int(config["mavlink"]["endpoints"][0].rpartition(":")[2]))
                 return
 
 
-def reaches_frame_0(config: dict[str, Any], out: Path, process: subprocess.Popen[str]) -> bool:
-    """Whether the daemon of this configuration comes so far, or the demo begins again."""
-    start_at_ns = config["camera"]["start_at_ns"]
-    until(lambda: time.monotonic_ns() >= start_at_ns or written_config(out, process) != config, what="frame 0")
-    return written_config(out, process) == config
+def plays(session: zenoh.Session, config: dict[str, Any], out: Path, process: subprocess.Popen[str]) -> bool:
+    """Whether the daemon of this configuration tells of frames, or the demo begins again since it was late."""
+    frames: list[str] = []
+    take = zenoh.handlers.Callback(lambda sample: frames.append(str(sample.key_expr)), indirect=False)
+    subscriber = session.declare_subscriber(topics.subscription_key(topics.DETECTIONS, "uav1"), take)
+    until(lambda: frames or written_config(out, process) != config, what="a frame")
+    subscriber.undeclare()
+    return bool(frames)
 
 
 def send_junk(session: zenoh.Session, mavlink_port: int) -> None:
