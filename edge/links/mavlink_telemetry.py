@@ -69,11 +69,12 @@ class Telemetry:
         if message_id == ATTITUDE_QUATERNION:
             self._quaternion_ns = now_ns
             q_wxyz = (message.q1, message.q2, message.q3, message.q4)
-            rising = self._own_ship.add_attitude(time_ns, q_wxyz, _rates(message))
+            rising = self._own_ship.add_attitude(time_ns, q_wxyz, _rates(message), self._boot_clock.std_s)
         elif message_id == ATTITUDE:
             if self._quaternion_ns is None or now_ns - self._quaternion_ns > FALLBACK_NS:
                 R_ned_body = R_from_euler(message.roll, message.pitch, message.yaw)
-                rising = self._own_ship.add_attitude(time_ns, q_wxyz_from_R(R_ned_body), _rates(message))
+                q_euler_wxyz = q_wxyz_from_R(R_ned_body)
+                rising = self._own_ship.add_attitude(time_ns, q_euler_wxyz, _rates(message), self._boot_clock.std_s)
         elif message_id == LOCAL_POSITION_NED:
             t_ned_m, v_ned_mps = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
             rising = self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)

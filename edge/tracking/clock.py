@@ -16,12 +16,16 @@ JUMP_NS = 100_000_000
 JUMP_AGREEING = 3  # samples in a row that must say so
 STAMP_FUTURE_MAX_NS = 20_000_000
 STAMP_AGE_MAX_NS = 1_000_000_000
+DRIFT = 50e-6  # of two crystals against each other: by it an offset grows old
+UNSYNCED_STD_S = 0.02  # the least delay of a link that was not measured, taken for zero
+BOUND_TO_STD = 3.0**-0.5  # of an error that is anywhere within its bound
 
 
 @dataclass(frozen=True)
 class Sample:
     offset_ns: int  # autopilot minus monotonic
     round_trip_ns: int
+    time_ns: int  # of the reply
 
 
 class TimesyncEstimator:
@@ -43,6 +47,13 @@ class TimesyncEstimator:
         """Bound of the offset's error: half the best round trip."""
         return self._best().round_trip_ns // 2 if self._samples else None
 
+    def std_s(self, now_ns: int) -> float | None:
+        """Of the offset now: within that bound when it was measured, and it has drifted since."""
+        if not self._samples:
+            return None
+        best = self._best()
+        return (BOUND_TO_STD * best.round_trip_ns / 2 + DRIFT * max(now_ns - best.time_ns, 0)) * 1e-9
+
     def request(self, now_ns: int) -> int:
         """The ts1 to ask with; its reply will be known by it."""
         self._asked.append(now_ns)
@@ -56,7 +67,7 @@ class TimesyncEstimator:
         round_trip_ns = now_ns - ts1_ns
         if not 0 <= round_trip_ns <= ROUND_TRIP_MAX_NS:
             return False
-        sample = Sample(tc1_ns - (ts1_ns + now_ns) // 2, round_trip_ns)
+        sample = Sample(tc1_ns - (ts1_ns + now_ns) // 2, round_trip_ns, now_ns)
         offset_ns = self.offset_ns
         if offset_ns is not None and abs(sample.offset_ns - offset_ns) > JUMP_NS:
             return self._suspect(sample)
@@ -95,6 +106,7 @@ class BootClock:
     def __init__(self, timesync: TimesyncEstimator) -> None:
         self._timesync = timesync
         self._delays: deque[int] = deque(maxlen=256)
+        self.std_s = UNSYNCED_STD_S  # of the last stamp that was turned into monotonic time
 
     def monotonic_ns(self, boot_ns: int, arrival_ns: int) -> int:
         """Monotonic time of a stamp; never later than its arrival."""
@@ -104,7 +116,9 @@ class BootClock:
             synced = boot_ns - offset_ns
             # Some peers answer TIMESYNC from another clock than the one in their stamps.
             if -STAMP_FUTURE_MAX_NS <= arrival_ns - synced <= STAMP_AGE_MAX_NS:
+                self.std_s = self._timesync.std_s(arrival_ns) or 0.0
                 return min(synced, arrival_ns)
+        self.std_s = UNSYNCED_STD_S
         return min(boot_ns + min(self._delays), arrival_ns)
 
     def clear(self) -> None:

@@ -28,6 +28,7 @@ class _Attitude:
     time_ns: int
     R_ned_body: Array
     rates_body_radps: Array
+    clock_std_s: float
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,12 @@ class OwnShipBuffer:
         self._positions: deque[_Position] = deque(maxlen=KEPT)
         self._global: _Global | None = None
 
-    def add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike) -> bool:
-        """Attitude [4] and body rates [3] (FRD). Raises ValueError on a zero quaternion."""
-        sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), np.array(rates_body_radps, dtype=np.float64))
+    def add_attitude(
+        self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike, clock_std_s: float = 0.0
+    ) -> bool:
+        """Attitude [4] and body rates [3] (FRD), at a time known to `clock_std_s`. Raises ValueError on a zero q."""
+        rates_radps = np.array(rates_body_radps, dtype=np.float64)
+        sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps, clock_std_s)
         with self._lock:
             return _append(self._attitudes, sample)
 
@@ -124,7 +128,8 @@ class OwnShipBuffer:
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
             origin = self._origin(time_ns, t_ned_m is not None)
-            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal)
+            clock_std_s = self._attitudes[-1].clock_std_s
+            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, clock_std_s)
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
         """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""

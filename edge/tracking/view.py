@@ -18,7 +18,7 @@ FrameKind = Literal["ned", "ned_relative", "cam"]
 NS_PER_S = 1e9
 
 ATTITUDE_JITTER_RAD = 1e-3  # from frame to frame: vibration of the mount, rounding
-CLOCK_STD_S = 0.005  # exposure against attitude: times the turning, an error of attitude
+EXPOSURE_STD_S = 0.005  # of the camera's stamps; times the turning, an error of attitude
 RATE_GAP_MAX_S = 0.5  # frames further apart do not tell how fast the camera turns
 
 # Slow errors, common to all frames: they move a track in ned, but nothing in `cam`.
@@ -39,6 +39,7 @@ class View:
     v_frame_cam_mps: Array | None  # [3]; zero in the frames that move with the own ship, None: not known
     nose_frame: Array | None = None  # [3], the own ship's; None in `cam`
     turning_radps: float = 0.0  # how fast the camera turns
+    clock_std_s: float = EXPOSURE_STD_S  # of exposure against attitude and position
 
     @classmethod
     def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount, before: View | None = None) -> View:
@@ -49,20 +50,21 @@ class View:
         R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
         lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
         nose, turning = own_ship.R_ned_body[:, 0], _turning_radps(before, time_ns, R_ned_cam)
+        clock_std_s = float(np.hypot(EXPOSURE_STD_S, own_ship.clock_std_s))
         if own_ship.t_ned_body_m is None:
-            return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning)
+            return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning, clock_std_s)
         t_m = own_ship.t_ned_body_m + lever_ned_m
         v_mps = own_ship.v_ned_body_mps
         if v_mps is None and before is not None and before.kind == "ned":
             v_mps = _moved_mps(before, time_ns, t_m)
-        return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning)
+        return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning, clock_std_s)
 
     @property
     def attitude_variance(self) -> float:
         """Of the attitude from frame to frame, rad^2 about each axis; in `cam` it is not used."""
         if self.kind == "cam":
             return 0.0
-        return ATTITUDE_JITTER_RAD**2 + (CLOCK_STD_S * self.turning_radps) ** 2
+        return ATTITUDE_JITTER_RAD**2 + (self.clock_std_s * self.turning_radps) ** 2
 
     def moved_to(self, time_ns: int) -> View:
         """The same camera later, at constant velocity and attitude."""
@@ -82,7 +84,7 @@ class View:
         attitude = np.array([TILT_STD_RAD, TILT_STD_RAD, HEADING_STD_RAD]) ** 2 + self.attitude_variance
         covariance = (by_attitude * attitude) @ by_attitude.T
         if self.kind == "ned":
-            covariance[:3, :3] += POSITION_STD_M**2 * so3.IDENTITY + CLOCK_STD_S**2 * np.outer(velocity, velocity)
+            covariance[:3, :3] += POSITION_STD_M**2 * so3.IDENTITY + self.clock_std_s**2 * np.outer(velocity, velocity)
             covariance[3:6, 3:6] += VELOCITY_STD_MPS**2 * so3.IDENTITY
         return covariance
 

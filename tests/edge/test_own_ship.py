@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, TimesyncEstimator
 from edge.tracking.geodesy import lat_lon_alt_from_ned, ned_from_lat_lon_alt
 from edge.tracking.own_ship import OwnShipBuffer
+from edge.tracking.view import View
+from edge.types import Mount
 from msgs.geometry import rotation_angle
 
 MS = 1_000_000
@@ -223,6 +225,38 @@ def test_stamps_become_monotonic_time_by_timesync() -> None:
     exchange(sync, 10_000 * MS, offset_ns, MS, MS)
     sampled_ns = 12_000 * MS
     assert clock.monotonic_ns(sampled_ns + offset_ns, sampled_ns + 15 * MS) == sampled_ns
+
+
+def test_a_clock_is_known_less_the_longer_it_was_not_asked_and_least_when_never() -> None:
+    sync = TimesyncEstimator()
+    clock = BootClock(sync)
+    clock.monotonic_ns(0, 5_000 * MS)
+    unsynced_s = clock.std_s
+    exchange(sync, 6_000 * MS, -7_000 * MS, MS, 3 * MS)
+    told_s = []
+    for sampled_ms in (6_010, 36_010):
+        clock.monotonic_ns((sampled_ms - 7_000) * MS, (sampled_ms + 2) * MS)
+        told_s.append(clock.std_s)
+    assert told_s[0] == pytest.approx(0.002 / np.sqrt(3), rel=0.01)  # the reply is anywhere within 2 ms
+    assert told_s[1] - told_s[0] == pytest.approx(30 * 50e-6)  # 50 parts in a million for half a minute
+    assert unsynced_s > told_s[1]
+
+
+def test_a_camera_that_turns_by_a_clock_hardly_known_has_an_attitude_hardly_known() -> None:
+    def variance(clock_std_s: float, turn_rad: float) -> float:
+        buffer = OwnShipBuffer()
+        views: list[View] = []
+        for k in range(2):
+            q = q_wxyz(Rotation.from_euler("z", k * turn_rad))
+            buffer.add_attitude(k * 100 * MS, q, np.zeros(3), clock_std_s)
+            own_ship = buffer.at(k * 100 * MS)
+            views.append(View.of(k * 100 * MS, own_ship, Mount(np.eye(3), np.zeros(3)), views[-1] if views else None))
+        return views[-1].attitude_variance
+
+    assert variance(0.02, 0.0) == variance(0.0, 0.0)
+    turning_radps = 1.0
+    more = variance(0.02, 0.1) - variance(0.0, 0.1)
+    assert more == pytest.approx((0.02 * turning_radps) ** 2)
 
 
 def test_stamps_from_another_clock_than_timesyncs_fall_back_to_the_quickest_arrival() -> None:
