@@ -31,6 +31,7 @@ class Flown:
     track_m: list[float] = field(default_factory=list)
     track_rad: list[float] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)  # of the track's position, 3 degrees of freedom
+    told_rel: list[float] = field(default_factory=list)  # its told standard deviation by its range
 
 
 class Listening(Tracker):
@@ -85,6 +86,9 @@ def flown() -> list[Flown]:
                 one.frame_m.append(float(np.linalg.norm(frame.t_cam_target_m - target.t_cam_target_m)))
                 one.frame_rad.append(angle_rad(frame.R_cam_target, target.R_cam_target))
                 one.nees.append(float(error_m @ np.linalg.solve(track.covariance[:3, :3], error_m)))
+                one.told_rel.append(
+                    float(np.sqrt(np.trace(track.covariance[:3, :3])) / np.linalg.norm(track.t_cam_target_m))
+                )
     patch.undo()
     assert len(targets) == 4
     assert min(len(one.nees) for one in targets.values()) >= 15
@@ -92,18 +96,20 @@ def flown() -> list[Flown]:
 
 
 def test_tracks_are_nearer_to_the_truth_than_the_frames_they_are_made_of(flown: list[Flown]) -> None:
-    """In the mean over all frames, and over those of the one long flight."""
+    """By their root mean square over all frames, and over those of the one long flight."""
     longest = max(flown, key=lambda one: len(one.nees))
     for some in (flown, [longest]):
         for track, frame in (("track_m", "frame_m"), ("track_rad", "frame_rad")):
             of_tracks, of_frames = (np.concatenate([getattr(one, name) for one in some]) for name in (track, frame))
-            assert np.mean(of_tracks) < np.mean(of_frames)
+            assert np.mean(of_tracks**2) < np.mean(of_frames**2)
 
 
 def test_position_errors_lie_inside_their_95_percent_bounds(flown: list[Flown]) -> None:
     """Frames of a flight share most of their error, so each flight counts as one draw of chi-square."""
-    low, high = chi2.ppf([0.025, 0.975], 3)
-    of_flights = [float(np.mean(one.nees)) for one in flown]
-    assert max(of_flights) < high
-    assert np.mean(of_flights) > low  # wider than that would be no covariance
+    assert max(float(np.mean(one.nees)) for one in flown) < chi2.ppf(0.975, 3)
     assert np.mean(np.concatenate([one.nees for one in flown]) < chi2.ppf(0.95, 3)) >= 0.95
+
+
+def test_a_position_is_not_told_wider_than_it_is_of_use(flown: list[Flown]) -> None:
+    """One aircraft in five that the network learnt from was a stranger: it allows for one, whose size is not known."""
+    assert np.median(np.concatenate([one.told_rel for one in flown])) < 0.25
