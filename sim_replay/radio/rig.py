@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from msgs.ground.keys import init_authority, issue
 from msgs.ground.router import AccessSettings, RouterSettings, TlsSettings, open_router
 from msgs.session import TlsFiles
 from sim_replay.faults.processes import Process
@@ -43,6 +42,8 @@ class Ground:
 @contextmanager
 def ground(folder: Path, transport: Transport, uavs: Sequence[str]) -> Iterator[Ground]:
     """A router with a certificate of its own and one for each vehicle; tools on this machine read without."""
+    from msgs.ground.keys import init_authority, issue  # of the extra `ground`, which the other commands do without
+
     init_authority(folder)
     router, *vehicles = (issue(folder, name, [LOOPBACK]) for name in ("ground", *uavs))
     port = free_port(SOCKET_KINDS[transport])
