@@ -85,12 +85,10 @@ def test_a_slow_reader_gets_the_newest_poses(network: Network) -> None:
         came: list[int] = []
         every = zenoh.handlers.Callback(lambda s: came.append(sequence_of(s)), indirect=False)
         tool.declare_subscriber(publisher.key, every)
-        for _ in range(50):
-            publisher.put(pose_now().encode())
+        until(lambda: len(came) >= 10, lambda: publisher.put(pose_now().encode()))
         # The marker takes the same way at the same priority, so it comes after the poses.
         until(arrived.is_set, lambda: network.daemon.put("0/last", b"", priority=zenoh.Priority.REAL_TIME))
         numbers = [pose.sequence for pose in iter(poses.poll, None)]
-    assert len(came) > 2
     assert numbers == came[-2:]
 
 
