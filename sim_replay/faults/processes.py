@@ -43,6 +43,13 @@ class Process:
         """None while it runs; minus the signal's number if one ended it."""
         return self._popen.poll()
 
+    def wait(self, within_s: float) -> int | None:
+        """Its exit code, as soon as there is one; None if it still runs after `within_s`."""
+        try:
+            return self._popen.wait(within_s)
+        except subprocess.TimeoutExpired:
+            return None
+
     def tell(self, line: str) -> None:
         """A line for its standard input."""
         assert self._popen.stdin is not None
@@ -57,11 +64,8 @@ class Process:
         if self._popen.poll() is None:
             self._popen.send_signal(number)
             self._popen.send_signal(signal.SIGCONT)
-        try:
-            self._popen.wait(_END_S)
-        except subprocess.TimeoutExpired:
+        if self.wait(_END_S) is None:
             self._popen.kill()
-            self._popen.wait()
         return self.reap()
 
     def reap(self) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import socket
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -110,10 +109,7 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
 
 def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputError | PlayError:
     """What the player met, with the daemon's last words if it has ended."""
-    deadline_s = time.monotonic() + ENDING_S
-    while daemon.exit_code is None and time.monotonic() < deadline_s:
-        time.sleep(0.05)
-    if daemon.exit_code is None:
+    if daemon.wait(ENDING_S) is None:
         return error
     code = daemon.reap()
     last = said[-1] if said else "it said nothing"

@@ -29,8 +29,6 @@ from tests.waiting import until
 from .reports import make_report, make_track
 from .test_zenoh_link import MOUNT, free_endpoint
 
-REPORT_PERIOD_S = 0.02
-
 
 @dataclass
 class Commanded:
@@ -110,17 +108,13 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
         began, before = time.monotonic(), one.link.counters().get("sent_pose", 0)
         reports = one.link.counters().get("sent_detections", 0) + 40
 
-        def turn() -> None:
-            put(one)
-            time.sleep(REPORT_PERIOD_S)
-
-        until(lambda: one.link.counters().get("sent_detections", 0) >= reports, turn, what="40 reports")
+        until(lambda: one.link.counters().get("sent_detections", 0) >= reports, lambda: put(one), what="40 reports")
         sent = one.link.counters()["sent_pose"] - before
         assert 1 <= sent <= 4 * (time.monotonic() - began) + 2
         assert answered(one, "rate", {"max_hz": None})["ok"]
         before = one.link.counters()["sent_pose"]
-        until(lambda: one.link.counters()["sent_pose"] >= before + 20, turn, what="all poses")
-        until(lambda: one.recorder.counters()["recorded"] > 4 * 40, turn, what="the recording")
+        until(lambda: one.link.counters()["sent_pose"] >= before + 20, lambda: put(one), what="all poses")
+        until(lambda: one.recorder.counters()["recorded"] > 4 * 40, lambda: put(one), what="the recording")
 
 
 @pytest.mark.parametrize(

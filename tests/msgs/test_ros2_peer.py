@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from msgs import topics
 from msgs.publish import Node
+from tests.waiting import until
 
 from .conftest import Network, pose_now
 from .ros2_peer import POSE_TYPE
 
 SECONDS = 60.0
-POSE_PERIOD_S = 0.05
 # As docs/ground.md says: between two peers a router of ours carries nothing.
 CLIENT = {**os.environ, "ZENOH_CONFIG_OVERRIDE": 'mode="client"'}
 NEEDED = (
@@ -52,9 +51,12 @@ def test_an_independent_peer_lists_the_node_and_its_topics_and_receives_poses(ne
         peer = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=root, env=CLIENT
         )
-        while peer.poll() is None:
-            poses.put(pose_now(321.0).encode())
-            time.sleep(POSE_PERIOD_S)
+        until(
+            lambda: peer.poll() is not None,
+            lambda: poses.put(pose_now(321.0).encode()),
+            what="the peer's end",
+            within_s=2 * SECONDS,
+        )
         said, complaints = peer.communicate()
     assert peer.returncode == 0, said + complaints
     found = json.loads(said)

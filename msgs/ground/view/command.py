@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -31,6 +31,7 @@ DRAWN = (*TAKEN, topics.CAMERA_INFO, topics.IMAGE)
 TICK_S = 0.2
 _LOOPBACK = "127.0.0.1"
 _START_S = 60.0
+_LOOK_EVERY_S = 0.05
 _SERVER_MEMORY = "1GiB"  # older data goes first when a browser joins a long flight
 
 
@@ -112,13 +113,21 @@ def _server(web_port: int) -> Iterator[str]:
     try:
         deadline_s = time.monotonic() + _START_S
         while not all(_answers(port) for port in ports):
-            if server.poll() is not None or time.monotonic() > deadline_s:
+            if _ended(server, _LOOK_EVERY_S) or time.monotonic() > deadline_s:
                 raise InputError(f"--web {web_port}: Rerun's server does not start there")
-            time.sleep(0.05)
         yield f"rerun+http://{_LOOPBACK}:{ports[1]}/proxy"
     finally:
-        os.killpg(server.pid, signal.SIGTERM)
+        with suppress(ProcessLookupError):  # both have ended by themselves
+            os.killpg(server.pid, signal.SIGTERM)
         server.wait()
+
+
+def _ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
+    try:
+        process.wait(within_s)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
 
 
 def _answers(port: int) -> bool:

@@ -27,7 +27,6 @@ from ..conftest import Network, free_endpoint
 from .flight import PERIOD_NS, START_NS, UAV, K, attitude, frame, places_m, record, samples, stamps_ns, target_attitude
 
 FRAMES = 30
-PUT_PERIOD_S = 0.02
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +127,6 @@ def test_what_is_told_live_is_drawn_until_told_to_stop(network: Network, tmp_pat
             now_ns = time.time_ns()
             for topic, _, payload, _ in frame(now_ns, now_ns):
                 publishers[topic.name].put(payload)
-            time.sleep(PUT_PERIOD_S)
 
         until(lambda: path.exists() and publishers[topics.POSE.name].sequence >= 100, put)
     viewer.terminate()

@@ -6,6 +6,8 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -14,6 +16,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 
+from msgs.ground.errors import InputError
+from msgs.ground.view.command import _server
 from msgs.ground.view.entities import TARGET_RGB
 from tests.waiting import until
 
@@ -42,46 +46,57 @@ def two_free_ports() -> int:
             return port
 
 
-def test_the_page_is_served_until_told_to_stop_and_nothing_stays_behind(tmp_path: Path) -> None:
-    record(tmp_path / "flight.mcap", 5)
+@contextmanager
+def served(flight: Path) -> Iterator[tuple[int, str, subprocess.Popen[str]]]:
+    """The view of a recording on a port of its own: port, address and process, which is ended."""
     port = two_free_ports()
-    command = [sys.executable, "-m", "msgs.ground.cli", "view", str(tmp_path / "flight.mcap"), "--web", str(port)]
+    command = [sys.executable, "-m", "msgs.ground.cli", "view", str(flight), "--web", str(port)]
     server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert server.stderr is not None
-    assert server.stderr.readline().startswith(f"open http://127.0.0.1:{port}/")
-    with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
-        assert b"rerun" in page.read().lower()
-    server.terminate()
-    assert "5 poses drawn" in server.communicate(timeout=60)[1]
+    try:
+        yield port, server.stderr.readline().strip().removeprefix("open "), server
+    finally:
+        server.terminate()
+        server.communicate(timeout=60)
+
+
+def test_the_page_is_served_until_told_to_stop_and_nothing_stays_behind(tmp_path: Path) -> None:
+    record(tmp_path / "flight.mcap", 5)
+    with served(tmp_path / "flight.mcap") as (port, address, server):
+        assert address.startswith(f"http://127.0.0.1:{port}/")
+        with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
+            assert b"rerun" in page.read().lower()
+        server.terminate()
+        assert server.stderr is not None
+        assert "5 poses drawn" in server.stderr.read()
     assert server.returncode == 0
     assert not answers(port)
     assert not answers(port + 1)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+def test_a_server_that_ends_at_once_is_told_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    unwilling = shutil.which("false")
+    assert unwilling is not None
+    monkeypatch.setattr(sys, "executable", unwilling)
+    with pytest.raises(InputError, match="Rerun's server does not start there"), _server(two_free_ports()):
+        pass
+
+
 @pytest.mark.timeout(500)
 def test_a_recorded_flight_is_drawn_in_a_browser(tmp_path: Path) -> None:
+    assert BROWSER is not None, "no chromium: sh deploy/bootstrap.sh dev installs it"
     record(tmp_path / "flight.mcap", 100)
-    port = two_free_ports()
-    command = [sys.executable, "-m", "msgs.ground.cli", "view", str(tmp_path / "flight.mcap"), "--web", str(port)]
-    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    assert server.stderr is not None
-    address = server.stderr.readline().strip().removeprefix("open ")
     shot = tmp_path / "view.png"
-    try:
-        with sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=BROWSER, args=SOFTWARE)
-            page = browser.new_page(viewport={"width": 1280, "height": 800})
-            page.goto(f"{address}&renderer=webgl", timeout=WITHIN_S * 1e3)
+    with served(tmp_path / "flight.mcap") as (_, address, server), sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=BROWSER, args=SOFTWARE)
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(f"{address}&renderer=webgl", timeout=WITHIN_S * 1e3)
 
-            def look() -> None:
-                page.screenshot(path=shot, timeout=WITHIN_S * 1e3)
+        def look() -> None:
+            page.screenshot(path=shot, timeout=WITHIN_S * 1e3)
 
-            until(lambda: drawn_parts(shot) >= 3, look, what="the target in three views", within_s=WITHIN_S)
-            browser.close()
-    finally:
-        server.terminate()
-        server.communicate(timeout=60)
+        until(lambda: drawn_parts(shot) >= 3, look, what="the target in three views", within_s=WITHIN_S)
+        browser.close()
     assert server.returncode == 0
 
 

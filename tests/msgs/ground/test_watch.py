@@ -29,7 +29,6 @@ from tests.waiting import until
 from ..conftest import Network, free_endpoint
 from .conftest import write_router_config
 
-FRAME_PERIOD_S = 0.01
 R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
 R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 R_NED_TARGET = Rotation.from_euler("ZYX", [200.0, 12.0, 33.0], degrees=True)
@@ -66,7 +65,6 @@ class Vehicle:
         self.put(topics.DETECTIONS, cdr.Detection3DArray(stamp_ns, "camera_optical_frame", (one,)))
         pose = cdr.PoseWithCovarianceStamped(stamp_ns, "camera_optical_frame", t, R.as_quat(), covariance)
         self.put(topics.POSE, pose, "t0")
-        time.sleep(FRAME_PERIOD_S)
 
     def tell_health(self) -> None:
         status = cdr.DiagnosticStatus(1, "uavpose_edge", "degraded; no own attitude", "uav", (("dropped", "3"),))
