@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -12,6 +13,22 @@ from trainer import evaluate_command, results, score_command
 from trainer.config import ConfigError, RenderingError, load_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
+
+
+def positive(text: str) -> float:
+    """A finite number above zero, for argparse."""
+    number = float(text)
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(text)
+    return number
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on, for argparse."""
+    number = int(text)
+    if number < 1:
+        raise ValueError(text)
+    return number
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -30,7 +47,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from trainer.export import export_models, export_unmeasured
+    from trainer.export import Tolerance, export_models, export_unmeasured
 
     contract = load_config(arguments.config).contract if arguments.config else None
     if arguments.untrained is not None or arguments.unmeasured:
@@ -43,7 +60,7 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.out,
         float_out=arguments.float_out,
         contract=contract,
-        tolerance_deg=arguments.tolerance,
+        tolerance=Tolerance(arguments.tolerance, arguments.tolerance_depth, arguments.tolerance_pose),
         samples=arguments.samples,
         say=lambda text: print(text, flush=True),
     )
@@ -68,12 +85,17 @@ def _parser() -> argparse.ArgumentParser:
         help="train a network on rendered windows",
         description="Train a network on rendered windows. Stops with a checkpoint when the planned samples are done, "
         "the budget is used up, or on SIGTERM or Ctrl-C; --resume goes on at the next step. The run folder holds "
-        "weights.pt, resume.pt, config.toml, run.json, log.jsonl and TensorBoard scalars.",
+        "weights.pt, resume.pt, config.toml, run.json (how each start was asked for), log.jsonl and TensorBoard "
+        "scalars and pictures.",
     )
     train.add_argument("--config", type=Path, required=True, help="TOML, such as trainer/configs/edge.toml")
     train.add_argument("--out", type=Path, required=True, help="run folder")
-    train.add_argument("--budget-minutes", type=float, help="wall-clock limit of this start; fits the schedule into it")
-    train.add_argument("--samples", type=int, help="planned samples in all, instead of the configuration's")
+    train.add_argument(
+        "--budget-minutes", type=positive, help="wall-clock limit of this start; fits the schedule into it"
+    )
+    train.add_argument(
+        "--samples", type=count, help="planned samples in all; default: the resumed run's, or the configuration's"
+    )
     train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="begin with another run's weights.pt")
     train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     train.set_defaults(run=_train)
@@ -119,17 +141,18 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
     export.add_argument("--config", type=Path, help="take [contract] from this TOML, not from the checkpoint")
     export.add_argument(
         "--samples",
-        type=int,
+        type=count,
         default=300,
         help="track windows to calibrate and to compare on, and half as many acquire windows (default %(default)s)",
     )
-    export.add_argument(
-        "--tolerance",
-        type=float,
-        default=2.0,
-        metavar="DEG",
-        help="refuse an INT8 file whose median rotation differs from FP32's by more degrees (default %(default)s)",
-    )
+    for option, unit, default, what in (
+        ("--tolerance", "DEG", 2.0, "median rotation differs from FP32's by more degrees"),
+        ("--tolerance-depth", "PERCENT", 2.0, "median depth differs from FP32's by more"),
+        ("--tolerance-pose", "POINTS", 5.0, "Pose@10°/5 %% is worse than FP32's by more"),
+    ):
+        export.add_argument(
+            option, type=positive, default=default, metavar=unit, help=f"no INT8 file if {what} (default %(default)s)"
+        )
     export.set_defaults(run=_export)
 
 
@@ -146,6 +169,9 @@ def main(argv: list[str] | None = None) -> int:
     except RenderingError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("uavpose-trainer: interrupted", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -20,6 +20,15 @@ class RenderingError(RuntimeError):
     """A rendering process failed; the message carries its traceback."""
 
 
+def made_folder(path: Path) -> Path:
+    """The folder, made if need be. Raises ConfigError if it cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+    return path
+
+
 class ModelConfig(Section):
     configuration: Literal["edge", "paper"] = Field(description="which of the two configurations this is")
     backbone: BackboneName

@@ -44,8 +44,15 @@ def register(commands: argparse._SubParsersAction) -> None:
         "--mode",
         choices=("frames", "track"),
         default="frames",
-        help="frames: each picture by itself; track: whole sequences through the daemon's tracker, which knows the "
+        help="frames: each picture by itself; track: whole sequences through the daemon's tracker, which is told the "
         "camera's attitude where the scene has it (default %(default)s)",
+    )
+    evaluate.add_argument(
+        "--own-ship",
+        choices=("exact", "usual"),
+        default="usual",
+        help="track: tell it the camera's attitude and place as they are, or off by what an autopilot usually is, "
+        "drawn by the scene's name (default %(default)s)",
     )
     evaluate.add_argument(
         "--score-min",
@@ -82,7 +89,7 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
 
     asked = arguments
     request = DatasetRequest(
-        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.score_min
+        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.own_ship, asked.score_min
     )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     errors = Console(stderr=True)
@@ -109,7 +116,7 @@ def _on_windows(arguments: argparse.Namespace) -> None:
     from rich.progress import Progress
 
     from sim_replay.offline import SHIPPED_MODEL
-    from trainer.config import ConfigError
+    from trainer.config import ConfigError, made_folder
     from trainer.held_out import Request, evaluate_file
 
     for name in ("results", "dataset", "split"):
@@ -121,7 +128,7 @@ def _on_windows(arguments: argparse.Namespace) -> None:
         task = progress.add_task("rendering", total=arguments.windows)
         measured = evaluate_file(request, rendered=lambda count: progress.update(task, completed=count))
     score = {name: value if math.isfinite(value) else None for name, value in measured.items()}
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    made_folder(arguments.out)
     (arguments.out / "windows.json").write_text(json.dumps(score, indent=2) + "\n", encoding="utf-8")
     if arguments.json:
         print(json.dumps(score, indent=2))

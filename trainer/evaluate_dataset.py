@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -14,9 +15,10 @@ from sim_replay.bop import Model as TargetModel
 from sim_replay.datasets import Dataset, open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation.bop_results import file_answers
+from sim_replay.evaluation.consistency import consistency
 from sim_replay.evaluation.files import write_files
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
-from sim_replay.evaluation.tracked import tracker_answers
+from sim_replay.evaluation.tracked import OwnShipTold, tracker_answers
 from sim_replay.offline import (
     DEFAULT_THREADS,
     SHIPPED_MODEL,
@@ -38,6 +40,7 @@ class DatasetRequest(NamedTuple):
     split: str | None = None
     every: int = 1  # score every n-th picture
     mode: Literal["frames", "track"] = "frames"  # each picture alone, or sequences through the tracker
+    own_ship: OwnShipTold = "usual"  # in mode track: its attitude and place as told to the tracker
     score_min: float | None = None  # below it a peak is no target; None: the model file's own
 
 
@@ -87,7 +90,7 @@ def evaluate_dataset(
     except InputError as error:
         raise ConfigError(str(error)) from error
     name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
-    score = {"mode": request.mode, **score_of(dataset, method, judged)}
+    score = {"mode": request.mode, **score_of(dataset, method, judged), "consistency": consistency(judged)}
     return Evaluation(score, name, dataset, judged, dataset.models)
 
 
@@ -99,7 +102,8 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
         if request.score_min is not None:
             raise ConfigError("--score-min: is for a model; a results file has its poses already")
         return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
-    answers = tracker_answers if request.mode == "track" else estimator_answers
+    tracker = partial(tracker_answers, own_ship=request.own_ship)
+    answers = tracker if request.mode == "track" else estimator_answers
     path = request.model or SHIPPED_MODEL
     if path.suffix == ".onnx":
         model = with_score_min(load_model(path, DEFAULT_THREADS), request.score_min)

@@ -92,7 +92,8 @@ def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str
     models = {score["method"]["file"]: score["method"] for score in scores}
     lines = ["# Results", "", f"Made by `{command}`. Missed targets count as failures in every rate; means are over "]
     lines[-1] += (
-        "found targets. Single frames, unless a row says *track*: then the daemon's tracker, which knows own attitude."
+        "found targets. Single frames, unless a row says *track*: then the daemon's tracker, "
+        "which is told own attitude with the errors that an autopilot usually has."
     )
     lines += ["", *(f"- `{name}`: {m['precision']}, sha256 `{m['sha256'][:16]}`" for name, m in models.items())]
     lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]

@@ -7,14 +7,18 @@ import json
 import platform
 import subprocess
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
-from trainer.config import TrainerConfig
+from trainer.config import TrainerConfig, made_folder
+
+RUN_NAME = "run.json"
 
 
 def _commit() -> str:
@@ -40,15 +44,28 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
     }
 
 
+def starts_of(out: Path) -> list[dict[str, Any]]:
+    """What run.json in a run folder tells of each start of the run, the first first; none without the file."""
+    path = out / RUN_NAME
+    if not path.exists():
+        return []
+    told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return list(told.get("starts", [told]))  # older files are the record of one start
+
+
 class RunLog:
     """Writes into a run folder; every line is on disk when its call returns."""
 
-    def __init__(self, out: Path, config_text: str, origin: dict[str, str | int | float]) -> None:
-        out.mkdir(parents=True, exist_ok=True)
+    def __init__(self, out: Path, config_text: str, start: Mapping[str, str | int | float | None]) -> None:
+        """`start` says how this start of the run was asked for; run.json keeps one record for each.
+
+        Raises ConfigError if the folder cannot be written.
+        """
+        made_folder(out)
         (out / "config.toml").write_text(config_text, encoding="utf-8")
         digest = hashlib.sha256(config_text.encode()).hexdigest()
-        record = json.dumps({**origin, "config_sha256": digest}, indent=2)
-        (out / "run.json").write_text(record + "\n", encoding="utf-8")
+        starts = [*starts_of(out), {**start, "config_sha256": digest}]
+        (out / RUN_NAME).write_text(json.dumps({"starts": starts}, indent=2) + "\n", encoding="utf-8")
         self._lines = (out / "log.jsonl").open("a", encoding="utf-8")
         self._board = SummaryWriter(str(out / "tensorboard"))
         self._started_s = time.monotonic()

@@ -204,8 +204,15 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def resume_run(out: Path, trainer: Trainer) -> float:
-    """Restore `trainer` from the run folder and return the seconds already used. Raises ConfigError.
+class Plan(NamedTuple):
+    """How far a run is to go and how far it has come."""
+
+    samples: int  # planned, in all
+    used_s: float = 0.0  # wall-clock seconds of the starts before this one
+
+
+def resume_run(out: Path, trainer: Trainer) -> Plan:
+    """Restore `trainer` from the run folder and return its plan. Raises ConfigError.
 
     Only what the weights do not depend on, [run] and [contract], may differ from the configuration of the checkpoint.
     """
@@ -216,7 +223,8 @@ def resume_run(out: Path, trainer: Trainer) -> float:
         if getattr(earlier, section) != getattr(trainer.config, section):
             raise ConfigError(f"{path}: [{section}] differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
-    return float(state["used_s"])
+    # Files written before the plan was kept had the configuration's.
+    return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]))
 
 
 def run_training(
@@ -234,6 +242,7 @@ def run_training(
     """Train until the planned samples, the budget, `max_steps` of this start, or a signal; leave a checkpoint.
 
     Progress, which drives the schedule, is the larger of samples done over planned and time used over budget.
+    A resumed run keeps its planned `samples` unless others are given. Raises ConfigError.
     """
     torch.set_num_threads(config.run.threads)
     opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
@@ -241,11 +250,13 @@ def run_training(
         trainer = Trainer(config, group.device, group)
         if not resume and (out / RESUME_NAME).exists():
             raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+        if resume and start_from is not None:
+            raise ConfigError(f"--start-from {start_from}: a resumed run goes on from its own weights")
         if start_from is not None:
             trainer.start_from(start_from)
-        used_before_s = resume_run(out, trainer) if resume else 0.0
-        budget = Budget(used_before_s, None if budget_s is None else used_before_s + budget_s)
-        loop = _Loop(trainer, config_text, out, budget, samples or config.schedule.samples, opener)
+        plan = resume_run(out, trainer) if resume else Plan(config.schedule.samples)
+        budget = Budget(plan.used_s, None if budget_s is None else plan.used_s + budget_s)
+        loop = _Loop(trainer, config_text, out, budget, samples or plan.samples, opener)
         with stop_on_signals() as stopped:
             loop.run(stopped, max_steps)
     return trainer
@@ -263,7 +274,9 @@ class _Loop:
         self.saved_s = self.started_s
         self.group = trainer.group
         self.provenance = {**provenance(trainer.config), "processes": self.group.size}
-        self.log = RunLog(out, config_text, self.provenance) if self.group.first else None
+        start = {**self.provenance, "from_samples": trainer.samples, "planned_samples": planned}
+        start |= {"budget_s": budget.total_s, "started_from": trainer.started_from}
+        self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}
 
@@ -343,6 +356,7 @@ class _Loop:
         if self.log is None:
             return
         state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
+        state["planned_samples"] = self.planned
         training = {
             **self.provenance,
             "started_from": self.trainer.started_from,

@@ -39,6 +39,8 @@ def score_table(score: dict[str, Any]) -> Group:
     title = f"{score['method']['file']} on {score['dataset']}, {overall['frames']} frames"
     false_rate = _text(overall["false_positives_per_1000"], "{:.1f}")
     caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
+    if score.get("consistency") is not None:
+        caption += f"\n{_consistency(score['consistency'])}"
     table = Table("", title=title, caption=caption, title_justify="left", caption_justify="left")
     groups = {"all": overall}
     groups |= {f"{band} m": group for band, group in score["by_range"].items() if group["targets"]}
@@ -60,6 +62,14 @@ def _calibration(group: dict[str, Any]) -> str:
         return "no covariances to check"
     shares = (f"{name} {value['inside_1sigma']:.0%}" for name, value in group["calibration"].items())
     return "truth inside one sigma (an honest one: 68 %): " + ", ".join(shares)
+
+
+def _consistency(found: dict[str, Any]) -> str:
+    low, high = found["position"]["bounds_95"]
+    means = ", ".join(f"{name} {found[name]['nees_mean']:.2f}" for name in ("position", "rotation"))
+    return (
+        f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
+    )
 
 
 def _text(value: float | None, form: str) -> str:

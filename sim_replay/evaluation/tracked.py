@@ -1,8 +1,8 @@
 """A model on whole sequences: the daemon's estimator and tracker over the pictures in their order, without its clock.
 
-A scene with sequence.toml is of this project's making: its fps counts, and its world is local NED, so the tracker
-knows the camera's attitude and place from cam_R_w2c, as exactly as the files have it. Any other scene is taken at
-DEFAULT_FPS, with nothing known of the own ship.
+A scene with sequence.toml is of this project's making: its fps counts, and its world is local NED, so the tracker is
+told the camera's attitude and place from cam_R_w2c: exactly as the files have it, or with an autopilot's usual errors.
+Any other scene is taken at DEFAULT_FPS, with nothing known of the own ship.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 import tomllib
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -19,12 +20,15 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.links.outgoing import sendable
 from edge.tracking.tracker import Tracker
-from edge.types import Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track, TrackState
+from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track, TrackState
+from msgs.geometry import so3_log
 from sim_replay.bop import BopFrame, BopScene
 from sim_replay.datasets import DatasetFrame
 from sim_replay.evaluation.judge import Answer, Answerer
+from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import TargetPose
 
+OwnShipTold = Literal["exact", "usual"]  # what the tracker is told of the own ship: the truth, or with usual errors
 DEFAULT_FPS = 30.0
 FIRST_FRAME_NS = 1_000_000_000
 _SETTINGS = EstimatorSettings()
@@ -40,37 +44,57 @@ class _Sequence:
     fps: float
     in_ned: bool
     places: dict[int, tuple[int, BopFrame]]  # by image id: its place in the sequence
+    errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
 
     @classmethod
-    def of(cls, scene: BopScene) -> _Sequence:
+    def of(cls, scene: BopScene, own_ship: OwnShipTold) -> _Sequence:
         """Raises InputError on a sequence.toml without a usable fps."""
         places = {frame.image_id: (k, frame) for k, frame in enumerate(scene.frames)}
+        errors = OwnShipErrors.of_flight(scene.folder.name) if own_ship == "usual" else None
         path = scene.folder / "sequence.toml"
         if not path.is_file():
-            return cls(scene, DEFAULT_FPS, False, places)
+            return cls(scene, DEFAULT_FPS, False, places, errors)
         try:
             fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: 'fps' is not a number that can be read") from error
         if not (np.isfinite(fps) and fps > 0):
             raise InputError(f"{path}: 'fps' is not above zero")
-        return cls(scene, fps, True, places)
+        return cls(scene, fps, True, places, errors)
 
     def capture_ns(self, image_id: int) -> int:
         return FIRST_FRAME_NS + round(self.places[image_id][0] * 1e9 / self.fps)
 
     def own_ship(self, image_id: int) -> OwnShip | None:
         """The camera as a vehicle of its own: nose along the optical axes, mount nil."""
-        frame = self.places[image_id][1]
-        if not self.in_ned or frame.R_cam_world is None or frame.t_cam_world_m is None:
+        k, frame = self.places[image_id]
+        place = _place(frame)
+        if not self.in_ned or place is None:
             return None
-        R_ned_cam = frame.R_cam_world.T
-        return OwnShip(self.capture_ns(image_id), R_ned_cam, -R_ned_cam @ frame.t_cam_world_m, None, None)
+        R_ned_cam, t_ned_cam_m = place
+        if self.errors is not None:
+            before, after = (_place(self.scene.frames[i]) for i in (max(k - 1, 0), min(k + 1, len(self.places) - 1)))
+            turning_radps, velocity_mps = _rates(before or place, after or place, 2.0 / self.fps)
+            R_ned_cam = self.errors.attitude(R_ned_cam, turning_radps)
+            t_ned_cam_m = self.errors.position(t_ned_cam_m, velocity_mps)
+        return OwnShip(self.capture_ns(image_id), R_ned_cam, t_ned_cam_m, None, None)
 
 
-def tracker_answers(model: Model) -> Answerer:
+def _place(frame: BopFrame) -> tuple[Array, Array] | None:
+    """R_ned_cam [3, 3] and t_ned_cam_m [3]; None where the file does not say."""
+    if frame.R_cam_world is None or frame.t_cam_world_m is None:
+        return None
+    return frame.R_cam_world.T, -frame.R_cam_world.T @ frame.t_cam_world_m
+
+
+def _rates(before: tuple[Array, Array], after: tuple[Array, Array], dt_s: float) -> tuple[Array, Array]:
+    """Turning [3], rad/s, and velocity [3], m/s, both in ned, of a camera that was at two places."""
+    return so3_log(after[0] @ before[0].T) / dt_s, (after[1] - before[1]) / dt_s
+
+
+def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
     """What the daemon would send of each picture if it flew through its scene; pictures must come in their order.
 
     Raises InputError if the model does not run.
@@ -81,19 +105,19 @@ def tracker_answers(model: Model) -> Answerer:
 
     def answer(index: int, picture: DatasetFrame) -> Answer:
         if not current or current[-1].scene is not picture.scene:
-            current[:] = [_Sequence.of(picture.scene)]
+            current[:] = [_Sequence.of(picture.scene, own_ship)]
         sequence = current[-1]
         image_bgr = picture.undistorted_bgr()
         capture_ns = sequence.capture_ns(picture.image_id)
         frame = Frame(FrameMeta(index, capture_ns, capture_ns), image_bgr, picture.K)
         size_wh = (image_bgr.shape[1], image_bgr.shape[0])
-        own_ship = sequence.own_ship(picture.image_id)
+        told_own_ship = sequence.own_ship(picture.image_id)
         started_ns = time.monotonic_ns()
-        expected = sequence.tracker.predict(capture_ns, own_ship, picture.K, size_wh)
+        expected = sequence.tracker.predict(capture_ns, told_own_ship, picture.K, size_wh)
         estimates = _estimate(estimator, sequence, frame, expected)
-        tracks = sequence.tracker.update(capture_ns, estimates, own_ship, picture.K, size_wh)
+        tracks = sequence.tracker.update(capture_ns, estimates, told_own_ship, picture.K, size_wh)
         time_ms = (time.monotonic_ns() - started_ns) * 1e-6
-        report = Report(frame.meta, picture.K, size_wh, tracks, own_ship, model.sha256)
+        report = Report(frame.meta, picture.K, size_wh, tracks, told_own_ship, model.sha256)
         told = sendable(report, capture_ns, _MAX_AGE_MS)
         poses = (
             TargetPose(index, t.R_cam_target, t.t_cam_target_m, score=t.score, covariance=t.covariance) for t in told

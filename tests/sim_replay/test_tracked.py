@@ -52,7 +52,7 @@ def write_scene(folder: Path, yaws_deg: list[float]) -> None:
 
 def flown(dataset_folder: Path, model: Path) -> list[JudgedFrame]:
     dataset = open_dataset(dataset_folder)
-    answers = tracker_answers(load_model(model, threads=1))
+    answers = tracker_answers(load_model(model, threads=1), own_ship="exact")
     return judge_frames(list(dataset.frames()), dataset.models, answers)
 
 

@@ -1,0 +1,105 @@
+"""Whether covariances told over many flights are honest, and the own ship's errors that a replay tells them with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edge.tracking import view
+from sim_replay.bop import BopScene
+from sim_replay.datasets import DatasetFrame
+from sim_replay.evaluation.consistency import bounds_95, consistency
+from sim_replay.evaluation.judge import JudgedFrame
+from sim_replay.evaluation.own_ship import OwnShipErrors
+from sim_replay.score import Match, TargetPose, Truth
+
+FLIGHTS, FRAMES = 60, 5
+STD = np.array([3.0, 2.0, 20.0, 0.05, 0.04, 0.1])  # m, rad
+
+
+def flights(told_wider: float, targets: int = 1) -> list[JudgedFrame]:
+    """Frames of one flight share their error; covariances are told so many times too wide."""
+    rng = np.random.default_rng(3)
+    covariance = told_wider * np.diag(STD**2)
+    judged = []
+    for number in range(FLIGHTS):
+        scene = BopScene(Path(f"{number:06d}"))
+        errors = rng.normal(scale=STD, size=(targets, 6))
+        for image in range(FRAMES):
+            matches = []
+            for error in errors:
+                truth = Truth(len(judged), np.eye(3), np.array([10.0, -5.0, 300.0]), 4, 10.0)
+                R = Rotation.from_rotvec(error[3:]).as_matrix()
+                estimate = TargetPose(len(judged), R, truth.t_cam_target_m + error[:3], covariance=covariance)
+                matches.append(Match(truth, estimate))
+            picture = DatasetFrame(number, image, np.eye(3), None, Path("none.jpg"), (), scene, ())
+            judged.append(JudgedFrame(picture, tuple(matches), (), None))
+    return judged
+
+
+def test_bounds_are_those_of_a_printed_table() -> None:
+    assert bounds_95(1) == pytest.approx((0.216, 9.348), abs=5e-4)
+    assert bounds_95(10) == pytest.approx((16.791 / 10, 46.979 / 10), abs=5e-5)
+
+
+def test_honest_covariances_lie_inside_and_each_flight_counts_once() -> None:
+    found = consistency(flights(1.0))
+    assert found is not None
+    assert found["flights"] == FLIGHTS
+    for part in ("position", "rotation"):
+        low, high = found[part]["bounds_95"]
+        assert low < found[part]["nees_mean"] < high
+        assert found[part]["flights_inside"] >= 0.9
+
+
+def test_two_targets_of_one_object_are_two_flights() -> None:
+    found = consistency(flights(1.0, targets=2))
+    assert found is not None
+    assert found["flights"] == 2 * FLIGHTS
+
+
+@pytest.mark.parametrize("told_wider", [0.25, 4.0])
+def test_what_is_told_too_wide_or_too_narrow_is_out_by_that_factor(told_wider: float) -> None:
+    found, honest = consistency(flights(told_wider)), consistency(flights(1.0))
+    assert found is not None
+    assert honest is not None
+    for part in ("position", "rotation"):
+        assert found[part]["nees_mean"] == pytest.approx(honest[part]["nees_mean"] / told_wider, rel=1e-3)
+        low, high = found[part]["bounds_95"]
+        assert not low < found[part]["nees_mean"] < high
+
+
+def test_nothing_is_said_where_no_pose_tells_how_sure_it_is() -> None:
+    (first, *_) = flights(1.0)
+    (match,) = first.matches
+    bare = TargetPose(0, np.eye(3), match.truth.t_cam_target_m)
+    assert (
+        consistency([JudgedFrame(first.picture, (Match(match.truth, bare), Match(match.truth, None)), (), None)])
+        is None
+    )
+
+
+def test_own_ship_errors_are_a_flights_own_and_of_the_size_that_the_tracker_allows_for() -> None:
+    drawn = [OwnShipErrors.of_flight(f"{number:06d}") for number in range(400)]
+    again = OwnShipErrors.of_flight("000003")
+    assert np.array_equal(again.attitude_rad, drawn[3].attitude_rad)
+    assert again.clock_s == drawn[3].clock_s
+    R = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True).as_matrix()
+    still = np.zeros(3)
+    off = np.array([Rotation.from_matrix(one.attitude(R, still) @ R.T).as_rotvec() for one in drawn])
+    expected = [view.TILT_STD_RAD, view.TILT_STD_RAD, view.HEADING_STD_RAD]
+    assert off.std(axis=0) == pytest.approx(expected, rel=0.15)
+    moved = np.array([one.position(still, np.array([0.0, 1000.0, 0.0])) for one in drawn])
+    late_m = 1000.0 * view.EXPOSURE_STD_S
+    north, east = view.POSITION_STD_M, np.hypot(view.POSITION_STD_M, late_m)
+    assert moved.std(axis=0) == pytest.approx([north, east, north], rel=0.15)
+
+
+def test_a_late_stamp_turns_the_attitude_of_a_turning_camera() -> None:
+    errors = OwnShipErrors.of_flight("a")
+    errors = OwnShipErrors(np.random.default_rng(1), np.zeros(3), errors.position_m, 0.02)
+    R = errors.attitude(np.eye(3), np.array([0.0, 0.0, 1.5]))
+    assert Rotation.from_matrix(R).as_rotvec() == pytest.approx([0.0, 0.0, 0.03], abs=5 * view.ATTITUDE_JITTER_RAD)
