@@ -80,7 +80,10 @@ class PoseReceiver:
             raise PayloadError(Refusal.SEQUENCE)
         if pose.stamp_ns - now_ns > self._max_future_ns:
             raise PayloadError(Refusal.FUTURE)
-        if now_ns - pose.stamp_ns > self._max_age_ns or pose.stamp_ns <= self._stamps_ns.get(target, pose.stamp_ns - 1):
+        last_ns = self._stamps_ns.get(target)
+        # One that lies ahead is of a clock that was set back since: it must not keep poses out until that time comes.
+        overtakes = last_ns is None or pose.stamp_ns > last_ns or last_ns - now_ns > self._max_future_ns
+        if now_ns - pose.stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
         self._remember(target, gid, sequence)
         self._stamps_ns[target] = pose.stamp_ns

@@ -91,3 +91,14 @@ def test_made_up_publishers_do_not_grow_the_receiver() -> None:
     for n in range(1, 1000):
         assert receiver.receive(KEY, *sample(1, NOW_NS + n, n.to_bytes(16, "little")), NOW_NS)
     assert len(receiver._sequences) <= 16
+
+
+def test_a_clock_that_is_set_back_does_not_keep_poses_out() -> None:
+    """An hour back on sender and receiver alike, as where both run on one host: the next pose is taken all the same."""
+    receiver, hour_ns = PoseReceiver("uav1"), 3_600_000_000_000
+    assert receiver.receive(KEY, *sample(1, NOW_NS), NOW_NS)
+    back_ns = NOW_NS - hour_ns
+    assert receiver.receive(KEY, *sample(2, back_ns), back_ns)
+    assert receiver.receive(KEY, *sample(2, back_ns + 1), back_ns) is None
+    assert receiver.receive(KEY, *sample(3, back_ns - 1), back_ns) is None
+    assert dict(receiver.refused) == {Refusal.SEQUENCE: 1, Refusal.STALE: 1}
