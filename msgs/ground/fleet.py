@@ -79,7 +79,7 @@ class _Vehicle:
     level: int = 0
     health: str = ""
     event: str = ""
-    event_stamp_ns: int = 0
+    event_number: tuple[bytes, int] = (b"", 0)  # publisher, and its number of the newest event
     R_ned_cam: Array | None = None
     attitude_stamp_ns: int = 0
     scores: dict[str, float] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class Fleet:
             except PayloadError as error:
                 vehicle.receiver.refused[error.reason] += 1
                 return None
-            return _note(vehicle, message)
+            return _note(vehicle, message, topics.parse_attachment(incoming.attachment))
 
     def rows(self, now_ns: int) -> list[VehicleRow]:
         """Every vehicle that was heard, by name; targets not seen for ten seconds are left out."""
@@ -134,6 +134,8 @@ class Fleet:
         known = vehicle.targets.get(pose.target)
         ranges = known.ranges if known is not None else deque(maxlen=_RANGES_KEPT)
         range_m = float(np.linalg.norm(pose.pose.t_cam_target_m))
+        if ranges and pose.stamp_ns <= ranges[-1][0]:
+            ranges.clear()  # the vehicle's clock was set back
         ranges.append((pose.stamp_ns, range_m))
         while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
             ranges.popleft()
@@ -146,9 +148,10 @@ class Fleet:
         return row
 
     def _row(self, uav: str, vehicle: _Vehicle, now_ns: int) -> VehicleRow:
-        for target in [name for name, one in vehicle.targets.items() if now_ns - one.seen_ns > FORGET_TARGET_NS]:
-            del vehicle.targets[target]
-        recent = sum(now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
+        # What was seen in the future was seen before our clock was set back, who knows when.
+        kept = {name: one for name, one in vehicle.targets.items() if 0 <= now_ns - one.seen_ns <= FORGET_TARGET_NS}
+        vehicle.targets = kept
+        recent = sum(0 <= now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
         targets = tuple(one.row for _, one in sorted(vehicle.targets.items()))
         return VehicleRow(
             uav,
@@ -162,7 +165,8 @@ class Fleet:
         )
 
 
-def _note(vehicle: _Vehicle, message: object) -> Log | DiagnosticArray | None:
+def _note(vehicle: _Vehicle, message: object, sent_as: tuple[int, int, bytes] | None) -> Log | DiagnosticArray | None:
+    """`sent_as`: number, time and publisher of the sample, as its attachment has them."""
     match message:
         case Detection3DArray():
             vehicle.scores = {one.id: one.hypotheses[0].score for one in message.detections if one.hypotheses}
@@ -172,10 +176,22 @@ def _note(vehicle: _Vehicle, message: object) -> Log | DiagnosticArray | None:
         case DiagnosticArray() if message.status:
             vehicle.level, vehicle.health = message.status[0].level, message.status[0].message
             return message
-        case Log() if message.stamp_ns >= vehicle.event_stamp_ns:
-            vehicle.event, vehicle.event_stamp_ns = message.msg, message.stamp_ns
+        case Log() if _is_news(vehicle, sent_as):
+            vehicle.event = message.msg
             return message
     return None
+
+
+def _is_news(vehicle: _Vehicle, sent_as: tuple[int, int, bytes] | None) -> bool:
+    """Whether an event is newer than those before, by its publisher's count: clocks are set, and history comes late."""
+    if sent_as is None:
+        return False
+    number, _, publisher = sent_as
+    known, newest = vehicle.event_number
+    if publisher == known and number <= newest:
+        return False
+    vehicle.event_number = (publisher, number)
+    return True
 
 
 def camera_attitude(message: TFMessage) -> Array | None:
