@@ -274,8 +274,8 @@ class _Loop:
         self.saved_s = self.started_s
         self.group = trainer.group
         self.provenance = {**provenance(trainer.config), "processes": self.group.size}
-        start = {**self.provenance, "from_samples": trainer.samples, "planned_samples": planned}
-        start |= {"budget_s": budget.total_s, "started_from": trainer.started_from}
+        asked = {"from_samples": trainer.samples, "planned_samples": planned, "budget_s": budget.total_s}
+        start = {**self.provenance, **asked, "started_from": trainer.started_from}
         self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}

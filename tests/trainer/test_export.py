@@ -17,9 +17,11 @@ from trainer.checkpoint import load_model, save_weights
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch, training_batch
 from trainer.evaluate import constant_guess, measure, predict_all
-from trainer.export import Measured, Views, export_models, write_int8
+from trainer.export import Measured, Strayed, Tolerance, Views, export_models, write_int8
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
+
+ANY = Tolerance(180.0, 100.0, 100.0)
 
 
 def open_view(seed: int, size_px: int, acquire_share: float) -> partial:
@@ -32,7 +34,7 @@ class Exported:
         save_weights(self.run / "weights.pt", tiny.network(), tiny.TOML, {"seed": 3, "samples": 0, "commit": "unknown"})
         self.said: list[str] = []
         self.fp32, self.int8 = export_models(
-            self.run, folder / "models", samples=16, tolerance_deg=180.0, open_view=open_view, say=self.said.append
+            self.run, folder / "models", samples=16, tolerance=ANY, open_view=open_view, say=self.said.append
         )
 
 
@@ -99,16 +101,38 @@ def windows(seed: int, size_px: int) -> TrainingBatch:
     return training_batch(open_view(seed, size_px, 0.0)().batch(0, 16))
 
 
-def test_an_int8_file_that_strays_is_not_written(exported: Exported, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("tolerance", "told"),
+    [
+        (ANY._replace(rotation_deg=0.0), r"median rotation differs .* --tolerance 0"),
+        (ANY._replace(depth_percent=0.0), r"median depth differs .* --tolerance-depth 0"),
+        (ANY._replace(pose_points=-1.0), r"Pose@10°/5 % is 0 points worse .* --tolerance-pose -1"),
+    ],
+)
+def test_an_int8_file_that_strays_is_not_written(
+    exported: Exported, tmp_path: Path, tolerance: Tolerance, told: str
+) -> None:
     views = Views([windows(1, 64)], [windows(2, 96)])
     predict = onnx_predictor(exported.fp32)
     floats = Measured(predict_all(predict, views.track), predict_all(predict, views.acquire))
     destination = tmp_path / "strays.onnx"
-    with pytest.raises(ConfigError, match=r"strays\.onnx: not written: .* --tolerance 0"):
+    with pytest.raises(ConfigError, match=rf"strays\.onnx: not written: {told}"):
         write_int8(
-            exported.fp32, destination, read_contract(exported.fp32), views, views, floats, 0.0, exported.said.append
+            exported.fp32,
+            destination,
+            read_contract(exported.fp32),
+            views,
+            views,
+            floats,
+            tolerance,
+            exported.said.append,
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_answer_that_is_no_number_is_refused() -> None:
+    assert Strayed(float("nan")).refusal(ANY) is not None
+    assert Strayed(1.0, 1.0, -3.0).refusal(Tolerance()) is None
 
 
 def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None:

@@ -1,0 +1,163 @@
+"""What a run leaves behind: enough to make it again, and what a person looks at while it goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import signal
+from pathlib import Path
+
+import pytest
+import synthetic_sampler
+import tiny
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from trainer.checkpoint import load_file
+from trainer.cli import main
+from trainer.config import ConfigError, parse_config
+from trainer.data import training_batch
+from trainer.train import Trainer, run_training
+
+LONG = tiny.TOML.replace("samples = 16\nw", "samples = 1000000\nw")
+
+
+def train(out: Path, text: str = tiny.TOML, **options: object) -> Trainer:
+    config = parse_config(text, "tiny.toml")
+    return run_training(config, text, out, open_sampler=synthetic_sampler.opener, **options)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two starts: three steps of eight samples, then to their end."""
+    out = tmp_path_factory.mktemp("run")
+    with (out / "said.txt").open("w") as said, contextlib.redirect_stdout(said):
+        train(out, samples=20, max_steps=3)
+        train(out, resume=True)
+    return out
+
+
+def test_the_folder_tells_how_each_start_was_asked_for(run: Path) -> None:
+    first, second = json.loads((run / "run.json").read_text())["starts"]
+    assert (first["from_samples"], second["from_samples"]) == (0, 12)
+    assert first["planned_samples"] == second["planned_samples"] == 20
+    for start in (first, second):
+        assert start["seed"] == 3
+        assert start["budget_s"] is None
+        assert start["started_from"] == "scratch"
+        assert {"commit", "torch", "numpy", "python", "device", "processes", "config_sha256"} <= start.keys()
+    assert (run / "config.toml").read_text() == tiny.TOML
+
+
+def test_a_resumed_run_keeps_its_plan(run: Path) -> None:
+    assert load_file(run / "resume.pt")["trainer"]["samples"] == 20
+
+
+def test_the_weights_say_where_they_come_from(run: Path) -> None:
+    training = load_file(run)["training"]
+    assert training["samples"] == 20
+    assert training["started_from"] == "scratch"
+
+
+def test_tensorboard_has_every_figure_of_the_log_and_pictures(run: Path) -> None:
+    records = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    board = EventAccumulator(str(run / "tensorboard"), size_guidance={"images": 0}).Reload()
+    losses = {event.step: event.value for event in board.Scalars("train/loss")}
+    logged = {record["samples"]: record["loss"] for record in records if record["kind"] == "train"}
+    assert losses == pytest.approx(logged)
+    assert {"train/geodesic", "train/lr", "validation/E_r_mean_deg", "validation/recall"} <= set(
+        board.Tags()["scalars"]
+    )
+    pictures = board.Images("held out")
+    assert (pictures[0].width, pictures[0].height) == (768, 384)
+
+
+def test_a_line_of_progress_says_how_far_how_fast_and_how_good(run: Path) -> None:
+    line = next(line for line in (run / "said.txt").read_text().splitlines() if line.startswith("step      3"))
+    assert re.match(r"step +3  samples +12 +40\.0 %.* images/s .*loss \d.* rotation +\d+\.\d deg  depth +\d", line)
+
+
+def test_a_budget_ends_a_run_and_stretches_its_schedule_over_itself(tmp_path: Path) -> None:
+    trainer = train(tmp_path, LONG, budget_s=1.0)
+    assert trainer.steps >= 1
+    state = load_file(tmp_path / "resume.pt")
+    assert state["used_s"] >= 1.0
+    progress = [json.loads(line).get("progress") for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert max(filter(None, progress)) > trainer.samples / 1_000_000
+
+
+def test_a_resumed_run_takes_no_other_weights(run: Path) -> None:
+    with pytest.raises(ConfigError, match="--start-from"):
+        train(run, resume=True, start_from=run / "weights.pt")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "--budget-minutes", "-1"],
+        ["train", "--budget-minutes", "nan"],
+        ["train", "--samples", "0"],
+        ["export", "--checkpoint", "x", "--samples", "0"],
+        ["export", "--checkpoint", "x", "--tolerance", "-1"],
+        ["export", "--checkpoint", "x", "--tolerance-pose", "inf"],
+    ],
+)
+def test_a_number_that_means_nothing_is_refused(arguments: list[str], capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--out", "x"])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert f"argument {arguments[-2]}: invalid" in said
+    assert repr(arguments[-1]) in said
+
+
+def test_a_folder_that_cannot_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "tiny.toml").write_text(tiny.TOML)
+    out = str(tmp_path / "file" / "run")
+    assert main(["train", "--config", str(tmp_path / "tiny.toml"), "--out", out]) == 2
+    assert main(["export", "--untrained", str(tmp_path / "tiny.toml"), "--out", out]) == 2
+    assert capsys.readouterr().err.count(f"uavpose-trainer: {out}: cannot be made a folder: Not a directory\n") == 2
+
+
+def test_ctrl_c_where_nothing_is_to_be_kept_ends_without_a_traceback(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    previous = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.5)
+    try:
+        assert main(["evaluate", "--out", str(tmp_path / "out")]) == 130
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, previous)
+    assert capsys.readouterr().err == "uavpose-trainer: interrupted\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_mixed_precision_on_cuda_learns_and_resumes(tmp_path: Path) -> None:
+    text = tiny.TOML.replace("threads = 1", "threads = 1\nbf16 = true")
+    train(tmp_path, text, max_steps=2)
+    trainer = train(tmp_path, text, resume=True)
+    assert trainer.device.type == "cuda"
+    assert trainer.steps == 4
+    assert all(torch.isfinite(value).all() for value in trainer.model.state_dict().values())
+
+
+def test_the_convolutions_run_in_bfloat16_and_the_poses_in_float32() -> None:
+    config = parse_config(tiny.TOML.replace("threads = 1", "threads = 1\nbf16 = true"), "tiny.toml")
+    trainer = Trainer(config, torch.device("cpu"))
+    seen: dict[str, torch.dtype] = {}
+
+    def listen(part: str) -> None:
+        hook = lambda *call: seen.update({part: call[-1].dtype})  # noqa: E731
+        trainer.model.get_submodule(part).register_forward_hook(hook)
+
+    listen("neck")
+    listen("pam")
+    result = trainer.step(training_batch(synthetic_sampler.PlateSampler(1, 64).batch(0, 4)), 0.0)
+    assert seen == {"neck": torch.bfloat16, "pam": torch.float32}
+    assert math.isfinite(result.loss)
+    assert all(p.dtype == torch.float32 for p in trainer.model.parameters())
