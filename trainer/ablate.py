@@ -14,7 +14,7 @@ from typing import Any
 import tomli_w
 
 from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model
-from trainer.config import ConfigError, TrainerConfig, parse_config
+from trainer.config import ConfigError, TrainerConfig, load_config, parse_config
 from trainer.data import DataConfig, Sampler, render_once, window_sampler
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.train import run_training
@@ -30,8 +30,10 @@ class Variant:
     name: str
     says: str
     change: dict[str, dict[str, Any]]
+    network_of: Path | None = None  # a configuration whose network and loss take the place of the base's
 
 
+PAPER_CONFIG = Path(__file__).parent / "configs" / "paper.toml"
 FULL = Variant("full", "all of it", {})
 VARIANTS = (
     FULL,
@@ -46,6 +48,7 @@ VARIANTS = (
     ),
     Variant("no-uncertainty", "no uncertainty heads", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
     Variant("no-window", "whole reduced frames only, no native window", {"data": {"acquire_share": 1.0}}),
+    Variant("paper", "the paper's network and loss, on the same windows", {}, PAPER_CONFIG),
 )
 COLUMNS = {
     "E_r_mean_deg": ("E_r mean °", 1.0, 1),
@@ -77,8 +80,11 @@ def chosen(names: Sequence[str] | None) -> tuple[Variant, ...]:
 
 
 def varied(base: TrainerConfig, variant: Variant, scale: Scale) -> str:
-    """The TOML of a variant: the base's with its change and one window size."""
+    """The TOML of a variant: the base's with its change and one window size. Raises ConfigError."""
     tree = base.model_dump(mode="json", exclude_none=True)
+    if variant.network_of is not None:
+        other = load_config(variant.network_of).model_dump(mode="json", exclude_none=True)
+        tree |= {section: other[section] for section in ("model", "loss")}
     for section, values in variant.change.items():
         tree[section].update(values)
     tree["schedule"].update(samples=scale.samples, sizes=[{"from_progress": 0.0, "size_px": scale.size_px}])
@@ -97,9 +103,11 @@ def ablate(
 ) -> dict[str, Any]:
     """Train what is not trained yet, measure all on the same held-out windows, write ablation.json and table.md.
 
-    A run that was interrupted goes on where it stopped. Raises ConfigError where `out` holds runs of another scale.
+    Stops where a run is interrupted, with the rows that are whole; the same call goes on from there. Raises ConfigError
+    where `out` holds runs of another scale.
     """
-    rows = {}
+    result: dict[str, Any] = {"samples": scale.samples, "size_px": scale.size_px, "windows": scale.windows, "rows": {}}
+    result["seed"], result["validation_seed"] = base.data.seed, base.data.validation_seed
     for variant in variants:
         text = varied(base, variant, scale)
         config = parse_config(text, f"variant {variant.name}")
@@ -110,10 +118,10 @@ def ablate(
             raise ConfigError(f"{folder}: holds a run of another configuration or scale; give another --out")
         if not started or int(load_model(folder)[2]["samples"]) < scale.samples:
             opener = lambda seed, size, data=config.data: open_view(data, seed, size)  # noqa: E731
-            run_training(config, text, folder, resume=started, open_sampler=opener)
-        rows[variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
-        result = {"samples": scale.samples, "size_px": scale.size_px, "windows": scale.windows, "rows": rows}
-        result["seed"], result["validation_seed"] = config.data.seed, config.data.validation_seed
+            if run_training(config, text, folder, resume=started, open_sampler=opener).samples < scale.samples:
+                say(f"{variant.name}: interrupted; the same command goes on from here")
+                break
+        result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
         (out / RESULT_NAME).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         (out / "table.md").write_text(table(result), encoding="utf-8")
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import tiny
 import torch
 
 from trainer.ablate import FULL, VARIANTS, Scale, ablate, chosen, table, varied
-from trainer.config import ConfigError, DataConfig, parse_config
+from trainer.config import ConfigError, DataConfig, load_config, parse_config
 from trainer.model import PoseNet
 
 SCALE = Scale(samples=8, size_px=64, windows=16)
@@ -27,7 +28,12 @@ def open_view(data: DataConfig, seed: int, size_px: int) -> partial:
 def test_a_variant_is_another_configuration_of_the_same_code(variant) -> None:
     base, config = tiny.config(), parse_config(varied(tiny.config(), variant, SCALE), variant.name)
     differing = {k for k in base.model.model_dump() if getattr(base.model, k) != getattr(config.model, k)}
-    assert differing == set(variant.change.get("model", {}))
+    if variant.network_of is None:
+        assert differing == set(variant.change.get("model", {}))
+    else:
+        assert config.model == load_config(variant.network_of).model
+        assert config.loss == load_config(variant.network_of).loss
+    assert config.data.seed == base.data.seed
     torch.manual_seed(0)
     image = torch.randint(0, 255, (1, 64, 64, 3), dtype=torch.uint8)
     K = torch.tensor([[[900.0, 0, 32], [0, 900.0, 32], [0, 0, 1]]])
@@ -65,6 +71,22 @@ def test_rows_are_trained_once_and_stand_in_one_table(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "full" / "log.jsonl").read_text().splitlines()[-1])["samples"] == 8
     with pytest.raises(ConfigError, match="another configuration or scale"):
         ablate(tiny.config(), [FULL], Scale(12, 64, 16), tmp_path, said.append, open_view)
+
+
+def test_an_interrupted_variant_has_no_row_and_the_next_call_goes_on(tmp_path: Path) -> None:
+    said: list[str] = []
+    variants = chosen(["full", "direct-depth"])
+
+    def interrupted_in_the_second(data: DataConfig, seed: int, size_px: int) -> partial:
+        if said[-1].startswith("direct-depth:"):
+            signal.raise_signal(signal.SIGINT)
+        return open_view(data, seed, size_px)
+
+    first = ablate(tiny.config(), variants, SCALE, tmp_path, said.append, interrupted_in_the_second)
+    assert list(first["rows"]) == ["full"]
+    assert said[-1].startswith("direct-depth: interrupted")
+    whole = ablate(tiny.config(), variants, SCALE, tmp_path, said.append, open_view)
+    assert [row["trained_samples"] for row in whole["rows"].values()] == [8, 8]
 
 
 def test_an_unknown_variant_is_named_with_those_there_are() -> None:
