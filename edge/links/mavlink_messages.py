@@ -80,8 +80,7 @@ def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
 def image_status(report: Report, track: Track | None) -> Any:
     """CAMERA_TRACKING_IMAGE_STATUS (275): the box as shares of the picture, 0..1; idle without a track."""
     if track is None:
-        idle = (dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE, dialect.CAMERA_TRACKING_MODE_NONE, 0)
-        return dialect.MAVLink_camera_tracking_image_status_message(*idle, *[NAN] * 7)
+        return idle_image_status()
     # Pixel centres are integers, so the picture's edge lies half a pixel before 0.
     shares = (track.box_xyxy_px.reshape(2, 2) + 0.5) / np.array(report.image_size_wh)
     (left, top), (right, bottom) = np.clip(shares, 0.0, 1.0).tolist()
@@ -97,6 +96,12 @@ def image_status(report: Report, track: Track | None) -> Any:
         right,
         bottom,
     )
+
+
+def idle_image_status() -> Any:
+    """CAMERA_TRACKING_IMAGE_STATUS (275) of a camera that tracks nothing."""
+    idle = (dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE, dialect.CAMERA_TRACKING_MODE_NONE, 0)
+    return dialect.MAVLink_camera_tracking_image_status_message(*idle, *[NAN] * 7)
 
 
 def geo_status(report: Report, track: Track) -> Any | None:

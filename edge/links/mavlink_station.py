@@ -36,7 +36,7 @@ from edge.links.mavlink_table import (
     TARGET_RELATIVE,
     TIMESYNC,
 )
-from edge.links.mavlink_telemetry import Telemetry
+from edge.links.mavlink_telemetry import Telemetry, uptime_ms
 from edge.links.mavlink_traffic import adsb_vehicle, follow_target
 from edge.links.mavlink_vehicle import Contact, Vehicle
 from edge.links.outgoing import sendable
@@ -51,6 +51,7 @@ SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, to make ourselves known 
 HEARTBEAT_NS = 1_000_000_000
 HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stuck, and no heartbeat may hide that
 HOME_SILENT_NS = 3_000_000_000
+FRAMELESS_NS = 1_000_000_000  # no report for longer: nothing is tracked, and who draws the box is told so
 TIMESYNC_NS = 200_000_000
 GLOBAL_POSITION_HZ = 5.0
 SYSTEM_TIME_HZ = 1.0
@@ -97,6 +98,7 @@ class Station:
         self._computer = ComputerReader()
         self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
         self._health: tuple[Condition, int] | None = None
+        self._reported_ns: int | None = None
         self._text_id = 0
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
@@ -149,6 +151,9 @@ class Station:
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns = now_ns + TIMESYNC_NS
             out.home.append(self._packed(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
+        frameless = self._reported_ns is not None and now_ns - self._reported_ns > FRAMELESS_NS
+        if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
+            out.everywhere.append(self._image_status(words.idle_image_status()))
         wanted = self.vehicle.request(now_ns)
         if wanted is not None:
             out.home.append(self._packed(self._interval_request(*wanted)))
@@ -158,13 +163,13 @@ class Station:
         """What goes out for one frame, as far as each message's rate allows."""
         if self.vehicle.contact is not Contact.HEARD:
             return []
+        self._reported_ns = now_ns
         tracks = sendable(report, now_ns, self._settings.max_age_ms)
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
         out = [self._target_relative(report, track) for track in tracks if self._wants_target_relative(track, now_ns)]
         first = words.primary(tracks, report.chosen_id)
         if self._schedule.due(IMAGE_STATUS, 0, now_ns):
-            status = words.image_status(report, first)
-            out.append(self._packed(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN))
+            out.append(self._image_status(words.image_status(report, first)))
         geo_due = first is not None and self._schedule.due(GEO_STATUS, 0, now_ns)
         place = words.geo_status(report, first) if first is not None and geo_due else None
         if place is not None:
@@ -216,7 +221,8 @@ class Station:
             return self._obey(message, now_ns)
         elif message_id != HEARTBEAT:
             by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
-            if by_autopilot and self.vehicle.boot_time(message.time_boot_ms):
+            up_ms = uptime_ms(message.time_boot_ms, self.timesync.offset_ns, now_ns)
+            if by_autopilot and self.vehicle.boot_time(up_ms):
                 self._telemetry.forget()
                 self.timesync.clear()
             reason = self._telemetry.take(message, now_ns)
@@ -279,6 +285,9 @@ class Station:
             due = [track for track in tracks if self._schedule.due(ADSB_VEHICLE, track.track_id, now_ns)]
             messages += [adsb_vehicle(report, track, address, now_ns) for track in due]
         return [self._signed(self._virtual, message) for message in messages if message is not None]
+
+    def _image_status(self, status: Any) -> bytes:
+        return self._packed(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN)
 
     def _computer_status(self, now_ns: int) -> list[bytes]:
         try:

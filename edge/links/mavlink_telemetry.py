@@ -17,6 +17,8 @@ from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from msgs.geometry import R_from_euler, q_wxyz_from_R
 from msgs.mavlink import dialect
 
+BOOT_WRAP_MS = 2**32
+SAME_CLOCK_MS = 2000
 FALLBACK_NS = 1_000_000_000  # the better source silent for so long: the other one is taken
 # What leaves a gimbal's own attitude in doubt; standing at an end stop does not.
 GIMBAL_FAILURES = (
@@ -42,6 +44,17 @@ def gimbal_frame(flags: int) -> GimbalFrame | None:
     return GimbalFrame.EARTH if earth else GimbalFrame.HEADING
 
 
+def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
+    """time_boot_ms without its wrap after 49.7 days, where TIMESYNC (autopilot's ns since boot minus ours) tells how
+    long the autopilot has been up; else as it came."""
+    if offset_ns is None:
+        return boot_ms
+    up_ms = (now_ns + offset_ns) // 1_000_000
+    unwrapped_ms = boot_ms + round((up_ms - boot_ms) / BOOT_WRAP_MS) * BOOT_WRAP_MS
+    # Some peers answer TIMESYNC from another clock than the one in their stamps: it tells nothing of the wrap.
+    return unwrapped_ms if unwrapped_ms >= 0 and abs(unwrapped_ms - up_ms) <= SAME_CLOCK_MS else boot_ms
+
+
 class Telemetry:
     """`gimbal_component` None: the first that tells, until it falls silent."""
 
@@ -64,7 +77,7 @@ class Telemetry:
         message_id = message.get_msgId()
         if message_id == GIMBAL_ATTITUDE:
             return self._take_gimbal(message, now_ns)
-        time_ns = self._boot_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+        time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
         rising = True
         if message_id == ATTITUDE_QUATERNION:
             self._quaternion_ns = now_ns
@@ -99,9 +112,14 @@ class Telemetry:
         if self._gimbal is not None and self._gimbal[0] != component:
             self._forget_gimbal_clock()
         self._gimbal = (component, now_ns)
-        clock = self._boot_clock if component == AUTOPILOT_COMPONENT else self._gimbal_clock
-        time_ns = clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+        if component == AUTOPILOT_COMPONENT:
+            time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
+        else:
+            time_ns = self._gimbal_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
         return None if self._own_ship.add_gimbal(time_ns, message.q, frame) else "late"
+
+    def _uptime_ns(self, message: Any, now_ns: int) -> int:
+        return uptime_ms(message.time_boot_ms, self._timesync.offset_ns, now_ns) * 1_000_000
 
     def _forget_gimbal_clock(self) -> None:
         # A gimbal that is a device of its own counts from its own start.

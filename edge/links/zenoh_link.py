@@ -22,7 +22,7 @@ from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
-from edge.links.outgoing import sendable
+from edge.links.outgoing import NS_PER_MS, sendable
 from edge.links.zenoh_commands import Actions, declare_commands
 from edge.pictures import Picture
 from edge.requests import AskReload, RequestQueue
@@ -252,7 +252,8 @@ class Desk:
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
-        tracks = sendable(report, clock.monotonic_ns(), self._max_age_ms)
+        now_ns = clock.monotonic_ns()
+        tracks = sendable(report, now_ns, self._max_age_ms)
         self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
         for track in tracks:
             name = ros.target_name(track)
@@ -261,9 +262,12 @@ class Desk:
                 odometry = ros.odometry(track, report.own_ship, stamp_ns)
                 if odometry is not None:
                     self._put(topics.ODOM, odometry, name)
-        self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
-        if report.own_ship is not None:
-            self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns))
+        if now_ns - report.meta.capture_ns <= self._max_age_ms * NS_PER_MS:
+            self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
+            if report.own_ship is not None:
+                self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns))
+        else:
+            self.counted["frames_withheld"] += 1
         intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh, report.distortion)
         if intrinsics != self._intrinsics:
             self._put(topics.CAMERA_INFO, ros.camera_info(report, stamp_ns))

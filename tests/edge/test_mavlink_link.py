@@ -105,6 +105,23 @@ def test_only_sure_fresh_whole_tracks_are_sent_and_coasting_is_said() -> None:
     assert {m.id for m in peer.received if m.get_type() == "TARGET_RELATIVE"} == {6, 7}
 
 
+def test_a_camera_that_gives_no_more_frames_is_said_to_track_nothing() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.publish(report(track(time.monotonic_ns())))
+        assert peer.named("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == 1
+        peer.until(
+            lambda m: m.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and m.tracking_status == 0,
+            "word that nothing is tracked",
+            lambda: link.set_health(FAULT),
+        )
+        peer.until(
+            lambda m: m.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and m.tracking_status == 1,
+            "the next frame's target",
+            lambda: link.publish(report(track(time.monotonic_ns()))),
+        )
+
+
 def test_rates_are_bounded() -> None:
     with linked(target_relative_rate_hz=20.0, tracking_rate_hz=10.0) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)

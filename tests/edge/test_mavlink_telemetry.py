@@ -82,6 +82,33 @@ def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
     assert own_ship.at(1_000_000_000_000) is None
 
 
+@pytest.mark.parametrize("synced", [True, False])
+def test_own_attitude_goes_on_when_the_autopilots_milliseconds_wrap_after_49_days(synced: bool) -> None:
+    own_ship = OwnShipBuffer()
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
+    mav, wrap_ns, ms = MAVLink(None, srcSystem=1, srcComponent=1), 1_000_000_000_000, 1_000_000
+    station.health(TRACKING, wrap_ns)
+
+    def tell(message: Any, now_ns: int) -> None:
+        station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns)
+
+    for now_ns in range(wrap_ns - 2_000 * ms, wrap_ns + 2_000 * ms, 20 * ms):
+        up_ns = now_ns - wrap_ns + 2**32 * ms
+        if now_ns % (1_000 * ms) == 0:
+            beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+            tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
+        asked = [m for data in station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        for question in (m for m in asked if m.get_type() == "TIMESYNC" and synced):
+            tell(dialect.MAVLink_timesync_message(up_ns + ms, question.ts1), now_ns + 2 * ms)
+        attitude = dialect.MAVLink_attitude_quaternion_message(up_ns // ms % 2**32, 1.0, 0, 0, 0, 0, 0, 0)
+        tell(attitude, now_ns + 5 * ms)
+        now = own_ship.at(now_ns + 5 * ms)
+        assert now is not None
+        if synced and now_ns > wrap_ns - 1_500 * ms:
+            assert now.clock_std_s < 2e-3
+    assert station.vehicle.reboots == (0 if synced else 1)
+
+
 def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
     with linked(attitude_rate_hz=50.0) as (link, _), Peer(link.ports[0]) as peer:
         link.set_health(TRACKING)

@@ -185,6 +185,18 @@ def test_a_report_that_waited_too_long_is_withheld_when_it_is_sent() -> None:
         assert "sent_pose" not in link.counters()
 
 
+def test_of_a_frame_that_is_too_old_nothing_is_told_that_has_its_time() -> None:
+    endpoint = free_endpoint()
+    with linked(endpoint) as link:
+        old_ns = time.monotonic_ns() - 700_000_000
+        link.publish(report(track(old_ns), now_ns=old_ns))
+        until(lambda: link.counters().get("frames_withheld") == 1, what="withholding")
+        link.publish(report(track(time.monotonic_ns())))
+        until(lambda: link.counters().get("sent_tf") == 1, what="the next frame")
+        counted = link.counters()
+    assert (counted["sent_pose"], counted["sent_odom"], counted["sent_detections"]) == (1, 1, 1)
+
+
 def test_the_typed_client_takes_every_pose_it_gets() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link, connect(endpoint) as session, subscribe(session, "uav1", depth=64) as poses:
