@@ -22,7 +22,7 @@ from edge.config_ground import RecorderSettings, ZenohSettings
 from edge.config_path import ConfigPath
 from edge.errors import InputError
 from edge.estimator.providers import Provider
-from edge.links.mavlink_endpoints import parse_endpoint
+from edge.links.mavlink_endpoints import parse_endpoint, plain_host
 from edge.links.signing_key import load_key
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
@@ -124,7 +124,7 @@ class MavlinkSettings(Section):
         default=191, ge=2, le=255, description="ours; 191 is the onboard computer, 1 is the autopilot's own"
     )
     camera_component_id: int = Field(default=100, ge=2, le=255, description="the camera's; 100 is the first")
-    allowed_hosts: list[str] = Field(
+    allowed_hosts: list[Annotated[str, AfterValidator(plain_host)]] = Field(
         default_factory=list,
         description="addresses heard on udpin and tcpin; empty: the first that sends a valid autopilot heartbeat",
     )

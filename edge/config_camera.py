@@ -85,7 +85,7 @@ class DeviceCamera(Camera):
     device: str = Field(default="/dev/video0", description="V4L2 device")
     width: int = Field(default=1920, gt=0, description="pixels asked of the device")
     height: int = Field(default=1080, gt=0, description="pixels asked of the device")
-    fps: float = Field(default=30.0, gt=0, description="rate asked of the device")
+    fps: float = Field(default=30.0, gt=0, le=1000, description="rate asked of the device")
     fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
     exposure_ms: float | None = Field(
         default=None, gt=0, le=1000, description="fixed exposure, where the driver has it; default: left as it is"

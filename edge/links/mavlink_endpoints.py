@@ -9,6 +9,7 @@ serial:DEVICE:BAUD  a serial port; opened again for ever
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -40,5 +41,17 @@ def parse_endpoint(text: str) -> NetworkEndpoint | SerialEndpoint:
     network = re.fullmatch(r"(udpin|udpout|tcpin|tcpout):(?:\[([^\]]+)\]|([^:\s]+)):(\d{1,5})", text)
     if network and int(network[4]) <= 65_535:
         kind: Literal["udpin", "udpout", "tcpin", "tcpout"] = network[1]  # type: ignore[assignment]
+        if kind.endswith("out") and int(network[4]) == 0:
+            raise ValueError(f"'{text}' has port 0, where nobody listens")
         return NetworkEndpoint(kind, network[2] or network[3], int(network[4]), text)
     raise ValueError(f"'{text}' is not {FORMS}")
+
+
+def plain_host(text: str) -> str:
+    """An address as sockets tell senders, but without its zone, and an IPv4 one seen through IPv6 as itself. Raises
+    ValueError for what is no address."""
+    try:
+        address = ipaddress.ip_address(text.partition("%")[0])
+    except ValueError:
+        raise ValueError(f"'{text}' is no address such as 192.168.1.10 or fe80::1; names are not looked up") from None
+    return str(getattr(address, "ipv4_mapped", None) or address)

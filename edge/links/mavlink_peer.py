@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from edge.links.mavlink_endpoints import plain_host
 from edge.links.mavlink_receive import Receiver
 from edge.links.mavlink_vehicle import LOST_NS
 from edge.links.transports.medium import Address, Received, Transport
@@ -50,7 +51,7 @@ class Endpoint:
         if peer is not None and received.sender != peer:
             self._refused["address"] += 1
             return []
-        if peer is None and self._allowed_hosts and received.sender[0] not in self._allowed_hosts:
+        if peer is None and self._allowed_hosts and plain_host(received.sender[0]) not in self._allowed_hosts:
             self._refused["host"] += 1
             return []
         receiver = self._stranger_receiver if peer is None else self._receiver

@@ -23,6 +23,11 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
         ("[mavlink]\nadsb_icao_address = 0x1000000\n", r":5: \[mavlink\] adsb_icao_address: .* less than or equal"),
         ("[mavlink]\nsystem_id = 7\nvirtual_system_id = 7\n", r"\[mavlink\]: virtual_system_id must not be"),
         ('[mavlink]\nsigning_state = "s"\n', r"\[mavlink\]: signing_state needs signing_key"),
+        (
+            '[mavlink]\nallowed_hosts = ["10.0.0.1", "autopilot.local"]\n',
+            r":5: \[mavlink\] allowed_hosts\[1\]: .* no address",
+        ),
+        ('[mavlink]\nendpoints = ["udpout:10.0.0.1:0"]\n', r":5: \[mavlink\] endpoints\[0\]: .* has port 0"),
         ("[mavlink]\ncommanders = [0]\n", r":5: \[mavlink\] commanders\[0\]: "),
         ('mount = "gimbal"\n[mavlink]\nenabled = false\n', r'the file: \[camera\] mount = "gimbal" needs \[mavlink\]'),
         ('mount = "strapped"\n', r":4: \[camera\] mount: "),

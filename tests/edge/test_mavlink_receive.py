@@ -173,6 +173,12 @@ def test_hosts_that_are_not_allowed_are_not_heard() -> None:
         assert alone(peer.wire)
 
 
+def test_an_allowed_ipv4_host_is_heard_on_a_port_for_both_families() -> None:
+    with linked("udpin:[::]:0", allowed_hosts=["127.0.0.1"]) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        assert "refused_host" not in link.counters()
+
+
 def test_an_answer_to_another_component_is_not_taken_for_ours() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
