@@ -130,6 +130,9 @@ class ScheduleConfig(Section):
     gradient_clip: float = Field(5.0, gt=0)
     ema_decay: float = Field(0.999, ge=0, lt=1)
     teacher_until: float = Field(0.4, ge=0, le=1, description="progress at which true centres and boxes stop guiding")
+    rounded_from: float = Field(
+        1.0, ge=0, le=1, description="progress from which convolutions see the rounding of INT8; 1: never"
+    )
     sizes: list[SizeStage] = Field(min_length=1)
 
     @model_validator(mode="after")

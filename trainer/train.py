@@ -23,6 +23,7 @@ from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
+from trainer.rounding import rounded
 from trainer.runlog import RunLog, provenance
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
@@ -119,13 +120,14 @@ class Trainer:
         draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
         generator = torch.Generator().manual_seed(draw_of)
         self.model.train()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
-            seen = self.model.perceive(image)
-            dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
-        seen = Perception(seen.F_global.float(), seen.heat_logits.float())
-        teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
-        peaks, guide_size = guided_peaks(seen.heat_logits, labels, teacher, generator)
-        out = self.model.decode(seen, labels.K, peaks, guide_size)
+        with rounded(self.model) if progress >= schedule.rounded_from else contextlib.nullcontext():
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
+                seen = self.model.perceive(image)
+                dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
+            seen = Perception(seen.F_global.float(), seen.heat_logits.float())
+            teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
+            peaks, guide_size = guided_peaks(seen.heat_logits, labels, teacher, generator)
+            out = self.model.decode(seen, labels.K, peaks, guide_size)
         loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss, self.config.model.ray)
 
         rate = learning_rate(schedule, self.samples, progress)

@@ -1,0 +1,65 @@
+"""Quantisation-aware training: convolutions that see the rounding of INT8 while gradients pass it by.
+
+The grid is export's (trainer.graph): S8 weights for each channel and U8 inputs over the range that a batch shows. A
+norm after a convolution scales each channel's weights as a whole, so folding it later leaves that rounding as it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+# Where trainer.graph quantises, as submodules.
+ROUNDED_PARTS = ("backbone", "neck", "head_hm.0", "dts.convs")
+IMAGE_CHANNELS = 3
+_SMALLEST_SCALE = 1e-8
+
+
+def rounded_weights(weight: Tensor) -> Tensor:
+    """Weights [O, ...] on the symmetric S8 grid of each output channel; the gradient is that of `weight`."""
+    scale = weight.detach().flatten(1).abs().amax(1).clamp(min=127 * _SMALLEST_SCALE) / 127
+    zero = torch.zeros(len(scale), dtype=torch.int32, device=weight.device)
+    return torch.fake_quantize_per_channel_affine(weight, scale, zero, 0, -127, 127)
+
+
+def rounded_activations(x: Tensor) -> Tensor:
+    """A tensor on the U8 grid between its least and largest value and zero; the gradient is that of `x`."""
+    wide = x.float()
+    low, high = torch.aminmax(wide.detach())
+    low, high = low.clamp(max=0.0), high.clamp(min=0.0)
+    scale = ((high - low) / 255).clamp(min=_SMALLEST_SCALE)
+    zero = torch.round(-low / scale).to(torch.int32)
+    return torch.fake_quantize_per_tensor_affine(wide, scale, zero, 0, 255).to(x.dtype)
+
+
+@contextlib.contextmanager
+def rounded(model: nn.Module) -> Iterator[None]:
+    """While it lasts, the convolutions of ROUNDED_PARTS compute with rounded weights and inputs.
+
+    A picture's bytes are whole numbers already, so the first convolution's input stays as it is.
+    """
+    parts = (model.get_submodule(name) for name in ROUNDED_PARTS)
+    convolutions = [module for part in parts for module in part.modules() if isinstance(module, nn.Conv2d)]
+    floats: dict[nn.Module, nn.Parameter] = {}
+
+    def put_rounded(conv: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...] | None:
+        weight = conv._parameters["weight"]
+        assert weight is not None
+        floats[conv] = weight
+        # In the parameter's place, so that their order stays.
+        conv._parameters["weight"] = rounded_weights(weight)  # type: ignore[assignment]
+        return None if conv.in_channels == IMAGE_CHANNELS else (rounded_activations(inputs[0]),)
+
+    def put_back(conv: nn.Module, *_: object) -> None:
+        conv._parameters["weight"] = floats.pop(conv)
+
+    handles = [conv.register_forward_pre_hook(put_rounded) for conv in convolutions]
+    handles += [conv.register_forward_hook(put_back, always_call=True) for conv in convolutions]
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
