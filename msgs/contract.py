@@ -79,12 +79,20 @@ class ModelContract(BaseModel):
     track_score: ScoreCalibration = ScoreCalibration()
     acquire_score_min: float = Field(ge=0, le=1, description="a whole-frame peak of lower probability is no target")
     track_score_min: float = Field(ge=0, le=1, description="a window's peak of lower probability is no target")
+    pixel_mean_bgr: tuple[float, float, float] | None = Field(
+        None, description="what the graph subtracts from a pixel's bytes; None: the file is older than this key"
+    )
+    pixel_std_bgr: tuple[float, float, float] | None = Field(None, description="and divides the rest by")
+    depth_limits_m: tuple[float, float] = Field(
+        (50.0, 600.0), description="the graph keeps its depths within; one told at a limit may lie beyond it"
+    )
     trained_range_m: tuple[float, float]
     trained_focal_px: tuple[float, float]
     trained_box_px: tuple[float, float] = Field(
         description="longer side of the visible box in network pixels, as trained"
     )
     airframes: list[str] = Field(description="airframe classes in the training data")
-    training: dict[str, str | int | float] = Field(description="data, seed, samples, resolution, commit")
+    data: str = Field("", description="what it was trained on; empty: the file is older than this key")
+    training: dict[str, str | int | float] = Field(description="seed, samples, resolution, commit")
     metrics: dict[str, float] = Field(description="measured when the file was made; empty if not measured")
     weights_sha256: str = Field(description="hash of the float weights the graph was made from")

@@ -18,7 +18,7 @@ from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfi
 from trainer.data import Sampler, TrainingBatch, render_once, window_sampler
 from trainer.evaluate import Predictions, Predictor, choose_threshold, difference, measure, predict_all, torch_predictor
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
-from trainer.model import PoseNet
+from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, Z_RANGE_M, PoseNet
 
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
@@ -116,14 +116,29 @@ def _contract(
         track_window_scale=contract.track_window_scale,
         acquire_score_min=thresholds[0],
         track_score_min=thresholds[1],
+        pixel_mean_bgr=IMAGENET_MEAN_BGR,
+        pixel_std_bgr=IMAGENET_STD_BGR,
+        depth_limits_m=Z_RANGE_M,
         trained_range_m=contract.trained_range_m,
         trained_focal_px=trained_focal_px,
         trained_box_px=trained_box_px,
         airframes=airframe_names(config.data.airframe_ids),
+        data=data_told(config.data),
         training=training,
         metrics={},
         weights_sha256=sha256,
     )
+
+
+def data_told(data: DataConfig) -> str:
+    """What a configuration trains on, for a person."""
+    rendered = 1.0 - sum(source.share for source in data.datasets)
+    parts = [f"{source.path.name}, split {source.split}: {source.share:.0%}" for source in data.datasets]
+    if rendered > 1e-6:
+        told = f"rendered windows: {rendered:.0%}, of them {data.empty_share:.0%} without a target"
+        told += f", {data.acquire_share:.0%} of the whole frame"
+        parts.append(told + (f", {data.invented_share:.0%} of invented aircraft" if data.invented_share else ""))
+    return "; ".join(parts)
 
 
 def airframe_names(ids: list[int] | None) -> list[str]:

@@ -26,6 +26,10 @@ EDGE_SHARE, EDGE_PX = 0.05, 1.5
 # What is cut off is not known, so neither is how large the whole is nor where its middle: 1-sigma of log Z, and of the
 # origin's pixels in longer sides of the box. They cover the shipped model's errors on targets of which half is off.
 CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
+# Nor does what is left show which end is the nose: each axis, radians.
+CUT_SIGMA_ROTATION_RAD = 0.8
+# A depth at the farthest that a graph tells is a least depth: 1-sigma of log Z then, and how near counts as at it.
+FARTHEST_SIGMA_LOG_Z, FARTHEST_TOLERANCE = 1.0, 1e-3
 
 
 def decode(
@@ -40,8 +44,8 @@ def decode(
 ) -> list[Estimate]:
     """Accepted, distinct targets of one image of the batch, best score first; refusals are counted by reason.
 
-    A target cut by the frame's edge or of a size that was not trained is told with a covariance that says so; one
-    whose origin lies off the frame, or too small to show a shape, is not told.
+    A target cut by the frame's edge, of a size that was not trained or at the end of what depth can be told is told
+    with a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
     """
     acquiring = stage == "acquire"
     score_min = contract.acquire_score_min if acquiring else contract.track_score_min
@@ -64,6 +68,8 @@ def decode(
             continue
         longer_px = float(peaks.size_px[image, peak].max())
         sigma = _widened(sigma, longer_px, cut, contract.trained_box_px)
+        if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
+            sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
         covariance = pose_covariance(t_m, sigma, K_network, contract.trained_range_m)
         box = np.clip(box, -0.5, np.tile(frame_wh, 2) - 0.5)
         found.append(Estimate(score, box, _nearest_rotation(R), t_m, covariance, stage))
@@ -170,6 +176,7 @@ def _widened(sigma: Array, longer_px: float, cut: bool, trained_box_px: tuple[fl
     if cut:
         wider[:2] = np.hypot(wider[:2], CUT_SIGMA_ORIGIN * longer_px)
         wider[2] = np.hypot(wider[2], CUT_SIGMA_LOG_Z)
+        wider[3:] = np.hypot(wider[3:], CUT_SIGMA_ROTATION_RAD)
     return wider
 
 

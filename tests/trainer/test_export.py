@@ -92,6 +92,10 @@ def test_both_files_carry_a_contract_with_what_was_measured(exported: Exported) 
     assert fp32.weights_sha256 == int8.weights_sha256 == load_model(exported.run)[3]
     assert fp32.track_size_wh == (64, 64)
     assert fp32.airframes
+    assert int8.data == "rendered windows: 100%, of them 12% without a target, 30% of the whole frame"
+    assert int8.depth_limits_m == (50.0, 600.0)
+    np.testing.assert_allclose(int8.pixel_mean_bgr, 255 * np.array([0.406, 0.456, 0.485]))  # ImageNet's, as BGR bytes
+    np.testing.assert_allclose(int8.pixel_std_bgr, 255 * np.array([0.225, 0.224, 0.229]))
     assert int8.metrics["track_windows"] == 16.0
     assert 0 <= int8.metrics["acquire_E_r_median_deg"] <= 180
     assert any("INT8 against FP32" in text for text in exported.said)
