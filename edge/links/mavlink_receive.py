@@ -73,12 +73,16 @@ def is_autopilot_heartbeat(message: Any) -> bool:
 
 
 class Receiver:
-    """Checks for one source, whose address was looked at before."""
+    """Checks for one address, which was looked at before.
+
+    Each system and component behind it has a rate limit of its own: the flood of one must not use up the autopilot's,
+    whose heartbeat would seem to stop.
+    """
 
     def __init__(self, refused: Counter[str]) -> None:
         self._refused = refused
         self._second = 0
-        self._in_second = 0
+        self._in_second: Counter[tuple[int, int]] = Counter()
 
     def take(self, data: bytes, reader: FrameReader, now_ns: int) -> list[Any]:
         """Messages that are well-formed, of a kind we read and plausible; who sent them is the next check."""
@@ -92,7 +96,7 @@ class Receiver:
         self._refused["message_id"] += reader.unknown_ids - unknown
         accepted = []
         for message in messages:
-            reason = malformed(message) or self._too_many(now_ns)
+            reason = malformed(message) or self._too_many(message, now_ns)
             if reason is None:
                 accepted.append(message)
             else:
@@ -103,11 +107,14 @@ class Receiver:
         self._refused[reason] += 1
         return []
 
-    def _too_many(self, now_ns: int) -> str | None:
+    def _too_many(self, message: Any, now_ns: int) -> str | None:
         second = now_ns // 1_000_000_000
-        self._in_second = self._in_second + 1 if second == self._second else 1
-        self._second = second
-        return "rate" if self._in_second > RATE_MAX_HZ else None
+        if second != self._second:
+            self._second = second
+            self._in_second.clear()
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        self._in_second[source] += 1
+        return "rate" if self._in_second[source] > RATE_MAX_HZ else None
 
 
 def malformed(message: Any) -> str | None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.links.mavlink_receive import RATE_MAX_HZ, Receiver
 from edge.requests import RequestQueue, StopTracking
-from msgs.mavlink import MAVLink, dialect
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import SYSTEM_ID, Peer, alone, linked, meet
 from .reports import TRACKING
@@ -151,6 +153,19 @@ def test_a_flood_from_the_autopilots_own_address_does_not_keep_poses_from_going_
 
         peer.named("TARGET_RELATIVE", flood_and_publish)
         peer.settle(lambda: link.counters().get("refused_rate", 0) > 0, "refusal of the surplus", flood_and_publish)
+
+
+def test_the_flood_of_another_system_behind_its_address_does_not_silence_the_autopilot() -> None:
+    refused: Counter[str] = Counter()
+    receiver, reader, now_ns = Receiver(refused), FrameReader(datagram=True), 10_200_000_000
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    others = [bytes(beat.pack(MAVLink(None, srcSystem=42, srcComponent=one))) for one in (1, 66)]
+    for _ in range(3 * RATE_MAX_HZ):
+        receiver.take(b"".join(others), reader, now_ns)
+    assert refused["rate"] == 4 * RATE_MAX_HZ
+    own = bytes(beat.pack(MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)))
+    assert len(receiver.take(own, reader, now_ns)) == 1
+    assert len(receiver.take(others[0], reader, now_ns + 1_000_000_000)) == 1
 
 
 def test_only_commanders_command_where_they_are_named() -> None:
