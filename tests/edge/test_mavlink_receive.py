@@ -159,7 +159,7 @@ def test_the_flood_of_another_system_behind_its_address_does_not_silence_the_aut
     refused: Counter[str] = Counter()
     receiver, reader, now_ns = Receiver(refused), FrameReader(datagram=True), 10_200_000_000
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
-    others = [bytes(beat.pack(MAVLink(None, srcSystem=42, srcComponent=one))) for one in (1, 66)]
+    others = [bytes(beat.pack(MAVLink(None, srcSystem=SYSTEM_ID + 1, srcComponent=one))) for one in (1, 66)]
     for _ in range(3 * RATE_MAX_HZ):
         receiver.take(b"".join(others), reader, now_ns)
     assert refused["rate"] == 4 * RATE_MAX_HZ
