@@ -144,6 +144,16 @@ def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
     assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
 
 
+def test_a_depth_at_the_end_of_what_a_graph_can_tell_is_a_least_depth() -> None:
+    contract = ModelContract(**(CONTRACT | {"depth_limits_m": (50.0, 600.0)}))
+    sigma = {}
+    for z_m in (590.0, 599.99):
+        (e,) = decode(peaks_of(z_m=z_m), 0, PixelMap((1, 1), (0, 0)), K, contract, "track", Counter(), SIZE_WH)
+        sigma[z_m] = e.covariance[2, 2] ** 0.5 / z_m
+    assert sigma[590.0] == pytest.approx(0.05, rel=1e-3)
+    assert sigma[599.99] > 0.9
+
+
 def seen_at(
     left_px: float, width_px: float, *, origin_x_px: float | None = None
 ) -> tuple[list[Estimate], Counter[str]]:
@@ -170,6 +180,7 @@ def test_a_target_cut_by_the_edge_is_told_with_doubt_in_place_and_range(left_px:
     assert depth_sigma > 0.35
     across_px = cut.covariance[1, 1] ** 0.5 * K[1, 1] / cut.t_cam_target_m[2]
     assert across_px > 0.2 * 60
+    assert np.sqrt(np.diagonal(cut.covariance)[3:]).min() > np.radians(40), "no nose to tell from a tail"
     assert cut.box_xyxy_px[0] >= -0.5
     assert cut.box_xyxy_px[2] <= SIZE_WH[0] - 0.5
 

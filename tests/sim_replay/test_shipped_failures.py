@@ -1,0 +1,113 @@
+"""What the shipped model says of pictures it should say little of: nothing there, cut off, too small, too far."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge.config import SHIPPED_MODEL
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import load_model
+from edge.types import Estimate, Frame, FrameMeta
+from sim_replay import metrics
+from sim_replay.render.frame import outline_px, render_frame
+from sim_replay.render.placing import frame_scene
+from sim_replay.render.projection import extents_px
+from sim_replay.render.scene import Scene
+
+AIRFRAMES = [0, 1, 3, 5, 8, 12, 14, 18]
+FRAME_WH = np.array([1920, 1080])
+# Chi-squared with three degrees of freedom leaves one in a thousand beyond.
+NEES_MAX = 16.3
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return Estimator(load_model(SHIPPED_MODEL, threads=1))
+
+
+def scene_at(seed: int, range_m: float, longer_px: float, at: tuple[float, float] = (0.5, 0.5)) -> Scene:
+    """A drawn scene with its target moved to `range_m`, shown `longer_px` long at that share of the frame."""
+    scene = frame_scene(np.random.default_rng(seed), AIRFRAMES)
+    camera, target = scene.camera, scene.targets[0]
+    for _ in range(5):  # a lens moves the target's ray, and so its outline, a little
+        ray = np.linalg.solve(camera.K, [*(np.array(at) * FRAME_WH), 1.0])
+        away_m = camera.R_ned_cam @ ray / np.linalg.norm(ray) * range_m
+        target = replace(target, t_ned_body_m=camera.t_ned_cam_m + away_m)
+        box = extents_px(outline_px(target, camera))
+        assert box is not None
+        zoom = longer_px / max(box[2] - box[0], box[3] - box[1])
+        camera = replace(camera, K=camera.K * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+    ray = np.linalg.solve(camera.K, [*(np.array(at) * FRAME_WH), 1.0])
+    away_m = camera.R_ned_cam @ ray / np.linalg.norm(ray) * range_m
+    return replace(scene, camera=camera, targets=(replace(target, t_ned_body_m=camera.t_ned_cam_m + away_m),))
+
+
+def frame_of(scene: Scene) -> Frame:
+    return Frame(FrameMeta(0, 0, 0), render_frame(scene).image_bgr, scene.camera.K)
+
+
+def told(estimator: Estimator, scene: Scene) -> list[Estimate]:
+    """By the whole frame, and by a track window around what is seen of the target."""
+    frame = frame_of(scene)
+    box = extents_px(outline_px(scene.targets[0], scene.camera))
+    seen = np.clip(box, -0.5, np.tile(FRAME_WH, 2) - 0.5)
+    return [e for e in (*estimator.acquire(frame), *estimator.track(frame, [seen])) if e is not None]
+
+
+def position_nees(estimate: Estimate, scene: Scene) -> float:
+    error_m = scene.targets[0].pose_in(scene.camera)[1] - estimate.t_cam_target_m
+    return float(error_m @ np.linalg.solve(estimate.covariance[:3, :3], error_m))
+
+
+def rotation_nees(estimate: Estimate, scene: Scene) -> float:
+    R, t_m = scene.targets[0].pose_in(scene.camera)
+    nees = metrics.nees(estimate.R_cam_target, estimate.t_cam_target_m, R, t_m, estimate.covariance)
+    return float(nees[2])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_frame_without_a_target_gives_no_pose(estimator: Estimator, seed: int) -> None:
+    scene = scene_at(seed, 300.0, 100.0)
+    frame = frame_of(replace(scene, targets=()))
+    assert estimator.acquire(frame) == []
+    middle = np.array([900.0, 500.0, 1000.0, 560.0])
+    assert estimator.track(frame, [middle]) == [None]
+
+
+def test_a_target_below_eight_pixels_is_not_told(estimator: Estimator) -> None:
+    shown = {px: sum(bool(told(estimator, scene_at(seed, 400.0, px))) for seed in range(4)) for px in (6.0, 60.0)}
+    assert shown[6.0] == 0
+    assert shown[60.0] >= 3, "the same aircraft larger are told"
+
+
+def test_a_target_cut_by_the_edge_is_told_with_the_doubt_it_deserves_or_not_at_all(estimator: Estimator) -> None:
+    edges = ((0.0, 0.5), (1.0, 0.4), (0.3, 0.0), (0.6, 1.0))
+    answers: list[tuple[float, float]] = []
+    for seed, at in enumerate(edges * 3):
+        scene = scene_at(100 + seed, 250.0, 140.0, at)
+        answers += [(position_nees(e, scene), rotation_nees(e, scene)) for e in told(estimator, scene)]
+    position, rotation = np.array(answers).T
+    assert len(answers) >= 6
+    assert position.max() < NEES_MAX
+    # Half of them take nose for tail: as far as a turn can be, and told so.
+    assert np.mean(rotation < NEES_MAX) > 0.9
+
+
+@pytest.mark.parametrize(("range_m", "least"), [(30.0, 0), (800.0, 6), (1200.0, 6)])
+def test_a_target_beyond_the_trained_range_is_told_with_the_doubt_it_deserves_or_not_at_all(
+    estimator: Estimator, range_m: float, least: int
+) -> None:
+    scenes = [scene_at(seed, range_m, 100.0) for seed in range(6)]
+    answers = [(e, scene) for scene in scenes for e in told(estimator, scene)]
+    honest = [position_nees(e, scene) < NEES_MAX for e, scene in answers]
+    assert len(answers) >= least
+    assert Counter(honest)[False] <= 0.2 * len(answers)
+    # Where the depth is only a bound, the direction is still an answer.
+    for estimate, scene in answers:
+        t_m = scene.targets[0].pose_in(scene.camera)[1]
+        aside = np.tan(np.radians(metrics.bearing_error_deg(estimate.t_cam_target_m, t_m)))
+        assert aside * scene.camera.K[0, 0] < 0.4 * 100.0, "pixels of the target's hundred"
