@@ -67,6 +67,7 @@ class MavlinkLink:
         self._wake, self._woken = socket.socketpair()
         self._thread: threading.Thread | None = None
         self._next_tick_ns = 0
+        self._told: tuple[int | None, int | None] | None = None  # system and autopilot that the log knows of
 
     def start(self) -> None:
         """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
@@ -217,6 +218,11 @@ class MavlinkLink:
         out = self._station.tick(now_ns)
         if was is Contact.HEARD and self._station.vehicle.contact is Contact.LOST:
             log.warning("mavlink: the autopilot's heartbeat has stopped")
+        vehicle = self._station.vehicle
+        if vehicle.contact is Contact.HEARD and (vehicle.system_id, vehicle.autopilot) != self._told:
+            self._told = (vehicle.system_id, vehicle.autopilot)
+            for sentence in self._station.withheld():
+                log.warning("mavlink: %s", sentence)
         self._send(out.everywhere)
         home = self._station.home
         if home is not None:

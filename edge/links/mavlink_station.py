@@ -181,6 +181,17 @@ class Station:
         self._text_id = self._text_id % 65535 + 1
         return [self._packed(message) for message in words.statustexts(severity, text, self._text_id)]
 
+    def withheld(self) -> list[str]:
+        """Sentences: what the settings ask for and this vehicle does not get."""
+        settings, found = self._settings, []
+        if settings.target_relative and TARGET_RELATIVE not in self._enabled():
+            found.append("TARGET_RELATIVE is not sent to PX4; target_relative_to_px4 = true sends it")
+        if self._traffic_ids and self._virtual.srcSystem == self.vehicle.system_id:
+            found.append(
+                f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle is {self.vehicle.system_id} too"
+            )
+        return found
+
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
         before = self.vehicle.system_id
         if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), heartbeat.autopilot, now_ns):
@@ -265,6 +276,10 @@ class Station:
         withheld = {TARGET_RELATIVE} if to_px4 and not self._settings.target_relative_to_px4 else set()
         return self._schedule.message_ids - withheld
 
+    @property
+    def _traffic_ids(self) -> set[int]:
+        return self._schedule.message_ids & {FOLLOW_TARGET, ADSB_VEHICLE}
+
     def _wants_target_relative(self, track: Track, now_ns: int) -> bool:
         return TARGET_RELATIVE in self._enabled() and self._schedule.due(TARGET_RELATIVE, track.track_id, now_ns)
 
@@ -275,7 +290,7 @@ class Station:
 
     def _traffic(self, report: Report, tracks: list[Track], first: Track | None, now_ns: int) -> list[bytes]:
         if self._virtual.srcSystem == self.vehicle.system_id:
-            self.counters["virtual_system_id_taken"] += 1
+            self.counters["virtual_system_id_taken"] += bool(self._traffic_ids)
             return []
         messages = []
         if first is not None and self._schedule.due(FOLLOW_TARGET, 0, now_ns):

@@ -138,7 +138,7 @@ def test_rates_are_bounded() -> None:
     assert 12 <= counts["boxes"] <= 23
 
 
-def test_px4_gets_no_target_relative_unless_asked() -> None:
+def test_px4_gets_no_target_relative_unless_asked(caplog: pytest.LogCaptureFixture) -> None:
     for asked in (False, True):
         with (
             linked(target_relative_to_px4=asked) as (link, _),
@@ -148,6 +148,7 @@ def test_px4_gets_no_target_relative_unless_asked() -> None:
             link.publish(report(track(time.monotonic_ns())))
             peer.named("CAMERA_TRACKING_IMAGE_STATUS")
             assert ("TARGET_RELATIVE" in {m.get_type() for m in peer.received}) == asked
+    assert sum("TARGET_RELATIVE is not sent to PX4" in record.message for record in caplog.records) == 1
 
 
 def test_an_attitude_that_is_not_known_is_told_as_unknown_and_the_place_all_the_same() -> None:
@@ -270,12 +271,14 @@ def test_without_a_place_on_the_globe_there_is_nothing_to_follow() -> None:
     assert not {"FOLLOW_TARGET", "ADSB_VEHICLE", "CAMERA_TRACKING_GEO_STATUS"} & {m.get_type() for m in peer.received}
 
 
-def test_a_vehicle_that_has_the_virtual_systems_id_gets_no_traffic() -> None:
+def test_a_vehicle_that_has_the_virtual_systems_id_gets_no_traffic(caplog: pytest.LogCaptureFixture) -> None:
     with linked(follow_target=True, virtual_system_id=SYSTEM_ID) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
         link.publish(report(track(time.monotonic_ns())))
         peer.settle(lambda: link.counters().get("virtual_system_id_taken", 0) > 0, "count")
     assert "FOLLOW_TARGET" not in {m.get_type() for m in peer.received}
+    told = [record.message for record in caplog.records if "FOLLOW_TARGET" in record.message]
+    assert told == [f"mavlink: neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {SYSTEM_ID}"]
 
 
 def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:
