@@ -187,9 +187,7 @@ class Station:
         if settings.target_relative and TARGET_RELATIVE not in self._enabled():
             found.append("TARGET_RELATIVE is not sent to PX4; target_relative_to_px4 = true sends it")
         if self._traffic_ids and self._virtual.srcSystem == self.vehicle.system_id:
-            found.append(
-                f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle is {self.vehicle.system_id} too"
-            )
+            found.append(f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {self._system_id}")
         return found
 
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
