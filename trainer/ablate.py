@@ -114,7 +114,7 @@ def ablate(
         folder = out / variant.name
         say(f"{variant.name}: {variant.says}")
         started = (folder / WEIGHTS_NAME).exists()
-        if started and load_file(folder)["config"] != text:
+        if started and parse_config(load_file(folder)["config"], f"{folder} (config)") != config:
             raise ConfigError(f"{folder}: holds a run of another configuration or scale; give another --out")
         if not started or int(load_model(folder)[2]["samples"]) < scale.samples:
             opener = lambda seed, size, data=config.data: open_view(data, seed, size)  # noqa: E731
