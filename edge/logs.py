@@ -6,6 +6,8 @@ import logging
 import os
 import re
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TextIO
 
@@ -27,15 +29,20 @@ class _Fault:
 
 class CountingHandler(logging.StreamHandler[TextIO]):
     """Writes a warning or an error at once, the same one (logger, level, words but for their numbers) again only as a
-    count after REPEAT_S. What is below a warning is written as it comes."""
+    count after REPEAT_S. What is below a warning is written as it comes.
 
-    def __init__(self, stream: TextIO) -> None:
+    `now_s` counts the time between them: not a record's own, which is of a clock that may be set back.
+    """
+
+    def __init__(self, stream: TextIO, now_s: Callable[[], float] = time.monotonic) -> None:
         super().__init__(stream)
+        self._now_s = now_s
         self._faults: dict[tuple[str, int, str], _Fault] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
+        now_s = self._now_s()
         for key, fault in list(self._faults.items()):
-            if record.created - fault.since_s >= REPEAT_S:
+            if now_s - fault.since_s >= REPEAT_S:
                 self._tell_count(fault)
                 del self._faults[key]
         if record.levelno >= logging.WARNING:
@@ -45,7 +52,7 @@ class CountingHandler(logging.StreamHandler[TextIO]):
                 known.repeated, known.last = known.repeated + 1, record
                 return
             if len(self._faults) < FAULTS_REMEMBERED:
-                self._faults[key] = _Fault(record.created, record)
+                self._faults[key] = _Fault(now_s, record)
         super().emit(record)
 
     def close(self) -> None:

@@ -170,12 +170,14 @@ def test_the_stages_of_a_frame_add_up_to_its_whole(steps_ns: list[int], capture_
     assert (stages["capture"], stages["wait"]) == (capture_ns, wait_ns)
 
 
-def logged(times_and_words: list[tuple[float, int, str]]) -> list[str]:
-    stream = io.StringIO()
-    handler = CountingHandler(stream)
-    for created_s, level, words in times_and_words:
+def logged(times_and_words: list[tuple[float, int, str]], wall_s: float = 0.0) -> list[str]:
+    """`wall_s`: by how much the wall clock is set back with each line."""
+    stream, now_s = io.StringIO(), 0.0
+    handler = CountingHandler(stream, lambda: now_s)
+    for number, (told_s, level, words) in enumerate(times_and_words):
+        now_s = told_s
         record = logging.LogRecord("edge.camera", level, "", 0, words, (), None)
-        record.created = created_s
+        record.created = told_s - number * wall_s
         handler.emit(record)
     handler.close()
     return stream.getvalue().splitlines()
@@ -189,6 +191,11 @@ def test_a_fault_that_repeats_is_one_line_and_a_count() -> None:
         "picture 499 cannot be read (499 more in 60 s)",
         "tracking",
     ]
+
+
+def test_a_wall_clock_that_is_set_back_keeps_no_fault_out_of_the_log() -> None:
+    fault = [(t_s, logging.WARNING, "camera lost") for t_s in (0.0, 61.0, 122.0)]
+    assert logged(fault, wall_s=3600.0) == ["camera lost"] * 3
 
 
 def test_other_faults_and_plain_news_are_all_written() -> None:
