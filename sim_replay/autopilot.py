@@ -7,8 +7,8 @@ it does not know, and asks for TIMESYNC itself, ten times a second, believing an
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
-Prints one JSON object a line: `ready`, each `target_relative` with its receive time, and a `summary` when it is told
-to stop (SIGTERM, SIGINT) or the process that started it ends.
+Prints one JSON object a line: `ready`, each `target_relative` with its receive time, with --all each `message` that it
+takes, and a `summary` when it is told to stop (SIGTERM, SIGINT) or the process that started it ends.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 SYSTEM_ID = 1
 COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 TARGET_RELATIVE_ID = 511
+TRAFFIC_IDS = (dialect.MAVLINK_MSG_ID_FOLLOW_TARGET, dialect.MAVLINK_MSG_ID_ADSB_VEHICLE)  # of systems of their own
 # What it streams unasked; MAV_CMD_SET_MESSAGE_INTERVAL changes it.
 DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -199,7 +200,8 @@ class Autopilot:
             return "not MAVLink"
         if kind.startswith("UNKNOWN"):
             return "unknown message"
-        if message.get_srcSystem() != self._system_id or message.get_srcComponent() == COMPONENT_ID:
+        traffic = message.get_msgId() in TRAFFIC_IDS
+        if (message.get_srcSystem() == self._system_id) is traffic or message.get_srcComponent() == COMPONENT_ID:
             return "not from a component of this vehicle"
         if self._signing is not None and (unproven := self._signing.refusal(message)) is not None:
             return f"signing: {unproven}"
@@ -299,6 +301,10 @@ def _fly(autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, sto
                 link.sendto(packed, address)
 
 
+def _tell(message: Any, now_ns: int) -> None:
+    _emit({"event": "message", **message_record(message, now_ns)})
+
+
 def _writer(args: argparse.Namespace, stack: ExitStack) -> Callable[[Any, int], None]:
     """Writes each message to --messages; `t_ns` counts on the telemetry's clock."""
     file = stack.enter_context(args.messages.open("w", encoding="utf-8"))
@@ -332,7 +338,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--firmware", choices=FIRMWARES, default="ardupilot", help="whose peculiarities it has (ardupilot)"
     )
-    parser.add_argument("--messages", type=Path, metavar="FILE", help="write each message that it takes, JSON lines")
+    taken = parser.add_mutually_exclusive_group()
+    taken.add_argument("--messages", type=Path, metavar="FILE", help="write each message that it takes, JSON lines")
+    taken.add_argument("--all", action="store_true", help="print each message that it takes, with its receive time")
     add_options(parser)
     args = parser.parse_args(argv)
     try:
@@ -346,7 +354,7 @@ def main(argv: list[str] | None = None) -> int:
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
     signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
     with ExitStack() as stack:
-        write = (lambda _message, _now_ns: None) if args.messages is None else _writer(args, stack)
+        write = _writer(args, stack) if args.messages else _tell if args.all else (lambda _message, _now_ns: None)
         autopilot = Autopilot(
             telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
         )

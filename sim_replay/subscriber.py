@@ -2,30 +2,35 @@
 
     python -m sim_replay.subscriber --connect tcp/127.0.0.1:7448 --uav uav1
 
-Prints one JSON object a line: `ready`, each valid `pose`, each `diagnostics`, and a `summary` of samples by topic
-and refusals by reason when it is told to stop (SIGTERM, SIGINT) or the process that started it ends.
+Prints one JSON object a line: `ready`, each valid `pose`, each `diagnostics`, with --all each `sample` of the other
+topics that have a time, and a `summary` of samples by topic and refusals by reason when it is told to stop (SIGTERM,
+SIGINT) or the process that started it ends.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import queue
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import zenoh
 
 from msgs import topics
-from msgs.cdr import DiagnosticArray
+from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage
 from msgs.client import connect, subscribe_all
 from msgs.receive import TargetPose
 from msgs.signals import stop_on_signals
 from msgs.wire import PayloadError
 
+TIMED = (topics.ODOM, topics.DETECTIONS, topics.TF)
+MAX_AGE_S = 1.0
 _POLL_S = 0.2
 _RETRY_S = 0.1
 
@@ -55,6 +60,28 @@ def _diagnostics_record(payload: bytes) -> dict[str, Any] | None:
     return {"event": "diagnostics", "stamp_utc_ns": array.stamp_ns, "message": message, "values": values}
 
 
+def sample_record(topic: topics.Topic, payload: bytes, now_utc_ns: int) -> dict[str, Any]:
+    """The `sample` line of one of TIMED: its stamp, age and content, or why it cannot be read."""
+    told: dict[str, Any] = {"event": "sample", "topic": topic.name.rpartition("/")[2]}
+    try:
+        stamp_ns, content = _content(topic, payload)
+    except PayloadError as error:
+        return {**told, "unreadable": str(error)}
+    return {**told, "stamp_utc_ns": stamp_ns, "age_ms": round((now_utc_ns - stamp_ns) / 1e6, 3), **content}
+
+
+def _content(topic: topics.Topic, payload: bytes) -> tuple[int, dict[str, Any]]:
+    if topic is topics.ODOM:
+        odometry = Odometry.decode(payload)
+        return odometry.stamp_ns, {"frame_id": odometry.frame_id, "t_m": odometry.t_ned_target_m.tolist()}
+    if topic is topics.DETECTIONS:
+        array = Detection3DArray.decode(payload)
+        return array.stamp_ns, {"targets": [one.id for one in array.detections]}
+    transforms = TFMessage.decode(payload).transforms
+    turned = {one.child_frame_id: one.q_frame_child_xyzw.tolist() for one in transforms}
+    return min((one.stamp_ns for one in transforms), default=0), {"q_xyzw": turned}
+
+
 def _connect(endpoint: str, wait_s: float, stop: threading.Event) -> zenoh.Session:
     """A session with the daemon, however late it starts. Raises ConnectionError after `wait_s` and on `stop`."""
     deadline = time.monotonic() + wait_s
@@ -66,7 +93,9 @@ def _connect(endpoint: str, wait_s: float, stop: threading.Event) -> zenoh.Sessi
                 raise
 
 
-def _listen(session: zenoh.Session, uav: str, stop: threading.Event) -> dict[str, Any]:
+def _listen(
+    session: zenoh.Session, uav: str, stop: threading.Event, everything: bool, max_age_s: float
+) -> dict[str, Any]:
     """Print what arrives until `stop` is set or the parent process is gone; returns the summary."""
     records: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     parent = os.getppid()
@@ -76,16 +105,25 @@ def _listen(session: zenoh.Session, uav: str, stop: threading.Event) -> dict[str
         if record is not None:
             records.put(record)
 
-    counts = subscribe_all(session, uav, lambda pose: records.put(pose_record(pose)))
-    handler = zenoh.handlers.Callback(on_diagnostics, indirect=False)
-    diagnostics = session.declare_subscriber(topics.subscription_key(topics.DIAGNOSTICS, uav), handler)
+    def on_sample(topic: topics.Topic, sample: zenoh.Sample) -> None:
+        records.put(sample_record(topic, sample.payload.to_bytes(), time.time_ns()))
+
+    counts = subscribe_all(session, uav, lambda pose: records.put(pose_record(pose)), max_age_s=max_age_s)
+    takers: list[tuple[topics.Topic, Callable[[zenoh.Sample], None]]] = [(topics.DIAGNOSTICS, on_diagnostics)]
+    if everything:
+        takers += [(topic, functools.partial(on_sample, topic)) for topic in TIMED]
+    subscribers = [
+        session.declare_subscriber(topics.subscription_key(topic, uav), zenoh.handlers.Callback(taker, indirect=False))
+        for topic, taker in takers
+    ]
     _emit({"event": "ready"})
     while not stop.is_set() and os.getppid() == parent:
         try:
             _emit(records.get(timeout=_POLL_S))
         except queue.Empty:
             continue
-    diagnostics.undeclare()
+    for subscriber in subscribers:
+        subscriber.undeclare()
     counts.close()
     while not records.empty():
         _emit(records.get())
@@ -103,11 +141,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--connect", required=True, help="zenoh endpoint of the daemon, e.g. tcp/127.0.0.1:7448")
     parser.add_argument("--uav", default="uav1", help="name of the vehicle")
     parser.add_argument("--wait-s", type=float, default=30.0, help="how long the daemon may take to appear")
+    parser.add_argument("--all", action="store_true", help="print a line for odometry, detections and transforms too")
+    parser.add_argument(
+        "--max-age-s", type=float, default=MAX_AGE_S, help="poses that come later than this are refused (%(default)s)"
+    )
     args = parser.parse_args(argv)
     stop = stop_on_signals()
     try:
         with _connect(args.connect, args.wait_s, stop) as session:
-            summary = _listen(session, args.uav, stop)
+            summary = _listen(session, args.uav, stop, args.all, args.max_age_s)
     except ConnectionError as error:
         print(error, file=sys.stderr)
         return 1

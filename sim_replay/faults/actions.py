@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -12,6 +13,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from functools import singledispatch
 from pathlib import Path
@@ -19,7 +21,7 @@ from pathlib import Path
 from msgs.mavlink import dialect
 from sim_replay.faults import hostile
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import LOOPBACK, LinkState
+from sim_replay.faults.relay import LOOPBACK, LinkState, udp_queue
 from sim_replay.faults.rig import START_S, UAV, Rig
 from sim_replay.faults.timeline import (
     Camera,
@@ -37,11 +39,16 @@ from sim_replay.play import PlayError
 
 FILLER = "filler"
 _BUSY = "while True: pass"
+LOOK_EVERY_N = 32  # datagrams of a flood between two looks at what is not read yet
+QUEUED_MAX_BYTES = 50_000  # of the socket's 200 kB, as the kernel counts them
+QUEUE_LOOK_S = 0.001
+PACED_S = 30.0  # on a busy machine; what is left then comes as fast as it can
 
 
 @singledispatch
-def act(step: object, rig: Rig) -> None:
-    """Carry out a step that is an act. Raises PlayError when the host does not let it, naming why."""
+def act(step: object, rig: Rig) -> str | None:
+    """Carry out a step that is an act; what there is to tell of it. Raises PlayError when the host does not let it,
+    naming why."""
     raise TypeError(f"{type(step).__name__} is no act")
 
 
@@ -73,14 +80,27 @@ def _camera(step: Camera, rig: Rig) -> None:
 def _link(step: Link, rig: Rig) -> None:
     drop_ids = frozenset(getattr(dialect, f"MAVLINK_MSG_ID_{name}") for name in step.drop)
     relay = rig.mavlink if step.which == "mavlink" else rig.zenoh
+    if step.which == "zenoh":
+        rig.witness.zenoh_cut(step.cut or step.delay_ms > 0, time.time_ns())
     relay.state = LinkState(step.cut, step.delay_ms / 1e3, step.corrupt, drop_ids)
 
 
 @act.register
-def _flood(step: Flood, rig: Rig) -> None:
+def _flood(step: Flood, rig: Rig) -> str:
+    _, lost_before = udp_queue(rig.mavlink_port)
+    paced_until_s = time.monotonic() + PACED_S
+    sent = 0
     with _sender(step.sender, rig) as send:
         for datagram in hostile.take_bytes(_datagrams(step, rig), step.total_bytes):
             send(datagram)
+            sent += 1
+            # Of a faster flood the kernel would drop most, and the daemon never see it.
+            while sent % LOOK_EVERY_N == 0 and udp_queue(rig.mavlink_port)[0] > QUEUED_MAX_BYTES:
+                if time.monotonic() > paced_until_s:
+                    break
+                time.sleep(QUEUE_LOOK_S)
+    lost = udp_queue(rig.mavlink_port)[1] - lost_before
+    return f"{sent} datagrams, of which {sent - max(lost, 0)} reached the daemon"
 
 
 @act.register
@@ -148,7 +168,12 @@ def _load(step: Load, rig: Rig) -> None:
 def _datagrams(step: Flood, rig: Rig) -> Iterator[bytes]:
     if step.what == "random":
         return hostile.random_datagrams(random.Random(0))
-    return hostile.hostile_datagrams() if step.what == "hostile" else iter(list(rig.mavlink.tape))
+    if step.what == "hostile":
+        return hostile.hostile_datagrams()
+    tape = list(rig.mavlink.tape)
+    if not tape:
+        raise PlayError("nothing to replay: the autopilot has said nothing yet")
+    return itertools.cycle(tape)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,7 @@
-"""What must hold all the time, whatever breaks: no peer is given anything stale, invented or invalid. Pure."""
+"""What must hold all the time, whatever breaks: no peer is given anything stale, invented or invalid. Pure.
+
+Judged are all poses, and all other messages that tell of a target or of the own attitude.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +12,36 @@ import numpy as np
 
 from edge.config import R_BODY_CAM_FORWARD
 from msgs.geometry import q_wxyz_from_R
+from sim_replay.faults.messages import ReceivedMessage
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose, Witness
 
 # The daemon's own limits on a measurement's age, and what a loaded host may add between its look and the peer's.
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
-TRANSIT_MAX_NS = 700_000_000
+TRANSIT_MAX_NS = 900_000_000
 SAME_FRAME_NS = 30_000_000
 # The rig's own ship hovers level and looks north through a camera along its nose.
 Q_NED_CAM_WXYZ = q_wxyz_from_R(R_BODY_CAM_FORWARD)
 ATTITUDE_TOLERANCE = 1e-2
-# To refuse these is right: what a cut link held back or a peer that stood still read late, what a relay spoiled, and
-# what is addressed as from the system that another has just replaced.
+# To refuse these is right: what a relay spoiled, and what comes as from the system that another has just replaced.
 MAY_REFUSE = {
-    SUBSCRIBER: ("STALE", "SEQUENCE"),
     AUTOPILOT: ("not MAVLink", "unknown message", "not from a component of this vehicle"),
 }
 
 
 def violations(witness: Witness) -> list[str]:
     """Sentences, none if all was well, of a run that is over."""
-    found = pose_faults(witness.poses, witness.frames)
+    found = faults_since(witness)
     for name, summary in witness.summaries:
         refused = summary["refused"].items()
         found += [f"the {name} refused {n}: {why}" for why, n in refused if why not in MAY_REFUSE.get(name, ())]
     return found
+
+
+def faults_since(witness: Witness, poses: int = 0, messages: int = 0) -> list[str]:
+    """Sentences, none if all was well, of what the peers received after so many poses and messages."""
+    sent_on_time = [one for one in witness.poses[poses:] if not _held_back(one, witness.held_back)]
+    told_on_time = [one for one in witness.messages[messages:] if not _held_back(one, witness.held_back)]
+    return pose_faults(sent_on_time, witness.frames) + message_faults(told_on_time, witness.frames)
 
 
 def pose_faults(poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame]) -> list[str]:
@@ -40,6 +49,13 @@ def pose_faults(poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame]) -
     true exposure."""
     exposures = _Exposures(frames)
     return [text for pose in poses if (text := _fault_of(pose, exposures))]
+
+
+def message_faults(messages: Sequence[ReceivedMessage], frames: Sequence[ExposedFrame]) -> list[str]:
+    """The same for other messages. One without a stamp speaks of now: a living frame must have been exposed just
+    before it came."""
+    exposures = _Exposures(frames)
+    return [text for message in messages if (text := _fault_of_message(message, exposures))]
 
 
 def ages_ms(witness: Witness, peer: str) -> list[float]:
@@ -57,6 +73,11 @@ class _Exposures:
             (frame for frame in frames if frame.stamp_ns != frame.exposed_ns), key=lambda frame: frame.exposed_ns
         )
         self._wrong_exposed = [frame.exposed_ns for frame in self._wrong]
+        self._living = sorted(frame.exposed_ns for frame in frames if not frame.frozen)
+
+    def any_living(self, from_ns: int, to_ns: int) -> bool:
+        """Whether a picture that shows something new was exposed then."""
+        return bisect.bisect_left(self._living, from_ns) < bisect.bisect_right(self._living, to_ns)
 
     def of(self, capture_ns: int) -> list[ExposedFrame]:
         """Those told with this stamp, or else told with one so wrong that their arrival may have taken its place."""
@@ -69,18 +90,43 @@ class _Exposures:
 
 
 def _fault_of(pose: ReceivedPose, exposures: _Exposures) -> str | None:
-    frames = exposures.of(pose.capture_ns)
     told = f"the {pose.peer} received a pose"
-    if not frames:
-        return f"{told} of a frame that the camera never exposed, stamped {pose.capture_ns}"
-    if all(frame.frozen for frame in frames):
-        return f"{told} of a frozen picture, stamped {pose.capture_ns}"
     if not _attitude_holds(pose):
         return f"{told} with an own attitude that nobody flew: {pose.q_ned_cam_wxyz}"
-    age_ns = pose.arrival_ns - max(frame.exposed_ns for frame in frames)
-    if age_ns > AGE_MAX_NS[pose.peer] + TRANSIT_MAX_NS:
+    return _stamp_fault(told, pose.peer, pose.capture_ns, pose.arrival_ns, exposures)
+
+
+def _fault_of_message(message: ReceivedMessage, exposures: _Exposures) -> str | None:
+    told = f"the {message.peer} received {message.kind}"
+    if message.fault is not None:
+        return f"{told}: {message.fault}"
+    if message.capture_ns is not None:
+        return _stamp_fault(told, message.peer, message.capture_ns, message.arrival_ns, exposures)
+    limit_ns = AGE_MAX_NS[message.peer] + TRANSIT_MAX_NS
+    if exposures.any_living(message.arrival_ns - limit_ns, message.arrival_ns):
+        return None
+    return f"{told} at {message.arrival_ns}, when no frame had been exposed for {limit_ns / 1e6:.0f} ms"
+
+
+def _stamp_fault(told: str, peer: str, capture_ns: int, arrival_ns: int, exposures: _Exposures) -> str | None:
+    frames = exposures.of(capture_ns)
+    if not frames:
+        return f"{told} of a frame that the camera never exposed, stamped {capture_ns}"
+    if all(frame.frozen for frame in frames):
+        return f"{told} of a frozen picture, stamped {capture_ns}"
+    age_ns = arrival_ns - max(frame.exposed_ns for frame in frames)
+    if age_ns > AGE_MAX_NS[peer] + TRANSIT_MAX_NS:
         return f"{told} {age_ns / 1e6:.0f} ms after its frame was exposed"
     return None
+
+
+def _held_back(received: ReceivedPose | ReceivedMessage, windows: Sequence[tuple[int, int]]) -> bool:
+    """Whether it was sent to the ground into a link that kept it."""
+    capture_ns = received.capture_ns
+    if received.peer != SUBSCRIBER or capture_ns is None:
+        return False
+    limit_ns = AGE_MAX_NS[SUBSCRIBER] + TRANSIT_MAX_NS
+    return any(from_ns - limit_ns <= capture_ns <= to_ns for from_ns, to_ns in windows)
 
 
 def _attitude_holds(pose: ReceivedPose) -> bool:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 
 Address = tuple[str, int]
 LOOPBACK = "127.0.0.1"
@@ -202,6 +203,15 @@ def flip_a_bit(data: bytes, chance: random.Random) -> bytes:
     spoiled = bytearray(data)
     spoiled[chance.randrange(len(spoiled))] ^= 1 << chance.randrange(8)
     return bytes(spoiled)
+
+
+def udp_queue(port: int) -> tuple[int, int]:
+    """Bytes that wait to be read at a local UDP port, as the kernel counts them, and datagrams dropped there so far."""
+    for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
+        columns = line.split()
+        if int(columns[1].rpartition(":")[2], 16) == port:
+            return int(columns[4].rpartition(":")[2], 16), int(columns[-1])
+    return 0, 0
 
 
 def free_port(kind: socket.SocketKind) -> int:

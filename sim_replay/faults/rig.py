@@ -27,6 +27,7 @@ from edge.links.signing_key import write_new_key
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.camera import TOPIC
+from sim_replay.faults.messages import OWN_LAT_LON_ALT, OWN_UP_M
 from sim_replay.faults.processes import Process
 from sim_replay.faults.relay import LOOPBACK, TcpRelay, UdpRelay, free_port
 from sim_replay.faults.timeline import Start, Who
@@ -38,7 +39,10 @@ START_S = 120.0
 UPTIME_NS = 734_567_891_234  # of an autopilot that was there before
 VOLUME_MB = 4
 UAV = "uav1"
+# The subscriber tells of everything, however late: what is stale is for the judge to say.
+PATIENT = ("--wait-s", str(START_S), "--all", "--max-age-s", "3600")
 KEY = "mavlink.key"
+ICAO_ADDRESS = 0xF00000
 
 
 @dataclass(frozen=True)
@@ -167,11 +171,11 @@ class Rig:
             return [*python, "msgs.ground.cli", "router", "--config", self.settings.out / "router.toml"]
         if step.who == "subscriber":
             endpoint = f"tcp/{LOOPBACK}:{self._router_port}"
-            return [*python, "sim_replay.subscriber", "--connect", endpoint, "--uav", UAV, "--wait-s", str(START_S)]
+            return [*python, "sim_replay.subscriber", "--connect", endpoint, "--uav", UAV, *PATIENT]
         now_ns = time.monotonic_ns()
         self._boot_at_ns = now_ns if step.rebooted else self._boot_at_ns - round(step.clock_ahead_s * 1e9)
         return [
-            *(*python, "sim_replay.autopilot", "--telemetry", self.settings.out / "telemetry.csv"),
+            *(*python, "sim_replay.autopilot", "--all", "--telemetry", self.settings.out / "telemetry.csv"),
             *("--endpoint", f"{LOOPBACK}:{self.mavlink.port}", "--start-at-ns", str(now_ns)),
             *("--boot-at-ns", str(self._boot_at_ns), "--system-id", str(step.system_id)),
             *(("--signing-key", self.settings.out / KEY) if self.settings.signed else ()),
@@ -215,6 +219,7 @@ class Rig:
             f'connect = ["tcp/{LOOPBACK}:{self.zenoh.port}"]',
             "[mavlink]",
             f'endpoints = ["udpin:{LOOPBACK}:{self.mavlink_port}"]',
+            f"follow_target = true\nadsb_icao_address = {ICAO_ADDRESS}",
             f"signing_key = {json.dumps(KEY)}" if self.settings.signed else "",
             "[recorder]",
             f"enabled = true\nfolder = {json.dumps(str(self.recordings))}\nfree_min_mb = 0",
@@ -227,7 +232,7 @@ def at_rest() -> Telemetry:
     """An own ship that hovers level, looking north: faults are not about flying."""
     row = np.zeros(len(COLUMNS) - 1)
     row[0] = 1.0
-    row[9], row[-3:] = -300.0, (47.3977, 8.5456, 788.0)
+    row[9], row[-3:] = -OWN_UP_M, OWN_LAT_LON_ALT
     return Telemetry(np.array([0, 1_000_000_000]), np.stack([row, row]))
 
 

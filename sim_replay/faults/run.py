@@ -34,6 +34,11 @@ class Outcome:
     seen: list[dict[str, Any]] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
 
+    def recovery(self) -> str:
+        """In a line: when processes were up again, poses came again, and the daemon ended when told to."""
+        told = [one["seen"] for one in self.seen if one["step"]["do"] in ("start", "expect_poses", "expect_exit")]
+        return "; ".join(told)
+
 
 def play_timeline(rig: Rig, timeline: Timeline, say: Say) -> Outcome:
     """Carry out every step on a running rig, first waiting until both peers have poses; stops at the first unmet."""
@@ -58,12 +63,19 @@ def _take(step: Step, rig: Rig, since: Since, outcome: Outcome, say: Say) -> Sin
         outcome.seen.append({"step": what, "seen": seen.text, "took_s": round(seen.took_s, 3)})
         say(f"  {seen.text}")
         return since
-    say("  " + " ".join(f"{value}" if key == "do" else f"{key}={value}" for key, value in what.items()))
     began_ns, counters = time.time_ns(), rig.witness.counters
-    act(step, rig)
+    remark = act(step, rig)
+    words = " ".join(f"{value}" if key == "do" else f"{key}={value}" for key, value in what.items())
+    say(f"  {words} ({(time.time_ns() - began_ns) / 1e9:.2f} s){'' if remark is None else ': ' + remark}")
     if step.do == "hold":
         return since
-    return Since(time.time_ns(), began_ns, counters)
+    acted_ns = time.time_ns()
+    if step.do == "start":
+        took_s = (acted_ns - began_ns) / 1e9
+        outcome.seen.append(
+            {"step": what, "seen": f"the {step.who} up after {took_s:.2f} s", "took_s": round(took_s, 3)}
+        )
+    return Since(acted_ns, began_ns, counters)
 
 
 def register(commands: Any) -> None:
@@ -72,7 +84,7 @@ def register(commands: Any) -> None:
         "faults",
         help="break cameras, links, disks and peers of the real daemon by a timeline, and see it recover",
         description="Start the daemon with a camera, an autopilot, a zenoh router and a subscriber, act on them as the "
-        "timeline says, and wait for what it expects. Looks at each pose that a peer received: none may be stale. "
+        "timeline says, and wait for what it expects. Looks at each message that a peer received: none may be stale. "
         f"Timelines that come with it: {', '.join(bundled())}. Writes faults.json and daemon.log. "
         "Exit code 0 if all was as expected, 1 if not.",
     )

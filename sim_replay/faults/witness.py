@@ -10,8 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge.clock import UtcClock
+from sim_replay.faults.messages import AUTOPILOT as AUTOPILOT
+from sim_replay.faults.messages import SUBSCRIBER as SUBSCRIBER
+from sim_replay.faults.messages import ReceivedMessage, from_mavlink, from_zenoh
 
-AUTOPILOT, SUBSCRIBER = "autopilot", "subscriber"
+NEVER_NS = 2**63
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Witness:
 
     frames: list[ExposedFrame] = field(default_factory=list)
     poses: list[ReceivedPose] = field(default_factory=list)
+    messages: list[ReceivedMessage] = field(default_factory=list)  # all else that tells of targets
+    held_back: list[tuple[int, int]] = field(default_factory=list)  # UTC ns: when a link kept what it was given
     said: list[tuple[int, str]] = field(default_factory=list)  # UTC ns, a line of the daemon's log
     counters: dict[str, int] = field(default_factory=dict)  # of the newest diagnostics
     state: str = ""  # of the same, with its reasons
@@ -80,6 +85,14 @@ class Witness:
         with self._changed:
             self.ready.discard(name)
 
+    def zenoh_cut(self, cut: bool, now_ns: int) -> None:
+        """The link to the ground keeps what it is given from now on, or gives it out."""
+        with self._changed:
+            if cut:
+                self.held_back.append((now_ns, NEVER_NS))
+            elif self.held_back and self.held_back[-1][1] == NEVER_NS:
+                self.held_back[-1] = (self.held_back[-1][0], now_ns)
+
     def poses_at(self, peer: str, since_ns: int) -> list[ReceivedPose]:
         """Poses of frames exposed after `since_ns` (UTC), in the order of their arrival."""
         return [pose for pose in self.poses if pose.peer == peer and pose.capture_ns > since_ns]
@@ -97,6 +110,11 @@ class Witness:
         elif event == "pose":
             capture_ns = record["capture_utc_ns"]
             self.poses.append(ReceivedPose(SUBSCRIBER, capture_ns, capture_ns + round(record["age_ms"] * 1e6)))
+        elif event == "message":
+            if (message := from_mavlink(record, self._clock.utc_ns)) is not None:
+                self.messages.append(message)
+        elif event == "sample":
+            self.messages.append(from_zenoh(record))
         elif event == "diagnostics":
             values = record["values"].items()
             self.counters = {key: int(value) for key, value in values if value.isdecimal()}

@@ -1,0 +1,34 @@
+"""For all tests: properties have no deadline on a busy machine, and the end tells how long each fault was felt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
+
+RECOVERY = "recovery"  # the user property in which a test leaves a line for the closing report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    lines = [
+        str(text)
+        for outcome in ("passed", "failed")
+        for report in terminalreporter.getreports(outcome)
+        if report.when == "call"
+        for name, text in report.user_properties
+        if name == RECOVERY
+    ]
+    if lines:
+        terminalreporter.write_sep("=", "faults, and how long until all was well again")
+        for line in sorted(lines):
+            terminalreporter.write_line(line)
+
+
+@pytest.fixture
+def tell_recovery(record_property: Callable[[str, object], None]) -> Callable[[str], None]:
+    """Called with a line, has the closing report show it, also from a worker of xdist."""
+    return lambda line: record_property(RECOVERY, line)
