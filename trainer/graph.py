@@ -20,6 +20,7 @@ from trainer.backbones import fuse_branches
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch
 from trainer.evaluate import Predictions, Predictor
+from trainer.half_storage import store_halved
 from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
 
@@ -83,7 +84,10 @@ def fold_pads(graph: onnx.GraphProto) -> None:
 
 
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
-    """Static INT8: QDQ, U8 activations, S8 weights for each channel, calibrated on `calibration`."""
+    """Static INT8: QDQ, U8 activations, S8 weights for each channel, calibrated on `calibration`.
+
+    The layers that stay in float keep their weights in half precision.
+    """
     with tempfile.TemporaryDirectory() as folder:
         prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
@@ -111,6 +115,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
         )
     quantised = onnx.load(str(destination))
     feed_pixels(quantised.graph, INPUT_NAMES[0])
+    store_halved(quantised.graph)
     onnx.save(quantised, str(destination))
 
 
