@@ -8,7 +8,8 @@ import select
 import socket
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from edge import clock
@@ -192,15 +193,17 @@ class MavlinkLink:
         now_ns = clock.monotonic_ns()
         if condition is not None:
             self._station.health(condition, now_ns)
-        try:
-            if report is not None:
-                self._send(self._station.report(report, now_ns))
-            for severity, text in events:
-                self._send(self._station.event(severity, text))
-        except ValueError as error:
-            # A value that no field holds: this is not sent, the next may be.
-            self._station.counters["unpackable"] += 1
-            log.warning("mavlink: not sent: %s", error)
+        packings: list[Callable[[], list[bytes]]] = []
+        if report is not None:
+            packings.append(partial(self._station.report, report, now_ns))
+        packings += [partial(self._station.event, severity, text) for severity, text in events]
+        for packing in packings:
+            try:
+                self._send(packing())
+            except ValueError as error:
+                # A value that no field holds: this is not sent, the next may be.
+                self._station.counters["unpackable"] += 1
+                log.warning("mavlink: not sent: %s", error)
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
         now_ns = clock.monotonic_ns()

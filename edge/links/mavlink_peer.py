@@ -62,7 +62,8 @@ class Endpoint:
                 return []
             self._found = received.sender
             log.info("mavlink: %s: autopilot at %s", self.transport.endpoint, received.sender)
-        self._heard_ns = now_ns
+        if messages:  # of noise, or of what is not signed, nobody is kept
+            self._heard_ns = now_ns
         return messages
 
     def send(self, data: bytes) -> bool:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter, deque
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -206,19 +208,20 @@ class ZenohLink:
                         return
 
     def _deliver(self, desk: Desk, mail: Mailbox) -> Counter[str]:
-        try:
-            if mail.report is not None:
-                desk.put_report(mail.report)
-            if mail.snapshot is not None:
-                desk.put_diagnostics(mail.snapshot)
-            for time_ns, level, text in mail.events:
-                desk.put_event(time_ns, level, text)
-            for picture in mail.pictures:
-                desk.put_picture(picture)
-        except Exception as error:
-            # One message that cannot go out, whatever is wrong with it, must not silently end the link.
-            desk.counted["failed"] += 1
-            log.warning("zenoh: not published: %r", error)
+        """Each by itself: one that cannot go out, whatever is wrong with it, silences neither link nor others."""
+        puts: list[Callable[[], None]] = []
+        if mail.report is not None:
+            puts.append(partial(desk.put_report, mail.report))
+        if mail.snapshot is not None:
+            puts.append(partial(desk.put_diagnostics, mail.snapshot))
+        puts += [partial(desk.put_event, *event) for event in mail.events]
+        puts += [partial(desk.put_picture, picture) for picture in mail.pictures]
+        for put in puts:
+            try:
+                put()
+            except Exception as error:
+                desk.counted["failed"] += 1
+                log.warning("zenoh: not published: %r", error)
         counted, desk.counted = desk.counted, Counter()
         return counted
 

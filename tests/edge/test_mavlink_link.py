@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import time
@@ -207,6 +208,22 @@ def test_a_heartbeat_tells_what_goes_on_behind_degraded() -> None:
                 f"heartbeat that tells {condition.headline}",
                 lambda condition=condition: link.set_health(condition),
             )
+
+
+def test_events_arrive_beside_a_report_that_no_message_holds() -> None:
+    nowhere = dataclasses.replace(report(track(time.monotonic_ns())).own_ship, lat_lon_alt=(1e4, 8.0, 400.0))  # type: ignore[type-var]
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        wanted = {f"news {k}" for k in range(20)}
+        for text in sorted(wanted):
+            link.publish(dataclasses.replace(report(track(time.monotonic_ns())), own_ship=nowhere))
+            link.event(6, text)
+
+        def arrived() -> bool:
+            return wanted <= {m.text for m in peer.received if m.get_type() == "STATUSTEXT"}
+
+        peer.settle(arrived, "all events")
+        peer.settle(lambda: link.counters().get("unpackable", 0) > 0, "count of what no message holds")
 
 
 def test_long_events_arrive_in_chunks_that_belong_together() -> None:

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edge.links.mavlink_receive import RATE_MAX_HZ, Receiver
+from edge.links.mavlink_endpoints import NetworkEndpoint
+from edge.links.mavlink_peer import Endpoint
+from edge.links.mavlink_receive import RATE_MAX_HZ, Receiver, is_autopilot_heartbeat
+from edge.links.transports.medium import Received
+from edge.links.transports.udp import Udp
 from edge.requests import RequestQueue, StopTracking
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
@@ -179,6 +183,22 @@ def test_only_commanders_command_where_they_are_named() -> None:
         peer.mav.srcSystem = vehicle
         assert peer.named("COMMAND_ACK").target_system == 255
     assert requests.take() == [StopTracking()]
+
+
+def test_who_has_fallen_silent_is_not_kept_by_noise_from_its_address() -> None:
+    """With the clock in hand: the autopilot comes again from another port, while its old one sends junk."""
+    refused: Counter[str] = Counter()
+    transport = Udp(NetworkEndpoint("udpin", "127.0.0.1", 0, "udpin:127.0.0.1:0"))
+    endpoint = Endpoint(transport, [], refused, list, is_autopilot_heartbeat)
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    data = bytes(beat.pack(MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)))
+    before, after, reader = ("10.0.0.1", 14550), ("10.0.0.1", 14999), FrameReader(datagram=True)
+    assert endpoint.believed(Received(data, before, reader), 0)
+    for second in range(1, 7):
+        assert endpoint.believed(Received(b"junk", before, reader), second * 1_000_000_000) == []
+        endpoint.tick(second * 1_000_000_000)
+    assert endpoint.believed(Received(data, after, reader), 7_000_000_000)
+    transport.close()
 
 
 def test_hosts_that_are_not_allowed_are_not_heard() -> None:

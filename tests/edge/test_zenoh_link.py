@@ -352,6 +352,20 @@ def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
         samples.wait("uav1/target/t0/pose", each=lambda: link.publish(report(track(time.monotonic_ns()))))
 
 
+def test_events_go_out_beside_a_message_that_cannot() -> None:
+    endpoint = free_endpoint()
+    link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
+    after_2038_ns = time.monotonic_ns() + 30 * 365 * 86_400 * 1_000_000_000
+    link.publish_diagnostics(HealthSnapshot(after_2038_ns, TRACKING, 1, 30.0, {}, {}))
+    link.publish_event(40, "fault")
+    link.start()
+    try:
+        until(lambda: link.counters().get("sent_events") == 1, what="the event")
+        assert link.counters()["failed"] == 1
+    finally:
+        link.stop()
+
+
 def test_a_port_that_is_taken_is_a_sentence() -> None:
     endpoint = free_endpoint()
     with linked(endpoint):
