@@ -86,7 +86,7 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
     return put(batch.image_bgr), labels
 
 
-def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler:
+def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
     from sim_replay.sampler import WindowSampler
     from trainer.dataset_windows import DatasetSampler, MixedSampler
 
@@ -94,7 +94,7 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler
     samplers: list[Sampler] = []
     shares: list[float] = []
     for source in config.datasets:
-        split = source.validation_split if validating else source.split
+        split = source.validation_split if validating or held_out else source.split
         if split is not None:
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
             shares.append(source.share)
@@ -108,9 +108,12 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int) -> Sampler
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
 
 
-def window_sampler(config: DataConfig, seed: int, size_px: int) -> Callable[[], Sampler]:
-    """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it."""
-    return partial(_open_window_sampler, config, seed, size_px)
+def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:
+    """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it.
+
+    `held_out` windows come from no picture that is trained on; those of the validation seed are always so.
+    """
+    return partial(_open_window_sampler, config, seed, size_px, held_out)
 
 
 def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, out: mp.Queue) -> None:

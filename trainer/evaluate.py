@@ -123,8 +123,13 @@ def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:
 
 
 def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> float:
-    """Score below which a peak is no target: the middle of where recall less false alarms is highest, of 0.05..0.95."""
+    """Score below which a peak is no target: the middle of where recall less false alarms is highest, of 0.05..0.95.
+
+    SCORE_THRESHOLD where all windows or none hold a target: they tell of no threshold.
+    """
     present = np.concatenate([batch.present for batch in batches])
+    if present.all() or not present.any():
+        return SCORE_THRESHOLD
     steps = np.arange(5, 96) / 100.0
     recall = (predicted.score[present][:, None] >= steps).mean(axis=0)
     alarms = (predicted.score[~present][:, None] >= steps).mean(axis=0)

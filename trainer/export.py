@@ -24,6 +24,7 @@ CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
 UNREACHABLE_SCORE = 1.0
+EMPTY_SHARE_MIN = 0.12
 
 OpenView = Callable[[int, int, float], Callable[[], Sampler]]  # (seed, size_px, acquire_share) to a picklable opener
 
@@ -50,9 +51,15 @@ class Measured(NamedTuple):
     acquire: Predictions
 
 
-def stage_sampler(data: DataConfig, seed: int, size_px: int, acquire_share: float) -> Callable[[], Sampler]:
-    """An opener of windows as one stage sees them: 0 for track, 1 for acquire."""
-    return window_sampler(data.model_copy(update={"acquire_share": acquire_share}), seed, size_px)
+def stage_sampler(
+    data: DataConfig, seed: int, size_px: int, acquire_share: float, held_out: bool = True
+) -> Callable[[], Sampler]:
+    """An opener of windows as one stage sees them: 0 for track, 1 for acquire.
+
+    Some hold no target, whatever was trained on: without them no score means anything.
+    """
+    shares = {"acquire_share": acquire_share, "empty_share": max(data.empty_share, EMPTY_SHARE_MIN)}
+    return window_sampler(data.model_copy(update=shares), seed, size_px, held_out)
 
 
 def render_views(config: TrainerConfig, seed: int, samples: int, open_view: OpenView) -> Views:
@@ -203,15 +210,16 @@ def export_models(
     model, config, training, sha256 = load_model(checkpoint)
     if contract is not None:
         config = config.model_copy(update={"contract": contract})
-    view = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share))
+    held_out = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share))
+    trained_on = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share, held_out=False))
     float_path = (float_out or out) / f"{config.contract.name}-fp32.onnx"
     int8_path = out / f"{config.contract.name}-int8.onnx"
     for path in (float_path, int8_path):
         made_folder(path.parent)
 
     say("rendering calibration and comparison windows")
-    calibration = render_views(config, CALIBRATION_SEED, samples, view)
-    comparison = render_views(config, COMPARISON_SEED, samples, view)
+    calibration = render_views(config, CALIBRATION_SEED, samples, trained_on)
+    comparison = render_views(config, COMPARISON_SEED, samples, held_out)
 
     write_graph(model, float_path)
     floats = _predict(onnx_predictor(float_path), comparison)

@@ -15,6 +15,7 @@ from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from trainer.config import ConfigError, parse_config
 from trainer.data import to_tensors, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
+from trainer.export import stage_sampler
 from trainer.losses import dense_terms
 from trainer.train import run_training
 
@@ -93,3 +94,11 @@ def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
     shares = '[[data.datasets]]\npath = "a"\nshare = 0.7\n[[data.datasets]]\npath = "b"\nshare = 0.6\n[schedule]'
     with pytest.raises(ConfigError, match=r"own\.toml: data: .*add up to more than 1"):
         parse_config(tiny.TOML.replace("[schedule]", shares), "own.toml")
+
+
+def test_held_out_windows_are_of_the_validation_split(dataset: Path) -> None:
+    source = f'[[data.datasets]]\npath = "{dataset}"\nshare = 1.0\nvalidation_split = "val"\n[schedule]'
+    data = parse_config(tiny.TOML.replace("[schedule]", source), "own.toml").data
+    assert stage_sampler(data, 77, 64, 0.0, held_out=False)().batch(0, 4).present.shape == (4,)
+    with pytest.raises(ConfigError, match="'val'"):
+        stage_sampler(data, 77, 64, 0.0)()

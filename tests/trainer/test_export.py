@@ -16,8 +16,8 @@ from msgs.geometry import R_from_euler
 from trainer.checkpoint import load_model, save_weights
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch, training_batch
-from trainer.evaluate import constant_guess, measure, predict_all
-from trainer.export import Measured, Strayed, Tolerance, Views, export_models, write_int8
+from trainer.evaluate import SCORE_THRESHOLD, choose_threshold, constant_guess, measure, predict_all
+from trainer.export import Measured, Strayed, Tolerance, Views, export_models, stage_sampler, write_int8
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
 
@@ -161,3 +161,22 @@ def test_the_constant_guess_lies_midway() -> None:
     t[:3, 2] = [100.0, 200.0, 400.0]
     got = constant_guess([batch._replace(present=on, R_cam_target=R, t_cam_target_m=t)])
     assert got == pytest.approx({"constant_E_r_mean_deg": 20.0, "constant_depth_rel_mean": 0.5}, abs=1e-4)
+
+
+def test_windows_without_a_target_are_measured_on_whatever_was_trained_on() -> None:
+    data = tiny.config().data.model_copy(update={"empty_share": 0.0})
+    present = stage_sampler(data, 5, 64, 0.0)().batch(0, 40).present
+    assert 20 < present.sum() < 40
+
+
+def test_where_every_window_holds_a_target_the_threshold_is_the_usual_one(exported: Exported) -> None:
+    batch = windows(1, 64)
+    predicted = predict_all(onnx_predictor(exported.fp32), [batch])
+    assert choose_threshold(predicted, [batch._replace(present=np.ones_like(batch.present))]) == SCORE_THRESHOLD
+
+
+def test_the_threshold_lies_between_targets_and_the_rest(exported: Exported) -> None:
+    batch = windows(1, 64)
+    score = np.where(batch.present, 0.8, 0.2).astype(np.float32)
+    predicted = predict_all(onnx_predictor(exported.fp32), [batch])._replace(score=score)
+    assert choose_threshold(predicted, [batch]) == pytest.approx(0.505, abs=0.01)
