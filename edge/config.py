@@ -206,6 +206,8 @@ class Config(Section):
     def _gimbal_is_heard(self) -> Config:
         if self.camera.mount == "gimbal" and not self.mavlink.enabled:
             raise ValueError('[camera] mount = "gimbal" needs [mavlink]: the gimbal\'s attitude comes by it')
+        if self.camera.mount == "fixed" and self.mavlink.gimbal_component_id is not None:
+            raise ValueError('[mavlink] gimbal_component_id needs [camera] mount = "gimbal": else none is heard')
         return self
 
 

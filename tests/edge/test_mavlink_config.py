@@ -30,6 +30,7 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
         ('[mavlink]\nendpoints = ["udpout:10.0.0.1:0"]\n', r":5: \[mavlink\] endpoints\[0\]: .* has port 0"),
         ("[mavlink]\ncommanders = [0]\n", r":5: \[mavlink\] commanders\[0\]: "),
         ('mount = "gimbal"\n[mavlink]\nenabled = false\n', r'the file: \[camera\] mount = "gimbal" needs \[mavlink\]'),
+        ("[mavlink]\ngimbal_component_id = 154\n", r"the file: \[mavlink\] gimbal_component_id needs \[camera\] mount"),
         ('mount = "strapped"\n', r":4: \[camera\] mount: "),
     ],
 )
