@@ -100,6 +100,7 @@ def _laplace_nll(residual: Tensor, log_scale: Tensor) -> Tensor:
 def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = True) -> dict[str, Tensor]:
     """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels.
 
+    Paper: size is L_wh, on log sizes; depth and planar make L_trans, geodesic (L_geo) and rotation_6d (L_6D) L_rot.
     Without `ray` the network's allocentric rotation is the one in `cam`.
     """
     center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma = (value[:, 0] for value in out)
