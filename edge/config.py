@@ -167,7 +167,10 @@ class MavlinkSettings(Section):
     )
 
     @model_validator(mode="after")
-    def _two_components(self) -> MavlinkSettings:
+    def _fits_together(self) -> MavlinkSettings:
+        twice = [text for text in self.endpoints if self.endpoints.count(text) > 1 and not text.endswith(":0")]
+        if twice:
+            raise ValueError(f"endpoints: {twice[0]} is there twice")
         if self.component_id == self.camera_component_id:
             raise ValueError("component_id and camera_component_id must differ")
         if self.system_id == self.virtual_system_id:

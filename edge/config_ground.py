@@ -62,7 +62,10 @@ class ZenohSettings(Section):
     @model_validator(mode="after")
     def _endpoints_do(self) -> ZenohSettings:
         for key in ("listen", "connect"):
-            for endpoint in getattr(self, key):
+            endpoints = getattr(self, key)
+            if twice := [endpoint for endpoint in endpoints if endpoints.count(endpoint) > 1]:
+                raise ValueError(f"{key}: {twice[0]} is there twice")
+            for endpoint in endpoints:
                 try:
                     check_endpoint(endpoint, tls=self.tls is not None)
                 except ValueError as error:

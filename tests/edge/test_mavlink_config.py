@@ -30,6 +30,14 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
         ('[mavlink]\nendpoints = ["udpout:10.0.0.1:0"]\n', r":5: \[mavlink\] endpoints\[0\]: .* has port 0"),
         ("[mavlink]\ncommanders = [0]\n", r":5: \[mavlink\] commanders\[0\]: "),
         ('mount = "gimbal"\n[mavlink]\nenabled = false\n', r'the file: \[camera\] mount = "gimbal" needs \[mavlink\]'),
+        (
+            '[mavlink]\nendpoints = ["tcpout:10.0.0.1:5762", "tcpout:10.0.0.1:5762"]\n',
+            r":4: \[mavlink\]: endpoints: tcpout:10.0.0.1:5762 is there twice",
+        ),
+        (
+            '[zenoh]\nlisten = ["tcp/127.0.0.1:7448", "tcp/127.0.0.1:7448"]\n',
+            r":4: \[zenoh\]: listen: tcp/127.0.0.1:7448 is there twice",
+        ),
         ("[mavlink]\ngimbal_component_id = 154\n", r"the file: \[mavlink\] gimbal_component_id needs \[camera\] mount"),
         ('mount = "strapped"\n', r":4: \[camera\] mount: "),
     ],
