@@ -15,7 +15,7 @@ import tiny
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from trainer.checkpoint import load_file
+from trainer.checkpoint import load_file, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
@@ -59,6 +59,20 @@ def test_the_weights_say_where_they_come_from(run: Path) -> None:
     training = load_file(run)["training"]
     assert training["samples"] == 20
     assert training["started_from"] == "scratch"
+
+
+def test_nothing_half_written_is_left_and_all_may_read_who_may_read_the_rest(run: Path) -> None:
+    assert not list(run.glob("*.part"))
+    assert (run / "weights.pt").stat().st_mode == (run / "run.json").stat().st_mode
+
+
+def test_a_write_that_fails_leaves_the_last_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pt"
+    write_atomic(path, {"whole": 1})
+    with pytest.raises(Exception, match="pickle"):
+        write_atomic(path, {"cannot": lambda: None})
+    assert load_file(path) == {"whole": 1}
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_tensorboard_has_every_figure_of_the_log_and_pictures(run: Path) -> None:
