@@ -21,6 +21,7 @@ from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopil
 from edge.links.mavlink_schedule import Schedule
 from edge.links.mavlink_table import (
     ADSB_VEHICLE,
+    ATTITUDE,
     ATTITUDE_QUATERNION,
     CAMERA_INFORMATION,
     COMMAND_ACK,
@@ -59,6 +60,7 @@ GIMBAL_HZ = 50.0
 FOLLOW_TARGET_HZ = 10.0
 ADSB_VEHICLE_HZ = 2.0
 COMPUTER_STATUS_HZ = 1.0
+STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
 
 @dataclass
@@ -83,7 +85,7 @@ class Station:
         self.counters: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.timesync = TimesyncEstimator()
-        self.vehicle = Vehicle(settings.system_id, _wanted_rates_hz(settings, own_ship))
+        self.vehicle = Vehicle(settings.system_id, _wanted_rates_hz(settings, own_ship), STANDS_IN)
         self.home: int | None = None
         self._settings = settings
         self._camera = camera
@@ -344,6 +346,7 @@ def _wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict
     gimbal = {GIMBAL_ATTITUDE: GIMBAL_HZ} if own_ship.gimballed else {}
     return {
         ATTITUDE_QUATERNION: settings.attitude_rate_hz,
+        ATTITUDE: settings.attitude_rate_hz,
         LOCAL_POSITION_NED: settings.position_rate_hz,
         GLOBAL_POSITION_INT: GLOBAL_POSITION_HZ,
         SYSTEM_TIME: SYSTEM_TIME_HZ,

@@ -72,7 +72,7 @@ SENT = (
 READ = (
     Read(HEARTBEAT, "HEARTBEAT", "1 Hz", "which vehicle, which autopilot, whether it lives"),
     Read(ATTITUDE_QUATERNION, "ATTITUDE_QUATERNION", "50 Hz asked", "own attitude at the exposure"),
-    Read(ATTITUDE, "ATTITUDE", "as it comes", "own attitude where ATTITUDE_QUATERNION does not come"),
+    Read(ATTITUDE, "ATTITUDE", "50 Hz asked at need", "own attitude where ATTITUDE_QUATERNION does not come"),
     Read(LOCAL_POSITION_NED, "LOCAL_POSITION_NED", "20 Hz asked", "own position and velocity"),
     Read(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "5 Hz asked", "where that lies on the globe"),
     Read(GIMBAL_ATTITUDE, "GIMBAL_DEVICE_ATTITUDE_STATUS", "50 Hz asked with a gimbal", "the camera's attitude"),

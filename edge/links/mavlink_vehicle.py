@@ -5,7 +5,8 @@ A pure state machine: every time comes in as an argument, nothing goes out but d
     WAITING --autopilot heartbeat--> HEARD --no heartbeat for 5 s--> LOST --heartbeat--> HEARD
 
 Rates are asked for one message at a time by MAV_CMD_SET_MESSAGE_INTERVAL, and again when one falls: another peer may
-have overwritten it. Refusals and silence are met with a growing pause, at most RETRY_MAX_NS.
+have overwritten it. Refusals and silence are met with a growing pause, at most RETRY_MAX_NS. What stands in for another
+message is asked for only where that one was asked for in vain.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ RETRY_NS = 3_000_000_000
 RETRY_MAX_NS = 30_000_000_000
 RATE_WINDOW_NS = 2_000_000_000
 RATE_ENOUGH = 0.7  # of what was asked
+IN_VAIN = 2  # times asked for, and none came
 
 
 class Contact(Enum):
@@ -38,6 +40,7 @@ class Stream:
     rate_hz: float
     arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
     asked_ns: int | None = None
+    times_asked: int = 0
     pause_ns: int = RETRY_NS
 
     def measured_hz(self, now_ns: int) -> float:
@@ -58,12 +61,18 @@ class Stream:
         if self.asked_ns is not None:
             self.pause_ns = min(2 * self.pause_ns, RETRY_MAX_NS)
         self.asked_ns = now_ns
+        self.times_asked += 1
 
 
 class Vehicle:
-    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that was lost."""
+    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that was lost.
 
-    def __init__(self, system_id: int | None, rates_hz: dict[int, float]) -> None:
+    `rates_hz` by message id; `stands_in` has of a message that is one the id that it stands in for.
+    """
+
+    def __init__(
+        self, system_id: int | None, rates_hz: dict[int, float], stands_in: dict[int, int] | None = None
+    ) -> None:
         self.contact = Contact.WAITING
         self.system_id = system_id
         self.autopilot: int | None = None  # MAV_AUTOPILOT
@@ -74,6 +83,7 @@ class Vehicle:
         self._heartbeat_ns: int | None = None
         self._boot = RebootDetector()
         self._rates_hz = dict(rates_hz)
+        self._stands_in = stands_in or {}
         self._streams = self._new_streams()
         self._in_flight: tuple[int, int] | None = None  # message id, asked ns
 
@@ -130,12 +140,18 @@ class Vehicle:
             return None
         self._in_flight = None
         for stream in self._streams.values():
-            if stream.due(now_ns):
+            if self._needed(stream, now_ns) and stream.due(now_ns):
                 self.asked_again += stream.asked_ns is not None
                 stream.asked(now_ns)
                 self._in_flight = (stream.message_id, now_ns)
                 return stream.message_id, stream.rate_hz
         return None
+
+    def _needed(self, stream: Stream, now_ns: int) -> bool:
+        if stream.message_id not in self._stands_in:
+            return True
+        better = self._streams[self._stands_in[stream.message_id]]
+        return better.times_asked >= IN_VAIN and better.measured_hz(now_ns) == 0.0
 
     def _forget(self) -> None:
         self._boot = RebootDetector()

@@ -147,6 +147,38 @@ def test_a_refused_rate_is_counted_and_asked_for_less_often() -> None:
         assert len(asked) < 3, "a refusal is not answered with the same request at once"
 
 
+@pytest.mark.parametrize("has_quaternion", [True, False])
+def test_attitude_in_angles_is_asked_for_where_none_comes_as_a_quaternion(has_quaternion: bool) -> None:
+    own_ship = OwnShipBuffer()
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
+    mav, ms = MAVLink(None, srcSystem=1, srcComponent=1), 1_000_000
+    rates_hz: dict[int, float] = {}
+
+    def tell(message: Any, now_ns: int) -> None:
+        station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns)
+
+    def answer(question: Any, now_ns: int) -> None:
+        has = has_quaternion or question.param1 != dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+        if has:
+            rates_hz[int(question.param1)] = 1e6 / question.param2
+        result = dialect.MAV_RESULT_ACCEPTED if has else dialect.MAV_RESULT_UNSUPPORTED
+        tell(dialect.MAVLink_command_ack_message(question.command, result, 0, 0, 1, 191), now_ns)
+
+    for now_ns in range(1_000_000 * ms, 1_015_000 * ms, 20 * ms):
+        if now_ns % (1_000 * ms) == 0:
+            beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
+            tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
+        if dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION in rates_hz:
+            tell(dialect.MAVLink_attitude_quaternion_message(now_ns // ms, 1.0, 0, 0, 0, 0, 0, 0), now_ns)
+        if dialect.MAVLINK_MSG_ID_ATTITUDE in rates_hz:
+            tell(dialect.MAVLink_attitude_message(now_ns // ms, 0, 0, 0, 0, 0, 0), now_ns)
+        asked = [m for data in station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        for question in (m for m in asked if m.get_type() == "COMMAND_LONG"):
+            answer(question, now_ns)
+    assert own_ship.at(1_014_990 * ms) is not None
+    assert rates_hz.get(dialect.MAVLINK_MSG_ID_ATTITUDE) == (None if has_quaternion else 50.0)
+
+
 BODY = Rotation.from_euler("ZYX", [1.2, 0.15, -0.4])
 GIMBAL = Rotation.from_euler("ZYX", [0.6, -0.5, 0.05])
 HEADING_ONLY = Rotation.from_euler("Z", 1.2)
