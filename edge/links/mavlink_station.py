@@ -197,7 +197,7 @@ class Station:
         if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), heartbeat.autopilot, now_ns):
             return False
         if before not in (None, self.vehicle.system_id):
-            self._telemetry.forget()  # another vehicle's clock, attitude and origin
+            self._telemetry.forget(now_ns)  # another vehicle's clock, attitude and origin
             self.timesync.clear()
         if link != self.home and (self.home is None or now_ns - self._home_heard_ns > HOME_SILENT_NS):
             self.home = link
@@ -234,9 +234,10 @@ class Station:
             by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
             up_ms = uptime_ms(message.time_boot_ms, self.timesync.offset_ns, now_ns)
             if by_autopilot and self.vehicle.boot_time(up_ms):
-                self._telemetry.forget()
+                self._telemetry.forget(now_ns)
                 self.timesync.clear()
             reason = self._telemetry.take(message, now_ns)
+            self.counters["position_jumps"] = self._telemetry.jumps
             if reason is not None:
                 self.refused[reason] += 1
         return []

@@ -1,0 +1,97 @@
+"""The autopilot's local position jumps, as when its filter is reset or its origin moves; no target jumps with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.config import MavlinkSettings, MountSettings
+from edge.links.mavlink_station import Station
+from edge.requests import RequestQueue
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.tracking.tracker import Tracker
+from edge.types import Array, Estimate, OwnShip
+from msgs.mavlink import FrameReader, MAVLink, dialect
+
+from .mavlink_peer import CAMERA
+
+MS = 1_000_000
+BEGIN_NS = 1_000_000 * MS
+K = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
+SIZE_WH = (1920, 1080)
+T_CAM_TARGET_M = np.array([5.0, 3.0, 300.0])  # it flies in front, as fast
+V_NED_MPS = np.array([20.0, 0.0, 0.0])
+R_CAM_TARGET = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+
+
+class Autopilot:
+    """Its messages, at their times, to a station."""
+
+    def __init__(self) -> None:
+        self.own_ship = OwnShipBuffer()
+        self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
+        self._mav = MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def tell(self, message: Any, now_ns: int) -> None:
+        self.station.take(FrameReader(datagram=True).feed(message.pack(self._mav)), 0, now_ns)
+
+    def turn(self, k_ms: int, t_ned_m: Array, v_ned_mps: Array) -> None:
+        """One millisecond: attitude at 50 Hz, position at 20 Hz, answers to TIMESYNC."""
+        now_ns = BEGIN_NS + k_ms * MS
+        if k_ms % 1000 == 0:
+            beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
+            self.tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
+        asked = [m for data in self.station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        for question in (m for m in asked if m.get_type() == "TIMESYNC"):
+            self.tell(dialect.MAVLink_timesync_message(now_ns, question.ts1), now_ns)
+        if k_ms % 20 == 3:
+            self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, 1, 0, 0, 0, 0, 0, 0), now_ns)
+        if k_ms % 50 == 7:
+            self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
+
+
+def seen(rng: np.random.Generator) -> Estimate:
+    t_m = T_CAM_TARGET_M * (1.0 + 0.01 * rng.normal())
+    u, v, _ = K @ t_m / t_m[2]
+    box = np.array([u - 20.0, v - 8.0, u + 20.0, v + 8.0])
+    return Estimate(0.9, box, R_CAM_TARGET, t_m, np.diag([0.3, 0.3, 9.0, 0.01, 0.01, 0.01]), "track")
+
+
+@pytest.mark.parametrize("jump_m", [10.0, 40.0, 1000.0])
+def test_no_target_is_told_elsewhere_when_the_own_position_jumps(jump_m: float) -> None:
+    autopilot, rng = Autopilot(), np.random.default_rng(0)
+    tracker = Tracker(4, MountSettings().mount())
+    own: OwnShip | None = None
+    for k_ms in range(6000):
+        t_ned_m = V_NED_MPS * k_ms / 1000 + np.array([jump_m if k_ms > 4000 else 0.0, 0.0, -300.0])
+        autopilot.turn(k_ms, t_ned_m, V_NED_MPS)
+        if k_ms % 33 != 30:
+            continue
+        capture_ns = BEGIN_NS + (k_ms - 15) * MS
+        own = autopilot.own_ship.at(capture_ns)
+        tracks = tracker.update(capture_ns, [seen(rng)], own, K, SIZE_WH)
+        if k_ms > 1000:
+            (track,) = tracks
+            off_m = np.linalg.norm(track.t_cam_target_m - T_CAM_TARGET_M)
+            assert off_m < 4.0 * np.sqrt(track.covariance[2, 2]), f"{off_m:.1f} m off at {k_ms} ms"
+            assert off_m < 15.0
+    assert autopilot.station.counters["position_jumps"] == 1
+    assert own is not None
+    assert own.t_ned_body_m is not None, "the position is taken again"
+
+
+@pytest.mark.parametrize(("speed_mps", "turn_radps"), [(25.0, 0.3), (60.0, 0.8), (15.0, 3.0)])
+def test_hard_flying_is_no_jump(speed_mps: float, turn_radps: float) -> None:
+    autopilot, rng = Autopilot(), np.random.default_rng(1)
+    for k_ms in range(4000):
+        angle = turn_radps * k_ms / 1000
+        t_ned_m = speed_mps / turn_radps * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]) + 0.3 * rng.normal(
+            size=3
+        )
+        autopilot.turn(k_ms, t_ned_m, speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    assert autopilot.station.counters["position_jumps"] == 0
+    now = autopilot.own_ship.at(BEGIN_NS + 3999 * MS)
+    assert now is not None
+    assert now.t_ned_body_m is not None
