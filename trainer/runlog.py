@@ -53,21 +53,38 @@ def starts_of(out: Path) -> list[dict[str, Any]]:
     return list(told.get("starts", [told]))  # older files are the record of one start
 
 
+def _is_of_the_past(line: str, samples: int) -> bool:
+    """Whether a line of log.jsonl is whole and tells of so many samples at most."""
+    try:
+        return bool(json.loads(line)["samples"] <= samples)
+    except ValueError:
+        return False
+
+
 class RunLog:
     """Writes into a run folder; every line is on disk when its call returns."""
 
     def __init__(self, out: Path, config_text: str, start: Mapping[str, str | int | float | None]) -> None:
         """`start` says how this start of the run was asked for; run.json keeps one record for each.
 
-        Raises ConfigError if the folder cannot be written.
+        What a run that crashed had told of samples beyond "from_samples" goes: they come again. Raises ConfigError if
+        the folder cannot be written.
         """
         made_folder(out)
         (out / "config.toml").write_text(config_text, encoding="utf-8")
         digest = hashlib.sha256(config_text.encode()).hexdigest()
         starts = [*starts_of(out), {**start, "config_sha256": digest}]
         (out / RUN_NAME).write_text(json.dumps({"starts": starts}, indent=2) + "\n", encoding="utf-8")
-        self._lines = (out / "log.jsonl").open("a", encoding="utf-8")
-        self._board = SummaryWriter(str(out / "tensorboard"))
+        samples = int(start["from_samples"] or 0)
+        log = out / "log.jsonl"
+        lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
+        kept = [line for line in lines if _is_of_the_past(line, samples)]
+        if len(kept) < len(lines):
+            part = log.with_suffix(".part")
+            part.write_text("".join(kept), encoding="utf-8")
+            part.replace(log)
+        self._lines = log.open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=samples + 1)
         self._started_s = time.monotonic()
         self._reset()
 

@@ -19,6 +19,7 @@ from trainer.checkpoint import load_file, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
+from trainer.runlog import RunLog
 from trainer.train import Trainer, run_training
 
 LONG = tiny.TOML.replace("samples = 16\nw", "samples = 1000000\nw")
@@ -49,6 +50,23 @@ def test_the_folder_tells_how_each_start_was_asked_for(run: Path) -> None:
         assert start["started_from"] == "scratch"
         assert {"commit", "torch", "numpy", "python", "device", "processes", "config_sha256"} <= start.keys()
     assert (run / "config.toml").read_text() == tiny.TOML
+
+
+def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_path: Path) -> None:
+    def told(from_samples: int, *samples: int) -> list[int]:
+        log = RunLog(tmp_path, tiny.TOML, {"from_samples": from_samples})
+        for count in samples:
+            log.add(1.0, {"geodesic": 0.1}, 5.0, 0.1)
+            log.report(count // 4, count, 0.5, 1e-3)
+        log.close()
+        return [json.loads(line)["samples"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+
+    assert told(0, 4, 8, 12) == [4, 8, 12]
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"kind": "tr')  # the power went
+    assert told(8, 12, 16) == [4, 8, 12, 16]
+    board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [event.step for event in board.Scalars("train/loss")] == [4, 8, 12, 16]
 
 
 def test_a_resumed_run_keeps_its_plan(run: Path) -> None:
