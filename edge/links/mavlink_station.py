@@ -237,7 +237,8 @@ class Station:
                 self._telemetry.forget(now_ns)
                 self.timesync.clear()
             reason = self._telemetry.take(message, now_ns)
-            self.counters["position_jumps"] = self._telemetry.jumps
+            self.counters["position_jumps"] = self._telemetry.position_jumps
+            self.counters["attitude_jumps"] = self._telemetry.attitude_jumps
             if reason is not None:
                 self.refused[reason] += 1
         return []

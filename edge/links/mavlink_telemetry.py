@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from edge.links.mavlink_jumps import Jumps
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
 from edge.links.mavlink_table import (
     ATTITUDE,
@@ -16,16 +18,12 @@ from edge.links.mavlink_table import (
 )
 from edge.tracking.clock import BootClock, RebootDetector, TimesyncEstimator
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
-from edge.types import Array
-from msgs.geometry import R_from_euler, q_wxyz_from_R
+from msgs.geometry import R_from_euler, R_from_q_wxyz, q_wxyz_from_R
 from msgs.mavlink import dialect
 
 BOOT_WRAP_MS = 2**32
 SAME_CLOCK_MS = 2000
-# A position that its own velocity did not bring about: the autopilot's filter was reset, or its origin moved.
-JUMP_MIN_M, JUMP_ACCELERATION_MPS2 = 3.0, 30.0
-JUMP_GAP_MAX_NS = 2_000_000_000
-# So long no position is taken then: the tracks must be carried over, in frames that know none, to the new origin.
+# After a jump none of its kind is taken for so long: the tracks must be carried over, in frames that know none.
 JUMP_REST_NS = 300_000_000
 FALLBACK_NS = 1_000_000_000  # the better source silent for so long: the other one is taken
 # What leaves a gimbal's own attitude in doubt; standing at an end stop does not.
@@ -70,9 +68,9 @@ class Telemetry:
         self._own_ship = own_ship
         self._timesync = timesync
         self._gimbal_component = gimbal_component
-        self.jumps = 0  # of the own position
+        self.attitude_jumps = self.position_jumps = 0
         self._forget()
-        self._positions_from_ns = 0
+        self._attitudes_from_ns = self._positions_from_ns = 0
 
     def forget(self, now_ns: int) -> None:
         """What was heard holds no more: the autopilot has started again, or it is another."""
@@ -81,7 +79,7 @@ class Telemetry:
 
     def _forget(self) -> None:
         self._own_ship.clear()
-        self._position: tuple[int, Array, Array] | None = None  # the last: time, place, velocity
+        self._jumps = Jumps()
         self._boot_clock = BootClock(self._timesync)
         self._forget_gimbal_clock()
         self._quaternion_ns: int | None = None
@@ -97,36 +95,37 @@ class Telemetry:
         if message_id == ATTITUDE_QUATERNION:
             self._quaternion_ns = now_ns
             q_wxyz = (message.q1, message.q2, message.q3, message.q4)
-            rising = self._own_ship.add_attitude(time_ns, q_wxyz, _rates(message), self._boot_clock.std_s)
+            rising = self._add_attitude(time_ns, q_wxyz, message, now_ns)
         elif message_id == ATTITUDE:
             if self._quaternion_ns is None or now_ns - self._quaternion_ns > FALLBACK_NS:
                 R_ned_body = R_from_euler(message.roll, message.pitch, message.yaw)
-                q_euler_wxyz = q_wxyz_from_R(R_ned_body)
-                rising = self._own_ship.add_attitude(time_ns, q_euler_wxyz, _rates(message), self._boot_clock.std_s)
+                rising = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
         elif message_id == LOCAL_POSITION_NED:
-            t_ned_m = np.array([message.x, message.y, message.z])
-            v_ned_mps = np.array([message.vx, message.vy, message.vz])
-            if self._jumped(time_ns, t_ned_m, v_ned_mps):
-                self.jumps += 1
-                self._own_ship.clear()
-                self._positions_from_ns = now_ns + JUMP_REST_NS
-            if now_ns >= self._positions_from_ns:
-                rising = self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
+            rising = self._add_position(time_ns, message, now_ns)
         # 0, 0 is how an autopilot without a fix says so.
         elif message_id == GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
             place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
-            v_global_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
-            rising = self._own_ship.add_global(time_ns, place, v_global_mps)
+            v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+            rising = self._own_ship.add_global(time_ns, place, v_ned_mps)
         return None if rising else "late"
 
-    def _jumped(self, time_ns: int, t_ned_m: Array, v_ned_mps: Array) -> bool:
-        """Whether the own ship cannot have flown here since the last position; this one is then the last."""
-        last, self._position = self._position, (time_ns, t_ned_m, v_ned_mps)
-        if last is None or not 0 < time_ns - last[0] <= JUMP_GAP_MAX_NS:
-            return False
-        dt_s = (time_ns - last[0]) * 1e-9
-        off_m = float(np.linalg.norm(t_ned_m - last[1] - 0.5 * (last[2] + v_ned_mps) * dt_s))
-        return off_m > JUMP_MIN_M + 0.5 * JUMP_ACCELERATION_MPS2 * dt_s**2
+    def _add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, message: Any, now_ns: int) -> bool:
+        rates_radps = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        if self._jumps.attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps):
+            self.attitude_jumps += 1
+            self._own_ship.clear()
+            self._attitudes_from_ns = now_ns + JUMP_REST_NS
+        if now_ns < self._attitudes_from_ns:
+            return True
+        return self._own_ship.add_attitude(time_ns, q_ned_body_wxyz, rates_radps, self._boot_clock.std_s)
+
+    def _add_position(self, time_ns: int, message: Any, now_ns: int) -> bool:
+        t_ned_m, v_ned_mps = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
+        if self._jumps.position(time_ns, t_ned_m, v_ned_mps):
+            self.position_jumps += 1
+            self._own_ship.clear()
+            self._positions_from_ns = now_ns + JUMP_REST_NS
+        return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
 
     def _take_gimbal(self, message: Any, now_ns: int) -> str | None:
         component = message.get_srcComponent()
@@ -159,7 +158,3 @@ class Telemetry:
         if self._gimbal_component is not None:
             return component == self._gimbal_component
         return self._gimbal is None or component == self._gimbal[0] or now_ns - self._gimbal[1] > FALLBACK_NS
-
-
-def _rates(message: Any) -> tuple[float, float, float]:
-    return message.rollspeed, message.pitchspeed, message.yawspeed

@@ -1,4 +1,4 @@
-"""The autopilot's local position jumps, as when its filter is reset or its origin moves; no target jumps with it."""
+"""The own position or heading jumps, as when the autopilot's filter is reset; no target jumps with it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Autopilot:
     def tell(self, message: Any, now_ns: int) -> None:
         self.station.take(FrameReader(datagram=True).feed(message.pack(self._mav)), 0, now_ns)
 
-    def turn(self, k_ms: int, t_ned_m: Array, v_ned_mps: Array) -> None:
+    def turn(self, k_ms: int, t_ned_m: Array, v_ned_mps: Array, yaw_rad: float = 0.0, rate_radps: float = 0.0) -> None:
         """One millisecond: attitude at 50 Hz, position at 20 Hz, answers to TIMESYNC."""
         now_ns = BEGIN_NS + k_ms * MS
         if k_ms % 1000 == 0:
@@ -47,7 +47,8 @@ class Autopilot:
         for question in (m for m in asked if m.get_type() == "TIMESYNC"):
             self.tell(dialect.MAVLink_timesync_message(now_ns, question.ts1), now_ns)
         if k_ms % 20 == 3:
-            self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, 1, 0, 0, 0, 0, 0, 0), now_ns)
+            q_wxyz = (np.cos(0.5 * yaw_rad), 0.0, 0.0, np.sin(0.5 * yaw_rad))
+            self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, *q_wxyz, 0, 0, rate_radps), now_ns)
         if k_ms % 50 == 7:
             self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
 
@@ -59,14 +60,15 @@ def seen(rng: np.random.Generator) -> Estimate:
     return Estimate(0.9, box, R_CAM_TARGET, t_m, np.diag([0.3, 0.3, 9.0, 0.01, 0.01, 0.01]), "track")
 
 
-@pytest.mark.parametrize("jump_m", [10.0, 40.0, 1000.0])
-def test_no_target_is_told_elsewhere_when_the_own_position_jumps(jump_m: float) -> None:
+@pytest.mark.parametrize(("jump_m", "jump_deg"), [(10.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (0.0, 8.0), (0.0, -90.0)])
+def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump_deg: float) -> None:
     autopilot, rng = Autopilot(), np.random.default_rng(0)
     tracker = Tracker(4, MountSettings().mount())
     own: OwnShip | None = None
     for k_ms in range(6000):
-        t_ned_m = V_NED_MPS * k_ms / 1000 + np.array([jump_m if k_ms > 4000 else 0.0, 0.0, -300.0])
-        autopilot.turn(k_ms, t_ned_m, V_NED_MPS)
+        jumped = k_ms > 4000
+        t_ned_m = V_NED_MPS * k_ms / 1000 + np.array([jump_m * jumped, 0.0, -300.0])
+        autopilot.turn(k_ms, t_ned_m, V_NED_MPS, np.deg2rad(jump_deg) * jumped)
         if k_ms % 33 != 30:
             continue
         capture_ns = BEGIN_NS + (k_ms - 15) * MS
@@ -77,7 +79,8 @@ def test_no_target_is_told_elsewhere_when_the_own_position_jumps(jump_m: float) 
             off_m = np.linalg.norm(track.t_cam_target_m - T_CAM_TARGET_M)
             assert off_m < 4.0 * np.sqrt(track.covariance[2, 2]), f"{off_m:.1f} m off at {k_ms} ms"
             assert off_m < 15.0
-    assert autopilot.station.counters["position_jumps"] == 1
+    assert autopilot.station.counters["position_jumps"] == (jump_m > 0.0)
+    assert autopilot.station.counters["attitude_jumps"] == (jump_deg != 0.0)
     assert own is not None
     assert own.t_ned_body_m is not None, "the position is taken again"
 
@@ -90,8 +93,8 @@ def test_hard_flying_is_no_jump(speed_mps: float, turn_radps: float) -> None:
         t_ned_m = speed_mps / turn_radps * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]) + 0.3 * rng.normal(
             size=3
         )
-        autopilot.turn(k_ms, t_ned_m, speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0]))
-    assert autopilot.station.counters["position_jumps"] == 0
+        autopilot.turn(k_ms, t_ned_m, speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0]), angle)
+    assert autopilot.station.counters["position_jumps"] == autopilot.station.counters["attitude_jumps"] == 0
     now = autopilot.own_ship.at(BEGIN_NS + 3999 * MS)
     assert now is not None
     assert now.t_ned_body_m is not None

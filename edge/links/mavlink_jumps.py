@@ -1,0 +1,41 @@
+"""Own attitude and position that jump: what no flight brings about is a reset of the autopilot's filter.
+
+Tracks are held in ned. Taken for flight, a jump of the own ship would move every target with it, in the camera's frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge.types import Array
+from msgs.geometry import rotation_angle, so3_exp
+
+POSITION_MIN_M, ACCELERATION_MPS2, POSITION_GAP_MAX_NS = 3.0, 30.0, 2_000_000_000
+ATTITUDE_MIN_RAD, TURNING_RADPS2, ATTITUDE_GAP_MAX_NS = 0.1, 50.0, 500_000_000
+NS_PER_S = 1e9
+
+
+class Jumps:
+    """Compares each sample with the one before; times are monotonic ns of the measurement."""
+
+    def __init__(self) -> None:
+        self._attitude: tuple[int, Array, Array] | None = None  # time, R_ned_body, rates
+        self._position: tuple[int, Array, Array] | None = None  # time, t_ned_m, v_ned_mps
+
+    def attitude(self, time_ns: int, R_ned_body: Array, rates_radps: Array) -> bool:
+        """Whether the body [3, 3] cannot have turned here since the last sample at its rates [3]."""
+        last, self._attitude = self._attitude, (time_ns, R_ned_body, rates_radps)
+        if last is None or not 0 < time_ns - last[0] <= ATTITUDE_GAP_MAX_NS:
+            return False
+        dt_s = (time_ns - last[0]) / NS_PER_S
+        turned = last[1] @ so3_exp(0.5 * (last[2] + rates_radps) * dt_s)
+        return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.5 * TURNING_RADPS2 * dt_s**2
+
+    def position(self, time_ns: int, t_ned_m: Array, v_ned_mps: Array) -> bool:
+        """Whether the own ship cannot have flown here [3] since the last sample at its velocities [3]."""
+        last, self._position = self._position, (time_ns, t_ned_m, v_ned_mps)
+        if last is None or not 0 < time_ns - last[0] <= POSITION_GAP_MAX_NS:
+            return False
+        dt_s = (time_ns - last[0]) / NS_PER_S
+        off_m = float(np.linalg.norm(t_ned_m - last[1] - 0.5 * (last[2] + v_ned_mps) * dt_s))
+        return off_m > POSITION_MIN_M + 0.5 * ACCELERATION_MPS2 * dt_s**2
