@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 HEARING_A_TURN_NS = 10_000_000  # for each endpoint, so that a flood cannot keep reports from going out
+HELD_UP_MAX_NS = 100_000_000  # between the look at a report's age and its sending
 EVENTS_WAITING = 64
 STOP_TIMEOUT_S = 5.0
 
@@ -195,7 +196,7 @@ class MavlinkLink:
             self._station.health(condition, now_ns)
         packings: list[Callable[[], list[bytes]]] = []
         if report is not None:
-            packings.append(partial(self._station.report, report, now_ns))
+            packings.append(partial(self._packed_in_time, report, now_ns))
         packings += [partial(self._station.event, severity, text) for severity, text in events]
         for packing in packings:
             try:
@@ -204,6 +205,14 @@ class MavlinkLink:
                 # A value that no field holds: this is not sent, the next may be.
                 self._station.counters["unpackable"] += 1
                 log.warning("mavlink: not sent: %s", error)
+
+    def _packed_in_time(self, report: Report, now_ns: int) -> list[bytes]:
+        """The report's frames; none if the process was held up since its age was looked at."""
+        frames = self._station.report(report, now_ns)
+        if clock.monotonic_ns() - now_ns <= HELD_UP_MAX_NS:
+            return frames
+        self._station.counters["held_up"] += 1
+        return []
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
         now_ns = clock.monotonic_ns()

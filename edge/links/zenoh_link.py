@@ -255,22 +255,20 @@ class Desk:
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
-        now_ns = clock.monotonic_ns()
-        tracks = sendable(report, now_ns, self._max_age_ms)
+        tracks = sendable(report, clock.monotonic_ns(), self._max_age_ms)
         self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
+        max_age_ns = round(self._max_age_ms * NS_PER_MS)
         for track in tracks:
-            name = ros.target_name(track)
-            self._put(topics.POSE, ros.pose(track, stamp_ns), name)
+            name, until_ns = ros.target_name(track), track.measured_ns + max_age_ns
+            self._put(topics.POSE, ros.pose(track, stamp_ns), name, until_ns)
             if report.own_ship is not None:
                 odometry = ros.odometry(track, report.own_ship, stamp_ns)
                 if odometry is not None:
-                    self._put(topics.ODOM, odometry, name)
-        if now_ns - report.meta.capture_ns <= self._max_age_ms * NS_PER_MS:
-            self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns))
-            if report.own_ship is not None:
-                self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns))
-        else:
-            self.counted["frames_withheld"] += 1
+                    self._put(topics.ODOM, odometry, name, until_ns)
+        until_ns = report.meta.capture_ns + max_age_ns
+        self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns), until_ns=until_ns)
+        if report.own_ship is not None:
+            self._put(topics.TF, ros.transforms(report.own_ship, self._mount, stamp_ns), until_ns=until_ns)
         intrinsics = (np.asarray(report.K).tobytes(), report.image_size_wh, report.distortion)
         if intrinsics != self._intrinsics:
             self._put(topics.CAMERA_INFO, ros.camera_info(report, stamp_ns))
@@ -296,8 +294,12 @@ class Desk:
     def put_event(self, time_ns: int, level: int, text: str) -> None:
         self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))
 
-    def _put(self, topic: Topic, message: Payload, target: str | None = None) -> None:
+    def _put(self, topic: Topic, message: Payload, target: str | None = None, until_ns: int | None = None) -> None:
+        """`until_ns` (monotonic): not after it, however long the process was held up on the way here."""
         payload = message.encode()
+        if until_ns is not None and clock.monotonic_ns() > until_ns:
+            self.counted["too_late"] += 1
+            return
         if self._recorder is not None and topic.recorded:
             self._recorder.record(topic, self._vehicle_name, target, payload, clock.utc_ns())
         if self._node is not None and self._due(topic, target):

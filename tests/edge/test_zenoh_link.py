@@ -190,7 +190,7 @@ def test_of_a_frame_that_is_too_old_nothing_is_told_that_has_its_time() -> None:
     with linked(endpoint) as link:
         old_ns = time.monotonic_ns() - 700_000_000
         link.publish(report(track(old_ns), now_ns=old_ns))
-        until(lambda: link.counters().get("frames_withheld") == 1, what="withholding")
+        until(lambda: link.counters().get("too_late") == 2, what="withholding")
         link.publish(report(track(time.monotonic_ns())))
         until(lambda: link.counters().get("sent_tf") == 1, what="the next frame")
         counted = link.counters()
