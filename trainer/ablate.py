@@ -14,9 +14,10 @@ from typing import Any
 import tomli_w
 
 from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model
-from trainer.config import ConfigError, TrainerConfig, load_config, parse_config
-from trainer.data import DataConfig, Sampler, render_once, window_sampler
+from trainer.config import ConfigError, DataConfig, TrainerConfig, load_config, parse_config
+from trainer.data import Sampler, render_once
 from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.sources import window_sampler
 from trainer.train import run_training
 
 OpenView = Callable[[DataConfig, int, int], Callable[[], Sampler]]

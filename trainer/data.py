@@ -12,7 +12,6 @@ import queue
 import signal
 import traceback
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from sim_replay.sample import SampleBatch
-from trainer.config import DataConfig, RenderingError
+from trainer.config import RenderingError
 from trainer.losses import Labels
 
 DENSE_STRIDE = 4
@@ -84,36 +83,6 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
         noc=put(batch.noc),
     )
     return put(batch.image_bgr), labels
-
-
-def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
-    from sim_replay.sampler import WindowSampler
-    from trainer.dataset_windows import DatasetSampler, MixedSampler
-
-    validating = seed == config.validation_seed
-    samplers: list[Sampler] = []
-    shares: list[float] = []
-    for source in config.datasets:
-        split = source.validation_split if validating or held_out else source.split
-        if split is not None:
-            samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
-            shares.append(source.share)
-    if sum(shares) < 1.0:
-        # What is validated on stays comparable whatever is trained on.
-        invented = 0.0 if validating else config.invented_share
-        samplers.append(
-            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented)
-        )
-        shares.append(1.0 - sum(shares))
-    return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
-
-
-def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:
-    """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it.
-
-    `held_out` windows come from no picture that is trained on; those of the validation seed are always so.
-    """
-    return partial(_open_window_sampler, config, seed, size_px, held_out)
 
 
 def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, out: mp.Queue) -> None:

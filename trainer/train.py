@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
-from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors, window_sampler
+from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors
 from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
@@ -25,6 +25,7 @@ from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.rounding import rounded
 from trainer.runlog import RunLog, provenance
+from trainer.sources import window_sampler
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
 

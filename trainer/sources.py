@@ -1,0 +1,39 @@
+"""What a run is trained and measured on: rendered windows, windows of datasets, or both, as its configuration says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from trainer.config import DataConfig
+from trainer.data import Sampler
+from trainer.dataset_windows import DatasetSampler, MixedSampler
+
+
+def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
+    from sim_replay.sampler import WindowSampler  # needs the renderer's packages
+
+    validating = seed == config.validation_seed
+    samplers: list[Sampler] = []
+    shares: list[float] = []
+    for source in config.datasets:
+        split = source.validation_split if validating or held_out else source.split
+        if split is not None:
+            samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
+            shares.append(source.share)
+    if sum(shares) < 1.0:
+        # What is validated on stays comparable whatever is trained on.
+        invented = 0.0 if validating else config.invented_share
+        samplers.append(
+            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented)
+        )
+        shares.append(1.0 - sum(shares))
+    return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
+
+
+def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:
+    """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it.
+
+    `held_out` windows come from no picture that is trained on; those of the validation seed are always so.
+    """
+    return partial(_open_window_sampler, config, seed, size_px, held_out)
