@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing as mp
-import pickle
+from concurrent.futures import ProcessPoolExecutor
 
 import cv2
 import numpy as np
@@ -45,20 +45,16 @@ def _digest(sample: SampleBatch) -> str:
     return digest.hexdigest()
 
 
-def _digest_in_a_process(sampler: WindowSampler, out: mp.SimpleQueue) -> None:
-    out.put(_digest(sampler.batch(37, 6)))
+def _digest_of_six(sampler: WindowSampler) -> str:
+    return _digest(sampler.batch(37, 6))
 
 
 def test_a_window_is_the_same_in_any_batch_and_any_process(sampler: WindowSampler, batch: SampleBatch) -> None:
     again = sampler.batch(37, 6)
     for name, values in vars(again).items():
         np.testing.assert_array_equal(values, getattr(batch, name)[37:43], err_msg=name)
-    context = mp.get_context("spawn")
-    out = context.SimpleQueue()
-    process = context.Process(target=_digest_in_a_process, args=(pickle.loads(pickle.dumps(sampler)), out))
-    process.start()
-    assert out.get() == _digest(again)
-    process.join()
+    with ProcessPoolExecutor(1, mp.get_context("spawn")) as elsewhere:
+        assert elsewhere.submit(_digest_of_six, sampler).result() == _digest(again)
 
 
 def test_samplers_of_two_sizes_live_in_one_process(sampler: WindowSampler, batch: SampleBatch) -> None:
