@@ -76,6 +76,12 @@ def _ablate(arguments: argparse.Namespace) -> None:
     print(json.dumps(result, indent=2) if arguments.json else table(result))
 
 
+def _average(arguments: argparse.Namespace) -> None:
+    from trainer.average import average
+
+    print(f"wrote {average(arguments.checkpoints, arguments.out)}")
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="uavpose-trainer", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -104,7 +110,20 @@ def _parser() -> argparse.ArgumentParser:
     _add_ablate(commands)
     _add_export(commands)
     score_command.register(commands)
+    _add_average(commands)
     return parser
+
+
+def _add_average(commands: argparse._SubParsersAction) -> None:
+    mean = commands.add_parser(
+        "average",
+        help="write the mean of several runs' weights",
+        description="Write weights.pt with the mean of the weights of runs that began alike, such as a run and the one "
+        "that went on from it. Often it is better than each; evaluate it to know.",
+    )
+    mean.add_argument("checkpoints", type=Path, nargs="+", metavar="RUN", help="run folders or their weights.pt")
+    mean.add_argument("--out", type=Path, required=True, help="folder for the mean")
+    mean.set_defaults(run=_average)
 
 
 def _add_ablate(commands: argparse._SubParsersAction) -> None:

@@ -1,0 +1,43 @@
+"""The mean of runs: every weight halfway, ready to be used like a run, and only of networks that are alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from trainer.average import average
+from trainer.checkpoint import load_file, load_model, save_weights
+from trainer.cli import main
+from trainer.config import ConfigError
+from trainer.model import PoseNet
+
+
+def write_run(folder: Path, seed: int, config: str = tiny.TOML) -> Path:
+    torch.manual_seed(seed)
+    save_weights(folder / "weights.pt", PoseNet(tiny.config().model), config, {"samples": seed})
+    return folder
+
+
+def test_weights_are_halfway_and_the_origin_is_told(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, seed) for seed, name in enumerate("ab", start=1)]
+    assert main(["average", *map(str, runs), "--out", str(tmp_path / "mean")]) == 0
+    one, other, mean = (load_file(folder)["weights"] for folder in (*runs, tmp_path / "mean"))
+    kernel = next(name for name, value in one.items() if value.ndim == 4)
+    assert torch.allclose(mean[kernel].float(), (one[kernel].float() + other[kernel].float()) / 2, atol=1e-3)
+    assert not torch.equal(one[kernel], other[kernel])
+    _, _, training, _ = load_model(tmp_path / "mean")
+    assert training["samples"] == 2
+    assert training["mean_of"] == ", ".join(load_model(run)[3][:16] for run in runs)
+
+
+def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:
+    one = write_run(tmp_path / "a", 1)
+    other = write_run(tmp_path / "b", 2, tiny.TOML.replace("origin_range = 0.5", "origin_range = 0.7"))
+    with pytest.raises(ConfigError, match=r"a: its \[model\] differs from that of"):
+        average([one, other], tmp_path / "mean")
+    with pytest.raises(ConfigError, match="fewer than two"):
+        average([one], tmp_path / "mean")
+    assert not (tmp_path / "mean").exists()

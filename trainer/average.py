@@ -1,0 +1,39 @@
+"""The mean of several runs' weights: of runs that began alike, often better than each (Wortsman et al., 2022)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model, write_atomic
+from trainer.config import ConfigError, made_folder, parse_config
+
+
+def average(runs: Sequence[Path], out: Path) -> Path:
+    """Write weights.pt with the mean of the runs' into `out`; configuration and origin are the last's.
+
+    Raises ConfigError for fewer than two, and for networks of different configurations.
+    """
+    if len(runs) < 2:
+        raise ConfigError("the mean of fewer than two runs is no other network")
+    contents = [load_file(run) for run in runs]
+    hashes = [load_model(run)[3] for run in runs]
+    networks = [
+        parse_config(content["config"], f"{run} (config)").model for run, content in zip(runs, contents, strict=True)
+    ]
+    for run, network in zip(runs, networks, strict=True):
+        if network != networks[-1]:
+            raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
+    last = contents[-1]
+    weights = {
+        name: torch.stack([content["weights"][name].double() for content in contents]).mean(0).to(value.dtype)
+        if value.is_floating_point()
+        else value
+        for name, value in last["weights"].items()
+    }
+    training = last["training"] | {"mean_of": ", ".join(sha256[:16] for sha256 in hashes)}
+    path = made_folder(out) / WEIGHTS_NAME
+    write_atomic(path, last | {"weights": weights, "training": training})
+    return path
