@@ -113,12 +113,13 @@ def test_attitude_and_position_are_the_telemetrys_at_their_own_boot_time(daemon:
         if t_s < -0.9:
             continue
         if message.get_type() == "LOCAL_POSITION_NED":
-            # Stamps are whole milliseconds: 25 m/s makes 2.5 cm of one, and of the exchange's error as much again.
-            np.testing.assert_allclose([message.x, message.y, message.z], np.outer(t_s, [25, 3, -1])[0], atol=0.08)
+            # Stamps are whole milliseconds: 25 m/s makes 2.5 cm of one. The exchange that tells the boot time errs by
+            # some more where cores are short; a sample's period, 20 ms, would be 0.5 m.
+            np.testing.assert_allclose([message.x, message.y, message.z], np.outer(t_s, [25, 3, -1])[0], atol=0.25)
             positions += 1
         else:
             sent = Rotation.from_quat([message.q1, message.q2, message.q3, message.q4], scalar_first=True)
-            assert np.rad2deg((truth([t_s])[0].inv() * sent).magnitude()) < 0.06
+            assert np.rad2deg((truth([t_s])[0].inv() * sent).magnitude()) < 0.2
             attitudes += 1
         if attitudes >= 50:
             break
