@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model, write_atomic
-from trainer.config import ConfigError, made_folder, parse_config
+from trainer.config import ConfigError, made_folder
 
 
 def average(runs: Sequence[Path], out: Path) -> Path:
@@ -19,12 +19,9 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     if len(runs) < 2:
         raise ConfigError("the mean of fewer than two runs is no other network")
     contents = [load_file(run) for run in runs]
-    hashes = [load_model(run)[3] for run in runs]
-    networks = [
-        parse_config(content["config"], f"{run} (config)").model for run, content in zip(runs, contents, strict=True)
-    ]
-    for run, network in zip(runs, networks, strict=True):
-        if network != networks[-1]:
+    _, configs, _, hashes = zip(*map(load_model, runs), strict=True)
+    for run, config in zip(runs, configs, strict=True):
+        if config.model != configs[-1].model:
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
     last = contents[-1]
     weights = {

@@ -75,11 +75,19 @@ class _Sequence:
             return None
         R_ned_cam, t_ned_cam_m = place
         if self.errors is not None:
-            before, after = (_place(self.scene.frames[i]) for i in (max(k - 1, 0), min(k + 1, len(self.places) - 1)))
-            turning_radps, velocity_mps = _rates(before or place, after or place, 2.0 / self.fps)
+            turning_radps, velocity_mps = self._rates(k)
             R_ned_cam = self.errors.attitude(R_ned_cam, turning_radps)
             t_ned_cam_m = self.errors.position(t_ned_cam_m, velocity_mps)
         return OwnShip(self.capture_ns(image_id), R_ned_cam, t_ned_cam_m, None, None)
+
+    def _rates(self, k: int) -> tuple[Array, Array]:
+        """Turning [3], rad/s, and velocity [3], m/s, both in ned, between the frames before and after the k-th."""
+        first, last = max(k - 1, 0), min(k + 1, len(self.places) - 1)
+        before, after = _place(self.scene.frames[first]), _place(self.scene.frames[last])
+        if before is None or after is None or first == last:
+            return np.zeros(3), np.zeros(3)
+        dt_s = (last - first) / self.fps
+        return so3_log(after[0] @ before[0].T) / dt_s, (after[1] - before[1]) / dt_s
 
 
 def _place(frame: BopFrame) -> tuple[Array, Array] | None:
@@ -87,11 +95,6 @@ def _place(frame: BopFrame) -> tuple[Array, Array] | None:
     if frame.R_cam_world is None or frame.t_cam_world_m is None:
         return None
     return frame.R_cam_world.T, -frame.R_cam_world.T @ frame.t_cam_world_m
-
-
-def _rates(before: tuple[Array, Array], after: tuple[Array, Array], dt_s: float) -> tuple[Array, Array]:
-    """Turning [3], rad/s, and velocity [3], m/s, both in ned, of a camera that was at two places."""
-    return so3_log(after[0] @ before[0].T) / dt_s, (after[1] - before[1]) / dt_s
 
 
 def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
