@@ -75,14 +75,14 @@ def is_autopilot_heartbeat(message: Any) -> bool:
 class Receiver:
     """Checks for one address, which was looked at before.
 
-    Each system and component behind it has a rate limit of its own: the flood of one must not use up the autopilot's,
-    whose heartbeat would seem to stop.
+    Each kind of message of each system and component behind it has a rate limit of its own: no flood, not even one in
+    the autopilot's name, may use up that of the autopilot's heartbeat, which would seem to stop.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
         self._refused = refused
         self._second = 0
-        self._in_second: Counter[tuple[int, int]] = Counter()
+        self._in_second: Counter[tuple[int, int, int]] = Counter()
 
     def take(self, data: bytes, reader: FrameReader, now_ns: int) -> list[Any]:
         """Messages that are well-formed, of a kind we read and plausible; who sent them is the next check."""
@@ -112,9 +112,9 @@ class Receiver:
         if second != self._second:
             self._second = second
             self._in_second.clear()
-        source = (message.get_srcSystem(), message.get_srcComponent())
-        self._in_second[source] += 1
-        return "rate" if self._in_second[source] > RATE_MAX_HZ else None
+        kind = (message.get_srcSystem(), message.get_srcComponent(), message.get_msgId())
+        self._in_second[kind] += 1
+        return "rate" if self._in_second[kind] > RATE_MAX_HZ else None
 
 
 def malformed(message: Any) -> str | None:

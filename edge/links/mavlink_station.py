@@ -124,6 +124,8 @@ class Station:
         """Take authentic messages from a trusted address of a link; returns replies to it."""
         replies: list[bytes] = []
         for message in messages:
+            if (message.get_srcSystem(), message.get_srcComponent()) == (self.vehicle.system_id, AUTOPILOT_COMPONENT):
+                self.vehicle.spoke(now_ns)
             if is_autopilot_heartbeat(message):
                 self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
                 continue

@@ -65,7 +65,7 @@ class Stream:
 
 
 class Vehicle:
-    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that was lost.
+    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that one fell silent.
 
     `rates_hz` by message id; `stands_in` has of a message that is one the id that it stands in for.
     """
@@ -81,6 +81,7 @@ class Vehicle:
         self.refusals = 0  # answers other than ACCEPTED
         self._fixed = system_id is not None
         self._heartbeat_ns: int | None = None
+        self._spoke_ns: int | None = None
         self._boot = RebootDetector()
         self._rates_hz = dict(rates_hz)
         self._stands_in = stands_in or {}
@@ -90,14 +91,20 @@ class Vehicle:
     def heartbeat(self, system_id: int, autopilot: int, now_ns: int) -> bool:
         """An autopilot's heartbeat; False if it is another vehicle's."""
         if self.system_id is not None and system_id != self.system_id:
-            if self._fixed or self.contact is Contact.HEARD:
+            # Who still tells anything is there, though a crowded line may have lost its heartbeats.
+            silent = self._spoke_ns is None or now_ns - self._spoke_ns > LOST_NS
+            if self._fixed or self.contact is Contact.HEARD or not silent:
                 return False
             self._forget()
         self.system_id = system_id
         self.autopilot = autopilot
-        self._heartbeat_ns = now_ns
+        self._heartbeat_ns = self._spoke_ns = now_ns
         self.contact = Contact.HEARD
         return True
+
+    def spoke(self, now_ns: int) -> None:
+        """Anything from our autopilot."""
+        self._spoke_ns = now_ns
 
     def boot_time(self, boot_ms: int) -> bool:
         """A stamp of the autopilot's; True if it says that the autopilot has started again."""

@@ -11,15 +11,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.config import MavlinkSettings
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.mavlink_peer import Endpoint
 from edge.links.mavlink_receive import RATE_MAX_HZ, Receiver, is_autopilot_heartbeat
+from edge.links.mavlink_station import Station
+from edge.links.mavlink_vehicle import Contact
 from edge.links.transports.medium import Received
 from edge.links.transports.udp import Udp
 from edge.requests import RequestQueue, StopTracking
+from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import SYSTEM_ID, Peer, alone, linked, meet
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, alone, linked, meet
 from .reports import TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
@@ -170,6 +174,41 @@ def test_the_flood_of_another_system_behind_its_address_does_not_silence_the_aut
     own = bytes(beat.pack(MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)))
     assert len(receiver.take(own, reader, now_ns)) == 1
     assert len(receiver.take(others[0], reader, now_ns + 1_000_000_000)) == 1
+
+
+def test_a_flood_in_the_autopilots_own_name_does_not_silence_its_heartbeat() -> None:
+    refused: Counter[str] = Counter()
+    receiver, reader, now_ns = Receiver(refused), FrameReader(datagram=True), 10_200_000_000
+    autopilot = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)
+    false_time = bytes(dialect.MAVLink_timesync_message(2**62, 1).pack(autopilot))
+    for _ in range(3 * RATE_MAX_HZ):
+        receiver.take(false_time, reader, now_ns)
+    assert refused["rate"] == 2 * RATE_MAX_HZ
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    assert len(receiver.take(bytes(beat.pack(autopilot)), reader, now_ns)) == 1
+
+
+def test_an_autopilot_that_still_speaks_is_not_replaced_when_its_heartbeats_are_lost() -> None:
+    """With the clock in hand: what another system then tells of its attitude is not ours."""
+    station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
+    ours, other = (MAVLink(None, srcSystem=system, srcComponent=1) for system in (SYSTEM_ID, SYSTEM_ID + 1))
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+
+    def tell(message: Any, mav: MAVLink, second: int) -> None:
+        now_ns = second * 1_000_000_000
+        station.tick(now_ns)
+        station.take(FrameReader(datagram=True).feed(bytes(message.pack(mav))), 0, now_ns)
+
+    tell(beat, ours, 0)
+    for second in range(1, 20):
+        level = dialect.MAVLink_attitude_quaternion_message(1000 * second, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        tell(level, ours, second)
+        tell(beat, other, second)
+    assert station.vehicle.contact is Contact.LOST
+    assert station.vehicle.system_id == SYSTEM_ID
+    for second in range(20, 27):
+        tell(beat, other, second)
+    assert station.vehicle.system_id == SYSTEM_ID + 1
 
 
 def test_only_commanders_command_where_they_are_named() -> None:
