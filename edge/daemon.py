@@ -28,7 +28,7 @@ from edge.supervisor import Supervisor
 from edge.tracking.by_hand import ByHand
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.tracking.tracker import Tracker
-from edge.types import Array, Estimate, Frame, OwnShip, Report, Track, TrackState
+from edge.types import Array, Estimate, Frame, OwnShip, Report, Track
 
 log = logging.getLogger(__name__)
 
@@ -169,11 +169,10 @@ class Pipeline:
         places = self.search.places(capture_ns, held, self._max_targets - len(held)) if searches else []
         found = self._look_into([*held, *places], frame, pointed_at, clock)
         self._since_acquire += 1
-        nothing_tracked = all(track.state is TrackState.COASTING for track in expected)
         if not searches:
             return found
-        if nothing_tracked or not self._estimator.has_track_stage:
-            found += self._estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found])
+        if not found:
+            found = self._estimator.acquire(frame, [])
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (

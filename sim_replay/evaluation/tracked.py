@@ -20,7 +20,7 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.links.outgoing import sendable
 from edge.tracking.tracker import Tracker
-from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track, TrackState
+from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
 from msgs.geometry import so3_log
 from sim_replay.bop import BopFrame, BopScene
 from sim_replay.datasets import DatasetFrame
@@ -131,15 +131,14 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
 
 
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
-    """Windows around what is expected; the whole frame where nothing is held, and now and then for more."""
+    """Windows around what is expected; the whole frame where they show nothing, and now and then for more."""
     found: list[Estimate] = []
     if expected and estimator.has_track_stage:
         seen = estimator.track(frame, [track.box_xyxy_px for track in expected])
         found = [estimate for estimate in seen if estimate is not None]
     sequence.since_acquire += 1
-    nothing_held = all(track.state is TrackState.COASTING for track in expected)
     due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
-    if nothing_held or due or not estimator.has_track_stage:
+    if not found or due:
         found += estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found])
         sequence.since_acquire = 0
     return found

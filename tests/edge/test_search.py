@@ -23,7 +23,7 @@ from edge.requests import RequestQueue, StopTracking
 from edge.search import PLACE_AGE_MAX_NS, Search
 from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, Report
+from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, Report, TrackState
 from tests.waiting import until
 
 from .toy_scene import SIZE_WH, TARGET_WH, K, draw
@@ -184,6 +184,18 @@ def test_poses_go_out_while_the_search_is_under_way_and_what_it_finds_becomes_a_
         loop._process(frame(index, HELD, OTHER))
     assert len(ear.reports[-1].tracks) == 2
     np.testing.assert_allclose(ear.reports[-1].tracks[1].box_xyxy_px, box_around(OTHER), atol=3.0)
+
+
+def test_a_target_that_has_left_its_window_is_looked_for_in_that_same_frame(
+    pipeline: tuple[Pipeline, Ear, RequestQueue],
+) -> None:
+    """Five pictures a second: it crosses by more than its window before anybody can know how fast it is."""
+    loop, ear, _ = pipeline
+    for index in range(5):
+        loop._process(frame(6 * index, (300.5 + 300 * index, 420.5)))
+    assert [len(report.tracks) for report in ear.reports] == [1] * 5
+    track = ear.reports[-1].tracks[0]
+    assert (track.state, track.measured_ns) == (TrackState.CONFIRMED, ear.reports[-1].meta.capture_ns)
 
 
 def test_a_place_where_the_window_sees_nothing_is_no_target(

@@ -23,13 +23,16 @@ SPOT_Z_M, SPOT_SIZE_M = 200.0, 12.0  # as the network of the dark_spot_model fix
 K = np.array([[FOCAL_PX, 0, CX_PX], [0, FOCAL_PX, CY_PX], [0, 0, 1]])
 
 
-def write_scene(folder: Path, yaws_deg: list[float]) -> None:
-    """A spot that stands still before a camera that stands at (10, 20, -30) in ned and turns about the vertical."""
+def write_scene(folder: Path, yaws_deg: list[float], east_m: float = 0.0, step_m: float = 0.0) -> None:
+    """A spot before a camera that stands at (10, 20, -30) in ned and turns about the vertical.
+
+    It stands still, at first so far east of north, or flies east by so much a frame.
+    """
     (folder / "rgb").mkdir(parents=True)
     t_ned_cam_m = np.array([10.0, 20.0, -30.0])
-    t_ned_spot_m = t_ned_cam_m + np.array([SPOT_Z_M, 0.0, 0.0])
     cameras, poses = {}, {}
     for image, yaw_deg in enumerate(yaws_deg):
+        t_ned_spot_m = t_ned_cam_m + np.array([SPOT_Z_M, east_m + image * step_m, 0.0])
         R_ned_cam = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix() @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
         t_m = R_ned_cam.T @ (t_ned_spot_m - t_ned_cam_m)
         u, v, _ = K @ t_m / t_m[2]
@@ -64,6 +67,14 @@ def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, d
     for scene in ("000000", "000001"):
         write_scene(tmp_path / "data" / "test" / scene, [0.5] * 5)
     assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, True, True, True] * 2
+
+
+def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(tmp_path: Path, dark_spot_model: Path) -> None:
+    """It flies 90 m/s across five pictures a second: how fast, no window around its first place can tell."""
+    scene = tmp_path / "data" / "test" / "000000"
+    write_scene(scene, [0.0] * 8, east_m=-63.0, step_m=18.0)
+    (scene / "sequence.toml").write_text("fps = 5.0\n")
+    assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, *[True] * 6]
 
 
 def test_own_attitude_takes_the_cameras_shaking_out_of_the_track(tmp_path: Path, dark_spot_model: Path) -> None:
