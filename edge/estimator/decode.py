@@ -28,6 +28,9 @@ EDGE_SHARE, EDGE_PX = 0.05, 1.5
 CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
 # Nor does what is left show which end is the nose: each axis, radians.
 CUT_SIGMA_ROTATION_RAD = 0.8
+# What scores low is often not what it is taken for: 1-sigma of those that are not, as above. Times 1 - score it is the
+# variance of the doubt. Chosen on the validation split and the first flights of strangers.
+DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
 # A depth at the farthest that a graph tells is a least depth: 1-sigma of log Z then, and how near counts as at it.
 FARTHEST_SIGMA_LOG_Z, FARTHEST_TOLERANCE = 1.0, 1e-3
 
@@ -67,7 +70,7 @@ def decode(
             refused[reason] += 1
             continue
         longer_px = float(peaks.size_px[image, peak].max())
-        sigma = _widened(sigma, longer_px, cut, contract.trained_box_px)
+        sigma = _widened(sigma, score, longer_px, cut, contract.trained_box_px)
         if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
         covariance = pose_covariance(t_m, sigma, K_network, contract.trained_range_m)
@@ -169,9 +172,12 @@ def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int
     return None
 
 
-def _widened(sigma: Array, longer_px: float, cut: bool, trained_box_px: tuple[float, float]) -> Array:
-    """Sigma [6] of (u, v, log Z, rotation), wider by what the network was not taught: cut targets, other sizes."""
-    wider = sigma.copy()
+def _widened(sigma: Array, score: float, longer_px: float, cut: bool, trained_box_px: tuple[float, float]) -> Array:
+    """Sigma [6] of (u, v, log Z, rotation), wider by what the score leaves in doubt and by what the network was not
+    taught: cut targets, other sizes."""
+    origin_px = DOUBT_SIGMA_ORIGIN * longer_px
+    doubt = np.array([origin_px, origin_px, DOUBT_SIGMA_LOG_Z, *[DOUBT_SIGMA_ROTATION_RAD] * 3])
+    wider = np.hypot(sigma, np.sqrt(1.0 - score) * doubt)
     wider[2] = np.hypot(wider[2], np.log(_excess(longer_px, trained_box_px)))
     if cut:
         wider[:2] = np.hypot(wider[:2], CUT_SIGMA_ORIGIN * longer_px)

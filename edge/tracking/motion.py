@@ -67,6 +67,18 @@ class Motion:
     turn_rate_radps: float  # about ned's down axis, right turns positive; 0 outside `ned`
     P: Array  # [7, 7], order (t, v, turn rate), without the error of range that all frames share
     scale: RangeScale
+    sight: Sight | None = None  # of a measurement at this very instant
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Where the frame that saw a target has it in `cam`.
+
+    More exact than the state turned into that frame, as by how much its attitude is off is common to both.
+    """
+
+    t_cam_m: Array  # [3]
+    covariance: Array  # [3, 3], without the error of range that all frames share
 
 
 @dataclass(frozen=True)
@@ -75,7 +87,8 @@ class Innovation:
 
     residual_m: Array  # [3]; along the ray it is range times the difference of log ranges
     predicted_m: Array  # [3]
-    predicted_covariance: Array  # [3, 3]
+    predicted_covariance: Array  # [3, 3], but for the frame's own attitude
+    attitude: Array  # [3, 3], what that may be off
     across: Array  # [3, 3], the measurement's covariance but for that of its range
     log_range_variance: float  # the network's own
     d2: float  # squared Mahalanobis distance, 3 degrees of freedom, as the network's own variances have it
@@ -83,7 +96,8 @@ class Innovation:
 
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
     """The state after a first measurement."""
-    across, log_range_variance = _measurement_noise(estimate, K, view)
+    across, log_range_variance = _measurement_noise(estimate, K)
+    across += _by_attitude(estimate.t_cam_target_m, view)
     R = view.R_frame_cam
     ray = R @ estimate.t_cam_target_m
     scale = RangeScale.begin(view.time_ns, 0.5 * float(np.log(ray @ ray)), log_range_variance)
@@ -128,6 +142,7 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
         t_m=motion.t_m + 0.5 * dt * (motion.v_mps + v),
         v_mps=v,
         P=symmetric(F @ motion.P @ F.T + Q),
+        sight=None,
     )
 
 
@@ -192,12 +207,13 @@ def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Inno
     at_predicted_range = range_m / measured_m
     residual_m = at_predicted_range * estimate.t_cam_target_m - predicted_m
     residual_m -= float(np.log(at_predicted_range)) * predicted_m
-    across, log_range_variance = _measurement_noise(estimate, K, view)
+    across, log_range_variance = _measurement_noise(estimate, K)
     across *= at_predicted_range**2
     predicted_covariance = symmetric(R_cam_frame @ motion.P[POSITION, POSITION] @ R_cam_frame.T)
-    S = predicted_covariance + across + log_range_variance * np.outer(predicted_m, predicted_m)
+    attitude = _by_attitude(predicted_m, view)
+    S = predicted_covariance + attitude + across + log_range_variance * np.outer(predicted_m, predicted_m)
     d2 = float(residual_m @ np.linalg.solve(S, residual_m))
-    return Innovation(residual_m, predicted_m, predicted_covariance, across, log_range_variance, d2)
+    return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance, d2)
 
 
 def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
@@ -216,18 +232,19 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
         motion, seen = _rescaled(motion, away, view), _rescaled_innovation(seen, away)
     ray = seen.predicted_m
     noise = seen.across + scale.noise(dt_s) * np.outer(ray, ray)
-    S = seen.predicted_covariance + noise
+    in_cam = seen.predicted_covariance + seen.attitude
+    S = in_cam + noise
     d2 = float(seen.residual_m @ np.linalg.solve(S, seen.residual_m))
     if d2 > SOFT_GATE:
         noise = noise * (d2 / SOFT_GATE)
-        S = seen.predicted_covariance + noise
+        S = in_cam + noise
     H = np.zeros((3, DIMENSION))
     H[:, POSITION] = view.R_frame_cam.T
     gain = np.linalg.solve(S, H @ motion.P).T
     change = gain @ seen.residual_m
     # Joseph's form keeps P positive semi-definite whatever the gain.
     keep = np.eye(DIMENSION) - gain @ H
-    P = symmetric(keep @ motion.P @ keep.T + gain @ noise @ gain.T)
+    P = symmetric(keep @ motion.P @ keep.T + gain @ (noise + seen.attitude) @ gain.T)
     if motion.kind == "cam":
         P = _follow_sight_line(P, motion.t_m, change)
     turn_rate = float(np.clip(motion.turn_rate_radps + change[TURN_RATE], -TURN_RATE_MAX, TURN_RATE_MAX))
@@ -239,6 +256,7 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
         turn_rate_radps=turn_rate,
         P=P,
         scale=scale,
+        sight=None if motion.kind == "cam" else _sight(seen, in_cam, noise),
     )
 
 
@@ -253,15 +271,19 @@ def covariance(motion: Motion, view: View) -> Array:
 
 def t_in_cam(motion: Motion, view: View) -> Array:
     """t_cam_target_m [3]."""
+    if motion.sight is not None:
+        return motion.sight.t_cam_m
     return view.R_frame_cam.T @ (motion.t_m - view.t_frame_cam_m)
 
 
 def covariance_in_cam(motion: Motion, view: View) -> Array:
-    """[3, 3] of t_in_cam, m^2: with how far this frame's own attitude may be off what the track was made with."""
+    """[3, 3] of t_in_cam, m^2; of a target not seen, with how far the frame's own attitude may be off."""
+    t_cam_m = t_in_cam(motion, view)
+    if motion.sight is not None:
+        return symmetric(motion.sight.covariance + motion.scale.common_variance * np.outer(t_cam_m, t_cam_m))
     R = view.R_frame_cam.T
-    across = so3.skew(t_in_cam(motion, view))
     inside = covariance(motion, view)[POSITION, POSITION]
-    return symmetric(R @ inside @ R.T + view.attitude_variance * across @ across.T)
+    return symmetric(R @ inside @ R.T + _by_attitude(t_cam_m, view))
 
 
 def symmetric(P: Array) -> Array:
@@ -293,14 +315,28 @@ def _rescaled_innovation(seen: Innovation, log_factor: float) -> Innovation:
         residual_m=factor * (seen.residual_m - log_factor * seen.predicted_m),
         predicted_m=factor * seen.predicted_m,
         predicted_covariance=factor**2 * seen.predicted_covariance,
+        attitude=factor**2 * seen.attitude,
         across=factor**2 * seen.across,
     )
 
 
-def _measurement_noise(estimate: Estimate, K: Array, view: View) -> tuple[Array, float]:
+def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
+    """The measurement and what was predicted of it, `in_cam` with the frame's attitude unknown, weighed in `cam`."""
+    gain = np.linalg.solve(in_cam + noise, in_cam).T
+    keep = so3.IDENTITY - gain
+    return Sight(seen.predicted_m + gain @ seen.residual_m, symmetric(keep @ in_cam @ keep.T + gain @ noise @ gain.T))
+
+
+def _by_attitude(t_cam_m: Array, view: View) -> Array:
+    """Covariance [3, 3] in `cam` of a place in the frame, as the view's attitude may be off."""
+    across = so3.skew(t_cam_m)
+    return view.attitude_variance * across @ across.T
+
+
+def _measurement_noise(estimate: Estimate, K: Array) -> tuple[Array, float]:
     """Covariance [3, 3] in `cam` of an estimate's position but for its range, and the variance of its log range."""
     t = estimate.t_cam_target_m
-    bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2 + view.attitude_variance
+    bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2
     C = symmetric(estimate.covariance[:3, :3])
     C += bearing_variance * (t @ t) * so3.IDENTITY + MODEL_LOG_RANGE**2 * np.outer(t, t)
     # Marginal along the ray with all else held: taking it away leaves C positive semi-definite.

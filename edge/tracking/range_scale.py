@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from statistics import median
+from statistics import fmean, median
 
 FRAME_SHARE = 0.2  # of the network's log-range variance: what differs from frame to frame
 FRAME_STD_MIN = 0.01
@@ -35,6 +35,7 @@ class RangeScale:
     sigma: float  # the network's own, smoothed
     recent: tuple[tuple[int, float], ...]  # (time_ns, log range) of the last frames
     frame_variance: float  # of a frame's own error: as the network has it at first, then as seen
+    discord: float = 0.0  # mean square of how far the last frames lie from their median
     center: float = 0.0  # the median of the last frames' log ranges, beyond the track's
     beyond: float = 0.0  # the last frame's log range, beyond that median
 
@@ -45,8 +46,11 @@ class RangeScale:
 
     @property
     def common_variance(self) -> float:
-        """Of the error that all frames share: the network's, more where its frames disagree more than it says."""
-        return (1.0 - FRAME_SHARE) * max(self.sigma**2, self.frame_variance / FRAME_SHARE)
+        """Of the error that all frames share: the network's, more where its frames disagree more than it says.
+
+        Where some frames take the target for quite another size, it may be they who are right.
+        """
+        return max((1.0 - FRAME_SHARE) * max(self.sigma**2, self.frame_variance / FRAME_SHARE), self.discord)
 
     def seen(
         self, time_ns: int, log_range: float, log_range_variance: float, track_log_range: float, rate_per_s: float
@@ -63,7 +67,8 @@ class RangeScale:
         scatter = (MAD_TO_STD * median(abs(one - center) for one in now)) ** 2
         told = PRIOR_FRAMES * FRAME_SHARE * sigma2
         frame_variance = max((told + len(now) * scatter) / (PRIOR_FRAMES + len(now)), FRAME_STD_MIN**2)
-        return RangeScale(math.sqrt(sigma2), recent, frame_variance, center, now[-1] - center)
+        discord = fmean((one - center) ** 2 for one in now)
+        return RangeScale(math.sqrt(sigma2), recent, frame_variance, discord, center, now[-1] - center)
 
     def noise(self, dt_s: float) -> float:
         """Variance of log range to take the last frame with, dt_s after the one before."""

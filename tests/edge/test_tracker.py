@@ -168,6 +168,23 @@ def test_with_own_attitude_a_target_missed_for_a_second_is_still_where_it_is_loo
             update(tracker, now, "ned")
 
 
+@pytest.mark.parametrize("jitter_rad", [0.0, 2e-3])
+def test_an_attitude_that_jitters_costs_no_bearing_in_the_frame_that_saw_the_target(jitter_rad: float) -> None:
+    """The picture tells where the target is in the picture, whatever the autopilot says the camera's attitude is."""
+    rng = np.random.default_rng(5)
+    tracker = Tracker(1, FORWARD)
+    off_px: dict[str, list[float]] = {"frames": [], "track": []}
+    for now in flight(5):
+        jitter = Rotation.from_rotvec(rng.normal(scale=jitter_rad, size=3)).as_matrix()
+        told = replace(now.own_ship, R_ned_body=jitter @ now.own_ship.R_ned_body)
+        (track,) = tracker.update(now.time_ns, [now.estimate], told, K, SIZE_WH)
+        for name, t_cam_m in (("frames", now.estimate.t_cam_target_m), ("track", track.t_cam_target_m)):
+            true_px, px = ((K @ t)[:2] / t[2] for t in (now.t_cam_target_m, t_cam_m))
+            off_px[name].append(float(np.linalg.norm(px - true_px)))
+    frames_px, track_px = (np.mean(off_px[name][30:]) for name in ("frames", "track"))
+    assert track_px < frames_px
+
+
 def test_velocity_in_ned_is_the_targets_own() -> None:
     tracker = Tracker(4, FORWARD)
     errors_mps = []

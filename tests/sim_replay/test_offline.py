@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from edge.errors import InputError
+from edge.estimator.decode import DOUBT_SIGMA_ROTATION_RAD
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import judge_frames
 from sim_replay.offline import estimator_answers, load_model, with_score_min
@@ -35,7 +36,8 @@ def test_every_frame_is_judged_by_itself(dark_spot_scene: Path, dark_spot_model:
         assert match.estimate is not None
         assert match.estimate.score == pytest.approx(250 / 255, abs=0.05)
         assert match.estimate.covariance is not None
-        assert match.estimate.covariance[3, 3] == pytest.approx(0.01)
+        doubt = (1.0 - match.estimate.score) * DOUBT_SIGMA_ROTATION_RAD**2
+        assert match.estimate.covariance[3, 3] == pytest.approx(0.1**2 + doubt, rel=1e-4)
 
 
 def test_a_higher_least_score_lets_less_through(dark_spot_scene: Path, dark_spot_model: Path) -> None:
