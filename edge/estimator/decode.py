@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -127,6 +128,23 @@ def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:
     if sides.min() <= 0:
         return 0.0
     return float(np.prod(sides) / min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])))
+
+
+def of_two_looks(first: Estimate, second: Estimate) -> Estimate:
+    """One estimate of a target seen in two windows of one frame, of which the second lies better.
+
+    Place and box are the second's, the range is between the two, and the rotation is the surer one. Both are of the
+    same pixels: the covariance is no smaller than one look's.
+    """
+    first_m, second_m = (float(np.linalg.norm(estimate.t_cam_target_m)) for estimate in (first, second))
+    scale = np.sqrt(first_m / second_m)
+    surer = min(second, first, key=lambda estimate: float(np.trace(estimate.covariance[3:, 3:])))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = scale**2 * second.covariance[:3, :3]
+    covariance[3:, 3:] = surer.covariance[3:, 3:]
+    return replace(
+        second, R_cam_target=surer.R_cam_target, t_cam_target_m=scale * second.t_cam_target_m, covariance=covariance
+    )
 
 
 def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> Estimate | None:

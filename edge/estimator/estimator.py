@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.estimator.decode import decode, distinct, nearest_expected
+from edge.estimator.decode import decode, distinct, nearest_expected, of_two_looks
 from edge.estimator.lens import lens_of
 from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, window_around
@@ -38,14 +38,20 @@ class Estimator:
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = ()) -> list[Estimate]:
         """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
 
-        Each is refined in a track window of the same frame; one the window does not confirm is no target.
+        Each is refined in a track window of the same frame; one the window does not confirm is no target. The first
+        window lies as the whole frame has the target, coarsely; so it is looked at again, as that window has it.
         """
         found = self._whole(frame, known_boxes, self.model.run, self.refused)
         if not self.has_track_stage:
             return found
         refined = [estimate for estimate in self.track(frame, [f.box_xyxy_px for f in found]) if estimate is not None]
         self.refused["unconfirmed"] += len(found) - len(refined)
-        return distinct(refined, known_boxes)
+        again = self.track(frame, [estimate.box_xyxy_px for estimate in refined])
+        twice = [
+            first if second is None else of_two_looks(first, second)
+            for first, second in zip(refined, again, strict=True)
+        ]
+        return distinct(twice, known_boxes)
 
     def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
         """The same as far as the whole frame alone tells, unconfirmed; refusals are added to `refused`.

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from edge.errors import InputError
-from edge.estimator.decode import decode, overlap, pose_covariance
+from edge.estimator.decode import decode, of_two_looks, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, window_around
@@ -234,6 +235,26 @@ def test_acquire_finds_a_target_anywhere_and_refines_it_to_native_accuracy(
     np.testing.assert_allclose(estimate.t_cam_target_m, truth_m, rtol=0.02, atol=0.2)
     half = np.array(TARGET_WH) / 2
     np.testing.assert_allclose(estimate.box_xyxy_px, [*(center - half), *(center + half)], atol=1.0)
+
+
+def test_of_two_looks_the_range_lies_between_and_the_surer_rotation_counts() -> None:
+    def look(range_m: float, rotation_std_rad: float) -> Estimate:
+        t_m = range_m * np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
+        covariance = np.diag([1.0, 1.0, 0.0, *[rotation_std_rad**2] * 3]) + 0.01 * np.outer(
+            [*t_m, 0, 0, 0], [*t_m, 0, 0, 0]
+        )
+        R = Rotation.from_rotvec([0.0, 0.0, range_m / 100.0]).as_matrix()
+        return Estimate(range_m / 200.0, np.array([10.0, 10.0, 50.0, 30.0]), R, t_m, covariance, "track")
+
+    first, second = look(100.0, 0.2), look(144.0, 0.4)
+    both = of_two_looks(first, second)
+    assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(120.0)
+    np.testing.assert_allclose(both.t_cam_target_m / 120.0, second.t_cam_target_m / 144.0)
+    np.testing.assert_array_equal(both.R_cam_target, first.R_cam_target)
+    assert both.covariance[3, 3] == first.covariance[3, 3]
+    along = both.t_cam_target_m / 120.0
+    share = np.sqrt(along @ both.covariance[:3, :3] @ along) / 120.0
+    assert share == pytest.approx(np.sqrt(along @ second.covariance[:3, :3] @ along) / 144.0)
 
 
 def test_track_says_none_where_the_window_holds_no_target(toy_model: Path) -> None:
