@@ -126,6 +126,8 @@ class Station:
         for message in messages:
             if (message.get_srcSystem(), message.get_srcComponent()) == (self.vehicle.system_id, AUTOPILOT_COMPONENT):
                 self.vehicle.spoke(now_ns)
+                if link == self.home:
+                    self._home_heard_ns = now_ns
             if is_autopilot_heartbeat(message):
                 self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
                 continue
@@ -196,12 +198,15 @@ class Station:
 
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
         before = self.vehicle.system_id
-        if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), heartbeat.autopilot, now_ns):
+        # Not at another link's word: to PX4 goes less than to others.
+        home_speaks = self.home not in (None, link) and now_ns - self._home_heard_ns <= HOME_SILENT_NS
+        autopilot = None if home_speaks else heartbeat.autopilot
+        if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), autopilot, now_ns):
             return False
         if before not in (None, self.vehicle.system_id):
             self._telemetry.forget(now_ns)  # another vehicle's clock, attitude and origin
             self.timesync.clear()
-        if link != self.home and (self.home is None or now_ns - self._home_heard_ns > HOME_SILENT_NS):
+        if link != self.home and not home_speaks:
             self.home = link
             self.vehicle.ask_anew()
         if link == self.home:

@@ -88,8 +88,8 @@ class Vehicle:
         self._streams = self._new_streams()
         self._in_flight: tuple[int, int] | None = None  # message id, asked ns
 
-    def heartbeat(self, system_id: int, autopilot: int, now_ns: int) -> bool:
-        """An autopilot's heartbeat; False if it is another vehicle's."""
+    def heartbeat(self, system_id: int, autopilot: int | None, now_ns: int) -> bool:
+        """An autopilot's heartbeat; False if it is another vehicle's. `autopilot` None: its kind stays as it is."""
         if self.system_id is not None and system_id != self.system_id:
             # Who still tells anything is there, though a crowded line may have lost its heartbeats.
             silent = self._spoke_ns is None or now_ns - self._spoke_ns > LOST_NS
@@ -97,7 +97,7 @@ class Vehicle:
                 return False
             self._forget()
         self.system_id = system_id
-        self.autopilot = autopilot
+        self.autopilot = self.autopilot if autopilot is None else autopilot
         self._heartbeat_ns = self._spoke_ns = now_ns
         self.contact = Contact.HEARD
         return True
