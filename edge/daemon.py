@@ -172,7 +172,8 @@ class Pipeline:
         if not searches:
             return found
         if not found:
-            found = self._estimator.acquire(frame, [])
+            # Windows looked into in vain have cost this frame its second look.
+            found = self._estimator.acquire(frame, twice=not expected)
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (

@@ -35,23 +35,25 @@ class Estimator:
             self.track(frame, [np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])])
         self.refused.clear()
 
-    def acquire(self, frame: Frame, known_boxes: Sequence[Array] = ()) -> list[Estimate]:
+    def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), twice: bool = True) -> list[Estimate]:
         """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
 
-        Each is refined in a track window of the same frame; one the window does not confirm is no target. The first
-        window lies as the whole frame has the target, coarsely; so it is looked at again, as that window has it.
+        Each is refined in a track window of the same frame; one the window does not confirm is no target. That window
+        lies as the whole frame has the target, coarsely; if `twice`, it is looked at again, as the window has it.
         """
         found = self._whole(frame, known_boxes, self.model.run, self.refused)
         if not self.has_track_stage:
             return found
         refined = [estimate for estimate in self.track(frame, [f.box_xyxy_px for f in found]) if estimate is not None]
         self.refused["unconfirmed"] += len(found) - len(refined)
+        if not twice:
+            return distinct(refined, known_boxes)
         again = self.track(frame, [estimate.box_xyxy_px for estimate in refined])
-        twice = [
+        both = [
             first if second is None else of_two_looks(first, second)
             for first, second in zip(refined, again, strict=True)
         ]
-        return distinct(twice, known_boxes)
+        return distinct(both, known_boxes)
 
     def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
         """The same as far as the whole frame alone tells, unconfirmed; refusals are added to `refused`.
