@@ -16,6 +16,7 @@ JUMP_NS = 100_000_000
 JUMP_AGREEING = 3  # samples in a row that must say so
 STAMP_FUTURE_MAX_NS = 20_000_000
 STAMP_AGE_MAX_NS = 1_000_000_000
+QUICKEST_NS = 30_000_000_000  # no backlog of a link lasts so long
 DRIFT = 50e-6  # of two crystals against each other: by it an offset grows old
 UNSYNCED_STD_S = 0.02  # the least delay of a link that was not measured, taken for zero
 BOUND_TO_STD = 3.0**-0.5  # of an error that is anywhere within its bound
@@ -98,31 +99,41 @@ class TimesyncEstimator:
 
 
 class BootClock:
-    """The autopilot's boot time to monotonic ns: by TIMESYNC where that fits, else by the quickest arrival so far.
+    """The autopilot's boot time to monotonic ns: by TIMESYNC where that fits, else by the quickest arrival lately.
 
-    The quickest arrival knows the offset but for the link's least delay, which is then taken for zero.
+    The quickest arrival knows the offset but for the link's least delay, which is then taken for zero. Stamps that
+    fitted TIMESYNC once and are too old now are no other clock's: what they tell was held back, and is old.
     """
 
     def __init__(self, timesync: TimesyncEstimator) -> None:
         self._timesync = timesync
-        self._delays: deque[int] = deque(maxlen=256)
+        self._fitted = False
+        self._quickest: deque[tuple[int, int]] = deque()  # (arrival, delay) of the last QUICKEST_NS, the latter growing
         self.std_s = UNSYNCED_STD_S  # of the last stamp that was turned into monotonic time
 
     def monotonic_ns(self, boot_ns: int, arrival_ns: int) -> int:
         """Monotonic time of a stamp; never later than its arrival."""
-        self._delays.append(arrival_ns - boot_ns)
+        least_delay_ns = self._least_delay_ns(arrival_ns - boot_ns, arrival_ns)
         offset_ns = self._timesync.offset_ns
         if offset_ns is not None:
             synced = boot_ns - offset_ns
+            age_ns = arrival_ns - synced
             # Some peers answer TIMESYNC from another clock than the one in their stamps.
-            if -STAMP_FUTURE_MAX_NS <= arrival_ns - synced <= STAMP_AGE_MAX_NS:
+            fits = -STAMP_FUTURE_MAX_NS <= age_ns <= STAMP_AGE_MAX_NS
+            self._fitted = self._fitted or fits
+            if fits or (self._fitted and age_ns > 0):
                 self.std_s = self._timesync.std_s(arrival_ns) or 0.0
                 return min(synced, arrival_ns)
         self.std_s = UNSYNCED_STD_S
-        return min(boot_ns + min(self._delays), arrival_ns)
+        return min(boot_ns + least_delay_ns, arrival_ns)
 
-    def clear(self) -> None:
-        self._delays.clear()
+    def _least_delay_ns(self, delay_ns: int, arrival_ns: int) -> int:
+        while self._quickest and self._quickest[-1][1] >= delay_ns:
+            self._quickest.pop()
+        self._quickest.append((arrival_ns, delay_ns))
+        while arrival_ns - self._quickest[0][0] > QUICKEST_NS:
+            self._quickest.popleft()
+        return self._quickest[0][1]
 
 
 class RebootDetector:

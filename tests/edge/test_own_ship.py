@@ -268,6 +268,22 @@ def test_stamps_from_another_clock_than_timesyncs_fall_back_to_the_quickest_arri
     assert time_ns == (5_000 + 3 * 20 + 3) * MS
 
 
+@given(synced=st.booleans(), backlog_ms=st.integers(1_100, 20_000), rate_hz=st.sampled_from([4, 20, 120]))
+def test_an_attitude_that_the_link_held_back_is_never_told_as_that_of_now(
+    synced: bool, backlog_ms: int, rate_hz: int
+) -> None:
+    """A line that is too slow or was cut for a while delivers all of it late: answers to TIMESYNC come too late too."""
+    sync = TimesyncEstimator()
+    clock = BootClock(sync)
+    if synced:
+        exchange(sync, 0, 5_000 * MS, MS, MS)
+    for k in range(12 * rate_hz):
+        sampled_ns = 1_000 * MS + k * 1_000 * MS // rate_hz
+        held_back_ns = backlog_ms * MS if k >= 2 * rate_hz else 0
+        time_ns = clock.monotonic_ns(sampled_ns + 5_000 * MS, sampled_ns + 3 * MS + held_back_ns)
+        assert abs(time_ns - sampled_ns) <= 3 * MS
+
+
 @pytest.mark.parametrize(
     ("stamps_ms", "reboots"),
     [([100_000, 100_020, 100_010, 100_040], 0), ([100_000, 500, 520], 1), ([3_000, 2_990, 3_020], 0)],
