@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -15,7 +16,9 @@ from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.findings import Finding, device_fault, good, poor, wrong
+from edge.links.mavlink_endpoints import NetworkEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
+from edge.links.transports.medium import resolve
 from edge.requests import RequestQueue
 from edge.status import ask
 from edge.tracking.own_ship import OwnShipBuffer
@@ -73,6 +76,11 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         if kind == "serial" and (fault := device_fault(Path(rest.rpartition(":")[0]), "dialout")) is not None:
             yield wrong("mavlink", *fault)
             return
+        if kind in ("udpout", "tcpout") and isinstance(named := parse_endpoint(endpoint), NetworkEndpoint):
+            try:
+                resolve(named, socket.SOCK_DGRAM)
+            except InputError as error:
+                yield poor("host", str(error), f"`getent hosts {named.host}` shows the same; give it an address")
     own_ship = OwnShipBuffer()
     camera = CameraInfo("doctor", (640, 480), np.eye(3), None)
     try:

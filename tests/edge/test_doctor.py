@@ -67,11 +67,12 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
-        text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0"]\n'
+        text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0", "tcpout:autopilot.invalid:5760"]\n'
         code, found = findings(cli, tmp_path, text)
     assert code == 1
     assert "cannot be listened on" in found["zenoh"]["says"]
     assert "no heartbeat" in found["mavlink"]["says"]
+    assert "host 'autopilot.invalid' cannot be resolved" in found["host"]["says"]
 
 
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint, parse_
 from edge.links.mavlink_link import MavlinkLink
 from edge.links.transports.backoff import FIRST_WAIT_NS, LONGEST_WAIT_NS, STEADY_NS, Backoff
 from edge.links.transports.medium import PENDING_MAX
-from edge.links.transports.tcp import CALLERS_MAX, TcpClient
+from edge.links.transports.tcp import CALLERS_MAX, TcpServer
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
@@ -214,9 +214,9 @@ def test_a_port_that_is_taken_is_a_sentence(medium: str) -> None:
         link.stop()
 
 
-def test_a_host_without_an_address_is_a_sentence() -> None:
+def test_a_host_of_ours_without_an_address_is_a_sentence() -> None:
     with pytest.raises(LinkError, match=r"host 'autopilot\.invalid' cannot be resolved"):
-        TcpClient(NetworkEndpoint("tcpout", "autopilot.invalid", 5760, "tcpout:autopilot.invalid:5760"))
+        TcpServer(NetworkEndpoint("tcpin", "autopilot.invalid", 5760, "tcpin:autopilot.invalid:5760"))
 
 
 def test_endpoints_are_read_or_refused_whole() -> None:

@@ -7,13 +7,13 @@ from edge.links.mavlink_endpoints import SerialEndpoint, parse_endpoint
 from edge.links.transports.medium import Transport
 from edge.links.transports.serial_port import SerialPort
 from edge.links.transports.tcp import TcpClient, TcpServer
-from edge.links.transports.udp import Udp
+from edge.links.transports.udp import Udp, UdpCaller
 
 
 def open_transport(text: str) -> Transport:
-    """The transport of an endpoint. What can only be there later, a server or a device, is waited for.
+    """The transport of an endpoint. What can only be there later, a server, its name or a device, is waited for.
 
-    Raises LinkError if the text is no endpoint, its host has no address or our own port is taken.
+    Raises LinkError if the text is no endpoint, or what is to be listened on is no address of ours or is taken.
     """
     try:
         endpoint = parse_endpoint(text)
@@ -23,4 +23,6 @@ def open_transport(text: str) -> Transport:
         return SerialPort(endpoint)
     if endpoint.kind == "tcpin":
         return TcpServer(endpoint)
-    return TcpClient(endpoint) if endpoint.kind == "tcpout" else Udp(endpoint)
+    if endpoint.kind == "tcpout":
+        return TcpClient(endpoint)
+    return UdpCaller(endpoint) if endpoint.kind == "udpout" else Udp(endpoint)

@@ -64,15 +64,17 @@ class Transport(Protocol):
     def close(self) -> None: ...
 
 
-def resolve(endpoint: NetworkEndpoint, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
-    """Family and address of an endpoint. Raises LinkError for a host without an address."""
+def resolve(
+    endpoint: NetworkEndpoint, kind: socket.SocketKind, flags: int = 0
+) -> list[tuple[socket.AddressFamily, Address]]:
+    """Family and address of an endpoint, all that its host has. Raises LinkError for a host without one."""
     try:
-        found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)
+        found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind, flags=flags)
     except OSError as error:
         raise LinkError(
             f"MAVLink endpoint {endpoint.text}: host {endpoint.host!r} cannot be resolved: {error.strerror}"
         ) from error
-    return found[0][0], found[0][4]
+    return [(family, address) for family, _, _, _, address in found]
 
 
 @contextmanager

@@ -10,8 +10,10 @@ import time
 from collections.abc import Sequence
 
 from edge import clock
+from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.transports.backoff import Backoff
+from edge.links.transports.lookup import Lookup
 from edge.links.transports.medium import (
     CHUNK_MAX,
     Address,
@@ -102,7 +104,7 @@ class Connection:
 class TcpClient:
     """Connects to a server and, when that fails or the connection is lost, again after a growing wait.
 
-    Raises LinkError for a host without an address.
+    Its host is looked up anew for each attempt; of several addresses each has its turn.
     """
 
     finds_peers = False
@@ -110,7 +112,9 @@ class TcpClient:
 
     def __init__(self, endpoint: NetworkEndpoint) -> None:
         self.endpoint = endpoint.text
-        self._family, self._address = resolve(endpoint, socket.SOCK_STREAM)
+        self._lookup = Lookup(endpoint, socket.SOCK_STREAM)
+        self._attempts = 0
+        self._address: Address = ()
         self._backoff = Backoff()
         self._connecting: tuple[socket.socket, int] | None = None
         self._connection: Connection | None = None
@@ -128,8 +132,12 @@ class TcpClient:
             self._part_if_closed(now_ns)
         elif self._connecting is not None:
             self._look_if_connected(now_ns)
-        elif self._backoff.due(now_ns):
-            self._connect(now_ns)
+        elif self._backoff.due(now_ns) and (places := self._lookup.answer()) is not None:
+            if isinstance(places, LinkError):
+                self._failed(str(places), now_ns)
+            else:
+                self._connect(*places[self._attempts % len(places)], now_ns)
+                self._attempts += 1
 
     def receive(self) -> Received | None:
         received = self._connection.receive() if self._connection is not None else None
@@ -148,9 +156,14 @@ class TcpClient:
         if self._connecting is not None:
             self._connecting[0].close()
 
-    def _connect(self, now_ns: int) -> None:
-        attempt = socket.socket(self._family, socket.SOCK_STREAM)
+    def _connect(self, family: socket.AddressFamily, address: Address, now_ns: int) -> None:
+        try:
+            attempt = socket.socket(family, socket.SOCK_STREAM)
+        except OSError as error:  # a host without IPv6
+            self._failed(f"{self.endpoint}: {error}", now_ns)
+            return
         attempt.setblocking(False)
+        self._address = address
         self._connecting = (attempt, now_ns)
         result = attempt.connect_ex(self._address)
         if result not in (0, errno.EINPROGRESS):
@@ -178,8 +191,11 @@ class TcpClient:
         assert self._connecting is not None, "called only while connecting"
         self._connecting[0].close()
         self._connecting = None
+        self._failed(f"{self.endpoint}: {errno.errorcode.get(error_number, error_number)}", now_ns)
+
+    def _failed(self, why: str, now_ns: int) -> None:
         if self._backoff.failures == 0:
-            log.warning("mavlink: %s: %s; trying again", self.endpoint, errno.errorcode.get(error_number, error_number))
+            log.warning("mavlink: %s; trying again", why)
         self._backoff = self._backoff.failed(now_ns)
 
     def _part_if_closed(self, now_ns: int) -> None:
@@ -202,7 +218,7 @@ class TcpServer:
         self.endpoint = endpoint.text
         self._callers: dict[Address, Connection] = {}
         self._heeded: Address | None = None
-        family, address = resolve(endpoint, socket.SOCK_STREAM)
+        family, address = resolve(endpoint, socket.SOCK_STREAM)[0]
         self._socket = socket.socket(family, socket.SOCK_STREAM)
         with opening(endpoint, self._socket):
             self._socket.setblocking(False)

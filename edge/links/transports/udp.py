@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Sequence
 
+from edge import clock
+from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
+from edge.links.transports.lookup import Lookup
 from edge.links.transports.medium import DATAGRAM_MAX, Address, Received, local_port, opening, resolve
 from msgs.mavlink import FrameReader
 
+log = logging.getLogger(__name__)
+
 RECEIVE_BUFFER = 1 << 20
+SILENT_NS = 5_000_000_000  # nothing heard for so long: the host may have another address by now
+
+
+def _bound(endpoint: NetworkEndpoint, family: socket.AddressFamily, address: Address) -> socket.socket:
+    """Raises LinkError if that cannot be."""
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    with opening(endpoint, opened):
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        opened.bind(address)
+    return opened
 
 
 class Udp:
-    """Raises LinkError if the endpoint cannot be opened."""
+    """`udpin`. Raises LinkError if the endpoint cannot be opened."""
+
+    finds_peers = True
+    peer: Address | None = None
 
     def __init__(self, endpoint: NetworkEndpoint) -> None:
         self.endpoint = endpoint.text
-        self.finds_peers = endpoint.kind == "udpin"
         self._reader = FrameReader(datagram=True)
-        family, address = resolve(endpoint, socket.SOCK_DGRAM)
-        self.peer: Address | None = None if self.finds_peers else address
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        with opening(endpoint, self._socket):
-            self._socket.setblocking(False)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-            self._socket.bind(address if self.finds_peers else ("", 0))
+        self._socket = _bound(endpoint, *resolve(endpoint, socket.SOCK_DGRAM)[0])
 
     @property
-    def port(self) -> int:
+    def port(self) -> int | None:
         """The local port."""
         return local_port(self._socket)
 
@@ -36,7 +49,7 @@ class Udp:
         return (self._socket.fileno(),)
 
     def tick(self, now_ns: int) -> None:
-        """UDP has no connection to look after."""
+        """Whoever calls knows where we are."""
 
     def receive(self) -> Received | None:
         try:
@@ -58,3 +71,76 @@ class Udp:
 
     def close(self) -> None:
         self._socket.close()
+
+
+class UdpCaller:
+    """`udpout`: one host, looked up until it has an address, and again while nothing is heard from there."""
+
+    finds_peers = False
+
+    def __init__(self, endpoint: NetworkEndpoint) -> None:
+        self.endpoint = endpoint.text
+        self.peer: Address | None = None
+        self._named = endpoint
+        self._lookup = Lookup(endpoint, socket.SOCK_DGRAM)
+        self._reader = FrameReader(datagram=True)
+        self._socket: socket.socket | None = None
+        self._heard = self._told = False
+        now_ns = clock.monotonic_ns()
+        self._look_at_ns = now_ns
+        self.tick(now_ns)
+
+    @property
+    def port(self) -> int | None:
+        return None if self._socket is None else local_port(self._socket)
+
+    def filenos(self) -> Sequence[int]:
+        return () if self._socket is None else (self._socket.fileno(),)
+
+    def tick(self, now_ns: int) -> None:
+        if self._heard:
+            self._heard, self._look_at_ns = False, now_ns + SILENT_NS
+        if now_ns < self._look_at_ns or (places := self._lookup.answer()) is None:
+            return
+        self._look_at_ns = now_ns + SILENT_NS
+        try:
+            if isinstance(places, LinkError):
+                raise places
+            if all(address != self.peer for _, address in places):
+                self._call(*places[0])
+        except LinkError as error:
+            if not self._told:
+                log.warning("mavlink: %s; trying again", error)
+            self._told = True
+
+    def receive(self) -> Received | None:
+        if self._socket is None:
+            return None
+        try:
+            data, sender = self._socket.recvfrom(DATAGRAM_MAX)
+        except OSError:
+            return None
+        self._heard = self._heard or sender == self.peer
+        return Received(data, sender, self._reader)
+
+    def send(self, data: bytes, peer: Address) -> bool:
+        try:
+            return self._socket is not None and self._socket.sendto(data, peer) > 0
+        except OSError:
+            return False
+
+    def reaches(self, peer: Address) -> bool:
+        return peer == self.peer
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+
+    def _call(self, family: socket.AddressFamily, address: Address) -> None:
+        """Raises LinkError if this host cannot call there at all."""
+        if self._socket is None or self._socket.family != family:
+            opened = _bound(self._named, family, ("", 0))
+            self.close()
+            self._socket = opened
+        self.peer, self._told = address, False
+        log.info("mavlink: %s: calling %s", self.endpoint, address)
