@@ -7,6 +7,10 @@ from collections import deque
 DOUBTED_FRAMES = 100  # in a row that are too old: no backlog is so long, so the clock is another
 WINDOW_NS = 5_000_000_000
 DRIFT_PPM = 500  # no two clocks of cameras and computers run further apart
+# What waited while nobody read comes faster than it was filmed, each frame less late than the one before.
+CATCHING_UP_NS = 10_000_000
+CAUGHT_UP_NS = 500_000_000  # no frame that much less late for so long
+CATCHING_UP_MAX_NS = 5_000_000_000  # after it the stream's clock runs faster than ours, and will go on so
 
 
 class StampCheck:
@@ -44,9 +48,13 @@ class StreamClock:
         self._fastest: tuple[int, int] | None = None  # (arrival, arrival - stamp)
         self._began_ns = 0
         self._recent: deque[tuple[int, int]] = deque()  # the same of the last WINDOW_NS, the latter growing
+        self._first_ns: int | None = None  # arrival
+        self._less_late: tuple[int, int] | None = None  # the last frame that showed the stream to be catching up
+        self.caught_up = False  # whether the stream tells what is now: before that, its stamps are too young
 
     def monotonic_ns(self, stamp_ns: int, arrival_ns: int) -> int | None:
         """The frame's time on our clock, never later than its arrival; None if the stream gives no stamp that grows."""
+        self._look_whether_caught_up(arrival_ns, arrival_ns - stamp_ns)
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if last_ns is not None and stamp_ns <= last_ns:
             self._fastest = None
@@ -69,6 +77,14 @@ class StreamClock:
         if self._fastest is None or now_ns - self._began_ns < WINDOW_NS:
             return 0
         return self._recent[0][1] - self._reference_ns(now_ns)
+
+    def _look_whether_caught_up(self, arrival_ns: int, delay_ns: int) -> None:
+        if self._first_ns is None:
+            self._first_ns = arrival_ns
+        if self._less_late is None or delay_ns < self._less_late[1] - CATCHING_UP_NS:
+            self._less_late = (arrival_ns, delay_ns)
+        calm = arrival_ns - self._less_late[0] >= CAUGHT_UP_NS
+        self.caught_up = self.caught_up or calm or arrival_ns - self._first_ns >= CATCHING_UP_MAX_NS
 
     def _reference_ns(self, now_ns: int) -> int:
         assert self._fastest is not None

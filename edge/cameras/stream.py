@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,6 +14,7 @@ from edge.cameras.live import LiveSource
 from edge.cameras.source import SourceLost
 from edge.cameras.stamps import StreamClock
 from edge.config_camera import StreamCamera
+from edge.types import Frame
 
 TIMEOUT_MS = 3000
 BEHIND_MAX_NS = 250_000_000  # a backlog for good; opened anew, the stream begins with what is now
@@ -29,6 +31,14 @@ class StreamSource(LiveSource):
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
+
+    def read(self, stop: threading.Event) -> Frame:
+        """The next frame; what waited while nobody read, or in the server, is passed over, as nobody knows its age."""
+        while True:
+            frame = super().read(stop)
+            if self._clock.caught_up:
+                return frame
+            self.counts["catching_up"] += 1
 
     def _connect(self) -> cv2.VideoCapture:
         transport = f"rtsp_transport;{self._settings.rtsp_transport}|" if self._settings.url.startswith("rtsp") else ""

@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-import http.server
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from functools import partial
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -21,8 +18,7 @@ from edge.cameras.live import LiveSource
 from edge.cameras.reconnect import LONGEST_WAIT_NS, LinkState, Reconnect
 from edge.cameras.sequence import SequenceSource
 from edge.cameras.source import EndOfStream
-from edge.cameras.stream import StreamSource
-from edge.config_camera import FileCamera, IntrinsicsSettings, SequenceCamera, StreamCamera
+from edge.config_camera import FileCamera, IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
 from edge.types import Frame
 
@@ -158,42 +154,6 @@ def test_however_late_its_reader_a_video_ends_with_its_last_frame(tmp_path: Path
         assert round(float(last.image_bgr.mean()) / 10) == 7
         with pytest.raises(EndOfStream):
             source.read(threading.Event())
-
-
-@contextmanager
-def streaming(folder: Path, port: int = 0) -> Iterator[int]:
-    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", port), handler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.05,))
-    thread.start()
-    try:
-        yield server.server_port
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
-
-
-def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends(tmp_path: Path) -> None:
-    write_video(tmp_path / "live.mp4", frames=5, fps=30)
-    with streaming(tmp_path) as port:
-        pass  # the port is known, and nobody answers on it
-    settings = StreamCamera(type="stream", url=f"http://127.0.0.1:{port}/live.mp4", intrinsics=INTRINSICS)
-    capture = Capture(StreamSource(settings), False)
-    capture.start()
-    try:
-        assert capture.newest(0.3) is None
-        with streaming(tmp_path, port):
-            last = capture.newest(10.0)
-            assert last is not None
-            while last.meta.sequence < 8:  # more than the stream's five frames: it was opened again
-                newer = capture.newest(10.0)
-                assert newer is not None
-                assert newer.meta.sequence > last.meta.sequence
-                last = newer
-    finally:
-        capture.stop()
-    assert capture.counters()["reconnects"] >= 2
 
 
 @given(st.lists(st.sampled_from(["lost", "delivered"]), max_size=30))

@@ -67,6 +67,38 @@ def test_what_a_stalled_stream_held_back_keeps_its_age(stall_s: float, drain_s: 
         assert abs(stamp_ns - exposed_ns) < 10_000_000
 
 
+@given(
+    waited_s=st.floats(0.1, 4.0),
+    fps=st.sampled_from([5, 30, 60]),
+    speed=st.floats(1.3, 8.0),
+    jitter_s=st.sampled_from([0.0, 0.005, 0.03]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_what_waited_in_a_stream_before_it_was_read_is_not_told_as_that_of_now(
+    waited_s: float, fps: int, speed: float, jitter_s: float, seed: int
+) -> None:
+    """Opened, and read first when the model was loaded: the frames of that time come at the decoder's speed."""
+    rng, clock, now_ns, told = np.random.default_rng(seed), StreamClock(), 0, 0
+    for k in range(12 * fps):
+        exposed_ns = 10 * S + k * S // fps
+        ready_ns = max(10 * S + round(waited_s * S), exposed_ns + round(jitter_s * S * rng.exponential()))
+        now_ns = max(ready_ns, now_ns + round(S / fps / speed))
+        stamp_ns = clock.monotonic_ns(k * S // fps, now_ns)
+        assert stamp_ns is not None
+        if clock.caught_up and now_ns < (14.9 + waited_s) * S:
+            told += 1
+            assert stamp_ns - exposed_ns < 0.1 * S
+    assert clock.caught_up
+    assert told > 0 or waited_s / (speed - 1) > 3.0
+
+
+def test_a_stream_whose_clock_is_fast_for_good_is_told_all_the_same() -> None:
+    clock = StreamClock()
+    for k in range(6 * 30):
+        clock.monotonic_ns(round(k * PERIOD_NS * 1.2), k * PERIOD_NS)
+    assert clock.caught_up
+
+
 def test_a_stream_that_stays_behind_says_so_and_one_that_jitters_or_drifts_does_not() -> None:
     rng = np.random.default_rng(3)
     clock, behind_s = StreamClock(), []
@@ -116,10 +148,15 @@ class Fed:
 
 
 def test_a_picture_of_another_shape_in_flight_is_a_camera_to_be_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = [(180, 320)] * 31 + [(360, 640), (1, 4711)]  # as many as it takes to show that nothing waits there
+    times_ns = iter([k * PERIOD_NS for k in range(len(shapes))])
+    monkeypatch.setattr("edge.cameras.live.time", SimpleNamespace(monotonic_ns=lambda: next(times_ns)))
     source = StreamSource(StreamCamera(type="stream", url="udp://127.0.0.1:9", intrinsics=INTRINSICS))
-    monkeypatch.setattr(source, "_connect", lambda: Fed([0, 33, 66], [(180, 320), (360, 640), (1, 4711)]))
+    monkeypatch.setattr(source, "_connect", lambda: Fed([k * PERIOD_NS / 1e6 for k in range(len(shapes))], shapes))
     source.open()
-    assert source.read(threading.Event()).K[0, 0] == 300
+    while (frame := source.read(threading.Event())).meta.sequence < 30:
+        pass
+    assert frame.K[0, 0] == 300
     assert source.read(threading.Event()).K[0, 0] == 600  # the same picture, larger
     with pytest.raises(SourceLost, match="another shape"):
         source.read(threading.Event())
