@@ -76,8 +76,8 @@ class MavlinkLink:
         station = self._station
         for text in self._settings.endpoints:
             transport = open_transport(text)
-            hosts = self._settings.allowed_hosts
-            self._endpoints.append(Endpoint(transport, hosts, station.refused, station.authentic, station.introduces))
+            hosts, judges = self._settings.allowed_hosts, (station.authentic, station.introduces, station.outruns)
+            self._endpoints.append(Endpoint(transport, hosts, station.refused, *judges))
         for end in (self._wake, self._woken):
             end.setblocking(False)
         if not clock.stepped():  # else each step takes its turn here

@@ -1,7 +1,8 @@
 """One endpoint and whom it heeds there.
 
 Who may call, on UDP and as a TCP server, is heeded once it shows the heartbeat of an autopilot that we listen to, and
-until it falls silent; until then nothing is sent to it. Who was dialled is heeded from the start.
+until it falls silent; until then nothing is sent to it. Who was dialled is heeded from the start. Where messages are
+signed, whoever holds back what the autopilot says and plays it later is heeded until the autopilot itself is heard.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ log = logging.getLogger(__name__)
 
 
 class Endpoint:
-    """`introduces` says whether a message is such a heartbeat, `authentic` leaves out what is not signed as it must."""
+    """`introduces` says whether a message is such a heartbeat, `authentic` leaves out what is not signed as it must,
+    `outruns` says whether a stranger's proves that the peer's are old; None: nothing does."""
 
     def __init__(
         self,
@@ -29,12 +31,14 @@ class Endpoint:
         refused: Counter[str],
         authentic: Callable[[list[Any]], list[Any]],
         introduces: Callable[[Any], bool],
+        outruns: Callable[[Any, int], bool] | None,
     ) -> None:
         self.transport = transport
         self._allowed_hosts = allowed_hosts
         self._refused = refused
         self._authentic = authentic
         self._introduces = introduces
+        self._outruns = outruns
         self._receiver = Receiver(refused)
         # Strangers have a rate limit of their own: their flood must not use up the autopilot's.
         self._stranger_receiver = Receiver(refused)
@@ -48,15 +52,17 @@ class Endpoint:
     def believed(self, received: Received, now_ns: int) -> list[Any]:
         """The messages of received bytes that are sound, authentic and from whom we heed."""
         peer = self.peer
-        if peer is not None and received.sender != peer:
+        stranger = received.sender != peer
+        if stranger and (reason := self._unheard(received)) is not None:
+            self._refused[reason] += 1
+            return []
+        receiver = self._stranger_receiver if stranger else self._receiver
+        messages = receiver.take(received.data, received.reader, now_ns)
+        if stranger and peer is not None and not self._outrun_by(messages, now_ns):
             self._refused["address"] += 1
             return []
-        if peer is None and self._allowed_hosts and plain_host(received.sender[0]) not in self._allowed_hosts:
-            self._refused["host"] += 1
-            return []
-        receiver = self._stranger_receiver if peer is None else self._receiver
-        messages = self._authentic(receiver.take(received.data, received.reader, now_ns))
-        if peer is None:
+        messages = self._authentic(messages)
+        if stranger:
             if not any(self._introduces(message) for message in messages):
                 self._refused["stranger"] += 1
                 return []
@@ -65,6 +71,17 @@ class Endpoint:
         if messages:  # of noise, or of what is not signed, nobody is kept
             self._heard_ns = now_ns
         return messages
+
+    def _outrun_by(self, messages: list[Any], now_ns: int) -> bool:
+        return self._outruns is not None and any(self._outruns(message, now_ns) for message in messages)
+
+    def _unheard(self, received: Received) -> str | None:
+        """Why a stranger's bytes are not even looked at, or None."""
+        if self.peer is not None and (self._outruns is None or not self.transport.finds_peers):
+            return "address"
+        if self._allowed_hosts and plain_host(received.sender[0]) not in self._allowed_hosts:
+            return "host"
+        return None
 
     def send(self, data: bytes) -> bool:
         """Send to whom we heed, if there is anybody; False if that failed."""

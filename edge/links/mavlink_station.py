@@ -7,7 +7,7 @@ from one of them alone, the home link, where the autopilot was heard first, unti
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -119,6 +119,15 @@ class Station:
     def introduces(self, message: Any) -> bool:
         """Whether a stranger's message is the heartbeat of an autopilot that we would listen to."""
         return is_autopilot_heartbeat(message) and self._settings.system_id in (None, message.get_srcSystem())
+
+    @property
+    def outruns(self) -> Callable[[Any, int], bool] | None:
+        """Whether a stranger's heartbeat, at a time, proves by its signature that who is heeded tells what was held
+        back; None: nothing is signed."""
+        signing = self._signing
+        return (
+            None if signing is None else lambda message, ns: self.introduces(message) and signing.outruns(message, ns)
+        )
 
     def take(self, messages: Iterable[Any], link: int, now_ns: int) -> list[bytes]:
         """Take authentic messages from a trusted address of a link; returns replies to it."""

@@ -23,6 +23,7 @@ TIMESTAMP_MAX = 2**48 - 1
 EPOCH_S = 1_420_070_400  # 2015-01-01 UTC
 UNIT_NS = 10_000
 NEW_STREAM_BEHIND_MAX = 60 * 100_000  # one minute
+HELD_BACK_MAX_NS = 1_500_000_000
 RESERVED_AHEAD = 60 * 100_000  # so often the state is saved; after a crash these are skipped
 
 
@@ -47,6 +48,7 @@ class Signing:
         self._save = save
         self._utc_ns = utc_ns
         self._streams: dict[tuple[int, int, int], int] = {}
+        self._ahead: dict[tuple[int, int, int], tuple[int, int]] = {}  # not heard when it came another way; and when
 
     def next_timestamp(self) -> int:
         """For the next message: the time it is, or one more than the last."""
@@ -67,14 +69,10 @@ class Signing:
 
         The hash comes first: what is not signed with our key leaves no trace in what is remembered of streams.
         """
-        if not message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED:
-            return "unsigned"
-        frame = bytes(message.get_msgbuf())
-        expected = hashlib.sha256(self._key + frame[:-SIGNATURE_BYTES]).digest()[:SIGNATURE_BYTES]
-        if not hmac.compare_digest(expected, frame[-SIGNATURE_BYTES:]):
-            return "signature"
-        timestamp = int.from_bytes(frame[-12:-6], "little")
-        stream = (frame[-13], message.get_srcSystem(), message.get_srcComponent())
+        reason = self._not_ours(message)
+        if reason is not None:
+            return reason
+        stream, timestamp = _stamp(message)
         last = self._streams.get(stream)
         now = max(self._seen, timestamp_of(self._utc_ns()))
         if timestamp <= last if last is not None else timestamp < now - NEW_STREAM_BEHIND_MAX:
@@ -83,6 +81,37 @@ class Signing:
         self._seen = max(self._seen, timestamp)
         self._last = max(self._last, timestamp)
         return None
+
+    def outruns(self, message: Any, now_ns: int) -> bool:
+        """Whether a message that came another way shows that what is heard of its stream is held back: what came that
+        way HELD_BACK_MAX_NS before `now_ns` (monotonic) has not been heard yet.
+
+        By the order of stamps, not by their time: autopilots that hear no time of others only count on.
+        """
+        if self._not_ours(message) is not None:
+            return False
+        stream, timestamp = _stamp(message)
+        last = self._streams.get(stream)
+        if last is None or timestamp <= last:
+            return False
+        ahead = self._ahead.get(stream)
+        if ahead is None or ahead[0] <= last:
+            ahead = self._ahead[stream] = (timestamp, now_ns)
+        return now_ns - ahead[1] > HELD_BACK_MAX_NS
+
+    def _not_ours(self, message: Any) -> str | None:
+        if not message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED:
+            return "unsigned"
+        frame = bytes(message.get_msgbuf())
+        expected = hashlib.sha256(self._key + frame[:-SIGNATURE_BYTES]).digest()[:SIGNATURE_BYTES]
+        return None if hmac.compare_digest(expected, frame[-SIGNATURE_BYTES:]) else "signature"
+
+
+def _stamp(message: Any) -> tuple[tuple[int, int, int], int]:
+    """Stream and timestamp of a signed message."""
+    frame = bytes(message.get_msgbuf())
+    stream = (frame[-13], message.get_srcSystem(), message.get_srcComponent())
+    return stream, int.from_bytes(frame[-12:-6], "little")
 
 
 def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) -> Signing:

@@ -228,7 +228,7 @@ def test_who_has_fallen_silent_is_not_kept_by_noise_from_its_address() -> None:
     """With the clock in hand: the autopilot comes again from another port, while its old one sends junk."""
     refused: Counter[str] = Counter()
     transport = Udp(NetworkEndpoint("udpin", "127.0.0.1", 0, "udpin:127.0.0.1:0"))
-    endpoint = Endpoint(transport, [], refused, list, is_autopilot_heartbeat)
+    endpoint = Endpoint(transport, [], refused, list, is_autopilot_heartbeat, None)
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     data = bytes(beat.pack(MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)))
     before, after, reader = ("10.0.0.1", 14550), ("10.0.0.1", 14999), FrameReader(datagram=True)

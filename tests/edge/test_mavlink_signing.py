@@ -8,9 +8,11 @@ import stat
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,7 +24,8 @@ from edge.links.signing import RESERVED_AHEAD, TIMESTAMP_MAX, Signing, open_sign
 from edge.links.signing_key import load_key, write_new_key
 from msgs.mavlink import FrameReader, MAVLink, dialect, pack
 
-from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
+from .mavlink_peer import SYSTEM_ID, Peer, Udp, alone, linked, meet
+from .reports import TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -91,6 +94,91 @@ def test_a_recorded_message_played_again_is_refused() -> None:
         peer.wire.send(recorded)
         peer.settle(lambda: link.counters().get("refused_replay") == 1, "refusal")
         assert link.counters()["received_COMMAND_LONG"] == 1
+
+
+class Relay:
+    """Hears the autopilot's signed frames and plays each on from an address of its own, `held_s` later."""
+
+    def __init__(self, port: int, held_s: float) -> None:
+        self.wire, self.held_s = Udp(port), held_s
+        self._heard: deque[tuple[float, bytes]] = deque()
+
+    def hear(self, frame: bytes) -> None:
+        self._heard.append((time.monotonic(), frame))
+
+    def play(self) -> None:
+        while self._heard and time.monotonic() - self._heard[0][0] >= self.held_s:
+            self.wire.send(self._heard.popleft()[1])
+
+
+class Overheard:
+    """The autopilot's way to the link, with the relay listening."""
+
+    def __init__(self, port: int, relay: Relay) -> None:
+        self._wire, self._relay, self.there = Udp(port), relay, False
+
+    def send(self, data: bytes) -> None:
+        self._relay.hear(data)
+        if self.there:
+            self._wire.send(data)
+
+    def receive(self) -> bytes:
+        return self._wire.receive()
+
+    def close(self) -> None:
+        self._wire.close()
+        self._relay.wire.close()
+
+
+def test_who_holds_back_what_the_autopilot_signed_is_heeded_until_it_is_heard_itself() -> None:
+    """As after a restart of ours, or while the autopilot's own way was cut: the relay comes first, and is authentic."""
+    with linked(signing=signing()) as (link, own_ship):
+        link.set_health(TRACKING)
+        relay = Relay(link.ports[0], held_s=6.0)
+        wire = Overheard(link.ports[0], relay)
+        upside_down, level = Rotation.from_euler("x", np.pi), Rotation.identity()
+        with Peer(wire, key=KEY) as peer:
+
+            def fly() -> None:
+                # It flies upside down until the link hears it, and what the relay holds tells that for long.
+                peer.attitude(level if wire.there else upside_down)
+                relay.play()
+
+            def tilt_rad() -> float | None:
+                now = own_ship.at(time.monotonic_ns())
+                return None if now is None else float(Rotation.from_matrix(now.R_ned_body).magnitude())
+
+            peer.settle(lambda: tilt_rad() == pytest.approx(np.pi, abs=1e-3), "what is long over", fly)
+            wire.there = True
+            peer.settle(lambda: tilt_rad() == pytest.approx(0.0, abs=1e-3), "what is now", fly)
+            peer.named("TIMESYNC", fly)
+            played = link.counters()["refused_address"]
+
+            def fly_level() -> None:
+                fly()
+                assert tilt_rad() in (None, pytest.approx(0.0, abs=1e-3))
+
+            peer.settle(lambda: link.counters()["refused_address"] > played + 50, "refusal of the relay", fly_level)
+
+
+def test_who_is_only_quicker_than_the_autopilot_does_not_take_its_place() -> None:
+    """A relay that plays at once what it hears on its way would otherwise have us speak to it instead."""
+    with linked(signing=signing()) as (link, _), Peer(link.ports[0], key=KEY) as peer:
+        meet(link, peer)
+        relay = Udp(link.ports[0])
+        beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, peer.autopilot, 0, 0, 4, 3)
+        began = time.monotonic()
+
+        def relay_and_forge() -> None:
+            relay.send(frame := peer.packed(beat))
+            peer.wire.send(frame)
+            relay.send(signed_frame(timestamp_of(time.time_ns()) + 1_000_000, key=bytes(32)))
+            peer.attitude(Rotation.identity())
+
+        peer.settle(lambda: time.monotonic() - began > 4.0, "four seconds", relay_and_forge)
+        assert alone(relay)
+        assert peer.named("TIMESYNC", relay_and_forge)
+        relay.close()
 
 
 def test_a_forged_timestamp_from_the_far_future_does_not_block_the_stream() -> None:
