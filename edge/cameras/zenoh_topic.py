@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import Counter
@@ -23,15 +24,19 @@ from msgs.session import client_config
 from msgs.topics import parse_attachment
 from msgs.wire import PayloadError
 
+log = logging.getLogger(__name__)
+
 SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
+PUBLISHER_SILENT_NS = 1_000_000_000  # then another may take its place
 
 
 class ZenohSource:
     """The newest picture of a topic, stamped by its header as far as the sender's UTC agrees with ours.
 
-    A picture that cannot be decoded or is of another size than the calibration's is counted and dropped.
+    A picture that cannot be decoded or is of another size than the calibration's is counted and dropped, and so are
+    those of a second publisher: of two cameras, or a camera and a recording of it, one alone is looked through.
     """
 
     live = True
@@ -47,7 +52,8 @@ class ZenohSource:
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # the publisher and its number of the last picture
-        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0)
+        self._heeded: tuple[bytes, int] | None = None  # the publisher that is looked at, heard ns
+        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0)
 
     def nominal(self) -> CameraInfo:
         return CameraInfo(self._settings.topic, self._intrinsics.image_size_wh, self._intrinsics.K, None)
@@ -85,8 +91,16 @@ class ZenohSource:
     def _take(self, sample: zenoh.Sample) -> None:
         """On zenoh's thread: keep the newest; what it replaces shows as a gap in the numbers."""
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        parsed, now_ns = parse_attachment(attachment), time.monotonic_ns()
+        publisher = b"" if parsed is None else parsed[2]
         with self._arrived:
-            self._sample = (time.monotonic_ns(), sample.payload.to_bytes(), attachment)
+            if self._heeded is not None and publisher != self._heeded[0]:
+                if now_ns - self._heeded[1] <= PUBLISHER_SILENT_NS:
+                    self.counts["other_publisher"] += 1
+                    return
+                log.info("the camera's topic has another publisher")
+            self._heeded = (publisher, now_ns)
+            self._sample = (now_ns, sample.payload.to_bytes(), attachment)
             self._arrived.notify()
 
     def _frame(self, arrival_ns: int, payload: bytes, attachment: bytes) -> Frame | None:

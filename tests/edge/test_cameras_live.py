@@ -131,6 +131,25 @@ def test_what_is_no_picture_on_the_topic_is_counted_and_what_is_lost_shows_as_a_
         assert later.meta.capture_ns < first.meta.capture_ns  # an old picture is not told as a new one
 
 
+def test_of_two_cameras_on_one_topic_one_alone_is_looked_through_until_it_is_gone() -> None:
+    """A recording that is played beside the camera would have the tracker see both skies in turn."""
+    port = free_port()
+    with router(port) as camera, zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+        recording = Node(session, "nose", name="playback").publisher(topics.IMAGE)
+        with closing(ZenohSource(zenoh_camera(port))) as source:
+            source.open()
+            put_until_read(source, camera, message(1))
+            seen: set[int] = set()
+            for _ in range(40):
+                recording.put(message(9))
+                camera.put(message(1))
+                seen.add(number_of(source.read(threading.Event())))
+            assert seen == {1}
+            assert source.counts["other_publisher"] > 0
+            # The camera falls silent: what else there is takes its place.
+            assert number_of(put_until_read(source, recording, message(9))) == 9
+
+
 def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None:
     port = free_port()
     source = ZenohSource(zenoh_camera(port))
