@@ -67,7 +67,8 @@ class ZenohSource:
             self._session.declare_subscriber(key, handlers.Callback(self._take, indirect=False))
         except zenoh.ZError as error:
             self.close()
-            raise SourceLost(f"no zenoh session with {self._settings.connect}: {error}") from error
+            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+            raise SourceLost(f"no zenoh session with {self._settings.connect}: {reason}") from error
         return self.nominal()
 
     def read(self, stop: threading.Event) -> Frame:

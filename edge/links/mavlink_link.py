@@ -197,7 +197,7 @@ class MavlinkLink:
         packings: list[Callable[[], list[bytes]]] = []
         if report is not None:
             packings.append(partial(self._packed_in_time, report, now_ns))
-        packings += [partial(self._station.event, severity, text) for severity, text in events]
+        packings += [partial(self._station.event, severity, text, now_ns) for severity, text in events]
         for packing in packings:
             try:
                 self._send(packing())

@@ -18,7 +18,7 @@ from edge.links import mavlink_messages as words
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
-from edge.links.mavlink_schedule import Schedule
+from edge.links.mavlink_schedule import Allowance, Schedule
 from edge.links.mavlink_table import (
     ADSB_VEHICLE,
     ATTITUDE,
@@ -60,6 +60,7 @@ GIMBAL_HZ = 50.0
 FOLLOW_TARGET_HZ = 10.0
 ADSB_VEHICLE_HZ = 2.0
 COMPUTER_STATUS_HZ = 1.0
+NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
 
@@ -102,6 +103,7 @@ class Station:
         self._health: tuple[Condition, int] | None = None
         self._reported_ns: int | None = None
         self._text_id = 0
+        self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """Those that carry a valid signature; all of them where nothing is signed."""
@@ -191,8 +193,12 @@ class Station:
             out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
         return out + self._traffic(report, tracks, first, now_ns)
 
-    def event(self, severity: int, text: str) -> list[bytes]:
-        """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY."""
+    def event(self, severity: int, text: str, now_ns: int) -> list[bytes]:
+        """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. What is wrong goes out always, what is only news
+        (a person who drags a point over the picture makes much of it) as far as a radio carries it."""
+        if severity > dialect.MAV_SEVERITY_WARNING and not self._news.take(now_ns):
+            self.counters["news_left_out"] += 1
+            return []
         self._text_id = self._text_id % 65535 + 1
         return [self._packed(message) for message in words.statustexts(severity, text, self._text_id)]
 

@@ -226,6 +226,23 @@ def test_events_arrive_beside_a_report_that_no_message_holds() -> None:
         peer.settle(lambda: link.counters().get("unpackable", 0) > 0, "count of what no message holds")
 
 
+def test_a_flood_of_news_leaves_the_line_to_poses_and_to_what_is_wrong() -> None:
+    """A ground station that drags a point over the picture chooses a target thirty times a second."""
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        began, number = time.monotonic(), 0
+
+        def drag() -> None:
+            nonlocal number
+            link.event(6, f"target {(number := number + 1)} chosen")
+
+        peer.settle(lambda: link.counters().get("news_left_out", 0) > 100, "news left out", drag)
+        link.event(3, "fault: no frame for 2 s")
+        peer.until(lambda m: m.get_type() == "STATUSTEXT" and m.severity == 3, "what is wrong", drag)
+        told = [m.text for m in peer.received if m.get_type() == "STATUSTEXT"]
+        assert len(told) < 40 + 2 * (time.monotonic() - began)
+
+
 def test_long_events_arrive_in_chunks_that_belong_together() -> None:
     text = "degraded: no own attitude: poses in the camera frame only; 12 % of frames dropped"
     with linked() as (link, _), Peer(link.ports[0]) as peer:

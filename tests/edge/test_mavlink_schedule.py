@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.links.mavlink_schedule import Schedule
+from edge.links.mavlink_schedule import Allowance, Schedule
 
 MESSAGE = 275
 GAPS_NS = st.lists(st.integers(1_000_000, 400_000_000), min_size=1, max_size=200)
@@ -40,3 +40,23 @@ def test_targets_have_a_rhythm_each_and_off_is_off(gaps_ns: list[int]) -> None:
     assert [schedule.due(MESSAGE, 0, now_ns + 10**12) for _ in range(2)] == [True, False]
     schedule.set_rate(MESSAGE, None)
     assert schedule.due(MESSAGE, 0, now_ns + 2 * 10**12)
+
+
+@given(
+    at_once=st.integers(1, 20),
+    period_ns=st.integers(1_000_000, 10**9),
+    gaps_ns=GAPS_NS,
+    began_ns=st.integers(0, 10**15),
+)
+def test_what_is_allowed_is_so_many_at_once_and_one_a_period(
+    at_once: int, period_ns: int, gaps_ns: list[int], began_ns: int
+) -> None:
+    allowance, now_ns = Allowance(at_once, period_ns), began_ns
+    assert [allowance.take(now_ns) for _ in range(at_once)] == [True] * at_once
+    went = 0
+    for gap_ns in gaps_ns:
+        now_ns += gap_ns
+        went += sum(allowance.take(now_ns) for _ in range(3))
+    assert went <= (now_ns - began_ns) / period_ns + 1
+    now_ns += (at_once + 1) * period_ns
+    assert [allowance.take(now_ns) for _ in range(at_once + 1)] == [True] * at_once + [False]
