@@ -29,6 +29,7 @@ WAITING_BYTES_MAX = 64 * 1024**2  # pictures are large
 STANDING_MAX = 256  # so that made-up names cannot grow it without bound
 FLUSH_S = 1.0
 RETRY_S = 3.0
+GAPS_S = 10.0  # between two words on a disk that does not keep up
 STOP_TIMEOUT_S = 10.0
 
 WhenFull = Literal["oldest", "stop"]
@@ -70,6 +71,8 @@ class Recorder:
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
         self._waiting_bytes = 0
+        self._overflowed = 0  # lost since it was last told, as too many waited
+        self._gaps_due_s = 0.0
         self._standing: dict[str, Sample] = {}
         self._counters: Counter[str] = Counter()
         self._wanted = on
@@ -102,6 +105,7 @@ class Recorder:
             full = len(self._waiting) >= WAITING_MAX or self._waiting_bytes + len(payload) > WAITING_BYTES_MAX
             if self._failure is not None or full:
                 self._counters["lost"] += 1
+                self._overflowed += self._failure is None
             else:
                 # Nobody is woken: the writer comes by each second.
                 self._waiting.append(sample)
@@ -134,6 +138,7 @@ class Recorder:
                 self._woken = False
                 samples, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
                 go_on, stopping = self._wanted and not self._stopping, self._stopping
+            self._tell_gaps()
             try:
                 self._turn(samples, go_on)
                 with self._changed:
@@ -143,6 +148,17 @@ class Recorder:
                 self._fail(error, len(samples))
             if stopping:
                 return
+
+    def _tell_gaps(self) -> None:
+        now_s = time.monotonic()
+        with self._changed:
+            if not self._overflowed or now_s < self._gaps_due_s:
+                return
+            lost, self._overflowed = self._overflowed, 0
+        self._gaps_due_s = now_s + GAPS_S
+        text = f"recording has gaps: the disk is too slow, {lost} messages were lost"
+        log.warning("%s", text)
+        self._tell(logging.WARNING, text)
 
     def _turn(self, samples: deque[Sample], go_on: bool) -> None:
         """One second's work: write, put it on the disk, and begin another file where the limits say."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -253,6 +254,39 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
     assert (kept[0], kept[-1]) == (b"before", b"after")
     assert b"lost" not in kept
+
+
+def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "WAITING_MAX", 50)
+    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
+
+    def sync(fd: int) -> None:
+        stands.set()
+        goes_on.wait()
+        real_sync(fd)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    try:
+        record_some(recorder, [b"before"])
+        stands.wait()
+        record_some(recorder, [b"kept"] * 50 + [b"lost"] * 20)
+        assert recorder.counters()["lost"] == 20
+        assert recorder.recording
+    finally:
+        goes_on.set()
+    until(lambda: told != [])
+    until(lambda: recorder.counters()["recorded"] == 51)
+    record_some(recorder, [b"after"])
+    recorder.stop()
+    assert told == [(30, "recording has gaps: the disk is too slow, 20 messages were lost")]
+    kept = Counter(data for path in tmp_path.iterdir() for *_, data, _ in read(path))
+    assert kept == {b"before": 1, b"kept": 50, b"after": 1}
 
 
 def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
