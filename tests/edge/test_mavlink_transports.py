@@ -27,6 +27,7 @@ from edge.links.transports.tcp import CALLERS_MAX, TcpServer
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
+from tests.waiting import until
 
 from .mavlink_peer import CAMERA, DEADLINE_S, Peer, Pty, Tcp, Udp, alone, linked, meet
 from .reports import SEARCHING, TRACKING
@@ -95,6 +96,18 @@ def test_idle_callers_do_not_keep_an_autopilot_out() -> None:
             exchanges(link, own_ship, peer)
         for caller in idle:
             caller.close()
+
+
+def test_a_host_that_calls_and_calls_does_not_displace_an_autopilot_that_has_not_spoken_yet() -> None:
+    with linked("tcpin:127.0.0.1:0") as (link, own_ship), contextlib.ExitStack() as calling:
+        address = ("127.0.0.1", link.ports[0])
+        with Peer(Tcp(socket.create_connection(address, source_address=("127.0.0.2", 0)))) as peer:
+            for _ in range(3 * CALLERS_MAX):
+                caller = calling.enter_context(socket.create_connection(address))
+                caller.sendall(b"hello")
+            # More than there is room for were taken.
+            until(lambda: link.counters().get("refused_stranger", 0) > CALLERS_MAX, what="callers")
+            exchanges(link, own_ship, peer)
 
 
 def test_a_tcp_client_starts_before_its_server_and_comes_back_after_it() -> None:

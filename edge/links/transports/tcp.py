@@ -7,6 +7,7 @@ import logging
 import socket
 import struct
 import time
+from collections import Counter
 from collections.abc import Sequence
 
 from edge import clock
@@ -206,7 +207,8 @@ class TcpClient:
 
 
 class TcpServer:
-    """Takes up to CALLERS_MAX callers, who must show who they are; with more, the oldest that was not heeded goes.
+    """Takes up to CALLERS_MAX callers, who must show who they are; with more, one that was not heeded goes: the oldest
+    of the host that has most.
 
     Raises LinkError if the port cannot be opened.
     """
@@ -269,9 +271,14 @@ class TcpServer:
         except OSError:
             return  # nobody calls, or has gone again
         if len(self._callers) >= CALLERS_MAX:
-            oldest = next(known for known in self._callers if known != self._heeded)
-            self._callers.pop(oldest).close()
+            self._callers.pop(self._spare()).close()
         self._callers[address] = Connection(connected, address)
+
+    def _spare(self) -> Address:
+        """Whom to part with for another: a host that calls and calls displaces itself alone."""
+        unheeded = [known for known in self._callers if known != self._heeded]
+        calls = Counter(known[0] for known in unheeded)
+        return max(unheeded, key=lambda known: calls[known[0]])
 
     def _forget_closed(self) -> None:
         self._callers = {address: caller for address, caller in self._callers.items() if caller.open}
