@@ -1,4 +1,5 @@
-"""Own attitude and position that jump: what no flight brings about is a reset of the autopilot's filter.
+"""Own attitude and position that jump: what no flight brings about is a reset of the autopilot's filter, what no motor
+does a gimbal that lost its bearings or is another one.
 
 Tracks are held in ned. Taken for flight, a jump of the own ship would move every target with it, in the camera's frame.
 """
@@ -7,11 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge.tracking.own_ship import GimbalFrame
 from edge.types import Array
 from msgs.geometry import rotation_angle, so3_exp
 
 POSITION_MIN_M, ACCELERATION_MPS2, POSITION_GAP_MAX_NS = 3.0, 30.0, 2_000_000_000
 ATTITUDE_MIN_RAD, TURNING_RADPS2, ATTITUDE_GAP_MAX_NS = 0.1, 50.0, 500_000_000
+GIMBAL_MIN_RAD, GIMBAL_RADPS = 0.1, 12.0  # no gimbal turns faster
 NS_PER_S = 1e9
 
 
@@ -21,6 +24,7 @@ class Jumps:
     def __init__(self) -> None:
         self._attitude: tuple[int, Array, Array] | None = None  # time, R_ned_body, rates
         self._position: tuple[int, Array, Array] | None = None  # time, t_ned_m, v_ned_mps
+        self._gimbal: tuple[int, Array, GimbalFrame] | None = None  # time, R_frame_gimbal, frame
 
     def attitude(self, time_ns: int, R_ned_body: Array, rates_radps: Array) -> bool:
         """Whether the body [3, 3] cannot have turned here since the last sample at its rates [3]."""
@@ -30,6 +34,14 @@ class Jumps:
         dt_s = (time_ns - last[0]) / NS_PER_S
         turned = last[1] @ so3_exp(0.5 * (last[2] + rates_radps) * dt_s)
         return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.5 * TURNING_RADPS2 * dt_s**2
+
+    def gimbal(self, time_ns: int, R_frame_gimbal: Array, frame: GimbalFrame) -> bool:
+        """Whether the gimbal [3, 3] cannot have turned here since the last sample in the same frame."""
+        last, self._gimbal = self._gimbal, (time_ns, R_frame_gimbal, frame)
+        if last is None or last[2] is not frame or not 0 < time_ns - last[0] <= ATTITUDE_GAP_MAX_NS:
+            return False
+        dt_s = (time_ns - last[0]) / NS_PER_S
+        return float(rotation_angle(last[1], R_frame_gimbal)) > GIMBAL_MIN_RAD + GIMBAL_RADPS * dt_s
 
     def position(self, time_ns: int, t_ned_m: Array, v_ned_mps: Array) -> bool:
         """Whether the own ship cannot have flown here [3] since the last sample at its velocities [3]."""

@@ -261,6 +261,7 @@ class Station:
             reason = self._telemetry.take(message, now_ns)
             self.counters["position_jumps"] = self._telemetry.position_jumps
             self.counters["attitude_jumps"] = self._telemetry.attitude_jumps
+            self.counters["gimbal_jumps"] = self._telemetry.gimbal_jumps
             if reason is not None:
                 self.refused[reason] += 1
         return []

@@ -68,9 +68,9 @@ class Telemetry:
         self._own_ship = own_ship
         self._timesync = timesync
         self._gimbal_component = gimbal_component
-        self.attitude_jumps = self.position_jumps = 0
+        self.attitude_jumps = self.position_jumps = self.gimbal_jumps = 0
         self._forget()
-        self._attitudes_from_ns = self._positions_from_ns = 0
+        self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
 
     def forget(self, now_ns: int) -> None:
         """What was heard holds no more: the autopilot has started again, or it is another."""
@@ -145,6 +145,12 @@ class Telemetry:
             time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
         else:
             time_ns = self._gimbal_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+        if self._jumps.gimbal(time_ns, R_from_q_wxyz(message.q), frame):
+            self.gimbal_jumps += 1
+            self._own_ship.clear()
+            self._gimbals_from_ns = now_ns + JUMP_REST_NS
+        if now_ns < self._gimbals_from_ns:
+            return None
         return None if self._own_ship.add_gimbal(time_ns, message.q, frame) else "late"
 
     def _uptime_ns(self, message: Any, now_ns: int) -> int:

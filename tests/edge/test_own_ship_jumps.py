@@ -29,8 +29,8 @@ R_CAM_TARGET = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 class Autopilot:
     """Its messages, at their times, to a station."""
 
-    def __init__(self) -> None:
-        self.own_ship = OwnShipBuffer()
+    def __init__(self, gimballed: bool = False) -> None:
+        self.own_ship = OwnShipBuffer(gimballed)
         self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
         self._mav = MAVLink(None, srcSystem=1, srcComponent=1)
 
@@ -51,6 +51,14 @@ class Autopilot:
             self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, *q_wxyz, 0, 0, rate_radps), now_ns)
         if k_ms % 50 == 7:
             self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
+
+    def gimbal(self, k_ms: int, pan_rad: float) -> None:
+        """Level, in the earth's frame."""
+        now_ns = BEGIN_NS + k_ms * MS
+        q_wxyz = [np.cos(0.5 * pan_rad), 0.0, 0.0, np.sin(0.5 * pan_rad)]
+        self.tell(
+            dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, now_ns // MS, 64, q_wxyz, 0, 0, 0, 0), now_ns
+        )
 
 
 def seen(rng: np.random.Generator) -> Estimate:
@@ -98,3 +106,33 @@ def test_hard_flying_is_no_jump(speed_mps: float, turn_radps: float) -> None:
     now = autopilot.own_ship.at(BEGIN_NS + 3999 * MS)
     assert now is not None
     assert now.t_ned_body_m is not None
+
+
+@pytest.mark.parametrize("lasts_ms", [20, 4000])
+def test_a_gimbal_that_jumps_points_nowhere_until_it_has_come_to_rest(lasts_ms: int) -> None:
+    """One odd sample, or another zero of its encoders: it turned no target."""
+    autopilot, known_rad = Autopilot(gimballed=True), []
+    for k_ms in range(4000):
+        autopilot.turn(k_ms, V_NED_MPS * k_ms / 1000, V_NED_MPS)
+        if k_ms % 20 == 11:
+            autopilot.gimbal(k_ms, 1.2 if 2000 <= k_ms < 2000 + lasts_ms else 0.3)
+        if k_ms > 500 and (own := autopilot.own_ship.at(BEGIN_NS + k_ms * MS)) is not None:
+            assert own.R_body_gimbal is not None
+            known_rad.append((k_ms, np.arctan2(own.R_body_gimbal[1, 0], own.R_body_gimbal[0, 0])))
+    before = [pan for k_ms, pan in known_rad if k_ms <= 2010]
+    after = [pan for k_ms, pan in known_rad if k_ms > 2010]
+    np.testing.assert_allclose(before, 0.3, atol=1e-6)
+    np.testing.assert_allclose(after, 0.3 if lasts_ms < 1000 else 1.2, atol=1e-6)
+    assert len(before) > 1400
+    assert len(after) > 1400
+    assert min(k_ms for k_ms, _ in known_rad if k_ms > 2010) > 2290
+
+
+def test_a_gimbal_that_slews_is_no_jump() -> None:
+    autopilot = Autopilot(gimballed=True)
+    for k_ms in range(3000):
+        autopilot.turn(k_ms, V_NED_MPS * k_ms / 1000, V_NED_MPS)
+        if k_ms % 20 == 11:
+            autopilot.gimbal(k_ms, 2.0 * np.sin(4.0 * k_ms / 1000))  # 8 rad/s at most
+    assert autopilot.station.counters["gimbal_jumps"] == 0
+    assert autopilot.own_ship.at(BEGIN_NS + 2999 * MS) is not None
