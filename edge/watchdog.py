@@ -19,7 +19,8 @@ EXIT_STUCK = 70
 
 class Watchdog:
     """Armed after warm-up, on the monotonic clock. Code that holds the interpreter's lock for ever stops this thread
-    too; then systemd's own watchdog, fed by the loop alone, ends the process."""
+    too; then systemd's own watchdog, fed by the loop alone, ends the process. Time for which this thread was held up
+    itself is not held against the loop: the host stood still, and a restart would only cost the tracks."""
 
     def __init__(self, limit_s: float, last_words: Callable[[str], None]) -> None:
         self._limit_ns = round(limit_s * 1e9)
@@ -45,8 +46,15 @@ class Watchdog:
             thread.join()
 
     def _watch(self, watched: int, disarmed: threading.Event) -> None:
-        while not disarmed.wait(self._limit_ns / 1e9 / LOOKS_PER_LIMIT):
-            still_ns = time.monotonic_ns() - self._beat_ns
+        period_ns = self._limit_ns // LOOKS_PER_LIMIT
+        beat_ns, held_up_ns, looked_ns = self._beat_ns, 0, time.monotonic_ns()
+        while not disarmed.wait(period_ns / 1e9):
+            now_ns = time.monotonic_ns()
+            if self._beat_ns != beat_ns:
+                beat_ns, held_up_ns = self._beat_ns, 0
+            held_up_ns += max(now_ns - looked_ns - period_ns, 0)
+            looked_ns = now_ns
+            still_ns = now_ns - beat_ns - held_up_ns
             if still_ns > self._limit_ns:
                 self._end(f"the main loop has stood still for {still_ns / 1e9:.1f} s {_place(watched)}: ending")
 
