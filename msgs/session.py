@@ -17,6 +17,8 @@ from typing import Any
 import zenoh
 
 LEASE_MS = 2000
+# Whoever accepts a connection and then says nothing holds up an opening, or a closing meanwhile, for so long.
+OPEN_TIMEOUT_MS = 4000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
 # On a link whose poses are capped: what a person needs beside them, and no more.
@@ -147,6 +149,7 @@ def _config(
     _insert(config, "scouting/gossip/enabled", discovery)
     _insert(config, "timestamping/enabled", True)
     _insert(config, "transport/link/tx/lease", LEASE_MS)
+    _insert(config, "transport/unicast/open_timeout", OPEN_TIMEOUT_MS)
     _insert(config, "transport/shared_memory/enabled", False)
     if tls is not None:
         settings = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import time
 from collections import Counter
@@ -112,3 +113,14 @@ def test_only_who_holds_our_certificate_gets_in_and_poses_are_thinned_there(
         elapsed_s = time.monotonic() - started
         # One for the period that had begun, one that was on its way when counting started.
         assert received["ground"] <= 5.0 * elapsed_s + 2
+
+
+def test_a_router_that_accepts_and_says_nothing_is_soon_parted_with_and_called_again() -> None:
+    """Until then neither a vehicle that is told to stop nor a camera that looks for its topic could go on."""
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        mute.settimeout(session.OPEN_TIMEOUT_MS / 1000 + 4.0)  # zenoh's own patience is 10 s
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with zenoh.open(session.peer_config([], [endpoint])):
+            calls = [mute.accept()[0] for _ in range(2)]
+        for call in calls:
+            call.close()
