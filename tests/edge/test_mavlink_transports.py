@@ -166,7 +166,7 @@ def test_a_serial_line_that_nobody_reads_loses_whole_messages_and_blocks_nothing
         text = "x" * 5000
 
         def tell() -> None:
-            link.event(6, text)
+            link.event(4, text)
 
         peer.settle(lambda: link.counters().get("send_failed", 0) > 0, "loss on the line", tell)
         frames = FrameReader(datagram=False)
