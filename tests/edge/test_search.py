@@ -171,7 +171,7 @@ def test_poses_go_out_while_the_search_is_under_way_and_what_it_finds_becomes_a_
     loop, ear, _ = pipeline
     for index in range(20):
         loop._process(frame(index, HELD))
-    assert gated.begun.is_set()
+    until(gated.begun.is_set, what="the search")
     assert loop.search.counters()["searches"] == 0  # still at it
     assert [len(report.tracks) for report in ear.reports] == [1] * 20
 
