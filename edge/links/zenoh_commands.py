@@ -62,7 +62,7 @@ class Record(_Body):
 
 
 class Rate(_Body):
-    max_hz: Annotated[float, Field(gt=0.0, le=240.0, allow_inf_nan=False)] | None
+    max_hz: Annotated[float, Field(ge=0.1, le=240.0, allow_inf_nan=False)] | None
 
 
 class Reload(_Body):

@@ -310,8 +310,10 @@ class Desk:
         if not topic.per_target or self._pose_period_s == 0.0:
             return True
         now_s = clock.monotonic_ns() / 1e9
-        due_s = self._pose_due_s.get((topic.name, target), 0.0)
+        # No further off than the rate of now has it, whatever rate was asked for before.
+        due_s = min(self._pose_due_s.get((topic.name, target), 0.0), now_s + self._pose_period_s)
         if now_s < due_s:
+            self._pose_due_s[topic.name, target] = due_s
             return False
         # Counted on from when it was due, so that the rate is met though frames come at their own times.
         self._pose_due_s[topic.name, target] = max(due_s, now_s - self._pose_period_s) + self._pose_period_s

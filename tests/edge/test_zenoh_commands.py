@@ -117,6 +117,16 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
         until(lambda: one.recorder.counters()["recorded"] > 4 * 40, lambda: put(one), what="the recording")
 
 
+def test_a_higher_rate_holds_at_once_however_low_the_one_before_it_was(tmp_path: Path) -> None:
+    with vehicle(tmp_path) as one:
+        assert answered(one, "rate", {"max_hz": 0.1})["ok"]
+        until(lambda: one.link.counters().get("sent_pose", 0) == 1, lambda: put(one), what="the first pose")
+        asked = time.monotonic()
+        assert answered(one, "rate", {"max_hz": 20})["ok"]
+        until(lambda: one.link.counters()["sent_pose"] >= 3, lambda: put(one), what="poses at the new rate")
+        assert time.monotonic() - asked < 1 / 0.1, "it waited for what the old rate had next"
+
+
 @pytest.mark.parametrize(
     ("name", "body", "error"),
     [
@@ -127,7 +137,7 @@ def test_the_rate_of_poses_is_capped_and_freed_and_the_recording_keeps_all(tmp_p
         ("track", b"{}", "box: is missing"),
         ("record", b'{"on": "yes"}', "on: Input should be a valid boolean"),
         ("record", b'{"on": true, "path": "/etc"}', "path: unknown key"),
-        ("rate", b'{"max_hz": 0}', "max_hz: Input should be greater than 0"),
+        ("rate", b'{"max_hz": 1e-300}', "max_hz: Input should be greater than or equal to 0.1"),
         ("reload", b'{"file": "/etc/passwd"}', "file: unknown key"),
         ("reload", b"{}", "this vehicle does not reload"),
         ("stop", b"[]", "Input should be an object"),
