@@ -1,11 +1,15 @@
-"""The daemon's log: one line a fault, and a count in place of its repetitions."""
+"""The daemon's log: one line a fault, and a count in place of its repetitions; nobody waits for its reader."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
 import os
+import queue
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,11 +17,50 @@ from typing import TextIO
 
 REPEAT_S = 60.0
 FAULTS_REMEMBERED = 64
+LINES_WAITING = 1000
+DRAIN_S = 1.0
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 # OpenCV and ffmpeg write lines of their own, past any counting: one for each try to open a camera, many for each
 # picture that a radio spoiled. Whoever looks into a fault sets these variables otherwise.
 QUIET = {"OPENCV_LOG_LEVEL": "ERROR", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _NUMBER = re.compile(r"\d+(\.\d+)?")
+
+
+class PatientStream(io.TextIOBase):
+    """Writes to a stream by a thread of its own: who logs flies, and a reader that stands still (a journal, a paused
+    terminal, a full pipe) must not hold it up. What comes meanwhile waits, the newest of too much is lost."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._waiting: queue.Queue[str | threading.Event] = queue.Queue(LINES_WAITING)
+        self._lost = 0
+        threading.Thread(target=self._work, name="log", daemon=True).start()
+
+    def write(self, text: str) -> int:
+        try:
+            self._waiting.put_nowait(text)
+        except queue.Full:
+            self._lost += 1
+        return len(text)
+
+    def drain(self) -> None:
+        """Return when all is written, or after DRAIN_S."""
+        written = threading.Event()
+        with contextlib.suppress(queue.Full):
+            self._waiting.put_nowait(written)
+            written.wait(DRAIN_S)
+
+    def _work(self) -> None:
+        while True:
+            line = self._waiting.get()
+            if isinstance(line, threading.Event):
+                line.set()
+                continue
+            lost, self._lost = self._lost, 0
+            said = f"{lost} lines of the log were lost: nobody read it\n" if lost else ""
+            with contextlib.suppress(OSError, ValueError):  # the reader is gone, or the stream closed
+                self._stream.write(said + line)
+                self._stream.flush()
 
 
 @dataclass
@@ -59,6 +102,8 @@ class CountingHandler(logging.StreamHandler[TextIO]):
         for fault in self._faults.values():
             self._tell_count(fault)
         self._faults.clear()
+        if isinstance(self.stream, PatientStream):
+            self.stream.drain()
         super().close()
 
     def _tell_count(self, fault: _Fault) -> None:
@@ -73,5 +118,5 @@ def set_up_logging() -> None:
     """Everything from INFO on to standard error. To be called before OpenCV is imported."""
     for variable, level in QUIET.items():
         os.environ.setdefault(variable, level)
-    handler = CountingHandler(sys.stderr)
+    handler = CountingHandler(PatientStream(sys.stderr))  # type: ignore[arg-type]
     logging.basicConfig(level=logging.INFO, format=FORMAT, handlers=[handler])

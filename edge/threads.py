@@ -24,6 +24,7 @@ THREADS = (
     ThreadRow("pictures", "makes JPEG of frames for who looks and for recordings", "the loop, the links"),
     ThreadRow("mavlink", "owns the sockets: sends, answers, hears the autopilot", "the loop", watched=True),
     ThreadRow("lookup", "asks where the host of a MAVLink endpoint is, and ends", "anybody"),
+    ThreadRow("log", "writes the log, however long its reader takes", "anybody but its reader"),
     ThreadRow("watchdog", "ends the process when the loop stands still", "anybody"),
     ThreadRow("signals", "hears SIGTERM, SIGINT and SIGHUP for the loop", "anybody"),
     ThreadRow("reload", "while SIGHUP is obeyed: reads the configuration, loads and warms the model", "the loop"),

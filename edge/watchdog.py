@@ -61,9 +61,14 @@ class Watchdog:
     def _end(self, sentence: str) -> None:
         log.critical("%s", sentence)
         # A link that hangs with the loop must not keep the process from its end.
-        last_words = threading.Thread(target=self._last_words, args=(sentence,), daemon=True)
-        last_words.start()
-        last_words.join(LAST_WORDS_S)
+        last_words = [
+            threading.Thread(target=self._last_words, args=(sentence,), daemon=True),
+            threading.Thread(target=logging.shutdown, daemon=True),
+        ]
+        for thread in last_words:
+            thread.start()
+        for thread in last_words:
+            thread.join(LAST_WORDS_S)
         os._exit(EXIT_STUCK)
 
 

@@ -1,0 +1,59 @@
+"""Whoever reads the daemon's log, or does not: it flies on."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import threading
+from pathlib import Path
+
+from edge.logs import LINES_WAITING, PatientStream
+from msgs.client import connect
+from tests.waiting import until
+
+from .flying import flying, free_port, toml, write_swaying_scene
+
+COMMANDS = 150  # each is a line of the log, of which forty fill the pipe
+
+
+def test_a_log_that_nobody_reads_keeps_the_daemon_from_nothing(tmp_path: Path, toy_model: Path) -> None:
+    scene, port = write_swaying_scene(tmp_path / "000001"), free_port()
+    with (
+        flying(tmp_path, toml(scene, toy_model, port)) as flight,
+        connect(f"tcp/127.0.0.1:{port}") as ground,
+    ):
+        assert flight.process.stderr is not None
+        fcntl.fcntl(flight.process.stderr, fcntl.F_SETPIPE_SZ, 4096)
+        for k in range(COMMANDS):
+            replies = list(ground.get("uavpose/@v1/uav1/cmd/loop", timeout=20.0))
+            assert [b"no such command" in reply.ok.payload.to_bytes() for reply in replies] == [True], f"at the {k}th"
+        flight.process.terminate()
+        assert flight.process.wait(timeout=60) == 0
+
+
+def test_what_a_slow_reader_missed_is_told_to_it() -> None:
+    read_end, write_end = os.pipe()
+    fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
+    with open(write_end, "w", encoding="utf-8") as pipe:
+        stream = PatientStream(pipe)
+        for k in range(2 * LINES_WAITING):
+            stream.write(f"line {k:05d} {'.' * 80}\n")
+        got = io.StringIO()
+
+        def read() -> None:
+            while data := os.read(read_end, 4096):
+                got.write(data.decode())
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        until(lambda: got.getvalue().count("line ") >= LINES_WAITING, what="what waited")
+        stream.write("the last\n")
+        until(lambda: got.getvalue().endswith("the last\n"), what="the last line")
+    reader.join()
+    os.close(read_end)
+    lines = got.getvalue().splitlines()
+    told = next(int(line.split()[0]) for line in lines if line.endswith("nobody read it"))
+    written = [line for line in lines if line.startswith("line ")]
+    assert told + len(written) == 2 * LINES_WAITING
+    assert written == sorted(written)
