@@ -42,23 +42,3 @@ class Schedule:
             return False
         self._due_ns[message_id, instance] = max(due_ns, now_ns - interval_ns) + interval_ns
         return True
-
-
-class Allowance:
-    """So many at once, and one more each period."""
-
-    def __init__(self, at_once: int, period_ns: int) -> None:
-        self._at_once = at_once
-        self._period_ns = period_ns
-        self._left = at_once
-        self._counted_ns = 0
-
-    def take(self, now_ns: int) -> bool:
-        """Whether one more may go at `now_ns`; it then counts as gone."""
-        more = (now_ns - self._counted_ns) // self._period_ns
-        self._counted_ns += more * self._period_ns
-        self._left = min(self._left + more, self._at_once)
-        if self._left == 0:
-            return False
-        self._left -= 1
-        return True

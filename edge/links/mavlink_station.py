@@ -15,10 +15,11 @@ from edge.clock import UtcClock
 from edge.config import MavlinkSettings
 from edge.health import Condition
 from edge.links import mavlink_messages as words
+from edge.links.allowance import Allowance
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
-from edge.links.mavlink_schedule import Allowance, Schedule
+from edge.links.mavlink_schedule import Schedule
 from edge.links.mavlink_table import (
     ADSB_VEHICLE,
     ATTITUDE,

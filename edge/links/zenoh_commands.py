@@ -24,6 +24,8 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from zenoh import handlers
 
+from edge import clock
+from edge.links.allowance import Allowance
 from edge.requests import AskReload, ReloadOutcome, Request, SelectTarget, StopTracking, TrackBox
 from msgs.recording import Recorder
 from msgs.settings import dotted, faults_of
@@ -31,6 +33,7 @@ from msgs.settings import dotted, faults_of
 log = logging.getLogger(__name__)
 
 BODY_BYTES_MAX = 4096
+LOGGED_AT_ONCE, LOGGED_NS = 32, 1_000_000_000  # then one line a second, however many commands come
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
@@ -177,6 +180,8 @@ def answer(name: str, body: bytes, actions: Actions, reply: Callable[[dict[str, 
 def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zenoh.Queryable:
     """Answer commands until the queryable is undeclared, on zenoh's receiving thread."""
 
+    allowance = Allowance(LOGGED_AT_ONCE, LOGGED_NS)
+
     def on_query(query: zenoh.Query) -> None:
         key = str(query.key_expr)
         if "*" in key:
@@ -186,7 +191,8 @@ def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zeno
             return
 
         def reply(said: dict[str, Any]) -> None:
-            log.info("command over zenoh: %s", said)
+            if allowance.take(clock.monotonic_ns()):
+                log.info("command over zenoh: %s", said)
             try:
                 with query:
                     query.reply(key, json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)

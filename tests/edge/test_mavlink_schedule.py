@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.links.mavlink_schedule import Allowance, Schedule
+from edge.links.allowance import Allowance
+from edge.links.mavlink_schedule import Schedule
 
 MESSAGE = 275
 GAPS_NS = st.lists(st.integers(1_000_000, 400_000_000), min_size=1, max_size=200)

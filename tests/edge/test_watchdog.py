@@ -33,7 +33,7 @@ def test_a_loop_that_was_suspended_with_its_process_flies_on_and_one_that_is_stu
         assert process.stdin is not None
         assert process.stdout is not None
         assert turns(process.stdout, 20)
-        for _ in range(4):
+        for _ in range(2):
             process.send_signal(signal.SIGSTOP)
             time.sleep(2.0 * LIMIT_S)
             process.send_signal(signal.SIGCONT)

@@ -1,0 +1,23 @@
+"""How much of what anybody may bring about without end is told. Pure: every time comes in as an argument."""
+
+from __future__ import annotations
+
+
+class Allowance:
+    """So many at once, and one more each period."""
+
+    def __init__(self, at_once: int, period_ns: int) -> None:
+        self._at_once = at_once
+        self._period_ns = period_ns
+        self._left = at_once
+        self._counted_ns = 0
+
+    def take(self, now_ns: int) -> bool:
+        """Whether one more may go at `now_ns`; it then counts as gone."""
+        more = (now_ns - self._counted_ns) // self._period_ns
+        self._counted_ns += more * self._period_ns
+        self._left = min(self._left + more, self._at_once)
+        if self._left == 0:
+            return False
+        self._left -= 1
+        return True
