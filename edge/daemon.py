@@ -93,7 +93,7 @@ class Pipeline:
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, capture.reasons)
         self.search = Search()  # to be started; until then each search is made where it is asked for
         self._since_acquire = 0
-        self._out_of_order = 0
+        self._out_of_order = self._time_jumps = 0
 
     def ready(self) -> None:
         """Warmed up: say so, and what is not as it was asked for."""
@@ -133,6 +133,9 @@ class Pipeline:
         }
 
     def _process(self, frame: Frame) -> None:
+        if frame.meta.time_jumps != self._time_jumps:
+            self._time_jumps = frame.meta.time_jumps
+            self._tracker.doubt_motion()
         if self._tracker.is_late(frame.meta.capture_ns):
             # The tracks are valid at a later time than this frame's: told with its stamp they would be wrong.
             self._out_of_order += 1

@@ -19,6 +19,7 @@ class FrameMeta:
     sequence: int  # counts frames the source produced, so a gap is a drop
     capture_ns: int  # exposure time
     arrival_ns: int  # when the daemon held the pixels
+    time_jumps: int = 0  # how often the camera's time had jumped by then
 
 
 @dataclass(frozen=True)

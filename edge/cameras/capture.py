@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from edge.cameras.reconnect import LinkState, Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
@@ -111,7 +112,8 @@ class Capture:
             else:
                 self._link = self._link.delivered()
                 if self._lives(frame):
-                    self._offer(frame)
+                    jumps = self._counts["time_jumps"]
+                    self._offer(replace(frame, meta=replace(frame.meta, time_jumps=jumps)))
 
     def _lose(self, error: SourceLost) -> None:
         if self._opened:

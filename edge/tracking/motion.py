@@ -103,10 +103,17 @@ def begin(estimate: Estimate, K: Array, view: View) -> Motion:
     scale = RangeScale.begin(view.time_ns, 0.5 * float(np.log(ray @ ray)), log_range_variance)
     P = np.zeros((DIMENSION, DIMENSION))
     P[POSITION, POSITION] = R @ across @ R.T + FIRST_SHARE * log_range_variance * np.outer(ray, ray)
-    P[VELOCITY, VELOCITY] = _first_velocity(view.kind, float(np.linalg.norm(ray)))
-    P[TURN_RATE, TURN_RATE] = TURN_RATE_STD**2 if view.kind == "ned" else 0.0
+    P = _unknown_velocity(P, view.kind, float(np.linalg.norm(ray)))
     t_m = view.t_frame_cam_m + ray
     return Motion(view.kind, view.time_ns, view.time_ns, t_m, np.zeros(3), 0.0, symmetric(P), scale)
+
+
+def unknown_motion(motion: Motion, view: View) -> Motion:
+    """The same place, and nothing known of how the target moves; `view` is of the motion's frame."""
+    range_m = float(np.linalg.norm(motion.t_m - view.t_frame_cam_m))
+    P = np.zeros((DIMENSION, DIMENSION))
+    P[POSITION, POSITION] = motion.P[POSITION, POSITION]
+    return replace(motion, v_mps=np.zeros(3), turn_rate_radps=0.0, P=_unknown_velocity(P, motion.kind, range_m))
 
 
 def turning(motion: Motion, time_ns: int) -> Array:
@@ -374,6 +381,14 @@ def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
         across = change[part] - (change[part] @ along) * along
         T[part, POSITION] += np.outer(across, along) / range_m
     return symmetric(T @ P @ T.T)
+
+
+def _unknown_velocity(P: Array, kind: FrameKind, range_m: float) -> Array:
+    """P [7, 7] of a position alone, with what is unknown of velocity and turn rate."""
+    P = P.copy()
+    P[VELOCITY, VELOCITY] = _first_velocity(kind, range_m)
+    P[TURN_RATE, TURN_RATE] = TURN_RATE_STD**2 if kind == "ned" else 0.0
+    return P
 
 
 def _first_velocity(kind: FrameKind, range_m: float) -> Array:

@@ -75,6 +75,12 @@ class Tracker:
         """Forget all targets."""
         self._targets.clear()
 
+    def doubt_motion(self) -> None:
+        """Forget how the targets move, not where they are: the stamps that it was learnt from may have been wrong."""
+        for target in self._targets:
+            assert self._view is not None, "a target exists only after a frame"
+            target.motion = ekf.unknown_motion(target.motion, self._view)
+
     def make_room(self) -> None:
         """Forget the target that was measured longest ago, if there is no room for another."""
         if len(self._targets) >= self.max_targets:

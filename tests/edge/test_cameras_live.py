@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -370,6 +371,34 @@ def test_stamps_that_jump_are_noticed_and_those_that_jitter_are_not() -> None:
     assert jumps(1000 + 600, 1550)  # in the future
     assert jumps(2000, 2900)  # much older than those before
     assert not jumps(2033, 2933)
+
+
+class Jumping(FolderSource):
+    """A folder whose fourth picture is stamped a second too early."""
+
+    def read(self, stop: threading.Event) -> Frame:
+        frame = super().read(stop)
+        early_ns = 1_000_000_000 if frame.meta.sequence == 3 else 0
+        return replace(frame, meta=replace(frame.meta, capture_ns=frame.meta.capture_ns - early_ns))
+
+
+def test_every_frame_tells_how_often_the_cameras_time_has_jumped(tmp_path: Path) -> None:
+    folder = write_pictures(tmp_path / "pictures", list(range(1, 7)))
+    settings = FolderCamera(type="folder", path=folder, fps=10.0, intrinsics=INTRINSICS)
+    capture = Capture(Jumping(settings), False)
+    capture.start()
+    told = {}
+    try:
+        while True:
+            if (frame := capture.newest(5.0)) is not None:
+                told[frame.meta.sequence] = frame.meta.time_jumps
+    except EndOfStream:
+        pass
+    finally:
+        capture.stop()
+    # There and back again.
+    assert all(jumps == {0: 0, 1: 0, 2: 0, 3: 1}.get(sequence, 2) for sequence, jumps in told.items())
+    assert max(told.values()) == 2
 
 
 def test_one_pixel_that_changed_is_another_picture() -> None:

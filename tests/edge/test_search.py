@@ -198,6 +198,24 @@ def test_a_target_that_has_left_its_window_is_looked_for_in_that_same_frame(
     assert (track.state, track.measured_ns) == (TrackState.CONFIRMED, ear.reports[-1].meta.capture_ns)
 
 
+def test_stamps_that_jump_teach_no_speed(pipeline: tuple[Pipeline, Ear, RequestQueue]) -> None:
+    """The target creeps by 8 px a frame; stamps a millisecond apart make it fly by 1,900 m/s and then vanish."""
+    loop, ear, _ = pipeline
+    for index in range(8):
+        time_ns = 1_000_000_000 + index * 1_000_000
+        meta = FrameMeta(index, time_ns, time_ns, time_jumps=index)
+        loop._process(Frame(meta, draw((HELD[0] + 8 * index, HELD[1])), K))
+    (held,) = ear.reports[-1].tracks
+    empty = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+    for index in range(10):
+        time_ns = 1_050_000_000 + index * PERIOD_NS
+        loop._process(Frame(FrameMeta(8 + index, time_ns, time_ns, time_jumps=7), empty, K))
+    (coasting,) = ear.reports[-1].tracks
+    assert coasting.state is TrackState.COASTING
+    away_m = np.abs(coasting.t_cam_target_m - held.t_cam_target_m)
+    assert np.all(away_m <= 3.0 * np.sqrt(np.diag(coasting.covariance)[:3]))
+
+
 def test_a_place_where_the_window_sees_nothing_is_no_target(
     pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
 ) -> None:
