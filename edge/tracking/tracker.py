@@ -57,6 +57,7 @@ class Tracker:
     _targets: list[Target] = field(default_factory=list)
     _view: View | None = None  # the camera at the last frame
     _tracks: tuple[Track, ...] = ()
+    _motion_doubted: bool = False
 
     def predict(self, capture_ns: int, own_ship: OwnShip | None, K: Array, image_size_wh: Size) -> list[Track]:
         """Where each target should be in the frame taken at `capture_ns`, without those whose box misses the picture.
@@ -76,10 +77,10 @@ class Tracker:
         self._targets.clear()
 
     def doubt_motion(self) -> None:
-        """Forget how the targets move, not where they are: the stamps that it was learnt from may have been wrong."""
-        for target in self._targets:
-            assert self._view is not None, "a target exists only after a frame"
-            target.motion = ekf.unknown_motion(target.motion, self._view)
+        """Forget how the targets move, not where they are, before the next frame and after it: the stamps that it was
+        learnt from, and the time between them and the next one, may be wrong."""
+        self._motion_doubted = True
+        self._forget_motion()
 
     def make_room(self) -> None:
         """Forget the target that was measured longest ago, if there is no room for another."""
@@ -118,9 +119,17 @@ class Tracker:
                 _miss(target)
         self._targets = [t for t in self._targets if _alive(t, K, view, image_size_wh)]
         self._give_birth(spare, K, view)
+        if self._motion_doubted:
+            self._forget_motion()
+            self._motion_doubted = False
         self._targets.sort(key=lambda t: t.track_id)
         self._tracks = tuple(_track(target, target.motion, target.attitude, view, K) for target in self._targets)
         return self._tracks
+
+    def _forget_motion(self) -> None:
+        for target in self._targets:
+            assert self._view is not None, "a target exists only after a frame"
+            target.motion = ekf.unknown_motion(target.motion, self._view)
 
     def _advanced(self, target: Target, view: View) -> tuple[Motion, Attitude]:
         """The target's state at the view's time and in its frame."""

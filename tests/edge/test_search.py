@@ -214,6 +214,7 @@ def test_stamps_that_jump_teach_no_speed(pipeline: tuple[Pipeline, Ear, RequestQ
     assert coasting.state is TrackState.COASTING
     away_m = np.abs(coasting.t_cam_target_m - held.t_cam_target_m)
     assert np.all(away_m <= 3.0 * np.sqrt(np.diag(coasting.covariance)[:3]))
+    assert away_m.max() < 1.0, "nothing true was learnt of its speed"
 
 
 def test_a_place_where_the_window_sees_nothing_is_no_target(
