@@ -8,7 +8,7 @@ import select
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -194,7 +194,7 @@ class MavlinkLink:
         now_ns = clock.monotonic_ns()
         if condition is not None:
             self._station.health(condition, now_ns)
-        packings: list[Callable[[], list[bytes]]] = []
+        packings: list[Callable[[], Iterable[bytes]]] = []
         if report is not None:
             packings.append(partial(self._packed_in_time, report, now_ns))
         packings += [partial(self._station.event, severity, text, now_ns) for severity, text in events]
@@ -206,13 +206,14 @@ class MavlinkLink:
                 self._station.counters["unpackable"] += 1
                 log.warning("mavlink: not sent: %s", error)
 
-    def _packed_in_time(self, report: Report, now_ns: int) -> list[bytes]:
-        """The report's frames; none if the process was held up since its age was looked at."""
-        frames = self._station.report(report, now_ns)
-        if clock.monotonic_ns() - now_ns <= HELD_UP_MAX_NS:
-            return frames
-        self._station.counters["held_up"] += 1
-        return []
+    def _packed_in_time(self, report: Report, now_ns: int) -> Iterator[bytes]:
+        """The report's frames one by one, each while the process has not been held up since the report's age was
+        looked at."""
+        for data in self._station.report(report, now_ns):
+            if clock.monotonic_ns() - now_ns > HELD_UP_MAX_NS:
+                self._station.counters["held_up"] += 1
+                return
+            yield data
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
         now_ns = clock.monotonic_ns()

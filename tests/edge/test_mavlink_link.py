@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.config import MavlinkSettings
 from edge.health import Activity, Condition, HealthState, Reason
+from edge.links.mavlink_link import HELD_UP_MAX_NS, MavlinkLink
+from edge.requests import RequestQueue
+from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import TrackState
-from msgs.mavlink import dialect
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet
 from .reports import (
     BOX_XYXY_PX,
     FAULT,
@@ -327,3 +331,18 @@ def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:
     assert all(load <= 100 for load in status.cpu_cores[: min(os.cpu_count() or 1, 8)])
     assert abs(status.time_usec * 1e-6 - time.time()) < 60.0
     assert status.fan_speed == [2**15 - 1] * 4, "what is not known says so"
+
+
+def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up() -> None:
+    """As when it is stopped between two datagrams of one report, and goes on later."""
+    link = MavlinkLink(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
+    kind = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
+    beat = dialect.MAVLink_heartbeat_message(*kind, 0, 0, 4, 3).pack(MAVLink(None, srcSystem=1, srcComponent=1))
+    now_ns = time.monotonic_ns()
+    link._station.take(FrameReader(datagram=True).feed(bytes(beat)), 0, now_ns)
+    frames = link._packed_in_time(report(track(now_ns), now_ns=now_ns), now_ns)
+    assert next(frames)
+    time.sleep(1.1 * HELD_UP_MAX_NS / 1e9)
+    assert list(frames) == []
+    link.stop()
+    assert link._count()["held_up"] == 1
