@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -22,10 +19,9 @@ from edge.cameras.device import complaints
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.intrinsics import read_calibration
 from edge.cameras.source import EndOfStream, SourceLost
-from edge.cameras.stream import StreamSource
 from edge.cameras.watch import FrameWatch
 from edge.cameras.zenoh_topic import ZenohSource
-from edge.config_camera import DeviceCamera, FolderCamera, IntrinsicsSettings, StreamCamera, ZenohCamera
+from edge.config_camera import DeviceCamera, FolderCamera, ZenohCamera
 from edge.errors import InputError
 from edge.types import Frame, FrameMeta
 from msgs import topics
@@ -33,24 +29,7 @@ from msgs.cdr import CompressedImage
 from msgs.publish import Node, TopicPublisher
 from msgs.session import client_config, router_config
 
-SIZE_WH = (320, 180)
-LENS = [-0.2, 0.05, 0.001, -0.001, 0.0]
-INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=320, height=180, distortion=LENS)
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as bound:
-        bound.bind(("127.0.0.1", 0))
-        return int(bound.getsockname()[1])
-
-
-def picture(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
-    """Tells its number, modulo 25, by its brightness."""
-    return np.full((size_wh[1], size_wh[0], 3), 10 * (index % 25), np.uint8)
-
-
-def number_of(frame: Frame) -> int:
-    return round(float(frame.image_bgr.mean()) / 10)
+from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
 
 
 def message(index: int, size_wh: tuple[int, int] = SIZE_WH, stamp_ns: int | None = None) -> bytes:
@@ -169,132 +148,6 @@ def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None
     finally:
         capture.stop()
     assert capture.counters()["reconnects"] >= 1
-
-
-class UdpCamera(threading.Thread):
-    """An encoder that sends MPEG-TS over UDP in real time until told to stop."""
-
-    def __init__(self, port: int, fps: int) -> None:
-        super().__init__()
-        self._url, self._fps, self.stop = f"udp://127.0.0.1:{port}?pkt_size=1316", fps, threading.Event()
-
-    def run(self) -> None:
-        with av.open(self._url, "w", format="mpegts") as out:
-            stream = out.add_stream("mpeg2video", rate=self._fps)
-            stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
-            stream.codec_context.gop_size, stream.codec_context.max_b_frames = 5, 0
-            start_s, index = time.monotonic(), 0
-            while not self.stop.wait(max(start_s + index / self._fps - time.monotonic(), 0)):
-                frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
-                frame.pts, frame.time_base = index, Fraction(1, self._fps)
-                out.mux(stream.encode(frame))
-                index += 1
-
-
-def test_a_udp_stream_is_stamped_by_its_own_clock() -> None:
-    port = free_port(socket.SOCK_DGRAM)
-    encoder = UdpCamera(port, fps=20)
-    settings = StreamCamera(type="stream", url=f"udp://127.0.0.1:{port}", intrinsics=INTRINSICS, latency_ms=30)
-    encoder.start()
-    try:
-        source = StreamSource(settings)
-        with closing(source):
-            source.open()
-            frames = [source.read(threading.Event()) for _ in range(30)]
-    finally:
-        encoder.stop.set()
-        encoder.join()
-    stamps_ns = np.array([frame.meta.capture_ns for frame in frames])
-    late_ns = np.array([frame.meta.arrival_ns for frame in frames]) - stamps_ns
-    assert np.all(late_ns >= 30_000_000 - 1)
-    # However the frames bunched on their way, most steps are the camera's own to the microsecond.
-    assert np.median(np.abs(np.diff(stamps_ns) - 50_000_000)) < 100_000
-    assert all(frame.distortion == tuple(LENS) for frame in frames)
-
-
-class Caller:
-    """Where a muxer writes; who has hung up is no error to it."""
-
-    def __init__(self, connected: socket.socket) -> None:
-        self._connected, self.there = connected, True
-
-    def write(self, data: bytes) -> int:
-        try:
-            self._connected.sendall(data)
-        except OSError:
-            self.there = False
-        return len(data)
-
-
-class TcpCamera(threading.Thread):
-    """A server that sends MPEG-TS in real time to who calls, one after the other; what is not read waits."""
-
-    def __init__(self, fps: int, frames: int = 2000, port: int = 0, calls: int = 1) -> None:
-        super().__init__(daemon=True)
-        self._server, self.began_s = socket.create_server(("127.0.0.1", port)), 0.0
-        self._fps, self._frames, self._calls = fps, frames, calls
-        self.port = int(self._server.getsockname()[1])
-
-    def run(self) -> None:
-        with self._server:
-            for _ in range(self._calls):
-                self._serve()
-
-    def _serve(self) -> None:
-        with self._server.accept()[0] as connected:
-            caller = Caller(connected)
-            with av.open(caller, "w", format="mpegts") as out:
-                stream = out.add_stream("mpeg2video", rate=self._fps)
-                stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
-                stream.codec_context.gop_size, stream.codec_context.max_b_frames = 5, 0
-                self.began_s = time.monotonic()
-                for index in range(self._frames):
-                    time.sleep(max(self.began_s + index / self._fps - time.monotonic(), 0))
-                    image = np.hstack([picture(index), picture(index // 25)])
-                    frame = av.VideoFrame.from_ndarray(cv2.resize(image, SIZE_WH), format="bgr24")
-                    frame.pts, frame.time_base = index, Fraction(1, self._fps)
-                    out.mux(stream.encode(frame))
-                    if not caller.there:
-                        return
-
-
-def test_a_stream_that_waited_to_be_read_begins_with_what_is_now() -> None:
-    camera = TcpCamera(fps=20)
-    settings = StreamCamera(type="stream", url=f"tcp://127.0.0.1:{camera.port}", intrinsics=INTRINSICS)
-    camera.start()
-    with closing(StreamSource(settings)) as source:
-        source.open()
-        held_s = 2.0
-        time.sleep(held_s)  # what the model takes to be loaded
-        frames = [source.read(threading.Event()) for _ in range(40)]
-
-    def late_s(frame: Frame) -> float:
-        left, right = np.array_split(frame.image_bgr, 2, axis=1)
-        index = round(float(left.mean()) / 10) + 25 * round(float(right.mean()) / 10)
-        return frame.meta.capture_ns / 1e9 - (camera.began_s + index / 20)
-
-    # What encoder, network and decoder take is common to all; what waited is not.
-    assert late_s(frames[0]) - min(late_s(frame) for frame in frames) < 0.3 * held_s
-
-
-def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends() -> None:
-    port, frames = free_port(), 40
-    settings = StreamCamera(type="stream", url=f"tcp://127.0.0.1:{port}", intrinsics=INTRINSICS)
-    capture = Capture(StreamSource(settings), False)
-    capture.start()
-    try:
-        assert capture.newest(0.3) is None
-        TcpCamera(fps=20, frames=frames, port=port, calls=3).start()
-        last = capture.newest(20.0)
-        assert last is not None
-        while last.meta.sequence <= frames:  # it was opened again
-            newer = capture.newest(20.0)
-            assert newer is not None
-            assert newer.meta.sequence > last.meta.sequence
-            last = newer
-    finally:
-        capture.stop()
-    assert capture.counters()["reconnects"] >= 2
 
 
 def test_a_device_that_does_other_than_asked_is_told() -> None:

@@ -6,12 +6,14 @@ import dataclasses
 import math
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge import clock
 from edge.config import MavlinkSettings
 from edge.health import Activity, Condition, HealthState, Reason
 from edge.links.mavlink_link import HELD_UP_MAX_NS, MavlinkLink
@@ -333,16 +335,26 @@ def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:
     assert status.fan_speed == [2**15 - 1] * 4, "what is not known says so"
 
 
-def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up() -> None:
+@pytest.fixture
+def stepped() -> Iterator[int]:
+    """The time, which stands still but for steps."""
+    now_ns = time.monotonic_ns()
+    clock.step_to(now_ns)
+    yield now_ns
+    clock.run_freely()
+
+
+def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up(stepped: int) -> None:
     """As when it is stopped between two datagrams of one report, and goes on later."""
     link = MavlinkLink(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
     kind = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
     beat = dialect.MAVLink_heartbeat_message(*kind, 0, 0, 4, 3).pack(MAVLink(None, srcSystem=1, srcComponent=1))
-    now_ns = time.monotonic_ns()
-    link._station.take(FrameReader(datagram=True).feed(bytes(beat)), 0, now_ns)
-    frames = link._packed_in_time(report(track(now_ns), now_ns=now_ns), now_ns)
-    assert next(frames)
-    time.sleep(1.1 * HELD_UP_MAX_NS / 1e9)
-    assert list(frames) == []
+    link._station.take(FrameReader(datagram=True).feed(bytes(beat)), 0, stepped)
+    for held_up_ns in (HELD_UP_MAX_NS, HELD_UP_MAX_NS + 1):
+        began_ns = clock.monotonic_ns()
+        frames = link._packed_in_time(report(track(began_ns), now_ns=began_ns), began_ns)
+        assert next(frames)
+        clock.step_to(began_ns + held_up_ns)
+        assert (list(frames) == []) == (held_up_ns > HELD_UP_MAX_NS)
     link.stop()
     assert link._count()["held_up"] == 1

@@ -50,7 +50,7 @@ def flying(endpoint: str, folder: Path) -> Iterator[tuple[Path, Any]]:
         shutil.which("unshare") is None
         or subprocess.run([*unshare, inside], cwd=folder, capture_output=True).returncode
     ):
-        pytest.skip("this host lets no user mount")
+        pytest.skip("this host does not let a user mount over /etc/hosts (unshare --map-root-user --mount)")
     root = Path(__file__).parents[2]
     command = f'{inside} && cd {shlex.quote(str(root))} && exec {shlex.quote(sys.executable)} -c "$1" {endpoint}'
     with subprocess.Popen(

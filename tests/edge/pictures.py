@@ -1,0 +1,29 @@
+"""Pictures that tell their numbers, and the lens that a live camera of the tests has."""
+
+from __future__ import annotations
+
+import socket
+
+import numpy as np
+
+from edge.config_camera import IntrinsicsSettings
+from edge.types import Frame
+
+SIZE_WH = (320, 180)
+LENS = [-0.2, 0.05, 0.001, -0.001, 0.0]
+INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=320, height=180, distortion=LENS)
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    with socket.socket(type=kind) as bound:
+        bound.bind(("127.0.0.1", 0))
+        return int(bound.getsockname()[1])
+
+
+def picture(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
+    """Tells its number, modulo 25, by its brightness."""
+    return np.full((size_wh[1], size_wh[0], 3), 10 * (index % 25), np.uint8)
+
+
+def number_of(frame: Frame) -> int:
+    return round(float(frame.image_bgr.mean()) / 10)
