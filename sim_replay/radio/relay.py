@@ -72,10 +72,10 @@ class RadioRelay:
             nonlocal vehicle
             vehicle = sender
             self.bytes_up += len(data)
-            self._carry(data, self._lanes[0], lambda: back.sendto(data, self._upstream))
+            self._carry(data, self._lanes[0], lambda: _send(back, data, self._upstream))
 
         def down(data: bytes, _: Address) -> None:
-            self._carry(data, self._lanes[1], lambda: front.sendto(data, vehicle))
+            self._carry(data, self._lanes[1], lambda: _send(front, data, vehicle))
 
         back, _ = await self._loop.create_datagram_endpoint(lambda: _End(down), local_addr=(LOOPBACK, 0))
         front, _ = await self._loop.create_datagram_endpoint(lambda: _End(up), local_addr=(LOOPBACK, 0))
@@ -134,6 +134,12 @@ class RadioRelay:
                     self.bytes_up += len(data)
                 await pieces.put((lane.segment(len(data), self._loop.time()), data))
         await pieces.put((self._loop.time(), b""))
+
+
+def _send(end: asyncio.DatagramTransport, data: bytes, address: Address | None) -> None:
+    """What is under way when the relay closes goes nowhere."""
+    if not end.is_closing():
+        end.sendto(data, address)
 
 
 class _End(asyncio.DatagramProtocol):
