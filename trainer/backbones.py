@@ -166,6 +166,10 @@ class RepVit(nn.Module):
             *(RepVitStage(i, o, d, use_se, act) for i, o, d in zip(inputs, widths, depths, strict=True))
         )
 
+    def first_layers(self, blocks: int) -> list[nn.Module]:
+        """The stem and so many of the stages."""
+        return [self.stem, *list(self.stages)[:blocks]]
+
     def forward(self, x: Tensor) -> Features:
         x = self.stages[0](self.stem(x))
         f8 = self.stages[1](x)
@@ -242,6 +246,10 @@ class EfficientNetLite0(nn.Module):
         ours = {key: value for key, value in state.items() if key.split(".")[0] not in ("_conv_head", "_bn1", "_fc")}
         ours["_conv_stem.weight"] = ours["_conv_stem.weight"].flip(1)
         self.load_state_dict(ours)
+
+    def first_layers(self, blocks: int) -> list[nn.Module]:
+        """The stem and so many of the blocks."""
+        return [self._conv_stem, self._bn0, *self._blocks[:blocks]]
 
     def forward(self, x: Tensor) -> Features:
         x = F.relu6(self._bn0(self._conv_stem(_pad_same(x, 3, 2))))

@@ -95,6 +95,10 @@ class Trainer:
         self.model = PoseNet(config.model).to(device)
         for part in (self.model.backbone, self.model.neck, self.model.head_hm):
             part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        frozen_blocks = config.schedule.frozen_blocks
+        self.frozen = self.model.backbone.first_layers(frozen_blocks) if frozen_blocks else []
+        for layer in self.frozen:
+            layer.requires_grad_(False)
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr)
         self.steps = 0
@@ -106,6 +110,8 @@ class Trainer:
         schedule = self.config.schedule
         groups: dict[tuple[float, float], list[nn.Parameter]] = {}
         for name, parameter in self.model.named_parameters():
+            if not parameter.requires_grad:
+                continue
             scale = schedule.backbone_lr_scale if name.startswith("backbone.") else 1.0
             decay = schedule.weight_decay if parameter.ndim > 1 else 0.0
             groups.setdefault((scale, decay), []).append(parameter)
@@ -121,6 +127,8 @@ class Trainer:
         draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
         generator = torch.Generator().manual_seed(draw_of)
         self.model.train()
+        for layer in self.frozen:
+            layer.eval()  # nor may its norm statistics move
         with rounded(self.model) if progress >= schedule.rounded_from else contextlib.nullcontext():
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
                 seen = self.model.perceive(image)

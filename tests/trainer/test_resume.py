@@ -99,3 +99,20 @@ def test_sigterm_ends_a_run_between_steps_with_a_checkpoint(tmp_path: Path) -> N
         watcher.join()
     assert 1 <= trainer.steps < 500
     assert load_model(tmp_path)[2]["steps"] == trainer.steps
+
+
+def test_frozen_blocks_stay_as_another_run_left_them_and_the_rest_learns(
+    whole: tuple[Path, Trainer], tmp_path: Path
+) -> None:
+    out, _ = whole
+    text = tiny.TOML.replace("[schedule]", "[schedule]\nfrozen_blocks = 1")
+    trained = train(tmp_path, 2, text, start_from=out / "weights.pt").model.state_dict()
+    begun = Trainer(parse_config(text, "frozen.toml"), torch.device("cpu"))
+    begun.start_from(out / "weights.pt")
+    same = {name for name, value in begun.model.state_dict().items() if torch.equal(value, trained[name])}
+    early = {name for name in trained if name.startswith(("backbone.stem.", "backbone.stages.0."))}
+    assert early
+    assert early <= same
+    learning = {name for name in trained if name.startswith(("backbone.stages.1.", "neck.")) and "running" in name}
+    assert learning
+    assert not learning & same
