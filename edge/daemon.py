@@ -175,8 +175,8 @@ class Pipeline:
         if not searches:
             return found
         if not found:
-            # Windows looked into in vain have cost this frame its second look.
-            found = self._estimator.acquire(frame, twice=not expected)
+            # Windows looked into in vain have cost this frame its finer looks.
+            found = self._estimator.acquire(frame, thrice=not expected)
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edge.estimator.model import Peaks
 from edge.estimator.window import PixelMap
@@ -36,24 +35,37 @@ DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
 FARTHEST_SIGMA_LOG_Z, FARTHEST_TOLERANCE = 1.0, 1e-3
 
 
+class View(NamedTuple):
+    """What of a frame the network was shown, and as which pixels."""
+
+    pixel_map: PixelMap
+    K: Array  # [3, 3] of the network's pixels
+    size_wh: tuple[int, int]  # the network's
+    frame_wh: tuple[int, int]
+
+    def shown_xyxy_px(self) -> Array:
+        """[4], the part of the frame that it holds."""
+        size = np.array(self.size_wh)
+        limit = np.array(self.frame_wh) - 0.5
+        return np.clip(self.pixel_map.box_to_frame(0.5 * (size - 1), size), -0.5, np.tile(limit, 2))
+
+
 def decode(
     peaks: Peaks,
     image: int,
-    pixel_map: PixelMap,
-    K_network: Array,
+    view: View,
     contract: ModelContract,
     stage: Literal["acquire", "track"],
+    score_min: float,
     refused: Counter[str],
-    frame_wh: tuple[int, int],
 ) -> list[Estimate]:
     """Accepted, distinct targets of one image of the batch, best score first; refusals are counted by reason.
 
-    A target cut by the frame's edge, of a size that was not trained or at the end of what depth can be told is told
-    with a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
+    A target cut by the edge of what was shown, of a size that was not trained or at the end of what depth can be told
+    has a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
     """
-    acquiring = stage == "acquire"
-    score_min = contract.acquire_score_min if acquiring else contract.track_score_min
-    calibration = contract.acquire_score if acquiring else contract.track_score
+    calibration = contract.acquire_score if stage == "acquire" else contract.track_score
+    pixel_map, shown_xyxy_px = view.pixel_map, view.shown_xyxy_px()
     found = []
     for peak in range(peaks.score.shape[1]):
         shown_px = shown_size_px(peaks.size_px[image, peak], pixel_map)
@@ -65,8 +77,8 @@ def decode(
         sigma = peaks.sigma[image, peak].astype(np.float64)
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
         origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
-        cut = _is_cut(box, frame_wh)
-        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, frame_wh)
+        cut = bool(np.any(_cut_sides(box, shown_xyxy_px)))
+        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, view.frame_wh)
         if reason is not None:
             refused[reason] += 1
             continue
@@ -74,8 +86,8 @@ def decode(
         sigma = _widened(sigma, score, longer_px, cut, contract.trained_box_px)
         if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
-        covariance = pose_covariance(t_m, sigma, K_network, contract.trained_range_m)
-        box = np.clip(box, -0.5, np.tile(frame_wh, 2) - 0.5)
+        covariance = pose_covariance(t_m, sigma, view.K, contract.trained_range_m)
+        box = np.clip(box, -0.5, np.tile(view.frame_wh, 2) - 0.5)
         found.append(Estimate(score, box, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
 
@@ -130,23 +142,6 @@ def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:
     return float(np.prod(sides) / min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])))
 
 
-def of_two_looks(first: Estimate, second: Estimate) -> Estimate:
-    """One estimate of a target seen in two windows of one frame, of which the second lies better.
-
-    Place and box are the second's, the range is between the two, and the rotation is the surer one. Both are of the
-    same pixels: the covariance is no smaller than one look's.
-    """
-    first_m, second_m = (float(np.linalg.norm(estimate.t_cam_target_m)) for estimate in (first, second))
-    scale = np.sqrt(first_m / second_m)
-    surer = min(second, first, key=lambda estimate: float(np.trace(estimate.covariance[3:, 3:])))
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = scale**2 * second.covariance[:3, :3]
-    covariance[3:, 3:] = surer.covariance[3:, 3:]
-    return replace(
-        second, R_cam_target=surer.R_cam_target, t_cam_target_m=scale * second.t_cam_target_m, covariance=covariance
-    )
-
-
 def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> Estimate | None:
     """The estimate for an expected box: a strong one beats a weak one, a near one a far one."""
     box = np.asarray(box_xyxy_px, dtype=np.float64)
@@ -171,12 +166,24 @@ def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tu
     return None
 
 
-def _is_cut(box_xyxy_px: Array, frame_wh: tuple[int, int]) -> bool:
-    """Whether the frame's edge may hide a part of what the box holds."""
+def grown(box_xyxy_px: Array, view: View) -> Array | None:
+    """The box, longer by its longer side beyond each edge of the window that cuts what it holds.
+
+    None: no edge does, or only the frame's own.
+    """
+    shown, whole = view.shown_xyxy_px(), np.array([-0.5, -0.5, *(np.array(view.frame_wh) - 0.5)])
+    cut = _cut_sides(box_xyxy_px, shown) & (np.abs(shown - whole) > EDGE_PX)
+    if not np.any(cut):
+        return None
+    longer_px = np.max(box_xyxy_px[2:] - box_xyxy_px[:2])
+    return np.asarray(box_xyxy_px + cut * longer_px * np.array([-1.0, -1.0, 1.0, 1.0]))
+
+
+def _cut_sides(box_xyxy_px: Array, shown_xyxy_px: Array) -> NDArray[np.bool_]:
+    """[4], at which sides the edge of what was shown may hide a part of what the box holds."""
     margin_px = EDGE_SHARE * float(np.max(box_xyxy_px[2:] - box_xyxy_px[:2])) + EDGE_PX
-    return bool(
-        np.any(box_xyxy_px[:2] < margin_px - 0.5) or np.any(box_xyxy_px[2:] > np.array(frame_wh) - 0.5 - margin_px)
-    )
+    inside = (box_xyxy_px - shown_xyxy_px) * np.array([1.0, 1.0, -1.0, -1.0])
+    return np.asarray(inside < margin_px)
 
 
 def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int, int]) -> str | None:

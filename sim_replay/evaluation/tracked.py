@@ -139,6 +139,6 @@ def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected:
     sequence.since_acquire += 1
     due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
     if not found or due:
-        found += estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found], twice=not expected)
+        found += estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found], thrice=not expected)
         sequence.since_acquire = 0
     return found

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from edge.errors import InputError
-from edge.estimator.decode import decode, of_two_looks, overlap, pose_covariance
+from edge.estimator.decode import View, decode, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, window_around
@@ -21,6 +20,7 @@ from .toy_model import CONTRACT, GRAPH, write_toy_model
 from .toy_scene import SIZE_WH, TARGET_WH, K, draw, true_t_cam_target_m
 
 TRACK_WH = (256, 256)
+WHOLE = View(PixelMap((1, 1), (0, 0)), K, SIZE_WH, SIZE_WH)  # the frame as it is
 boxes = st.tuples(st.floats(-50, 1900), st.floats(-50, 1060), st.floats(4, 700), st.floats(4, 500)).map(
     lambda b: np.array([b[0], b[1], b[0] + b[2], b[1] + b[3]])
 )
@@ -121,7 +121,7 @@ def peaks_of(*, score: float = 0.9, z_m: float = 300.0, n: int = 1, apart_px: fl
 def accepted(peaks: Peaks) -> tuple[int, Counter[str]]:
     refused: Counter[str] = Counter()
     contract = ModelContract(**CONTRACT)
-    return len(decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused, SIZE_WH)), refused
+    return len(decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, refused)), refused
 
 
 def test_what_is_no_pose_is_refused_and_counted() -> None:
@@ -150,7 +150,7 @@ def test_a_depth_at_the_end_of_what_a_graph_can_tell_is_a_least_depth() -> None:
     sigma = {}
     for z_m in (590.0, 599.99):
         certain = peaks_of(score=1.0, z_m=z_m)
-        (e,) = decode(certain, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", Counter(), SIZE_WH)
+        (e,) = decode(certain, 0, WHOLE, contract, "track", contract.track_score_min, Counter())
         sigma[z_m] = e.covariance[2, 2] ** 0.5 / z_m
     assert sigma[590.0] == pytest.approx(0.05, rel=1e-3)
     assert sigma[599.99] > 0.9
@@ -162,7 +162,7 @@ def test_what_may_not_be_what_it_is_taken_for_is_less_sure_in_all_it_tells() -> 
     stds = []
     for score in (1.0, 0.5):
         peaks = peaks_of(score=score)
-        (e,) = decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", Counter(), SIZE_WH)
+        (e,) = decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, Counter())
         stds.append(np.sqrt(np.diag(e.covariance)))
     certain, doubtful = stds
     assert np.all(doubtful > certain)
@@ -180,7 +180,7 @@ def seen_at(
     peaks.origin_px[0, 0] = [left_px + width_px / 2 if origin_x_px is None else origin_x_px, 500.0]
     refused: Counter[str] = Counter()
     contract = ModelContract(**CONTRACT)
-    return decode(peaks, 0, PixelMap((1, 1), (0, 0)), K, contract, "track", refused, SIZE_WH), refused
+    return decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, refused), refused
 
 
 def test_a_target_below_eight_pixels_is_not_told() -> None:
@@ -237,24 +237,17 @@ def test_acquire_finds_a_target_anywhere_and_refines_it_to_native_accuracy(
     np.testing.assert_allclose(estimate.box_xyxy_px, [*(center - half), *(center + half)], atol=1.0)
 
 
-def test_of_two_looks_the_range_lies_between_and_the_surer_rotation_counts() -> None:
-    def look(range_m: float, rotation_std_rad: float) -> Estimate:
-        t_m = range_m * np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
-        covariance = np.diag([1.0, 1.0, 0.0, *[rotation_std_rad**2] * 3]) + 0.01 * np.outer(
-            [*t_m, 0, 0, 0], [*t_m, 0, 0, 0]
-        )
-        R = Rotation.from_rotvec([0.0, 0.0, range_m / 100.0]).as_matrix()
-        return Estimate(range_m / 200.0, np.array([10.0, 10.0, 50.0, 30.0]), R, t_m, covariance, "track")
-
-    first, second = look(100.0, 0.2), look(144.0, 0.4)
-    both = of_two_looks(first, second)
-    assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(120.0)
-    np.testing.assert_allclose(both.t_cam_target_m / 120.0, second.t_cam_target_m / 144.0)
-    np.testing.assert_array_equal(both.R_cam_target, first.R_cam_target)
-    assert both.covariance[3, 3] == first.covariance[3, 3]
-    along = both.t_cam_target_m / 120.0
-    share = np.sqrt(along @ both.covariance[:3, :3] @ along) / 120.0
-    assert share == pytest.approx(np.sqrt(along @ second.covariance[:3, :3] @ along) / 144.0)
+@pytest.mark.parametrize("sequence", [0, 1])
+def test_what_the_window_s_edge_cuts_is_looked_at_again_whole(toy_model: Path, sequence: int) -> None:
+    """Plain and mirrored: the target has moved by its own length, and its window's edge leaves half of it."""
+    center = (700.5, 500.5)
+    frame = Frame(FrameMeta(sequence, 0, 0), draw(center), K)
+    half = np.array(TARGET_WH) / 2
+    moved = np.array([*(center - half), *(center + half)]) - [TARGET_WH[0], 0, TARGET_WH[0], 0]
+    (seen,) = Estimator(load_model(toy_model, 1)).track(frame, [moved])
+    assert seen is not None
+    np.testing.assert_allclose(seen.t_cam_target_m, true_t_cam_target_m(center), rtol=0.02, atol=0.2)
+    np.testing.assert_allclose(seen.box_xyxy_px, [*(center - half), *(center + half)], atol=1.0)
 
 
 def test_track_says_none_where_the_window_holds_no_target(toy_model: Path) -> None:

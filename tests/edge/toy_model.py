@@ -1,7 +1,8 @@
 """A network small enough to reason about: it sees the bright rectangle in a dark picture.
 
-Its centre and size are the rectangle's, its depth Z = f S / sqrt(w h) with S = 10 m (paper: APDD), its rotation the
-identity. It has the interface of msgs.contract, so everything around it can be held to exact truth.
+Its centre and size are the rectangle's, its depth Z = f S / sqrt(w h) with S = 10 m (paper: APDD), its rotation that
+of an aircraft seen from behind, which mirrored is the same. It has the interface of msgs.contract, so everything around
+it can be held to exact truth.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ toy (uint8[N, H, W, 3] image, float[N, 3, 3] K) => (
 <float threshold = {128.0}, float one = {1.0}, float size_m = {10.0}, int64 zero = {0},
  int64 step = {1}, int64[1] first = {0}, int64[1] second = {1}, int64[1] third = {2},
  int64[1] end2 = {3}, int64[1] axis_m = {1}, int64[1] axes_last = {1},
- float[1, 1, 3, 3] eye = {1, 0, 0, 0, 1, 0, 0, 0, 1},
+ float[1, 1, 3, 3] from_behind = {0, 1, 0, 0, 0, 1, 1, 0, 0},
  float[1, 1, 6] sigmas = {0.5, 0.5, 0.05, 0.1, 0.1, 0.1}>
 {
     pixels = Cast<to = 1>(image)
@@ -83,7 +84,7 @@ toy (uint8[N, H, W, 3] image, float[N, 3, 3] K) => (
     zero_n = Sub(score, score)
     zero_n3 = Unsqueeze(zero_n, axis_m)
     zero_n4 = Unsqueeze(zero_n3, axis_m)
-    R_cam_target = Add(zero_n4, eye)
+    R_cam_target = Add(zero_n4, from_behind)
     sigma = Add(zero_n3, sigmas)
 }
 """
