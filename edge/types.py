@@ -73,6 +73,7 @@ class OwnShip:
     lat_lon_alt: tuple[float, float, float] | None  # degrees, degrees, metres AMSL, of the ned origin
     R_body_gimbal: Array | None = None  # [3, 3]; None: the camera is fixed to the body
     clock_std_s: float = 0.0  # of the autopilot's stamps on our clock
+    attitude_std_rad: float = 0.0  # about each axis, of an attitude that was gone on from by its rates
 
     def camera(self, mount: Mount) -> Mount:
         """How the camera sits on the body now; on a gimbal, `mount` says how it sits on that."""

@@ -16,7 +16,10 @@ from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
 ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the time between
-ATTITUDE_AHEAD_MAX_NS = 50_000_000
+# How long an attitude goes on by its rates: one and a half times what lies between two, within these. Where more lies
+# between two they are of no use for frames, which come after the last: rather none than now and then.
+ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
+ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
 GLOBAL_AGE_MAX_NS = 5_000_000_000
@@ -113,7 +116,7 @@ class OwnShipBuffer:
             self._global = None
 
     def at(self, time_ns: int) -> OwnShip | None:
-        """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 50 ms.
+        """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 150 ms.
 
         None without an attitude for that time, of the gimbal too if there is one. Position and velocity are None where
         the positions do not reach; then the ned origin is the own ship itself.
@@ -128,8 +131,12 @@ class OwnShipBuffer:
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
             origin = self._origin(time_ns, t_ned_m is not None)
-            clock_std_s = self._attitudes[-1].clock_std_s
-            return OwnShip(time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, clock_std_s)
+            last = self._attitudes[-1]
+            ahead_s = max(time_ns - last.time_ns, 0) / NS_PER_S
+            attitude_std_rad = 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * ahead_s**2
+            return OwnShip(
+                time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, last.clock_std_s, attitude_std_rad
+            )
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
         """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
@@ -167,7 +174,7 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     a = samples[after - 1]
     elapsed_s = (time_ns - a.time_ns) / NS_PER_S
     if after == len(samples):
-        if time_ns - a.time_ns > ATTITUDE_AHEAD_MAX_NS:
+        if time_ns - a.time_ns > _reach_ns(samples):
             return None
         return a.R_ned_body @ so3_exp(a.rates_body_radps * elapsed_s)
     b = samples[after]
@@ -177,10 +184,19 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
 
 
+def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int:
+    """How long after the last sample it can be gone on from."""
+    least_ns, most_ns = ATTITUDE_AHEAD_NS
+    if len(samples) < 2:
+        return least_ns
+    gap_ns = samples[-1].time_ns - samples[-2].time_ns
+    return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else 0
+
+
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
-    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 50 ms."""
+    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 150 ms."""
     after = _first_after(samples, time_ns)
-    if after == 0 or (after == len(samples) and time_ns - samples[-1].time_ns > ATTITUDE_AHEAD_MAX_NS):
+    if after == 0 or (after == len(samples) and time_ns - samples[-1].time_ns > _reach_ns(samples)):
         return None
     a, b = samples[max(min(after, len(samples) - 1) - 1, 0)], samples[min(after, len(samples) - 1)]
     if a.frame is not b.frame or not 0 < b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:

@@ -40,6 +40,7 @@ class View:
     nose_frame: Array | None = None  # [3], the own ship's; None in `cam`
     turning_radps: float = 0.0  # how fast the camera turns
     clock_std_s: float = EXPOSURE_STD_S  # of exposure against attitude and position
+    attitude_std_rad: float = 0.0  # of this frame's attitude, beyond what its clock and jitter make of it
 
     @classmethod
     def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount, before: View | None = None) -> View:
@@ -50,21 +51,22 @@ class View:
         R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
         lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
         nose, turning = own_ship.R_ned_body[:, 0], _turning_radps(before, time_ns, R_ned_cam)
-        clock_std_s = float(np.hypot(EXPOSURE_STD_S, own_ship.clock_std_s))
+        doubts = float(np.hypot(EXPOSURE_STD_S, own_ship.clock_std_s)), own_ship.attitude_std_rad
         if own_ship.t_ned_body_m is None:
-            return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning, clock_std_s)
+            return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning, *doubts)
         t_m = own_ship.t_ned_body_m + lever_ned_m
         v_mps = own_ship.v_ned_body_mps
         if v_mps is None and before is not None and before.kind == "ned":
             v_mps = _moved_mps(before, time_ns, t_m)
-        return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning, clock_std_s)
+        return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning, *doubts)
 
     @property
     def attitude_variance(self) -> float:
         """Of the attitude from frame to frame, rad^2 about each axis; in `cam` it is not used."""
         if self.kind == "cam":
             return 0.0
-        return ATTITUDE_JITTER_RAD**2 + (self.clock_std_s * self.turning_radps) ** 2
+        by_clock_rad = self.clock_std_s * self.turning_radps
+        return ATTITUDE_JITTER_RAD**2 + by_clock_rad**2 + self.attitude_std_rad**2
 
     def moved_to(self, time_ns: int) -> View:
         """The same camera later, at constant velocity and attitude."""

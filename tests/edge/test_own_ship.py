@@ -51,6 +51,31 @@ def test_attitude_goes_on_by_body_rates_for_fifty_milliseconds_and_then_is_unkno
     assert buffer.at(999 * MS) is None
 
 
+@pytest.mark.parametrize(("gap_ms", "reach_ms"), [(10, 50), (50, 75), (100, 150), (150, 150), (151, 0)])
+def test_attitude_that_comes_seldom_is_gone_on_from_for_longer_or_never(gap_ms: int, reach_ms: int) -> None:
+    """At ten a second each frame has one, at five none: a track does not change its frame with every other picture."""
+    buffer = OwnShipBuffer()
+    for k in range(3):
+        buffer.add_attitude((1_000 + k * gap_ms) * MS, [1, 0, 0, 0], np.zeros(3))
+    last_ms = 1_000 + 2 * gap_ms
+    assert buffer.at((last_ms + reach_ms) * MS) is not None
+    assert buffer.at((last_ms + reach_ms + 1) * MS) is None
+
+
+def test_the_longer_an_attitude_is_gone_on_from_the_less_sure_the_view_is() -> None:
+    buffer = OwnShipBuffer()
+    for k in range(3):
+        buffer.add_attitude((1_000 + k * 100) * MS, [1, 0, 0, 0], np.zeros(3))
+    mount = Mount(np.eye(3), np.zeros(3))
+    stds_rad = []
+    for time_ms in (1_150, 1_200, 1_300, 1_350):
+        own_ship = buffer.at(time_ms * MS)
+        assert own_ship is not None
+        stds_rad.append(View.of(time_ms * MS, own_ship, mount).attitude_variance ** 0.5)
+    # Between two and at one there is only jitter; 1.5 rad/s^2 for 0.1 s and 0.15 s turn by 7.5 and 17 mrad.
+    np.testing.assert_allclose(stds_rad, [1e-3, 1e-3, np.hypot(1e-3, 7.5e-3), np.hypot(1e-3, 16.875e-3)])
+
+
 def test_attitude_is_not_invented_across_a_long_gap() -> None:
     buffer = OwnShipBuffer()
     for time_ns in (0, 2_000 * MS):
