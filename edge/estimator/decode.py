@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge.estimator.model import Peaks
-from edge.estimator.window import PixelMap
+from edge.estimator.window import PixelMap, whole_frame
 from edge.types import Array, Estimate
 from msgs.contract import ModelContract
 
@@ -43,11 +43,18 @@ class View(NamedTuple):
     size_wh: tuple[int, int]  # the network's
     frame_wh: tuple[int, int]
 
-    def shown_xyxy_px(self) -> Array:
-        """[4], the part of the frame that it holds."""
-        size = np.array(self.size_wh)
-        limit = np.array(self.frame_wh) - 0.5
-        return np.clip(self.pixel_map.box_to_frame(0.5 * (size - 1), size), -0.5, np.tile(limit, 2))
+    def cut_sides(self, box_xyxy_px: Array) -> NDArray[np.bool_]:
+        """[4], at which sides of a box on the frame an edge of the window, with more of the frame behind it, may hide
+        a part of what the box holds."""
+        lens = self.pixel_map.lens
+        corners = np.array([[-0.5, -0.5], np.array(self.size_wh) - 0.5])
+        window = self.pixel_map.to_pinhole(corners).ravel()
+        whole = whole_frame(self.frame_wh, lens)
+        picture = np.array([whole.left, whole.top, whole.left + whole.width, whole.top + whole.height]) - 0.5
+        box = box_xyxy_px if lens is None else lens.box_to_pinhole(box_xyxy_px)
+        inwards = np.array([1.0, 1.0, -1.0, -1.0])
+        hides = (window - picture) * inwards > EDGE_PX
+        return np.asarray(hides & ((box - window) * inwards < _edge_margin_px(box)))
 
 
 def decode(
@@ -65,7 +72,7 @@ def decode(
     has a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
     """
     calibration = contract.acquire_score if stage == "acquire" else contract.track_score
-    pixel_map, shown_xyxy_px = view.pixel_map, view.shown_xyxy_px()
+    pixel_map = view.pixel_map
     found = []
     for peak in range(peaks.score.shape[1]):
         shown_px = shown_size_px(peaks.size_px[image, peak], pixel_map)
@@ -77,7 +84,8 @@ def decode(
         sigma = peaks.sigma[image, peak].astype(np.float64)
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
         origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
-        cut = bool(np.any(_cut_sides(box, shown_xyxy_px)))
+        on_frame = np.clip(box, -0.5, np.tile(view.frame_wh, 2) - 0.5)
+        cut = _is_cut(box, view.frame_wh) or bool(np.any(view.cut_sides(on_frame)))
         reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, view.frame_wh)
         if reason is not None:
             refused[reason] += 1
@@ -87,8 +95,7 @@ def decode(
         if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
         covariance = pose_covariance(t_m, sigma, view.K, contract.trained_range_m)
-        box = np.clip(box, -0.5, np.tile(view.frame_wh, 2) - 0.5)
-        found.append(Estimate(score, box, _nearest_rotation(R), t_m, covariance, stage))
+        found.append(Estimate(score, on_frame, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
 
 
@@ -167,23 +174,24 @@ def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tu
 
 
 def grown(box_xyxy_px: Array, view: View) -> Array | None:
-    """The box, longer by its longer side beyond each edge of the window that cuts what it holds.
-
-    None: no edge does, or only the frame's own.
-    """
-    shown, whole = view.shown_xyxy_px(), np.array([-0.5, -0.5, *(np.array(view.frame_wh) - 0.5)])
-    cut = _cut_sides(box_xyxy_px, shown) & (np.abs(shown - whole) > EDGE_PX)
+    """The box, longer by its longer side beyond each edge of the window that cuts what it holds; None: none does."""
+    cut = view.cut_sides(box_xyxy_px)
     if not np.any(cut):
         return None
     longer_px = np.max(box_xyxy_px[2:] - box_xyxy_px[:2])
     return np.asarray(box_xyxy_px + cut * longer_px * np.array([-1.0, -1.0, 1.0, 1.0]))
 
 
-def _cut_sides(box_xyxy_px: Array, shown_xyxy_px: Array) -> NDArray[np.bool_]:
-    """[4], at which sides the edge of what was shown may hide a part of what the box holds."""
-    margin_px = EDGE_SHARE * float(np.max(box_xyxy_px[2:] - box_xyxy_px[:2])) + EDGE_PX
-    inside = (box_xyxy_px - shown_xyxy_px) * np.array([1.0, 1.0, -1.0, -1.0])
-    return np.asarray(inside < margin_px)
+def _is_cut(box_xyxy_px: Array, frame_wh: tuple[int, int]) -> bool:
+    """Whether the frame's edge may hide a part of what the box holds."""
+    margin_px = _edge_margin_px(box_xyxy_px)
+    return bool(
+        np.any(box_xyxy_px[:2] < margin_px - 0.5) or np.any(box_xyxy_px[2:] > np.array(frame_wh) - 0.5 - margin_px)
+    )
+
+
+def _edge_margin_px(box_xyxy_px: Array) -> float:
+    return EDGE_SHARE * float(np.max(box_xyxy_px[2:] - box_xyxy_px[:2])) + EDGE_PX
 
 
 def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int, int]) -> str | None:

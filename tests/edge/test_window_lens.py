@@ -11,8 +11,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from edge.estimator.decode import View, grown
 from edge.estimator.estimator import Estimator
-from edge.estimator.lens import Lens
+from edge.estimator.lens import Lens, lens_of
 from edge.estimator.model import load_model
 from edge.estimator.window import cut, fit_frame, whole_frame, window_around
 from edge.types import Frame, FrameMeta
@@ -202,3 +203,21 @@ def test_a_target_seen_through_a_lens_is_where_it_is_and_its_box_where_the_frame
     away_m = [float(np.linalg.norm(e.t_cam_target_m - true_t_cam_target_m(center))) for e in naive]
     if center != (960.5, 540.5):
         assert min(away_m) > 3.0
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, BARREL, (-0.45, 0.2, 0.0, 0.0, -0.05)])  # the last one folds
+def test_only_a_window_cuts_a_target_in_the_middle_of_the_frame(distortion: tuple[float, ...]) -> None:
+    """Whatever the lens: the whole frame shows it all, and so does a window that lies right."""
+    wh, lens = (1920, 1080), lens_of(K, distortion)
+    box = np.array([850.0, 500.0, 1010.0, 560.0])
+    _, pixel_map = fit_frame(np.zeros((wh[1], wh[0], 3), np.uint8), (768, 448), "letterbox", lens)
+    assert not np.any(View(pixel_map, pixel_map.intrinsics(K), (768, 448), wh).cut_sides(box))
+    for moved_px, expected in ((0.0, [0, 0, 0, 0]), (110.0, [1, 0, 0, 0]), (-110.0, [0, 0, 1, 0])):
+        window = window_around(box + np.array([moved_px, 0, moved_px, 0]), 1.8, NETWORK_WH, wh, lens)
+        window_map = window.pixel_map(NETWORK_WH, lens)
+        view = View(window_map, window_map.intrinsics(K), NETWORK_WH, wh)
+        np.testing.assert_array_equal(view.cut_sides(box), np.array(expected, dtype=bool))
+        larger = grown(box, view)
+        assert (larger is None) == (moved_px == 0.0)
+        if larger is not None:
+            assert larger[2] - larger[0] == pytest.approx(320.0)
