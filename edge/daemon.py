@@ -170,7 +170,7 @@ class Pipeline:
         searches = self._by_hand.searches(capture_ns)
         held = [track.box_xyxy_px for track in expected]
         places = self.search.places(capture_ns, held, self._max_targets - len(held)) if searches else []
-        found = self._look_into([*held, *places], frame, pointed_at, clock)
+        found = self._look_into(held, places, frame, pointed_at, clock)
         self._since_acquire += 1
         if not searches:
             return found
@@ -182,16 +182,17 @@ class Pipeline:
         elif (
             self._since_acquire >= self._acquire_every_n
             and len(held) < self._max_targets
-            and self.search.begin(self._estimator, frame, [*held, *places])
+            and self.search.begin(self._estimator, frame, [*held, *(place.box_xyxy_px for place in places)])
         ):
             self._since_acquire = 0
         return found
 
     def _look_into(
-        self, boxes: list[Array], frame: Frame, pointed_at: Array | None, clock: StageClock
+        self, held: list[Array], places: list[Estimate], frame: Frame, pointed_at: Array | None, clock: StageClock
     ) -> list[Estimate]:
+        boxes = [*held, *(place.box_xyxy_px for place in places)]
         if pointed_at is not None:
-            boxes = [*boxes, pointed_at]
+            boxes.append(pointed_at)
         if not boxes or not self._estimator.has_track_stage:
             return []
         seen = self._estimator.track(frame, boxes)
@@ -199,6 +200,9 @@ class Pipeline:
             self._by_hand.found(there)
             self._tracker.make_room()
         clock.estimated(self._estimator.model.take_runs_ns())
+        for i, place in enumerate(places, start=len(held)):
+            if (look := seen[i]) is not None and not self._estimator.confirms(place, [look]):
+                seen[i] = None
         return [estimate for estimate in seen if estimate is not None]
 
     def _publish(

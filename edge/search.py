@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from edge import clock
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
-from edge.types import Array, Frame
+from edge.types import Array, Estimate, Frame
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class Search:
         self._changed = threading.Condition()
         self._asked: _Asked | None = None
         self._busy = False
-        self._places: list[Array] = []
+        self._places: list[Estimate] = []
         self._seen_ns = 0  # exposure of the frame that they were seen in
         self._counts: Counter[str] = Counter(searches=0)
         self._stopping = False
@@ -71,14 +71,14 @@ class Search:
             self._look()
         return True
 
-    def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Array]:
-        """Boxes [4] px, best first, of what was found since the last call and may still be there at `capture_ns`
-        (monotonic), off `known_boxes`."""
+    def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Estimate]:
+        """What was found since the last call, best first, and may still be there at `capture_ns` (monotonic), off
+        `known_boxes`."""
         with self._changed:
             found, self._places = self._places, []
             if capture_ns - self._seen_ns > PLACE_AGE_MAX_NS:
                 return []
-        return [box for box in found if not lies_on(box, known_boxes)][: max(at_most, 0)]
+        return [place for place in found if not lies_on(place.box_xyxy_px, known_boxes)][: max(at_most, 0)]
 
     def counters(self) -> dict[str, int]:
         """searches made, search_failed, and refused_REASON of what they saw."""
@@ -100,10 +100,10 @@ class Search:
             asked, self._asked = self._asked, None
         assert asked is not None
         refused: Counter[str] = Counter()
-        places: list[Array] = []
+        places: list[Estimate] = []
         failed = False
         try:
-            places = [found.box_xyxy_px for found in asked.estimator.anywhere(asked.frame, asked.known_boxes, refused)]
+            places = asked.estimator.anywhere(asked.frame, asked.known_boxes, refused)
         except Exception:
             # One search is lost; tracking goes on, and the next may do.
             failed = True

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from trainer.config import ConfigError
 from trainer.depthwise import DepthwiseConv2d
 from trainer.image_conv import ImageConv2d
 
@@ -167,14 +168,20 @@ class RepVit(nn.Module):
         )
 
     def first_layers(self, blocks: int) -> list[nn.Module]:
-        """The stem and so many of the stages."""
-        return [self.stem, *list(self.stages)[:blocks]]
+        """The stem and so many of the stages. Raises ConfigError where there are fewer."""
+        return _first(self.stem, list(self.stages), blocks)
 
     def forward(self, x: Tensor) -> Features:
         x = self.stages[0](self.stem(x))
         f8 = self.stages[1](x)
         f16 = self.stages[2](f8)
         return f8, f16, self.stages[3](f16)
+
+
+def _first(stem: nn.Module, blocks: list[nn.Module], count: int) -> list[nn.Module]:
+    if count > len(blocks):
+        raise ConfigError(f"[schedule] frozen_blocks = {count}: the backbone has {len(blocks)}")
+    return [stem, *blocks[:count]]
 
 
 def _pad_same(x: Tensor, kernel: int, stride: int) -> Tensor:
@@ -248,8 +255,8 @@ class EfficientNetLite0(nn.Module):
         self.load_state_dict(ours)
 
     def first_layers(self, blocks: int) -> list[nn.Module]:
-        """The stem and so many of the blocks."""
-        return [self._conv_stem, self._bn0, *self._blocks[:blocks]]
+        """The stem and so many of the blocks. Raises ConfigError where there are fewer."""
+        return _first(nn.ModuleList([self._conv_stem, self._bn0]), list(self._blocks), blocks)
 
     def forward(self, x: Tensor) -> Features:
         x = F.relu6(self._bn0(self._conv_stem(_pad_same(x, 3, 2))))

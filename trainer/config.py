@@ -127,7 +127,9 @@ class ScheduleConfig(Section):
     lr_final: float = Field(1e-5, gt=0)
     backbone_lr_scale: float = Field(1.0, gt=0)
     frozen_blocks: int = Field(
-        0, ge=0, description="first blocks of the backbone that stay, with its stem, as the run began; 0: all learn"
+        0,
+        ge=0,
+        description="first blocks (of a RepViT: stages) that stay, with the stem, as the run began; 0: all learn",
     )
     weight_decay: float = Field(0.01, ge=0)
     gradient_clip: float = Field(5.0, gt=0)

@@ -35,7 +35,7 @@ DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
 FARTHEST_SIGMA_LOG_Z, FARTHEST_TOLERANCE = 1.0, 1e-3
 
 
-class View(NamedTuple):
+class Shown(NamedTuple):
     """What of a frame the network was shown, and as which pixels."""
 
     pixel_map: PixelMap
@@ -60,19 +60,23 @@ class View(NamedTuple):
 def decode(
     peaks: Peaks,
     image: int,
-    view: View,
+    shown: Shown,
     contract: ModelContract,
     stage: Literal["acquire", "track"],
     score_min: float,
     refused: Counter[str],
 ) -> list[Estimate]:
-    """Accepted, distinct targets of one image of the batch, best score first; refusals are counted by reason.
+    """Accepted, distinct targets of one image of the batch, best score first.
+
+    What the contract's least score would take for a target and is refused is counted by reason.
 
     A target cut by the edge of what was shown, of a size that was not trained or at the end of what depth can be told
     has a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
     """
-    calibration = contract.acquire_score if stage == "acquire" else contract.track_score
-    pixel_map = view.pixel_map
+    acquiring = stage == "acquire"
+    calibration = contract.acquire_score if acquiring else contract.track_score
+    least = contract.acquire_score_min if acquiring else contract.track_score_min
+    pixel_map = shown.pixel_map
     found = []
     for peak in range(peaks.score.shape[1]):
         shown_px = shown_size_px(peaks.size_px[image, peak], pixel_map)
@@ -84,17 +88,17 @@ def decode(
         sigma = peaks.sigma[image, peak].astype(np.float64)
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
         origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
-        on_frame = np.clip(box, -0.5, np.tile(view.frame_wh, 2) - 0.5)
-        cut = _is_cut(box, view.frame_wh) or bool(np.any(view.cut_sides(on_frame)))
-        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, view.frame_wh)
+        on_frame = np.clip(box, -0.5, np.tile(shown.frame_wh, 2) - 0.5)
+        cut = _is_cut(box, shown.frame_wh) or bool(np.any(shown.cut_sides(on_frame)))
+        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, shown.frame_wh)
         if reason is not None:
-            refused[reason] += 1
+            refused[reason] += score >= least
             continue
         longer_px = float(peaks.size_px[image, peak].max())
         sigma = _widened(sigma, score, longer_px, cut, contract.trained_box_px)
         if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
-        covariance = pose_covariance(t_m, sigma, view.K, contract.trained_range_m)
+        covariance = pose_covariance(t_m, sigma, shown.K, contract.trained_range_m)
         found.append(Estimate(score, on_frame, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
 
@@ -173,9 +177,9 @@ def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tu
     return None
 
 
-def grown(box_xyxy_px: Array, view: View) -> Array | None:
+def grown(box_xyxy_px: Array, shown: Shown) -> Array | None:
     """The box, longer by its longer side beyond each edge of the window that cuts what it holds; None: none does."""
-    cut = view.cut_sides(box_xyxy_px)
+    cut = shown.cut_sides(box_xyxy_px)
     if not np.any(cut):
         return None
     longer_px = np.max(box_xyxy_px[2:] - box_xyxy_px[:2])

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.estimator.decode import View, decode, distinct, grown, nearest_expected
+from edge.estimator.decode import Shown, decode, distinct, grown, nearest_expected
 from edge.estimator.lens import lens_of
-from edge.estimator.looks import confirmed, mirrored, of_looks, unmirrored
+from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, window_around
 from edge.types import Array, Estimate, Frame
 
 WORTH_A_LOOK = 0.1  # where the whole frame has a target less probably, no window is spent on it
-LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
 FAINTEST = 0.02  # the least that a window says of a place that the whole frame has named
+LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
 
 
 class Estimator:
-    """Poses of the targets in single frames; it remembers nothing between them but counts of what it refused."""
+    """Poses of the targets in single frames; between them it remembers only whether the last was looked at mirrored,
+    and counts of what it refused."""
 
     def __init__(self, model: Model, max_targets: int = 4) -> None:
         self.model = model
         self.refused: Counter[str] = Counter()
         self._max_targets = max_targets
+        self._mirror = True
 
     @property
     def has_track_stage(self) -> bool:
@@ -45,37 +46,54 @@ class Estimator:
         """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
 
         Each is looked at in a track window of the same frame, which lies as the whole frame has the target: coarsely;
-        if `thrice`, twice more in a window that lies as the first has it, plain and mirrored. What the whole frame and
-        the windows together do not confirm is no target.
+        if `thrice`, twice more in a window that lies as the first has it, plain and mirrored. What the windows do not
+        show, or all together do not confirm, is no target.
         """
-        least = self.model.contract.acquire_score_min
         if not self.has_track_stage:
-            return self._whole(frame, known_boxes, least, self.model.run, self.refused)
-        places = self._whole(frame, known_boxes, WORTH_A_LOOK, self.model.run, self.refused)
-        firsts = self._look(frame, [place.box_xyxy_px for place in places], FAINTEST)
+            return self._whole(frame, known_boxes, self.model.contract.acquire_score_min, self.model.run, self.refused)
+        places = self._whole(frame, known_boxes, self._worth_a_look, self.model.run, self.refused)
+        faintest = min(FAINTEST, self.model.contract.track_score_min)
+        firsts = self._look(frame, [place.box_xyxy_px for place in places], faintest)
         seen = [
             (place, first)
             for place, first in zip(places, firsts, strict=True)
-            if first is not None and confirmed(place.score, [first.score]) >= WORTH_A_LOOK
+            if first is not None and confirmed(place.score, [first.score]) >= self._worth_a_look
         ]
-        boxes = [first.box_xyxy_px for _, first in seen]
-        finer = [self._look(frame, boxes, FAINTEST, mirror) for mirror in ((False, True) if thrice else ())]
-        found = []
-        for (place, first), *again in zip(seen, *finer, strict=True):
-            scores = [FAINTEST if look is None else look.score for look in (first, *again)]
-            looks = [look for look in again if look is not None]
-            estimate = of_looks(looks, [first]) if looks else first
-            found.append(replace(estimate, score=confirmed(place.score, scores)))
-        targets = [estimate for estimate in found if estimate.score >= least]
-        self.refused["unconfirmed"] += len(places) - len(targets)
-        return distinct(sorted(targets, key=lambda estimate: -estimate.score), known_boxes)
+        if thrice:
+            boxes = [first.box_xyxy_px for _, first in seen]
+            finer = [self._look(frame, boxes, faintest, mirror, looks_left=1) for mirror in (False, True)]
+            looks = [self._together(*one) for one in zip(seen, *finer, strict=True)]
+        else:
+            looks = [first if self.confirms(place, [first]) else None for place, first in seen]
+        found = [look for look in looks if look is not None]
+        likely = sum(place.score >= self.model.contract.acquire_score_min for place in places)
+        self.refused["unconfirmed"] += max(likely - len(found), 0)
+        return distinct(sorted(found, key=lambda estimate: -estimate.score), known_boxes)
+
+    def _together(self, seen: tuple[Estimate, Estimate], *finer: Estimate | None) -> Estimate | None:
+        """What a place of the whole frame, the first look at it and two finer ones say; None: that there is nothing."""
+        place, first = seen
+        looks = [look for look in finer if look is not None and of_one_target(look, first)]
+        if not looks or not self.confirms(place, [first, *looks], missed=len(finer) - len(looks)):
+            return None
+        return of_looks(looks, [first])
+
+    def confirms(self, place: Estimate, looks: Sequence[Estimate], missed: int = 0) -> bool:
+        """Whether windows show a target where the whole frame, this one or one before, has a place; `missed`: how many
+        windows do not."""
+        scores = [*(look.score for look in looks), *[FAINTEST] * missed]
+        return confirmed(place.score, scores) >= self.model.contract.acquire_score_min
 
     def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
-        """The same as far as the whole frame alone tells, unconfirmed; refusals are added to `refused`.
+        """Places that are worth a look, as far as the whole frame alone tells; refusals are added to `refused`.
 
         It touches nothing of the estimator's own, so another thread than the loop's may call it.
         """
-        return self._whole(frame, known_boxes, self.model.contract.acquire_score_min, self.model.infer, refused)
+        return self._whole(frame, known_boxes, self._worth_a_look, self.model.infer, refused)
+
+    @property
+    def _worth_a_look(self) -> float:
+        return min(WORTH_A_LOOK, self.model.contract.acquire_score_min)
 
     def _whole(
         self,
@@ -89,8 +107,8 @@ class Estimator:
         lens = lens_of(frame.K, frame.distortion)
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
-        view = View(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh)
-        found = decode(run(image[None], view.K[None]), 0, view, contract, "acquire", score_min, refused)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh)
+        found = decode(run(image[None], shown.K[None]), 0, shown, contract, "acquire", score_min, refused)
         return distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array]) -> list[Estimate | None]:
@@ -98,8 +116,8 @@ class Estimator:
 
         Every other frame is looked at mirrored: what the network gets wrong of one it gets wrong otherwise of the next.
         """
-        mirror = frame.meta.sequence % 2 == 1
-        return self._look(frame, boxes_xyxy_px, self.model.contract.track_score_min, mirror)
+        self._mirror = not self._mirror
+        return self._look(frame, boxes_xyxy_px, self.model.contract.track_score_min, self._mirror)
 
     def _look(
         self,
@@ -120,18 +138,18 @@ class Estimator:
         lens = lens_of(frame.K, frame.distortion)
         windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh, lens) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
-        views = [View(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
+        shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
         images = np.stack([cut(frame.image_bgr, window, size_wh, lens) for window in windows])
-        K = np.stack([view.K for view in views])
+        K = np.stack([one.K for one in shown])
         peaks = unmirrored(self.model.run(*mirrored(images, K)), size_wh[0]) if mirror else self.model.run(images, K)
         found = [
-            nearest_expected(decode(peaks, i, view, contract, "track", score_min, self.refused), boxes_xyxy_px[i])
-            for i, view in enumerate(views)
+            nearest_expected(decode(peaks, i, one, contract, "track", score_min, self.refused), boxes_xyxy_px[i])
+            for i, one in enumerate(shown)
         ]
         beyond = {
             i: box
-            for i, (estimate, view) in enumerate(zip(found, views, strict=True))
-            if estimate is not None and (box := grown(estimate.box_xyxy_px, view)) is not None
+            for i, (estimate, one) in enumerate(zip(found, shown, strict=True))
+            if estimate is not None and (box := grown(estimate.box_xyxy_px, one)) is not None
         }
         if beyond and looks_left > 1:
             again = self._look(frame, list(beyond.values()), score_min, mirror, looks_left - 1)

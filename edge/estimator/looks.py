@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.estimator.decode import lies_on
 from edge.estimator.model import Peaks
 from edge.types import Array, Estimate
 from msgs.geometry import rotation_angle, so3_log
@@ -59,6 +60,11 @@ def confirmed(place_score: float, look_scores: Sequence[float]) -> float:
     return float(1.0 / (1.0 + np.exp(-log_odds)))
 
 
+def of_one_target(look: Estimate, first: Estimate) -> bool:
+    """Whether a look lies where the first one does, and is not of another aircraft in the same window."""
+    return lies_on(look.box_xyxy_px, [first.box_xyxy_px])
+
+
 def of_looks(looks: Sequence[Estimate], coarser: Sequence[Estimate] = ()) -> Estimate:
     """One estimate of one target seen in several windows of one frame.
 
@@ -77,10 +83,12 @@ def of_looks(looks: Sequence[Estimate], coarser: Sequence[Estimate] = ()) -> Est
         look.covariance[:3, :3] / np.exp(2 * log_range) for look, log_range in zip(looks, log_ranges, strict=True)
     ]
     covariance[:3, :3] = np.exp(2 * log_ranges.mean()) * np.mean(relative, axis=0)
-    covariance[:3, :3] += log_ranges.var() * np.outer(t_mean_m, t_mean_m)
+    aside_m = t_m * (np.exp(log_ranges.mean()) / np.exp(log_ranges))[:, None] - t_mean_m
+    covariance[:3, :3] += log_ranges.var() * np.outer(t_mean_m, t_mean_m) + aside_m.T @ aside_m / len(looks)
     R, covariance[3:, 3:] = _rotation_of([*looks, *coarser])
     return replace(
         looks[0],
+        score=float(np.mean([look.score for look in looks])),
         box_xyxy_px=np.mean([look.box_xyxy_px for look in looks], axis=0),
         R_cam_target=R,
         t_cam_target_m=t_mean_m,

@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,7 @@ ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the
 # How long an attitude goes on by its rates: one and a half times what lies between two, within these. Where more lies
 # between two they are of no use for frames, which come after the last: rather none than now and then.
 ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
+USUAL_OF = 5  # so many samples tell how far they usually lie apart: one that is lost or late changes nothing
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
@@ -131,12 +133,18 @@ class OwnShipBuffer:
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
             origin = self._origin(time_ns, t_ned_m is not None)
-            last = self._attitudes[-1]
-            ahead_s = max(time_ns - last.time_ns, 0) / NS_PER_S
-            attitude_std_rad = 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * ahead_s**2
+            clock_std_s, attitude_std_rad = self._attitudes[-1].clock_std_s, self._attitude_std_rad(time_ns)
             return OwnShip(
-                time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, last.clock_std_s, attitude_std_rad
+                time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, clock_std_s, attitude_std_rad
             )
+
+    def _attitude_std_rad(self, time_ns: int) -> float:
+        """How far the camera may have turned otherwise than at the last rates, since the samples that its attitude
+        comes from: a gimbal's against the earth is the camera's whole attitude."""
+        body_rad, gimbal_rad = _turned_rad(self._attitudes, time_ns), _turned_rad(self._gimbals, time_ns)
+        if not self.gimballed:
+            return body_rad
+        return gimbal_rad if self._gimbals[-1].frame is GimbalFrame.EARTH else float(np.hypot(body_rad, gimbal_rad))
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
         """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
@@ -172,9 +180,11 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     if after == 0:
         return None
     a = samples[after - 1]
-    elapsed_s = (time_ns - a.time_ns) / NS_PER_S
+    elapsed_s, reach_ns = (time_ns - a.time_ns) / NS_PER_S, _reach_ns(samples)
+    if reach_ns is None:
+        return None
     if after == len(samples):
-        if time_ns - a.time_ns > _reach_ns(samples):
+        if time_ns - a.time_ns > reach_ns:
             return None
         return a.R_ned_body @ so3_exp(a.rates_body_radps * elapsed_s)
     b = samples[after]
@@ -184,23 +194,35 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
 
 
-def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int:
-    """How long after the last sample it can be gone on from."""
+def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> float:
+    ahead_s = max(time_ns - samples[-1].time_ns, 0) / NS_PER_S if samples else 0.0
+    return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * ahead_s**2
+
+
+def _usual_gap_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
+    """Median time between the last few samples; None: there are too few to tell."""
+    times = [samples[i].time_ns for i in range(max(len(samples) - USUAL_OF, 0), len(samples))]
+    gaps = sorted(b - a for a, b in pairwise(times))
+    return gaps[len(gaps) // 2] if gaps else None
+
+
+def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
+    """How long after the last sample it can be gone on from; None: too few come, and they serve no frame."""
+    gap_ns = _usual_gap_ns(samples)
     least_ns, most_ns = ATTITUDE_AHEAD_NS
-    if len(samples) < 2:
+    if gap_ns is None:
         return least_ns
-    gap_ns = samples[-1].time_ns - samples[-2].time_ns
-    return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else 0
+    return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else None
 
 
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
     """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 150 ms."""
-    after = _first_after(samples, time_ns)
-    if after == 0 or (after == len(samples) and time_ns - samples[-1].time_ns > _reach_ns(samples)):
+    after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples)
+    if after == 0 or reach_ns is None or (after == len(samples) and time_ns - samples[-1].time_ns > reach_ns):
         return None
     a, b = samples[max(min(after, len(samples) - 1) - 1, 0)], samples[min(after, len(samples) - 1)]
     if a.frame is not b.frame or not 0 < b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
-        if after < len(samples):
+        if after < len(samples) or time_ns - b.time_ns > ATTITUDE_AHEAD_NS[0]:
             return None
         a, share = b, 0.0  # the last sample stands alone
     else:

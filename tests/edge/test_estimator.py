@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from edge.errors import InputError
-from edge.estimator.decode import View, decode, overlap, pose_covariance
+from edge.estimator.decode import Shown, decode, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, window_around
@@ -20,7 +20,7 @@ from .toy_model import CONTRACT, GRAPH, write_toy_model
 from .toy_scene import SIZE_WH, TARGET_WH, K, draw, true_t_cam_target_m
 
 TRACK_WH = (256, 256)
-WHOLE = View(PixelMap((1, 1), (0, 0)), K, SIZE_WH, SIZE_WH)  # the frame as it is
+WHOLE = Shown(PixelMap((1, 1), (0, 0)), K, SIZE_WH, SIZE_WH)  # the frame as it is
 boxes = st.tuples(st.floats(-50, 1900), st.floats(-50, 1060), st.floats(4, 700), st.floats(4, 500)).map(
     lambda b: np.array([b[0], b[1], b[0] + b[2], b[1] + b[3]])
 )

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, TimesyncEstimator
 from edge.tracking.geodesy import lat_lon_alt_from_ned, ned_from_lat_lon_alt
-from edge.tracking.own_ship import OwnShipBuffer
+from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from edge.tracking.view import View
 from edge.types import Mount
 from msgs.geometry import rotation_angle
@@ -51,15 +51,38 @@ def test_attitude_goes_on_by_body_rates_for_fifty_milliseconds_and_then_is_unkno
     assert buffer.at(999 * MS) is None
 
 
-@pytest.mark.parametrize(("gap_ms", "reach_ms"), [(10, 50), (50, 75), (100, 150), (150, 150), (151, 0)])
-def test_attitude_that_comes_seldom_is_gone_on_from_for_longer_or_never(gap_ms: int, reach_ms: int) -> None:
-    """At ten a second each frame has one, at five none: a track does not change its frame with every other picture."""
+@pytest.mark.parametrize(("gap_ms", "reach_ms"), [(10, 50), (50, 75), (100, 150), (150, 150)])
+def test_attitude_that_comes_less_often_is_gone_on_from_for_longer(gap_ms: int, reach_ms: int) -> None:
     buffer = OwnShipBuffer()
     for k in range(3):
         buffer.add_attitude((1_000 + k * gap_ms) * MS, [1, 0, 0, 0], np.zeros(3))
     last_ms = 1_000 + 2 * gap_ms
     assert buffer.at((last_ms + reach_ms) * MS) is not None
     assert buffer.at((last_ms + reach_ms + 1) * MS) is None
+
+
+def known(attitudes_ms: list[int]) -> list[bool]:
+    """Whether each picture has an attitude: 30 a second, looked up 33 ms after exposure; attitudes come 10 ms late."""
+    buffer, waiting, answers = OwnShipBuffer(), list(attitudes_ms), []
+    for frame in range(150):
+        exposed_ms = 1_000 + round(frame * 1000 / 30)
+        while waiting and waiting[0] + 10 <= exposed_ms + 33:
+            buffer.add_attitude(waiting.pop(0) * MS, [1, 0, 0, 0], np.zeros(3))
+        answers.append(buffer.at(exposed_ms * MS) is not None)
+    return answers
+
+
+def test_a_stream_of_attitudes_serves_every_picture_or_none() -> None:
+    """A track changes its frame with each picture that has one and the next that has none."""
+    ten_a_second = list(range(0, 6_000, 100))
+    assert all(known(ten_a_second))
+    jitter_ms = np.random.default_rng(5).integers(-20, 21, len(ten_a_second))
+    assert all(known([t + int(j) for t, j in zip(ten_a_second, jitter_ms, strict=True)]))
+    assert not any(known(list(range(0, 6_000, 200))))
+    one_lost = known([t for t in ten_a_second if t != 3_000])
+    assert one_lost.count(False) in (1, 2)
+    after_an_outage = known([t for t in range(0, 6_000, 20) if not 3_000 < t < 4_000])
+    assert after_an_outage.index(True, after_an_outage.index(False)) - 1 <= (4_010 - 33 - 1_000) * 30 / 1000
 
 
 def test_the_longer_an_attitude_is_gone_on_from_the_less_sure_the_view_is() -> None:
@@ -76,12 +99,34 @@ def test_the_longer_an_attitude_is_gone_on_from_the_less_sure_the_view_is() -> N
     np.testing.assert_allclose(stds_rad, [1e-3, 1e-3, np.hypot(1e-3, 7.5e-3), np.hypot(1e-3, 16.875e-3)])
 
 
+@pytest.mark.parametrize(
+    ("frame", "body_ms", "gimbal_ms", "ages_s"),
+    [
+        (GimbalFrame.EARTH, range(0, 1_101, 10), range(0, 1_001, 100), [0.1]),
+        (GimbalFrame.EARTH, range(0, 1_001, 100), range(0, 1_101, 10), [0.0]),
+        (GimbalFrame.HEADING, range(0, 1_001, 100), range(0, 1_001, 100), [0.1, 0.1]),
+    ],
+)
+def test_the_age_of_a_gimbal_s_attitude_counts(
+    frame: GimbalFrame, body_ms: range, gimbal_ms: range, ages_s: list[float]
+) -> None:
+    """Against the earth it is the camera's whole attitude; against the heading the body's comes on top."""
+    buffer = OwnShipBuffer(gimballed=True)
+    for time_ms in body_ms:
+        buffer.add_attitude(time_ms * MS, [1, 0, 0, 0], np.zeros(3))
+    for time_ms in gimbal_ms:
+        buffer.add_gimbal(time_ms * MS, [1, 0, 0, 0], frame)
+    own_ship = buffer.at(1_100 * MS)
+    assert own_ship is not None
+    assert own_ship.attitude_std_rad == pytest.approx(np.linalg.norm([0.5 * 1.5 * age_s**2 for age_s in ages_s]))
+
+
 def test_attitude_is_not_invented_across_a_long_gap() -> None:
     buffer = OwnShipBuffer()
-    for time_ns in (0, 2_000 * MS):
-        buffer.add_attitude(time_ns, [1, 0, 0, 0], np.zeros(3))
+    for time_ms in (0, 20, 40, 60, 80, 2_080):
+        buffer.add_attitude(time_ms * MS, [1, 0, 0, 0], np.zeros(3))
     assert buffer.at(1_000 * MS) is None
-    assert buffer.at(2_000 * MS) is not None
+    assert buffer.at(2_080 * MS) is not None
 
 
 def test_position_is_interpolated_extrapolated_and_then_unknown_while_attitude_stays() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def test_what_it_finds_is_a_place_off_the_targets_held(search: Search, estimator
     assert search.begin(estimator, seen, [])
     until(lambda: search.counters()["searches"] == 1)
     (place,) = search.places(seen.meta.capture_ns, [], 4)
-    np.testing.assert_allclose(place, box_around(OTHER), atol=3.0)  # a third of the frame's resolution
+    np.testing.assert_allclose(place.box_xyxy_px, box_around(OTHER), atol=3.0)  # a third of the frame's resolution
     assert search.places(seen.meta.capture_ns, [], 4) == []  # told once
 
     assert search.begin(estimator, seen, [])
@@ -215,6 +216,23 @@ def test_stamps_that_jump_teach_no_speed(pipeline: tuple[Pipeline, Ear, RequestQ
     away_m = np.abs(coasting.t_cam_target_m - held.t_cam_target_m)
     assert np.all(away_m <= 3.0 * np.sqrt(np.diag(coasting.covariance)[:3]))
     assert away_m.max() < 1.0, "nothing true was learnt of its speed"
+
+
+def test_a_place_that_the_window_does_not_make_likely_enough_is_no_target(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
+) -> None:
+    """The toy is as sure as can be of what it sees, the whole frame nearly that there is nothing: two to one."""
+    loop, ear, _ = pipeline
+    gated.model.contract = gated.model.contract.model_copy(update={"acquire_score_min": 0.8})
+    (estimate,) = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+    gated.sees = [replace(estimate, score=0.01)]
+    gated.gate.set()
+    for index in range(8):
+        loop._process(frame(index, HELD))
+    until(lambda: loop.search.counters()["searches"] >= 1)
+    for index in range(8, 12):
+        loop._process(frame(index, HELD, OTHER))
+    assert [len(report.tracks) for report in ear.reports] == [1] * 12
 
 
 def test_a_place_where_the_window_sees_nothing_is_no_target(

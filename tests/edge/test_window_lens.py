@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from edge.estimator.decode import View, grown
+from edge.estimator.decode import Shown, grown
 from edge.estimator.estimator import Estimator
 from edge.estimator.lens import Lens, lens_of
 from edge.estimator.model import load_model
@@ -211,11 +211,11 @@ def test_only_a_window_cuts_a_target_in_the_middle_of_the_frame(distortion: tupl
     wh, lens = (1920, 1080), lens_of(K, distortion)
     box = np.array([850.0, 500.0, 1010.0, 560.0])
     _, pixel_map = fit_frame(np.zeros((wh[1], wh[0], 3), np.uint8), (768, 448), "letterbox", lens)
-    assert not np.any(View(pixel_map, pixel_map.intrinsics(K), (768, 448), wh).cut_sides(box))
+    assert not np.any(Shown(pixel_map, pixel_map.intrinsics(K), (768, 448), wh).cut_sides(box))
     for moved_px, expected in ((0.0, [0, 0, 0, 0]), (110.0, [1, 0, 0, 0]), (-110.0, [0, 0, 1, 0])):
         window = window_around(box + np.array([moved_px, 0, moved_px, 0]), 1.8, NETWORK_WH, wh, lens)
         window_map = window.pixel_map(NETWORK_WH, lens)
-        view = View(window_map, window_map.intrinsics(K), NETWORK_WH, wh)
+        view = Shown(window_map, window_map.intrinsics(K), NETWORK_WH, wh)
         np.testing.assert_array_equal(view.cut_sides(box), np.array(expected, dtype=bool))
         larger = grown(box, view)
         assert (larger is None) == (moved_px == 0.0)

@@ -113,6 +113,12 @@ def test_frozen_blocks_stay_as_another_run_left_them_and_the_rest_learns(
     early = {name for name in trained if name.startswith(("backbone.stem.", "backbone.stages.0."))}
     assert early
     assert early <= same
-    learning = {name for name in trained if name.startswith(("backbone.stages.1.", "neck.")) and "running" in name}
+    learning = {name for name in trained if name.startswith(("backbone.stages.1.", "neck.")) and ".c.weight" in name}
     assert learning
     assert not learning & same
+
+    with pytest.raises(ConfigError, match="frozen_blocks = 9: the backbone has 4"):
+        Trainer(
+            parse_config(tiny.TOML.replace("[schedule]", "[schedule]\nfrozen_blocks = 9"), "f.toml"),
+            torch.device("cpu"),
+        )

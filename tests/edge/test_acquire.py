@@ -1,0 +1,149 @@
+"""What makes a target of a place in the whole frame: the looks at it, plain and mirrored, and what each may say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import Peaks
+from edge.types import Frame, FrameMeta
+from msgs.contract import ModelContract
+
+from .toy_model import CONTRACT
+from .toy_scene import SIZE_WH, K
+
+RANGE_M = 250.0
+TARGET_PX = np.array([700.0, 500.0])
+OTHER_PX = np.array([760.0, 500.0])
+SIZE_PX = np.array([50.0, 20.0])
+# Brighter to the right, so that an image tells whether it is mirrored.
+SLOPE = np.broadcast_to(np.linspace(0, 255, SIZE_WH[0])[None, :, None], (SIZE_WH[1], SIZE_WH[0], 3)).astype(np.uint8)
+
+
+def answer(score: float, at_px: np.ndarray = TARGET_PX, range_m: float = RANGE_M) -> tuple[float, np.ndarray, float]:
+    return score, at_px, range_m
+
+
+@dataclass
+class Scripted:
+    """Stands in for a network whose every answer is known: what it says of whole frames and of windows, plain and
+    mirrored, is a script; where that lies in an image, the image's own K tells."""
+
+    script: dict[str, list[tuple[float, np.ndarray, float]]]  # the last answer of a kind stays
+    contract: ModelContract
+    asked: list[str] = field(default_factory=list)
+
+    def run(self, images: np.ndarray, K_image: np.ndarray) -> Peaks:
+        assert len(images) == 1
+        left, right = images[0, :, images.shape[2] // 3].mean(), images[0, :, 2 * images.shape[2] // 3].mean()
+        whole = images.shape[2::-1][:2] == self.contract.acquire_size_wh
+        kind = "whole" if whole else "plain" if left < right else "mirrored"
+        self.asked.append(kind)
+        answers = self.script[kind]
+        score, at_px, range_m = answers.pop(0) if len(answers) > 1 else answers[0]
+        ray = np.linalg.inv(K) @ [*at_px, 1.0]
+        if kind == "mirrored":
+            ray[0] *= -1
+        center = (K_image[0] @ ray)[:2]
+        size = SIZE_PX * K_image[0, 0, 0] / K[0, 0]
+        R = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])  # from behind, the same when mirrored
+        return Peaks(
+            *(
+                np.asarray(value, dtype=np.float32)[None, None]
+                for value in (score, center, size, center, range_m * ray / np.linalg.norm(ray), R, np.full(6, 0.05))
+            )
+        )
+
+    infer = run
+
+
+def scripted(
+    whole: list[Any], plain: list[Any], mirrored: list[Any], **changes: object
+) -> tuple[Estimator, Scripted, Frame]:
+    contract = ModelContract(**(CONTRACT | {"acquire_score_min": 0.7, "track_score_min": 0.3} | changes))
+    model = Scripted({"whole": whole, "plain": plain, "mirrored": mirrored}, contract)
+    return Estimator(model), model, Frame(FrameMeta(0, 0, 0), SLOPE, K)  # type: ignore[arg-type]
+
+
+def test_a_place_is_looked_at_once_then_plain_and_mirrored_and_a_track_by_turns() -> None:
+    estimator, model, frame = scripted([answer(0.9)], [answer(0.9)], [answer(0.9)])
+    (found,) = estimator.acquire(frame)
+    assert model.asked == ["whole", "plain", "plain", "mirrored"]
+    np.testing.assert_allclose(found.box_xyxy_px, [*(TARGET_PX - SIZE_PX / 2), *(TARGET_PX + SIZE_PX / 2)], atol=0.01)
+    model.asked.clear()
+    estimator.acquire(frame, thrice=False)
+    assert model.asked == ["whole", "plain"]
+    model.asked.clear()
+    for _ in range(4):
+        assert estimator.track(frame, [found.box_xyxy_px]) != [None]
+    assert model.asked == ["plain", "mirrored", "plain", "mirrored"]
+
+
+@pytest.mark.parametrize(
+    ("place", "look", "targets", "unconfirmed"),
+    [
+        (0.5, 0.9, 1, 0),  # windows show what the whole frame is not sure of
+        (0.6, 0.7, 1, 0),  # neither is sure, both together are
+        (0.6, 0.5, 0, 0),
+        (0.9, 0.15, 0, 1),  # the whole frame is sure, and wrong
+        (0.09, 1.0, 0, 0),  # nobody looks
+    ],
+)
+def test_the_whole_frame_and_its_windows_confirm_a_target_together(
+    place: float, look: float, targets: int, unconfirmed: int
+) -> None:
+    for thrice in (True, False):
+        estimator, model, frame = scripted([answer(place)], [answer(look)], [answer(look)])
+        found = estimator.acquire(frame, thrice=thrice)
+        assert len(found) == targets
+        assert [estimate.score for estimate in found] == [pytest.approx(look)] * targets
+        assert estimator.refused["unconfirmed"] == unconfirmed
+        assert ("plain" in model.asked) == (place > 0.1)
+
+
+def test_what_the_finer_windows_do_not_show_is_no_target_however_sure_the_first_was() -> None:
+    estimator, _, frame = scripted([answer(0.99)], [answer(0.99), answer(0.0)], [answer(0.0)])
+    assert estimator.acquire(frame) == []
+    assert estimator.refused["unconfirmed"] == 1
+
+
+def test_a_first_look_that_shows_nothing_is_the_last() -> None:
+    estimator, model, frame = scripted([answer(0.2)], [answer(0.05)], [answer(0.99)])
+    assert estimator.acquire(frame) == []
+    assert model.asked == ["whole", "plain"]
+
+
+def test_one_finer_look_of_two_may_miss_it() -> None:
+    estimator, _, frame = scripted([answer(0.95)], [answer(0.95)], [answer(0.0)])
+    assert len(estimator.acquire(frame)) == 1
+    estimator, _, frame = scripted([answer(0.72)], [answer(0.72)], [answer(0.0)])
+    assert estimator.acquire(frame) == []
+
+
+def test_looks_at_two_aircraft_in_one_window_are_not_made_one() -> None:
+    estimator, _, frame = scripted([answer(0.9)], [answer(0.9)], [answer(0.95, OTHER_PX, 2 * RANGE_M)])
+    (found,) = estimator.acquire(frame)
+    assert np.linalg.norm(found.t_cam_target_m) == pytest.approx(RANGE_M, rel=1e-4)
+    np.testing.assert_allclose(found.box_xyxy_px[0], TARGET_PX[0] - SIZE_PX[0] / 2, atol=0.01)
+
+
+def test_a_place_of_an_earlier_frame_needs_a_look_that_goes_with_it() -> None:
+    estimator, _, frame = scripted([answer(0.3)], [answer(0.4)], [answer(0.9)])
+    (place,) = estimator.anywhere(frame, [], estimator.refused)
+    weak, strong = (estimator.track(frame, [place.box_xyxy_px])[0] for _ in range(2))
+    assert weak is not None
+    assert strong is not None
+    assert not estimator.confirms(place, [weak])  # though it would do for a track
+    assert estimator.confirms(place, [strong])
+
+
+def test_a_model_that_asks_for_less_is_looked_at_for_less() -> None:
+    estimator, model, frame = scripted(
+        [answer(0.05)], [answer(0.6)], [answer(0.6)], acquire_score_min=0.04, track_score_min=0.04
+    )
+    assert len(estimator.acquire(frame)) == 1
+    assert "plain" in model.asked
