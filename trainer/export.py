@@ -24,6 +24,7 @@ from trainer.sources import window_sampler
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
+ANY_SIZE_PX = (0.0, 1e6)  # of what nobody has measured: nothing is untrained
 UNREACHABLE_SCORE = 1.0
 EMPTY_SHARE_MIN = 0.12
 
@@ -264,7 +265,7 @@ def export_unmeasured(
     made_folder(out)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
     write_graph(model, path)
-    write_contract(path, _contract(config, training, sha256, (score_min, score_min), (0.0, 0.0), (0.0, 0.0)))
+    write_contract(path, _contract(config, training, sha256, (score_min, score_min), ANY_SIZE_PX, ANY_SIZE_PX))
     return path
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
 
+from edge.estimator.decode import Shown, decode
+from edge.estimator.model import Peaks
+from edge.estimator.window import PixelMap
 from msgs.contract import OUTPUT_NAMES
 from trainer.checkpoint import save_weights
 from trainer.graph import open_session, read_contract
@@ -45,6 +49,28 @@ def test_a_network_is_written_to_be_timed_and_not_flown(tmp_path: Path, config: 
     outputs = dict(zip(OUTPUT_NAMES, open_session(path).run(None, {"image": image, "K": K}), strict=True))
     assert outputs["t_cam_target_m"].shape == (1, contract.max_peaks, 3)
     assert (outputs["score"] < min(contract.acquire_score_min, contract.track_score_min)).all()
+
+
+def test_targets_of_a_file_that_nobody_measured_are_of_no_untrained_size(tmp_path: Path, config: Path) -> None:
+    """A checkpoint is evaluated through such a file: its estimates are told as the network has them."""
+    assert export("--untrained", config, "--out", tmp_path).returncode == 0
+    contract = read_contract(tmp_path / "tiny-unmeasured-fp32.onnx")
+    size_wh = (640, 480)
+    K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
+    shown = Shown(PixelMap((1.0, 1.0), (0.0, 0.0)), K, size_wh, size_wh)
+    center, sigma = np.array([[[300.0, 200.0]]], np.float32), np.full((1, 1, 6), 0.05, np.float32)
+    for size_px in (9.0, 300.0):
+        peaks = Peaks(
+            score=np.ones((1, 1), np.float32),
+            center_px=center,
+            size_px=np.full((1, 1, 2), size_px, np.float32),
+            origin_px=center,
+            t_cam_target_m=np.array([[[0.0, 0.0, 300.0]]], np.float32),
+            R_cam_target=np.eye(3, dtype=np.float32)[None, None],
+            sigma=sigma,
+        )
+        (estimate,) = decode(peaks, 0, shown, contract, "track", 0.5, Counter())
+        assert np.sqrt(estimate.covariance[2, 2]) == pytest.approx(0.05 * 300.0, rel=1e-3)
 
 
 def test_a_configuration_that_is_wrong_is_named(tmp_path: Path, config: Path) -> None:
