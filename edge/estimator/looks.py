@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +34,7 @@ def mirrored(images_bgr: NDArray[np.uint8], K: Array) -> tuple[NDArray[np.uint8]
     K = K.copy()
     K[:, 0, 1:] *= -1.0
     K[:, 0, 2] += images_bgr.shape[2] - 1
-    return np.ascontiguousarray(images_bgr[:, :, ::-1]), K
+    return np.stack([cv2.flip(image, 1) for image in images_bgr]), K
 
 
 def unmirrored(peaks: Peaks, width_px: int) -> Peaks:
