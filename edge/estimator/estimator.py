@@ -35,11 +35,12 @@ class Estimator:
         return self.model.contract.track_size_wh is not None
 
     def warm_up(self, frame: Frame) -> None:
-        """Go through both stages once with an empty frame of the camera's size, so that the first real one is fast."""
+        """Go through both stages with an empty frame of the camera's size, so that the first real one is fast."""
         width, height = frame.image_bgr.shape[1], frame.image_bgr.shape[0]
         self.acquire(frame)
-        if self.has_track_stage:
-            self.track(frame, [np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])])
+        box = np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])
+        for _ in range(2 if self.has_track_stage else 0):  # plain and mirrored
+            self.track(frame, [box])
         self.refused.clear()
 
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), thrice: bool = True) -> list[Estimate]:
