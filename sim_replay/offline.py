@@ -50,7 +50,9 @@ def estimator_answers(model: Model) -> Answerer:
 
 
 def with_score_min(model: Model, score_min: float | None) -> Model:
-    """The model with another score below which a peak is no target, in both stages; None: as it is.
+    """The model with another least probability of a target, in both stages; None: as it is.
+
+    When acquiring it is that of the whole frame and its windows together.
 
     Raises InputError outside 0..1.
     """
