@@ -77,7 +77,7 @@ class ModelContract(BaseModel):
     )
     acquire_score: ScoreCalibration = ScoreCalibration()
     track_score: ScoreCalibration = ScoreCalibration()
-    acquire_score_min: float = Field(ge=0, le=1, description="a whole-frame peak of lower probability is no target")
+    acquire_score_min: float = Field(ge=0, le=1, description="less probable of frame and windows together: no target")
     track_score_min: float = Field(ge=0, le=1, description="a window's peak of lower probability is no target")
     pixel_mean_bgr: tuple[float, float, float] | None = Field(
         None, description="what the graph subtracts from a pixel's bytes; None: the file is older than this key"

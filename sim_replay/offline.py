@@ -52,9 +52,7 @@ def estimator_answers(model: Model) -> Answerer:
 def with_score_min(model: Model, score_min: float | None) -> Model:
     """The model with another least probability of a target, in both stages; None: as it is.
 
-    When acquiring it is that of the whole frame and its windows together.
-
-    Raises InputError outside 0..1.
+    When acquiring it is that of the whole frame and its windows together. Raises InputError outside 0..1.
     """
     if score_min is None:
         return model

@@ -58,7 +58,8 @@ def register(commands: argparse._SubParsersAction) -> None:
         "--score-min",
         type=float,
         metavar="P",
-        help="what is less probably a target, of the whole frame and its windows together, is none (default: what the ONNX file says; a checkpoint: 0.3)",
+        help="what whole frame and windows together make a target of less probably is none (default: what the ONNX "
+        "file says; a checkpoint: 0.3)",
     )
     evaluate.add_argument(
         "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="folder to write to (default %(default)s)"
