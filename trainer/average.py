@@ -29,6 +29,8 @@ def average(runs: Sequence[Path], out: Path) -> Path:
         if value.is_floating_point()
         else value
         for name, value in last["weights"].items()
+        # Files written before the training-only heads were kept have none of them.
+        if all(name in content["weights"] for content in contents)
     }
     training = last["training"] | {"mean_of": ", ".join(sha256[:16] for sha256 in hashes)}
     path = made_folder(out) / WEIGHTS_NAME

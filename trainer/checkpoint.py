@@ -36,15 +36,19 @@ def write_atomic(path: Path, content: dict[str, Any]) -> None:
 
 
 def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Matrices and kernels in half precision; vectors (norm statistics, biases) stay whole. Training-only heads go."""
-    kept = {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
-    return {key: value.half() if value.ndim > 1 else value.clone() for key, value in kept.items()}
+    """Matrices and kernels in half precision; vectors (norm statistics, biases) stay whole."""
+    return {key: value.half() if value.ndim > 1 else value.clone() for key, value in state.items()}
+
+
+def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Without the heads that only training has. A run that goes on needs them too: drawn anew they upset the rest."""
+    return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:
-    """Hash of names and values, in order of name, whatever the file around them."""
+    """Hash of the deployed weights' names and values, in order of name, whatever the file around them."""
     digest = hashlib.sha256()
-    for key in sorted(state):
+    for key in sorted(deployed_weights(state)):
         digest.update(key.encode())
         digest.update(state[key].detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
@@ -74,6 +78,6 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
         raise ConfigError(f"{path}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
     model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False}))
-    weights = content["weights"]
+    weights = deployed_weights(content["weights"])
     model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
     return model.eval(), config, content["training"], weights_sha256(weights)
