@@ -100,7 +100,7 @@ class Trainer:
         for layer in self.frozen:
             layer.requires_grad_(False)
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
-        self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr)
+        self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr, fused=True)
         self.steps = 0
         self.samples = 0
         self.started_from = "public ImageNet weights" if config.model.pretrained else "scratch"
