@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -102,6 +103,19 @@ def test_a_mavlink_port_that_is_taken_is_named(
     sentence = refusal(cli, tmp_path, text + links)
     assert sentence.startswith("config.toml:10: [mavlink] endpoints: ")
     assert str(taken_ports[1]) in sentence
+
+
+def test_a_command_that_a_person_interrupts_ends_without_a_traceback(tmp_path: Path, text: str) -> None:
+    links = '[zenoh]\nlisten = ["tcp/127.0.0.1:0"]\n[mavlink]\nendpoints = ["udpin:127.0.0.1:0"]\n'
+    (tmp_path / "config.toml").write_text(text + links)
+    command = [sys.executable, "-m", "edge.cli", "doctor", "--config", "config.toml"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as doctor:
+        assert doctor.stdout is not None
+        assert any("listened on" in line for line in doctor.stdout)  # it now listens for an autopilot, for seconds
+        doctor.send_signal(signal.SIGINT)
+        _, said = doctor.communicate(timeout=60)
+    assert doctor.returncode == 130
+    assert "Traceback" not in said
 
 
 def test_the_daemon_needs_no_torch_and_nothing_of_the_trainer_or_the_replay() -> None:
