@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from edge.cameras import open_source
 from edge.cameras.capture import Capture
 from edge.cameras.source import EndOfStream
 from edge.config import ConfigFile
-from edge.doctor_links import link_findings
+from edge.doctor_links import link_findings, running_daemon
 from edge.doctor_machine import machine_findings
 from edge.errors import InputError
 from edge.estimator.model import Model
@@ -26,6 +27,7 @@ from edge.status_board import no_password
 FRAME_S = 8.0
 TIMED_RUNS = 10
 LIVE_FRAMES = 20
+CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # kinds of edge.health.Reason
 
 
 def doctor(file: ConfigFile, as_json: bool) -> int:
@@ -46,12 +48,26 @@ def doctor(file: ConfigFile, as_json: bool) -> int:
 def findings(file: ConfigFile) -> Iterator[Finding]:
     """Every look in its order; none of them raises for what it finds."""
     yield from machine_findings(file.config)
+    running = running_daemon(file.config)
     frame_ms: float | None = None
-    for finding, rate_hz in _camera(file):
+    for finding, rate_hz in _camera(file) if running is None else _camera_as_told(running):
         frame_ms = 1e3 / rate_hz if rate_hz else frame_ms
         yield finding
     yield from _model(file, frame_ms)
-    yield from link_findings(file.config)
+    yield from link_findings(file.config, running)
+
+
+def _camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float | None]]:
+    """A camera serves one program at a time: where the daemon has it, its word is taken."""
+    reasons = zip(running.get("reason_kinds", ()), running.get("reasons", ()), strict=True)
+    wrongs = [text for kind, text in reasons if kind.startswith(CAMERA_REASONS)]
+    if wrongs:
+        advice = "is it on, plugged in, and reachable from here?"
+        yield wrong("camera", f"the daemon, which has it, says: {'; '.join(wrongs)}", advice), None
+        return
+    rate_hz = running.get("frame_rate_hz")
+    rate = f", {rate_hz:.0f} a second" if rate_hz else ""
+    yield good("camera", f"{running['camera']}{rate}, as the daemon says, which has it"), rate_hz
 
 
 def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -20,7 +21,7 @@ from edge.links.mavlink_endpoints import NetworkEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.links.transports.medium import resolve
 from edge.requests import RequestQueue
-from edge.status import ask
+from edge.status import ask, loopback_endpoints
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
 from msgs.session import client_config, peer_config
@@ -29,11 +30,11 @@ HEARING_S = 4.0
 LOOK_S = 0.1
 
 
-def link_findings(config: Config) -> Iterator[Finding]:
-    """Where the daemon runs already, its endpoints are its own: it is asked instead."""
-    running = _running(config)
+def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator[Finding]:
+    """`running` is what the daemon says of itself: its endpoints are then its own, and not tried."""
     if running is not None:
-        yield running
+        said = f"the daemon runs (process {running['pid']}) and is {running.get('state', 'starting')}"
+        yield good("daemon", f"{said}; its links are not tried from here")
         return
     if config.zenoh.enabled:
         yield from _zenoh(config.zenoh)
@@ -41,12 +42,13 @@ def link_findings(config: Config) -> Iterator[Finding]:
         yield from _mavlink(config.mavlink)
 
 
-def _running(config: Config) -> Finding | None:
-    for endpoint in config.zenoh.listen if config.zenoh.enabled else []:
-        if endpoint.startswith("tcp/127.0.0.1:") and (answer := ask(endpoint, config.vehicle.name)) is not None:
-            info = answer["info"]
-            said = f"the daemon runs (process {info['pid']}) and is {info.get('state', 'starting')}"
-            return good("daemon", f"{said}; its links are not tried from here")
+def running_daemon(config: Config) -> Mapping[str, Any] | None:
+    """What the daemon that flies with this configuration says of itself (`info`); None if none does."""
+    tls = config.zenoh.tls.files() if config.zenoh.tls is not None else None
+    for endpoint in loopback_endpoints(config.zenoh) if config.zenoh.enabled else []:
+        if (answer := ask(endpoint, config.vehicle.name, tls)) is not None:
+            info: Mapping[str, Any] = answer["info"]
+            return info
     return None
 
 

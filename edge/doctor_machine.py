@@ -23,8 +23,9 @@ def machine_findings(config: Config) -> Iterator[Finding]:
     yield cpu_finding(CPUINFO.read_text(errors="replace") if CPUINFO.exists() else "", platform.machine())
     yield from _cores(config.model.threads)
     yield clock_finding(_clock_state())
-    if config.recorder.enabled:
-        yield disk_finding(config.recorder.folder, round(config.recorder.free_min_mb * 1e6))
+    recorder = config.recorder
+    if recorder.enabled or (config.zenoh.enabled and config.zenoh.commands):
+        yield disk_finding(recorder.folder, round(recorder.free_min_mb * 1e6), from_start=recorder.enabled)
 
 
 def cpu_finding(cpuinfo: str, machine: str) -> Finding:
@@ -69,14 +70,17 @@ def _clock_state() -> int:
         return -1
 
 
-def disk_finding(folder: Path, free_min_bytes: int) -> Finding:
-    """Where recordings go; the folder is made when the daemon starts, so its parents count."""
+def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Finding:
+    """Where recordings go; the folder is made when one begins, so its parents count. Not `from_start`: only when the
+    ground asks for one."""
+    bad, of_what = (wrong, "") if from_start else (poor, "a recording that the ground asks for will fail: ")
     there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         advice = f"sudo install -d -o $USER {folder}, or name another in [recorder] folder"
-        return wrong("disk", f"{folder} cannot be written by this user", advice)
+        return bad("disk", f"{of_what}{folder} cannot be written by this user", advice)
     free = shutil.disk_usage(there).free
     if free < free_min_bytes:
         advice = "remove old recordings, or lower [recorder] free_min_mb"
-        return wrong("disk", f"{folder}: {free / 1e6:.0f} MB free, {free_min_bytes / 1e6:.0f} to be left free", advice)
+        said = f"{of_what}{folder}: {free / 1e6:.0f} MB free, {free_min_bytes / 1e6:.0f} to be left free"
+        return bad("disk", said, advice)
     return good("disk", f"{folder}: {free / 1e9:.1f} GB free")

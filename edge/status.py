@@ -109,13 +109,13 @@ def _address(config: Path | None, connect: str | None, vehicle: str | None) -> t
             return check_endpoint(connect, tls=tls is not None), uav, tls
     except ValueError as error:
         raise InputError(str(error)) from error
-    own = [_reachable(endpoint) for endpoint in settings.listen]
-    here = [endpoint for endpoint in own if any(f"/{host}:" in endpoint for host in LOOPBACK)]
+    here = loopback_endpoints(settings)
     if not here:
         raise InputError(f"{config}: [zenoh] listen names no loopback address to ask at; give --connect")
     return here[0], uav, tls
 
 
-def _reachable(endpoint: str) -> str:
-    """An endpoint that listens everywhere is asked on loopback."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+def loopback_endpoints(settings: ZenohSettings) -> list[str]:
+    """Where a daemon with these settings can be asked on its own machine; what listens everywhere does so there."""
+    own = [point.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for point in settings.listen]
+    return [endpoint for endpoint in own if any(f"/{host}:" in endpoint for host in LOOPBACK)]

@@ -11,9 +11,13 @@ import pytest
 
 from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
+from edge.status import ask
+from tests.waiting import until
 
+from . import pictures
 from .conftest import Cli
-from .flying import free_port, toml, write_swaying_scene
+from .flying import flying, free_port, toml, write_swaying_scene
+from .test_cameras_stream import UdpCamera
 
 
 def findings(cli: Cli, tmp_path: Path, text: str) -> tuple[int, dict[str, dict[str, Any]]]:
@@ -32,6 +36,7 @@ def test_a_machine_that_can_fly_is_told_so(cli: Cli, tmp_path: Path, toy_model: 
     scene = write_swaying_scene(tmp_path / "000001")
     more = f'[recorder]\nenabled = true\nfolder = "{tmp_path}"\nfree_min_mb = 1\n'
     code, found = findings(cli, tmp_path, toml(scene, toy_model, free_port(), more))
+    assert [f for f in found.values() if f["verdict"] == "wrong"] == []
     assert code == 0
     assert set(found) >= {"processor", "cores", "clock", "disk", "camera", "model", "zenoh"}
     assert "1920x1080" in found["camera"]["says"]
@@ -104,11 +109,53 @@ def test_the_clock_is_judged_by_what_the_kernel_says() -> None:
 
 
 def test_a_disk_without_room_is_wrong(tmp_path: Path) -> None:
-    assert disk_finding(tmp_path / "not" / "yet", 0).verdict == "good"
-    assert "MB free" in disk_finding(tmp_path, 10**18).says
+    assert disk_finding(tmp_path / "not" / "yet", 0, from_start=True).verdict == "good"
+    assert "MB free" in disk_finding(tmp_path, 10**18, from_start=True).says
     file = tmp_path / "file"
     file.write_text("")
-    assert "cannot be written" in disk_finding(file / "folder", 0).says
+    found = disk_finding(file / "folder", 0, from_start=True)
+    assert (found.verdict, "cannot be written" in found.says) == ("wrong", True)
+
+
+def test_a_disk_that_only_the_ground_s_command_would_write_to_is_looked_at_too(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    scene = write_swaying_scene(tmp_path / "000001")
+    text = toml(scene, toy_model, free_port(), '[recorder]\nfolder = "/proc/none"\n')
+    code, found = findings(cli, tmp_path, text)
+    assert (code, found["disk"]["verdict"]) == (0, "poor")
+    assert "the ground asks for" in found["disk"]["says"]
+    _, found = findings(cli, tmp_path, text.replace("[mavlink]", "commands = false\n[mavlink]"))
+    assert "disk" not in found
+
+
+NONE: dict[str, Any] = {"info": {}}
+
+
+def test_a_camera_that_the_running_daemon_has_is_not_taken_for_a_broken_one(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    port, asked_at = pictures.free_port(socket.SOCK_DGRAM), free_port()  # the first is one program's alone to read
+    intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
+    text = (
+        f'[camera]\ntype = "stream"\nurl = "udp://127.0.0.1:{port}"\nintrinsics = {intrinsics}\n'
+        f'[model]\npath = "{toy_model}"\nthreads = 1\n'
+        f'[zenoh]\nlisten = ["tcp/0.0.0.0:{asked_at}"]\n[mavlink]\nenabled = false\n'
+    )
+    encoder = UdpCamera(port, fps=20)
+    encoder.start()
+    try:
+        with flying(tmp_path, text):
+            until(lambda: (ask(f"tcp/127.0.0.1:{asked_at}", "uav1") or NONE)["info"].get("frame_rate_hz"))
+            code, found = findings(cli, tmp_path, text)
+    finally:
+        encoder.stop.set()
+        encoder.join()
+    assert [f for f in found.values() if f["verdict"] == "wrong"] == []
+    assert code == 0
+    assert found["camera"]["verdict"] == "good"
+    assert "320x180" in found["camera"]["says"]
+    assert "the daemon runs" in found["daemon"]["says"]
 
 
 NO_ROOT_LOOKS = """
