@@ -27,6 +27,7 @@ from edge.links.signing_key import load_key
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
 from msgs.settings import Fault, Section, faults_of, parse_toml, read_text
+from msgs.topics import check_uav_name
 
 SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
@@ -52,8 +53,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class VehicleSettings(Section):
-    name: str = Field(
-        default="uav1", pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$", description="ROS-legal name, first part of every topic"
+    name: Annotated[str, AfterValidator(check_uav_name)] = Field(
+        default="uav1", description="ROS-legal name, first part of every topic"
     )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from edge.config_ground import ZenohTlsSettings
 from edge.config_path import ConfigPath
@@ -13,6 +14,20 @@ from msgs.settings import Section
 
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _network_address(text: str) -> str:
+    # Not told: the address itself, in which a password may stand.
+    scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text, re.IGNORECASE)
+    if scheme is None or scheme[1].lower() == "file":
+        raise ValueError('is no network address such as rtsp://HOST/PATH or udp://HOST:PORT; a video is type = "file"')
+    return text
+
+
+def _topic(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*", text):
+        raise ValueError(f"{text!r} is no ROS topic without its first slash, such as camera/image/compressed")
+    return text
 
 
 class IntrinsicsSettings(Section):
@@ -98,7 +113,9 @@ class DeviceCamera(Camera):
 
 class StreamCamera(Camera):
     type: Literal["stream"]
-    url: str = Field(min_length=1, description="RTSP, HTTP or UDP address, as ffmpeg takes it")
+    url: Annotated[str, AfterValidator(_network_address)] = Field(
+        description="RTSP, HTTP or UDP address, as ffmpeg takes it"
+    )
     rtsp_transport: Literal["tcp", "udp"] = Field(default="tcp", description="what RTSP's pictures come by")
     latency_ms: float = Field(
         default=0.0, ge=0, le=5000, description="measured time from exposure to the fastest arrival, milliseconds"
@@ -108,9 +125,8 @@ class StreamCamera(Camera):
 
 class ZenohCamera(Camera):
     type: Literal["zenoh"]
-    topic: str = Field(
-        pattern=r"^[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*$",
-        description="sensor_msgs/CompressedImage, as ROS names it, without the first slash",
+    topic: Annotated[str, AfterValidator(_topic)] = Field(
+        description="sensor_msgs/CompressedImage, as ROS names it, without the first slash"
     )
     connect: str = Field(default="tcp/127.0.0.1:7447", description="endpoint of the router or publisher")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of the key")

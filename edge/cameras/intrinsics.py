@@ -60,7 +60,8 @@ def read_calibration(path: Path) -> Intrinsics:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"calibration {path} cannot be read: {error}", INTRINSICS_KEY) from error
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise InputError(f"calibration {path} cannot be read: {reason}", INTRINSICS_KEY) from error
     if not text.startswith("%YAML"):
         text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")
     try:

@@ -79,6 +79,12 @@ def test_intrinsics_for_another_resolution_are_refused(cli: Cli, tmp_path: Path,
     assert "1920x1080" in sentence
 
 
+def test_a_calibration_that_is_not_there_is_named(cli: Cli, tmp_path: Path) -> None:
+    sentence = refusal(cli, tmp_path, '[camera]\ntype = "device"\nintrinsics = { file = "none.yaml" }\n', "check")
+    place = f"config.toml:3: [camera] intrinsics: calibration {tmp_path / 'none.yaml'}"
+    assert sentence == f"{place} cannot be read: No such file or directory"
+
+
 def test_an_unreadable_video_is_named(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     (tmp_path / "flight.mp4").write_bytes(b"no video" * 100)
     intrinsics = "[camera.intrinsics]\nfx = 800\nfy = 800\ncx = 320\ncy = 240\nwidth = 640\nheight = 480\n"

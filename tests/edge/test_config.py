@@ -11,6 +11,7 @@ from edge.cameras.intrinsics import read_calibration
 from edge.config import load_config
 from edge.errors import InputError
 
+LIVE = "[camera]\nintrinsics = { fx = 9, fy = 9, cx = 3, cy = 2, width = 6, height = 4 }\n"
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
 
 
@@ -36,6 +37,13 @@ def write(tmp_path: Path, text: str) -> Path:
         (CAMERA + "[mavlink]\ncomponent_id = 1", "config.toml:5: [mavlink] component_id: Input should be greater"),
         (CAMERA + "[mavlink]\ncomponent_id = 100", "config.toml:4: [mavlink]: component_id and camera_component_id"),
         (CAMERA + "[zenoh]\nmax_age_ms = inf", "config.toml:5: [zenoh] max_age_ms: Input should be a finite number"),
+        (CAMERA + "[vehicle]\nname = 'uav 1'", "config.toml:5: [vehicle] name: uav name 'uav 1' must be a letter"),
+        (
+            LIVE + "type = 'zenoh'\ntopic = '/camera'",
+            "config.toml:4: [camera] topic: '/camera' is no ROS topic without",
+        ),
+        (LIVE + "type = 'stream'\nurl = 'flight.mp4'", "config.toml:4: [camera] url: is no network address such as"),
+        (LIVE + "type = 'stream'\nurl = 'file:///a.mp4'", "config.toml:4: [camera] url: is no network address such as"),
         ("[camera\n", "config.toml: not valid TOML: "),
     ],
 )
