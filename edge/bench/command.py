@@ -11,6 +11,7 @@ from pathlib import Path
 from edge.errors import InputError
 
 PIPELINE = "uavpose-replay"
+THREADS, RUNS = "1,2", 50
 
 
 def register(commands: argparse._SubParsersAction) -> None:
@@ -22,8 +23,8 @@ def register(commands: argparse._SubParsersAction) -> None:
         "from it. With --pipeline: fly a replayed sequence through the daemon instead and hold it to its budgets.",
     )
     bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
-    bench.add_argument("--threads", default="1,2", metavar="N,N", help="CPU threads of one inference (default 1,2)")
-    bench.add_argument("--runs", type=int, default=50, help="timed inferences of each row (default %(default)s)")
+    bench.add_argument("--threads", metavar="N,N", help=f"CPU threads of one inference (default {THREADS})")
+    bench.add_argument("--runs", type=int, help=f"timed inferences of each row (default {RUNS})")
     bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
     bench.add_argument("--alone", action="store_true", help="ONNX Runtime alone, without the other engines installed")
     bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
@@ -41,9 +42,10 @@ def run(options: argparse.Namespace) -> int:
     for name in ("sequence", "minutes", "fps"):
         if getattr(options, name) is not None:
             raise InputError(f"--{name} needs --pipeline")
-    threads = _threads(options.threads)
-    if options.runs < 1:
-        raise InputError(f"--runs {options.runs}: must be at least 1")
+    threads = _threads(THREADS if options.threads is None else options.threads)
+    runs = RUNS if options.runs is None else options.runs
+    if runs < 1:
+        raise InputError(f"--runs {runs}: must be at least 1")
     from edge.bench.measure import measure
     from edge.bench.report import table, to_tree
     from edge.bench.timing import UNTIMED_ROUNDS
@@ -51,12 +53,10 @@ def run(options: argparse.Namespace) -> int:
 
     def on_round(done: int) -> None:
         if sys.stderr.isatty():
-            end = "\n" if done == options.runs + UNTIMED_ROUNDS else ""
-            print(f"\rround {done} of {options.runs + UNTIMED_ROUNDS}", end=end, file=sys.stderr, flush=True)
+            end = "\n" if done == runs + UNTIMED_ROUNDS else ""
+            print(f"\rround {done} of {runs + UNTIMED_ROUNDS}", end=end, file=sys.stderr, flush=True)
 
-    measured = measure(
-        options.models or [SHIPPED_MODEL], threads, options.spinning, options.runs, not options.alone, on_round
-    )
+    measured = measure(options.models or [SHIPPED_MODEL], threads, options.spinning, runs, not options.alone, on_round)
     print(json.dumps(to_tree(measured)) if options.json else table(measured))
     return 0
 
@@ -70,6 +70,11 @@ def _threads(text: str) -> list[int]:
 
 def _pipeline(options: argparse.Namespace) -> int:
     """The replay harness is a program of its own, beside this one; the daemon's package does not import it."""
+    for name in ("threads", "runs", "spinning", "alone"):
+        if getattr(options, name) not in (None, False):
+            raise InputError(f"--{name} does not go with --pipeline, which flies the daemon as it is")
+    if len(options.models) > 1:
+        raise InputError(f"--pipeline flies one model, not {len(options.models)}")
     command = Path(sys.executable).parent / PIPELINE
     if not command.exists():
         raise InputError(f"--pipeline needs {PIPELINE}, which is not installed beside {sys.executable}")
