@@ -18,8 +18,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 def _network_address(text: str) -> str:
     # Not told: the address itself, in which a password may stand.
-    scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text, re.IGNORECASE)
-    if scheme is None or scheme[1].lower() == "file":
+    scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text)
+    if scheme is None or scheme[1] == "file":
         raise ValueError('is no network address such as rtsp://HOST/PATH or udp://HOST:PORT; a video is type = "file"')
     return text
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import configparser
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -99,3 +100,14 @@ def test_the_unit_starts_reloads_and_watches_the_daemon() -> None:
     assert f"\nu {service['User']} " in users
     for group in service["SupplementaryGroups"].split():
         assert f"\nm {service['User']} {group}\n" in users
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_the_unit_is_as_little_exposed_as_the_guide_says() -> None:
+    told = re.search(r"exposure\nis ([\d.]+) by `(systemd-analyze .*)`\n?\s?\(systemd (\d+)\)", INSTALL)
+    assert told is not None
+    version = subprocess.run(["systemd-analyze", "--version"], capture_output=True, text=True, check=True).stdout
+    if version.split()[1] != told[3]:
+        pytest.skip(f"the guide's figure is of systemd {told[3]}; others look at more or less")
+    done = subprocess.run(shlex.split(told[2]), capture_output=True, text=True, check=False, cwd=ROOT)
+    assert f"exposure level for {UNIT.name}: {told[1]} " in done.stdout, done.stdout + done.stderr
