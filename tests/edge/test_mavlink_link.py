@@ -311,6 +311,19 @@ def test_without_a_place_on_the_globe_there_is_nothing_to_follow() -> None:
     assert not {"FOLLOW_TARGET", "ADSB_VEHICLE", "CAMERA_TRACKING_GEO_STATUS"} & {m.get_type() for m in peer.received}
 
 
+def test_without_own_attitude_the_pose_says_so_and_nothing_is_told_on_the_globe() -> None:
+    in_cam_only = {"R_ned_target": None, "t_ned_target_m": None, "v_ned_target_mps": None, "covariance_ned": None}
+    with linked(follow_target=True, adsb_icao_address=1) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.publish(report(track(time.monotonic_ns(), **in_cam_only), own_ship=False))
+        pose = peer.named("TARGET_RELATIVE")
+        peer.until(lambda m: m.get_type() == "TIMESYNC", "what comes after")
+    assert pose.q_sensor == [0.0] * 4
+    np.testing.assert_allclose([pose.x, pose.y, pose.z], T_CAM_TARGET_M, rtol=1e-6)
+    assert math.hypot(*pose.q_target) == pytest.approx(1.0, abs=1e-6)
+    assert not {"FOLLOW_TARGET", "ADSB_VEHICLE", "CAMERA_TRACKING_GEO_STATUS"} & {m.get_type() for m in peer.received}
+
+
 def test_a_vehicle_that_has_the_virtual_systems_id_gets_no_traffic(caplog: pytest.LogCaptureFixture) -> None:
     with linked(follow_target=True, virtual_system_id=SYSTEM_ID) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
