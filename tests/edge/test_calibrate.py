@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -21,6 +22,7 @@ K = np.array([[820.0, 0, 471.3], [0, 826.0, 309.8], [0, 0, 1]])
 DISTORTION = np.array([-0.21, 0.06, 0.0012, -0.0009, 0.0])
 SQUARES = (9, 6)
 FINE = 2
+HELD_FRAMES = 3  # of a video, of each view
 
 
 @cache
@@ -85,6 +87,23 @@ def test_a_known_camera_is_found_again_and_its_file_flies(cli: Cli, tmp_path: Pa
     true_px, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, DISTORTION)
     found_px, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), found.K, np.array(found.distortion))
     assert np.abs(found_px - true_px).max() < 1.0
+
+
+def test_a_video_of_a_board_becomes_a_file_and_a_person_is_told_how_good_it_is(cli: Cli, tmp_path: Path) -> None:
+    pictures = film(tmp_path / "board", "charuco", poses(0.55, 1.0))
+    video = cv2.VideoWriter(str(tmp_path / "board.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE_WH)
+    for picture in sorted(pictures.iterdir()):
+        for _ in range(HELD_FRAMES):
+            video.write(cv2.imread(str(picture)))
+    video.release()
+    done = cli("calibrate", "board.mp4", "--out", "nose.yaml")
+    assert done.returncode == 0, done.stderr
+    told = re.search(r"reprojection error ([\d.]+) px RMS over \d+ views", done.stdout)
+    assert told is not None
+    assert 0 < float(told[1]) < 0.5
+    assert f"Reprojection {told[1]} px RMS" in (tmp_path / "nose.yaml").read_text()
+    found = load_intrinsics(IntrinsicsSettings(file=tmp_path / "nose.yaml"))
+    np.testing.assert_allclose(np.diag(found.K)[:2], np.diag(K)[:2], rtol=0.01)
 
 
 def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:
