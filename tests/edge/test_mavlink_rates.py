@@ -21,20 +21,20 @@ from .reports import TRACKING, make_report, make_track
 SECONDS, FPS = 20, 60
 
 
-def asked_hz(text: str) -> float | None:
+def told_hz(text: str) -> float | None:
     """The rate in a cell of the tables; None where there is none."""
     told = re.search(r"([\d.]+) Hz", text)
     return float(told[1]) if told else None
 
 
-def test_every_message_goes_and_is_asked_for_as_often_as_the_tables_say() -> None:
-    settings = MavlinkSettings(follow_target=True, adsb_icao_address=0xF00000, onboard_computer_status=True)
+def flown(settings: MavlinkSettings, autopilot: int) -> tuple[Counter[str], dict[int, float]]:
+    """How often each message went in SECONDS with a target in each frame, and the rates asked of the autopilot."""
     station = Station(settings, OwnShipBuffer(gimballed=True), CAMERA, RequestQueue())
-    peer, began_ns, went = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1), time.monotonic_ns(), Counter[str]()
-    asked_of_us: dict[int, float] = {}
+    peer, began_ns = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1), time.monotonic_ns()
+    went, asked_hz = Counter[str](), dict[int, float]()
     for frame in range(SECONDS * FPS):
         now_ns = began_ns + frame * 1_000_000_000 // FPS
-        beat = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
+        beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, autopilot, 0, 0, 4, 3)
         station.take(FrameReader(datagram=True).feed(beat.pack(peer)), 0, now_ns)
         station.health(TRACKING, now_ns)
         out = station.tick(now_ns)
@@ -42,11 +42,23 @@ def test_every_message_goes_and_is_asked_for_as_often_as_the_tables_say() -> Non
         for message in FrameReader(datagram=False).feed(b"".join(sent)):
             went[message.get_type()] += 1
             if message.get_type() == "COMMAND_LONG":
-                asked_of_us[int(message.param1)] = 1e6 / message.param2
-    told_hz = {row.name: asked_hz(row.rate) for row in SENT}
+                asked_hz[int(message.param1)] = 1e6 / message.param2
     went["HEARTBEAT"] //= 2  # of two components
-    for name, hz in told_hz.items():
-        if hz is not None:
-            assert went[name] == pytest.approx(SECONDS * hz, abs=1), name
-    told = {row.message_id: asked_hz(row.rate) for row in READ if "asked" in row.rate}
-    assert asked_of_us == pytest.approx(told)
+    return went, asked_hz
+
+
+def test_every_message_goes_and_is_asked_for_as_often_as_the_tables_say() -> None:
+    settings = MavlinkSettings(follow_target=True, adsb_icao_address=0xF00000, onboard_computer_status=True)
+    went, asked_hz = flown(settings, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
+    for row in SENT:
+        if (hz := told_hz(row.rate)) is not None:
+            assert went[row.name] == pytest.approx(SECONDS * hz, abs=1), row.name
+    assert asked_hz == pytest.approx({row.message_id: told_hz(row.rate) for row in READ if "asked" in row.rate})
+
+
+@pytest.mark.parametrize("autopilot", [dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, dialect.MAV_AUTOPILOT_PX4])
+def test_what_goes_unasked_by_default_is_what_the_table_says(autopilot: int) -> None:
+    went, _ = flown(MavlinkSettings(), autopilot)
+    to_px4 = autopilot == dialect.MAV_AUTOPILOT_PX4
+    wanted = {row.name for row in SENT if row.default == "on" or (row.default == "on, off to PX4" and not to_px4)}
+    assert set(went) == wanted - {"STATUSTEXT", "COMMAND_ACK"}  # on a change, and to a command: there was none
