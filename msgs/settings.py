@@ -14,7 +14,11 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-_KNOWN = {"extra_forbidden": "unknown key", "missing": "is missing"}
+_KNOWN = {
+    "extra_forbidden": "unknown key",
+    "missing": "is missing",
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must be a table"),
+}
 
 
 class Section(BaseModel):
