@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from edge import clock
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
-from edge.health import HealthState
+from edge.health import HealthSnapshot, HealthState
 from edge.outlets import Outlets
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
@@ -18,6 +22,15 @@ from edge.types import CameraInfo, FrameMeta
 from .toy_scene import SIZE_WH, K
 
 AGES = {"mavlink": 200.0, "zenoh": 500.0}  # the defaults
+FPS, PERIOD_NS = 25, 40_000_000
+
+
+def supervised(toy_model: Path, outlets: Outlets, links: dict[str, dict[str, bool]]) -> Supervisor:
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "/scene"}, **links})
+    board = StatusBoard(
+        ConfigFile(Path("c.toml"), "", config), load_model(toy_model, 1), CameraInfo("toy", SIZE_WH, K, 30.0)
+    )
+    return Supervisor(config.health, True, outlets, board, lambda: {}, lambda _: ())
 
 
 @pytest.mark.parametrize(
@@ -33,11 +46,7 @@ def test_a_camera_so_late_that_its_poses_are_withheld_is_no_good_state(
     toy_model: Path, latency_ms: int, links_on: set[str], withheld: set[str]
 ) -> None:
     links = {name: {"enabled": name in links_on} for name in AGES}
-    config = Config.model_validate({"camera": {"type": "sequence", "path": "/scene"}, **links})
-    board = StatusBoard(
-        ConfigFile(Path("c.toml"), "", config), load_model(toy_model, 1), CameraInfo("toy", SIZE_WH, K, 30.0)
-    )
-    supervisor = Supervisor(config.health, True, Outlets(None, None), board, lambda: {}, lambda _: ())
+    supervisor = supervised(toy_model, Outlets(None, None), links)
     for index in range(3):
         now_ns = time.monotonic_ns()
         meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
@@ -48,3 +57,40 @@ def test_a_camera_so_late_that_its_poses_are_withheld_is_no_good_state(
     assert (condition.state is HealthState.DEGRADED) == bool(withheld)
     for link in withheld:
         assert f"{latency_ms} ms from the exposure, [{link}] max_age_ms {AGES[link]:g}" in str(condition)
+
+
+class Kept(Outlets):
+    """Keeps the times of what goes out as diagnostics."""
+
+    def __init__(self) -> None:
+        super().__init__(None, None)
+        self.times_ns: list[int] = []
+
+    def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
+        self.times_ns.append(snapshot.time_ns)
+
+
+@pytest.fixture
+def began_ns() -> Iterator[int]:
+    """The time, which from now on stands still but for steps."""
+    now_ns = time.monotonic_ns()
+    clock.step_to(now_ns)
+    yield now_ns
+    clock.run_freely()
+
+
+def test_counters_and_latency_go_out_each_second_and_to_the_log_each_ten(
+    toy_model: Path, began_ns: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    outlets = Kept()
+    supervisor = supervised(toy_model, outlets, {})
+    caplog.set_level(logging.INFO)
+    for frame in range(25 * FPS):  # 25 s
+        now_ns = began_ns + frame * PERIOD_NS
+        clock.step_to(now_ns)
+        supervisor.frame_done(FrameMeta(frame, now_ns, now_ns), {"total": 10_000_000}, (), has_attitude=True)
+        supervisor.turn()
+    gaps_ns = np.diff(outlets.times_ns)
+    assert len(outlets.times_ns) == 25
+    assert np.all(np.abs(gaps_ns - 1_000_000_000) <= PERIOD_NS)
+    assert sum("p50/p95/p99" in message for message in caplog.messages) == 3
