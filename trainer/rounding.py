@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,14 +26,24 @@ def rounded_weights(weight: Tensor) -> Tensor:
     return torch.fake_quantize_per_channel_affine(weight, scale, zero, 0, -127, 127)
 
 
+class _Rounded(torch.autograd.Function):
+    """Multiples of the grid's step. Its ends are the tensor's own, so nothing is cut and every gradient passes."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        low, high = torch.aminmax(x)
+        scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE).item()
+        # 0 .. 255 steps are whole numbers in bfloat16 too, and zero is one of the grid's points.
+        return (x * (1.0 / scale)).round_().mul_(scale)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        return gradients[0]
+
+
 def rounded_activations(x: Tensor) -> Tensor:
     """A tensor on the U8 grid between its least and largest value and zero; the gradient is that of `x`."""
-    wide = x.float()
-    low, high = torch.aminmax(wide.detach())
-    low, high = low.clamp(max=0.0), high.clamp(min=0.0)
-    scale = ((high - low) / 255).clamp(min=_SMALLEST_SCALE)
-    zero = torch.round(-low / scale).to(torch.int32)
-    return torch.fake_quantize_per_tensor_affine(wide, scale, zero, 0, 255).to(x.dtype)
+    return _Rounded.apply(x)
 
 
 @contextlib.contextmanager
