@@ -32,7 +32,7 @@ class _Rounded(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         low, high = torch.aminmax(x)
-        scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE).item()
+        scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE)
         # 0 .. 255 steps are whole numbers in bfloat16 too, and zero is one of the grid's points.
         return (x * (1.0 / scale)).round_().mul_(scale)
 

@@ -98,6 +98,40 @@ def test_a_slow_reader_gets_the_newest_frame_and_every_drop_is_counted(scene: Pa
     assert capture.counters()["dropped"] == 40 - len(taken)
 
 
+class Numbered:
+    """A camera that has lost what its numbers pass over, and then shows nothing more."""
+
+    live = False
+
+    def __init__(self, numbers: list[int]) -> None:
+        self._numbers, self.counts = numbers, Counter[str]()
+
+    def open(self) -> CameraInfo:
+        return CameraInfo("numbered", VIDEO_WH, np.eye(3), None)
+
+    def read(self, stop: threading.Event) -> Frame:
+        if not self._numbers:
+            stop.wait()
+            raise EndOfStream
+        number, now_ns = self._numbers.pop(0), time.monotonic_ns()
+        return Frame(FrameMeta(number, now_ns, now_ns), np.zeros((2, 2, 3), np.uint8), np.eye(3))
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_the_source_lost_and_what_nobody_took_in_time_are_counted_apart() -> None:
+    capture = Capture(Numbered([0, 1, 4, 5]), False)
+    capture.start()
+    until(lambda: capture.counters()["captured"] == 4, what="all frames")
+    newest = capture.newest(0.0)
+    capture.stop()
+    assert newest is not None
+    assert newest.meta.sequence == 5
+    told = {name: count for name, count in capture.counters().items() if name.startswith("dropped")}
+    assert told == {"dropped": 5, "dropped_at_source": 2, "dropped_overtaken": 3}
+
+
 class Broken(SequenceSource):
     """Fails as no camera should after its first frame."""
 

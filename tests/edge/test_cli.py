@@ -111,6 +111,13 @@ def test_a_mavlink_port_that_is_taken_is_named(
     assert str(taken_ports[1]) in sentence
 
 
+def test_a_port_for_prometheus_that_is_taken_is_named(
+    cli: Cli, tmp_path: Path, text: str, taken_ports: tuple[int, int]
+) -> None:
+    sentence = refusal(cli, tmp_path, text + OFF + f"[health]\nprometheus_port = {taken_ports[0]}\n")
+    assert sentence.startswith(f"config.toml:12: [health] prometheus_port: port {taken_ports[0]} of 127.0.0.1 cannot")
+
+
 def test_a_command_that_a_person_interrupts_ends_without_a_traceback(tmp_path: Path, text: str) -> None:
     links = '[zenoh]\nlisten = ["tcp/127.0.0.1:0"]\n[mavlink]\nendpoints = ["udpin:127.0.0.1:0"]\n'
     (tmp_path / "config.toml").write_text(text + links)

@@ -115,6 +115,24 @@ def test_without_systemd_nothing_is_said_and_nothing_fails() -> None:
     notifier.close()
 
 
+def test_systemd_s_watchdog_is_fed_twice_and_more_within_its_time(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.setblocking(False)
+        notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "15000000"})
+        fed_s = []
+        for tenth in range(600):  # the loop turns ten times a second, for a minute
+            notifier.feed(10**12 + tenth * 10**8)
+            with contextlib.suppress(BlockingIOError):
+                assert systemd.recv(100) == b"WATCHDOG=1"
+                fed_s.append(tenth / 10)
+        notifier.close()
+    assert fed_s[0] == 0.0
+    gaps_s = [after - before for before, after in pairwise([*fed_s, 60.0])]
+    assert max(gaps_s) <= 7.5
+    assert len(fed_s) < 60, "not at every turn"
+
+
 def test_a_watchdog_meant_for_another_process_is_not_fed(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))

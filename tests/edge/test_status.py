@@ -99,6 +99,8 @@ def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
         assert any(f'stage="{stage}",quantile="0.99"' in line for line in samples)
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/etc/passwd", timeout=10)
+    with pytest.raises(urllib.error.URLError, match="refused"):  # who listens everywhere listens there too
+        urllib.request.urlopen(f"http://127.0.0.2:{ports[1]}/metrics", timeout=10)
 
 
 @pytest.mark.usefixtures("daemon")
