@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from contextlib import closing
 from pathlib import Path
 
@@ -20,7 +21,8 @@ from edge.cameras.sequence import SequenceSource
 from edge.cameras.source import EndOfStream
 from edge.config_camera import FileCamera, IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
-from edge.types import Frame
+from edge.types import CameraInfo, Frame, FrameMeta
+from tests.waiting import until
 
 from .toy_scene import write_scene
 

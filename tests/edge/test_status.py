@@ -11,9 +11,11 @@ import pytest
 
 from edge.health import Activity, HealthState
 from edge.stages import STAGES
+from edge.status import ask
 from msgs import topics
 from msgs.cdr import DiagnosticArray
 from msgs.client import connect
+from tests.waiting import until
 
 from .conftest import Cli
 from .flying import Flight, flying, free_port, toml, write_swaying_scene
@@ -84,6 +86,7 @@ def test_another_vehicle_s_name_is_not_answered(cli: Cli, ports: tuple[int, int]
 
 @pytest.mark.usefixtures("daemon")
 def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
+    until(lambda: ask(f"tcp/127.0.0.1:{ports[0]}", "kestrel")["info"].get("state"), what="the first second's figures")
     with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"].startswith("text/plain; version=0.0.4")
         lines = answer.read().decode().splitlines()
