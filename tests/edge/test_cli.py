@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -129,6 +130,17 @@ def test_a_command_that_a_person_interrupts_ends_without_a_traceback(tmp_path: P
         _, said = doctor.communicate(timeout=60)
     assert doctor.returncode == 130
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("command", ["check", "doctor"])
+def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: Path, text: str, command: str) -> None:
+    (tmp_path / "config.toml").write_text(text + OFF)
+    read_end, write_end = os.pipe()
+    os.close(read_end)  # as `| head` does when it has enough
+    arguments = [sys.executable, "-m", "edge.cli", command, "--config", "config.toml"]
+    done = subprocess.run(arguments, cwd=tmp_path, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_the_daemon_needs_no_torch_and_nothing_of_the_trainer_or_the_replay() -> None:
