@@ -16,7 +16,7 @@ from msgs.signals import on_signals
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted."""
+    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
     options = _parser().parse_args(arguments)
     set_up_logging()
     return exit_code(lambda: int(options.act(options)), InputError)

@@ -19,7 +19,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted."""
+    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
     options = _parser().parse_args(arguments)
     return exit_code(lambda: int(options.act(options)), InputError)
 
