@@ -222,6 +222,7 @@ class ConfigFile:
     path: Path
     text: str
     config: Config
+    calibration: bytes | None = None  # of the camera's calibration file, as it was then
 
     @contextmanager
     def blame(self, *key: str) -> Iterator[None]:
@@ -241,7 +242,18 @@ def load_config(path: Path) -> ConfigFile:
     except ValidationError as error:
         lines = [_sentence(path, text, _key(fault), _reason(fault)) for fault in faults_of(error)]
         raise InputError("\n".join(lines)) from error
-    return ConfigFile(path, text, config)
+    return ConfigFile(path, text, config, _calibration(config))
+
+
+def _calibration(config: Config) -> bytes | None:
+    """What the camera's calibration file holds; None: it has none, or the camera will say that it cannot be read."""
+    intrinsics = getattr(config.camera, "intrinsics", None)
+    if intrinsics is None or intrinsics.file is None:
+        return None
+    try:
+        return bytes(intrinsics.file.read_bytes())
+    except OSError:
+        return None
 
 
 def _key(fault: Fault) -> tuple[str, ...]:

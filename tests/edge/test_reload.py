@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -98,6 +99,23 @@ def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Pa
     config.write_text(good)
     flight.process.send_signal(signal.SIGHUP)
     assert "nothing has changed" in flight.until("reloaded: ")
+
+
+def test_a_calibration_made_anew_in_the_same_file_is_named(tmp_path: Path, swaying: Path, port: int) -> None:
+    calibration, model = tmp_path / "camera.yaml", tmp_path / "flown.onnx"
+    write_toy_model(model)
+    matrix = "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{f}, 0, 500, 0, {f}, 400, 0, 0, 1]\n"
+    numbers = "image_width: {w}\nimage_height: {h}\n" + matrix
+    height, width = cv2.imread(str(swaying / "rgb" / "000000.png")).shape[:2]
+    calibration.write_text(numbers.format(w=width, h=height, f=900))
+    text = toml(swaying, model, port).replace(
+        "loop = true\n", f'loop = true\nintrinsics = {{ file = "{calibration}" }}\n'
+    )
+    with flying(tmp_path, text) as flight:
+        for focal_px, words in ((910, "needs a restart: [camera] intrinsics"), (900, "nothing has changed")):
+            calibration.write_text(numbers.format(w=width, h=height, f=focal_px))
+            flight.process.send_signal(signal.SIGHUP)
+            assert words in flight.until("reloaded: ")
 
 
 def commanded(port: int, *words: str) -> dict[str, Any]:
