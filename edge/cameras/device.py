@@ -19,6 +19,7 @@ STAMP_AGE_MAX_NS = 1_000_000_000
 EXPOSURE_MANUAL = 1
 EXPOSURE_UNITS_PER_MS = 10
 FPS_TOLERANCE = 0.05
+EXPOSURE_TOLERANCE = 0.1  # drivers have steps
 # OpenCV gives the buffer of a frame back when the next one is asked for: with one alone the driver would have nowhere
 # to put the next picture while this one is decoded, and lose every other one. A third would only hold stale ones.
 BUFFERS = 2
@@ -50,7 +51,9 @@ class DeviceSource(LiveSource):
             manual = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, EXPOSURE_MANUAL)
             if not (capture.set(cv2.CAP_PROP_EXPOSURE, settings.exposure_ms * EXPOSURE_UNITS_PER_MS) and manual):
                 log.warning("%s does not let its exposure be set", settings.device)
-        for complaint in complaints(settings, _fourcc(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)):
+        exposure_ms = capture.get(cv2.CAP_PROP_EXPOSURE) / EXPOSURE_UNITS_PER_MS
+        fourcc, fps = _fourcc(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)
+        for complaint in complaints(settings, fourcc, fps, exposure_ms):
             log.warning("%s %s", settings.device, complaint)
         return capture
 
@@ -64,13 +67,16 @@ class DeviceSource(LiveSource):
         return stamp_ns - self._latency_ns
 
 
-def complaints(settings: DeviceCamera, fourcc: str, fps: float) -> list[str]:
+def complaints(settings: DeviceCamera, fourcc: str, fps: float, exposure_ms: float) -> list[str]:
     """What the device does other than asked; the size is judged with the intrinsics."""
     found = []
     if fourcc != settings.fourcc:
         found.append(f"gives {fourcc or 'an unnamed format'}, not {settings.fourcc}")
     if fps > 0 and abs(fps - settings.fps) > FPS_TOLERANCE * settings.fps:
         found.append(f"gives {fps:g} frames a second, not {settings.fps:g}")
+    asked_ms = settings.exposure_ms
+    if asked_ms is not None and exposure_ms > 0 and abs(exposure_ms - asked_ms) > EXPOSURE_TOLERANCE * asked_ms:
+        found.append(f"exposes for {exposure_ms:g} ms, not {asked_ms:g}")
     return found
 
 

@@ -18,8 +18,8 @@ EXPOSURES = {cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}
 class Driver:
     """In place of cv2.VideoCapture: keeps what it is set to, but for the properties that it lacks."""
 
-    def __init__(self, lacks: set[int]) -> None:
-        self._lacks = lacks
+    def __init__(self, lacks: set[int], exposure_most: float) -> None:
+        self._lacks, self._exposure_most = lacks, exposure_most
         self.opened: tuple[str, int] | None = None
         self.held: dict[int, float] = {}
         self.asked: list[int] = []
@@ -35,15 +35,20 @@ class Driver:
         self.asked.append(prop)
         if prop in self._lacks:
             return False
-        self.held[prop] = value
+        self.held[prop] = min(value, self._exposure_most) if prop == cv2.CAP_PROP_EXPOSURE else value
         return True
 
     def get(self, prop: int) -> float:
         return self.held.get(prop, 0.0)
 
 
-def opened(monkeypatch: pytest.MonkeyPatch, exposure_ms: float | None, lacks: set[int] | None = None) -> Driver:
-    driver = Driver(lacks or set())
+def opened(
+    monkeypatch: pytest.MonkeyPatch,
+    exposure_ms: float | None,
+    lacks: set[int] | None = None,
+    exposure_most: float = 1000.0,
+) -> Driver:
+    driver = Driver(lacks or set(), exposure_most)
     monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", driver)
     width, height = SIZE_WH
     settings = DeviceCamera(
@@ -92,3 +97,10 @@ def test_a_driver_without_exposure_is_told_and_looked_through_all_the_same(
 ) -> None:
     opened(monkeypatch, exposure_ms=2.5, lacks={lacking})
     assert caplog.messages == ["/dev/video3 does not let its exposure be set"]
+
+
+def test_an_exposure_that_the_driver_cuts_short_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    opened(monkeypatch, exposure_ms=40.0, exposure_most=166.0)
+    assert caplog.messages == ["/dev/video3 exposes for 16.6 ms, not 40"]

@@ -152,9 +152,9 @@ def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None
 
 def test_a_device_that_does_other_than_asked_is_told() -> None:
     asked = DeviceCamera(type="device", fps=30, fourcc="MJPG", intrinsics=INTRINSICS)
-    assert complaints(asked, "MJPG", 30.0) == []
-    assert complaints(asked, "MJPG", 29.97) == []
-    assert complaints(asked, "YUYV", 5.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
+    assert complaints(asked, "MJPG", 30.0, 4.0) == []
+    assert complaints(asked, "MJPG", 29.97, 4.0) == []
+    assert complaints(asked, "YUYV", 5.0, 4.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
 
 
 class Playing(FolderSource):
