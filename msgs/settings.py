@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 _KNOWN = {
     "extra_forbidden": "unknown key",
     "missing": "is missing",
-    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must be a table"),
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must hold keys with values"),
 }
 
 

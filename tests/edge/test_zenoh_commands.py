@@ -140,7 +140,7 @@ def test_a_higher_rate_holds_at_once_however_low_the_one_before_it_was(tmp_path:
         ("rate", b'{"max_hz": 1e-300}', "max_hz: Input should be greater than or equal to 0.1"),
         ("reload", b'{"file": "/etc/passwd"}', "file: unknown key"),
         ("reload", b"{}", "this vehicle does not reload"),
-        ("stop", b"[]", "Input should be an object"),
+        ("stop", b"[]", "must hold keys with values"),
         ("stop", b"\xff\x00", "Invalid JSON"),
         ("stop", b" " * 5000, "a body of 5000 bytes is too long"),
         ("self_destruct", b"{}", "no such command; there are track, select, stop, reload, record, rate"),
