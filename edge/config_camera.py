@@ -18,7 +18,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 def _network_address(text: str) -> str:
     # Not told: the address itself, in which a password may stand.
-    scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text.lower())
+    scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text)  # ffmpeg knows none in capitals
     if scheme is None or scheme[1] == "file":
         raise ValueError('is no network address such as rtsp://HOST/PATH or udp://HOST:PORT; a video is type = "file"')
     return text
