@@ -44,7 +44,7 @@ def write(tmp_path: Path, text: str) -> Path:
         ),
         (LIVE + "type = 'stream'\nurl = 'flight.mp4'", "config.toml:4: [camera] url: is no network address such as"),
         (LIVE + "type = 'stream'\nurl = 'file:///a.mp4'", "config.toml:4: [camera] url: is no network address such as"),
-        (LIVE + "type = 'stream'\nurl = 'RTSP://10.0.0.2/a'", "config.toml:4: [camera] url: is no network address such as"),
+        (LIVE + "type = 'stream'\nurl = 'RTSP://a/b'", "config.toml:4: [camera] url: is no network address such as"),
         ("camera = 3", "config.toml:1: [camera]: must hold keys with values"),
         ("zenoh = 3\n" + CAMERA, "config.toml:1: [zenoh]: must hold keys with values"),
         ("[camera\n", "config.toml: not valid TOML: "),
