@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from edge import clock
 
 from .toy_model import write_toy_model
 from .toy_scene import write_scene
@@ -34,3 +37,12 @@ def cli(tmp_path: Path) -> Cli:
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=timeout_s, check=False)
 
     return run
+
+
+@pytest.fixture
+def stepped() -> Iterator[int]:
+    """The time, which stands still but for steps."""
+    now_ns = time.monotonic_ns()
+    clock.step_to(now_ns)
+    yield now_ns
+    clock.run_freely()

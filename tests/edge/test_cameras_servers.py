@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import closing
 from fractions import Fraction
@@ -63,7 +64,7 @@ def film(send: Callable[[bytes], object], size: int | None = None) -> None:
             index += 1
 
 
-class Server(threading.Thread):
+class Server(threading.Thread, ABC):
     """Serves one caller, whose requests it keeps."""
 
     def __init__(self) -> None:
@@ -76,8 +77,9 @@ class Server(threading.Thread):
         with self._listening, self._listening.accept()[0] as caller, caller.makefile("rb") as lines:
             self.serve(caller, lines)
 
+    @abstractmethod
     def serve(self, caller: socket.socket, lines: BinaryIO) -> None:
-        raise NotImplementedError
+        """Answer its requests and film until it hangs up."""
 
     def heard(self, lines: BinaryIO) -> str:
         """The next request's head."""

@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -346,15 +345,6 @@ def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:
     assert all(load <= 100 for load in status.cpu_cores[: min(os.cpu_count() or 1, 8)])
     assert abs(status.time_usec * 1e-6 - time.time()) < 60.0
     assert status.fan_speed == [2**15 - 1] * 4, "what is not known says so"
-
-
-@pytest.fixture
-def stepped() -> Iterator[int]:
-    """The time, which stands still but for steps."""
-    now_ns = time.monotonic_ns()
-    clock.step_to(now_ns)
-    yield now_ns
-    clock.run_freely()
 
 
 def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up(stepped: int) -> None:

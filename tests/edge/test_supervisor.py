@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -70,23 +69,14 @@ class Kept(Outlets):
         self.times_ns.append(snapshot.time_ns)
 
 
-@pytest.fixture
-def began_ns() -> Iterator[int]:
-    """The time, which from now on stands still but for steps."""
-    now_ns = time.monotonic_ns()
-    clock.step_to(now_ns)
-    yield now_ns
-    clock.run_freely()
-
-
 def test_counters_and_latency_go_out_each_second_and_to_the_log_each_ten(
-    toy_model: Path, began_ns: int, caplog: pytest.LogCaptureFixture
+    toy_model: Path, stepped: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     outlets = Kept()
     supervisor = supervised(toy_model, outlets, {})
     caplog.set_level(logging.INFO)
     for frame in range(25 * FPS):  # 25 s
-        now_ns = began_ns + frame * PERIOD_NS
+        now_ns = stepped + frame * PERIOD_NS
         clock.step_to(now_ns)
         supervisor.frame_done(FrameMeta(frame, now_ns, now_ns), {"total": 10_000_000}, (), has_attitude=True)
         supervisor.turn()
