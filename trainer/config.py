@@ -131,6 +131,9 @@ class ScheduleConfig(Section):
         ge=0,
         description="first blocks (of a RepViT: stages) that stay, with the stem, as the run began; 0: all learn",
     )
+    fixed_norms: bool = Field(
+        False, description="norm statistics stay as the run began, which must be from trained weights: a faster step"
+    )
     weight_decay: float = Field(0.01, ge=0)
     gradient_clip: float = Field(5.0, gt=0)
     ema_decay: float = Field(0.999, ge=0, lt=1)

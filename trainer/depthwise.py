@@ -16,18 +16,19 @@ from torch.nn import functional as F
 
 class _Depthwise(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, stride: int, padding: int) -> Tensor:
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int) -> Tensor:
         ctx.save_for_backward(x, weight)
         ctx.stride, ctx.padding = stride, padding
-        return F.conv2d(x, weight, None, stride, padding, groups=x.shape[1])
+        return F.conv2d(x, weight, bias, stride, padding, groups=x.shape[1])
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None, None]:
         x, weight = ctx.saved_tensors
+        gradient_bias = gradients[0].sum((0, 2, 3)).to(weight.dtype) if ctx.needs_input_grad[2] else None
         g = _at_every_pixel(gradients[0], x, ctx.stride, weight.shape[-1] // 2 - ctx.padding)
         turned = weight.flip(2, 3).to(g.dtype)
         gradient_x = F.conv2d(g, turned, None, 1, weight.shape[-1] // 2, groups=x.shape[1])
-        return gradient_x, _weight_gradient(g, weight, x.to(g.dtype)), None, None
+        return gradient_x, _weight_gradient(g, weight, x.to(g.dtype)), gradient_bias, None, None
 
 
 def _at_every_pixel(g: Tensor, x: Tensor, stride: int, first: int) -> Tensor:
@@ -71,5 +72,5 @@ class DepthwiseConv2d(nn.Conv2d):
     def forward(self, x: Tensor) -> Tensor:
         slow = self.kernel_size != (3, 3) or self.stride != (1, 1)
         if slow and x.device.type == "cpu" and torch.is_grad_enabled() and self.weight.requires_grad:
-            return _Depthwise.apply(x, self.weight, self.stride[0], int(self.padding[0]))
+            return _Depthwise.apply(x, self.weight, self.bias, self.stride[0], int(self.padding[0]))
         return super().forward(x)

@@ -20,6 +20,7 @@ from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_con
 from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors
 from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.fixed_norms import folded_norms
 from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
@@ -129,7 +130,11 @@ class Trainer:
         self.model.train()
         for layer in self.frozen:
             layer.eval()  # nor may its norm statistics move
-        with rounded(self.model) if progress >= schedule.rounded_from else contextlib.nullcontext():
+        with contextlib.ExitStack() as views:
+            if schedule.fixed_norms:
+                views.enter_context(folded_norms(self.model))
+            if progress >= schedule.rounded_from:
+                views.enter_context(rounded(self.model))
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
                 seen = self.model.perceive(image)
                 dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
