@@ -89,6 +89,21 @@ def test_pointing_drawing_and_stopping_reach_the_loop_as_requests() -> None:
     assert stop == StopTracking()
 
 
+@pytest.mark.parametrize("radius", [math.nan, 0.0, -1.0, 2.0])
+def test_a_point_without_a_usable_radius_is_looked_at_four_hundredths_of_the_width_wide(radius: float) -> None:
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(2004, 0.5, 0.5, radius)
+        assert peer.named("COMMAND_ACK").result == ACCEPTED
+        (point,) = requests.take()
+    assert isinstance(point, TrackBox)
+    left, top, right, bottom = point.box_xyxy_share
+    assert (left, right) == pytest.approx((0.48, 0.52))
+    side_px = 0.04 * SIZE_WH[0]
+    assert ((top + bottom) / 2, bottom - top) == pytest.approx((0.5, side_px / SIZE_WH[1])), "a square in the picture"
+
+
 def test_a_loop_that_takes_no_requests_is_told_to_the_sender() -> None:
     with linked(requests=RequestQueue()) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
