@@ -30,6 +30,12 @@ def _topic(text: str) -> str:
     return text
 
 
+def _own_machine(text: str) -> str:
+    if not re.fullmatch(r"(127\.0\.0\.1|localhost):[1-9][0-9]{0,4}", text):
+        raise ValueError(f"{text!r} is neither 127.0.0.1:PORT nor localhost:PORT; the player runs on the same machine")
+    return text
+
+
 class IntrinsicsSettings(Section):
     """Either `file`, or the numbers themselves."""
 
@@ -70,9 +76,8 @@ class SequenceCamera(Camera):
         default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
     )
     loop: bool = Field(default=False, description="begin again after the last frame")
-    lockstep: str | None = Field(
+    lockstep: Annotated[str, AfterValidator(_own_machine)] | None = Field(
         default=None,
-        pattern=r"^(127\.0\.0\.1|localhost):[1-9][0-9]{0,4}$",
         description="HOST:PORT of the player that steps the frames and the daemon's clock; not for flight",
     )
     intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")

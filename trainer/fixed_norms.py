@@ -24,8 +24,8 @@ def _pairs(model: nn.Module) -> list[tuple[nn.Conv2d, nn.BatchNorm2d]]:
     ]
 
 
-def _same(x: Tensor) -> Tensor:
-    return x
+def _same(input: Tensor) -> Tensor:
+    return input
 
 
 @contextlib.contextmanager

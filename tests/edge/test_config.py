@@ -26,6 +26,7 @@ def write(tmp_path: Path, text: str) -> Path:
     [
         (CAMERA + "fps = -3", "config.toml:4: [camera] fps: Input should be greater than 0"),
         (CAMERA + "[zenoh]\nlisten_on = 3", "config.toml:5: [zenoh] listen_on: unknown key"),
+        (CAMERA + "lockstep = 'uav:5'", "config.toml:4: [camera] lockstep: 'uav:5' is neither 127.0.0.1:PORT"),
         ("[vehicle]\nname = 'uav1'", "config.toml: [camera]: is missing"),
         ("[camera]\npath = 'x'", "config.toml:1: [camera]: needs type = one of"),
         ("[camera]\ntype = 'film'", "config.toml:1: [camera]: type must be one of"),
