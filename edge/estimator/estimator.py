@@ -13,22 +13,24 @@ from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, window_around
-from edge.types import Array, Estimate, Frame
+from edge.types import Array, Estimate, Frame, FrameMeta
 
 WORTH_A_LOOK = 0.1  # where the whole frame has a target less probably, no window is spent on it
 FAINTEST = 0.02  # the least that a window says of a place that the whole frame has named
+UNHURRIED_NS = 60_000_000  # from one of the camera's frames to the next: time for two looks at each target
 LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
 
 
 class Estimator:
-    """Poses of the targets in single frames; between them it remembers only whether the last was looked at mirrored,
-    and counts of what it refused."""
+    """Poses of the targets in single frames; between them it remembers only which was tracked last and whether that
+    one was looked at mirrored, and counts of what it refused."""
 
     def __init__(self, model: Model, max_targets: int = 4) -> None:
         self.model = model
         self.refused: Counter[str] = Counter()
         self._max_targets = max_targets
         self._mirror = True
+        self._tracked: FrameMeta | None = None
 
     @property
     def has_track_stage(self) -> bool:
@@ -41,6 +43,7 @@ class Estimator:
         box = np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])
         for _ in range(2 if self.has_track_stage else 0):  # plain and mirrored
             self.track(frame, [box])
+        self._tracked = None
         self.refused.clear()
 
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), thrice: bool = True) -> list[Estimate]:
@@ -116,9 +119,15 @@ class Estimator:
         """For each expected box the target in the window around it, or None. One inference for all windows.
 
         Every other frame is looked at mirrored: what the network gets wrong of one it gets wrong otherwise of the next.
+        A camera of few frames a second has each looked at both ways.
         """
+        before, self._tracked = self._tracked, frame.meta
         self._mirror = not self._mirror
-        return self._look(frame, boxes_xyxy_px, self.model.contract.track_score_min, self._mirror)
+        score_min = self.model.contract.track_score_min
+        if before is None or _interval_ns(before, frame.meta) < UNHURRIED_NS:
+            return self._look(frame, boxes_xyxy_px, score_min, self._mirror)
+        looks = [self._look(frame, boxes_xyxy_px, score_min, mirror) for mirror in (False, True)]
+        return _each_once([_of_either(*pair) for pair in zip(*looks, strict=True)])
 
     def _look(
         self,
@@ -156,6 +165,23 @@ class Estimator:
             again = self._look(frame, list(beyond.values()), score_min, mirror, looks_left - 1)
             for i, estimate in zip(beyond, again, strict=True):
                 found[i] = estimate
-        # Two windows may see the same aircraft; the stronger sight of it counts.
-        kept = {id(e) for e in distinct(sorted(filter(None, found), key=lambda e: -e.score))}
-        return [estimate if id(estimate) in kept else None for estimate in found]
+        return _each_once(found)
+
+
+def _interval_ns(before: FrameMeta, after: FrameMeta) -> float:
+    """Between two frames of the source, those that were not looked at counted."""
+    return (after.capture_ns - before.capture_ns) / max(after.sequence - before.sequence, 1)
+
+
+def _of_either(plain: Estimate | None, mirrored: Estimate | None) -> Estimate | None:
+    """What two looks at one place say: both together if they show one aircraft, else the surer."""
+    looks = sorted(filter(None, (plain, mirrored)), key=lambda look: -look.score)
+    if not looks:
+        return None
+    return of_looks([look for look in looks if look is looks[0] or of_one_target(look, looks[0])])
+
+
+def _each_once(found: Sequence[Estimate | None]) -> list[Estimate | None]:
+    """Two windows may see the same aircraft; the stronger sight of it counts."""
+    kept = {id(e) for e in distinct(sorted(filter(None, found), key=lambda e: -e.score))}
+    return [estimate if id(estimate) in kept else None for estimate in found]

@@ -10,7 +10,7 @@ import pytest
 
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks
-from edge.types import Frame, FrameMeta
+from edge.types import Estimate, Frame, FrameMeta
 from msgs.contract import ModelContract
 
 from .toy_model import CONTRACT
@@ -81,6 +81,44 @@ def test_a_place_is_looked_at_once_then_plain_and_mirrored_and_a_track_by_turns(
     for _ in range(4):
         assert estimator.track(frame, [found.box_xyxy_px]) != [None]
     assert model.asked == ["plain", "mirrored", "plain", "mirrored"]
+
+
+def tracked(estimator: Estimator, meta: FrameMeta) -> Estimate | None:
+    box = np.concatenate([TARGET_PX - SIZE_PX / 2, TARGET_PX + SIZE_PX / 2])
+    return estimator.track(Frame(meta, SLOPE, K), [box])[0]
+
+
+def test_a_camera_of_few_frames_a_second_has_each_looked_at_both_ways() -> None:
+    estimator, model, _ = scripted([answer(0.9)], [answer(0.9, range_m=200.0)], [answer(0.8, range_m=242.0)])
+    tracked(estimator, FrameMeta(7, 1_000_000_000, 0))
+    both = tracked(estimator, FrameMeta(8, 1_100_000_000, 0))
+    assert model.asked[1:] == ["plain", "mirrored"]
+    assert both is not None
+    assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(220.0, rel=1e-3)
+    # A camera of thirty a second, of which two frames in three were dropped, is still in a hurry.
+    model.asked.clear()
+    tracked(estimator, FrameMeta(11, 1_200_000_000, 0))
+    assert len(model.asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("plain", "mirrored", "range_m"),
+    [
+        (answer(0.9, range_m=200.0), answer(0.1, range_m=300.0), 200.0),
+        (answer(0.1, range_m=200.0), answer(0.9, range_m=300.0), 300.0),
+        (answer(0.5, range_m=200.0), answer(0.9, OTHER_PX, 300.0), 300.0),  # two aircraft: the surer sight
+        (answer(0.1), answer(0.1), None),
+    ],
+)
+def test_what_one_of_two_looks_does_not_show_the_other_may(plain: Any, mirrored: Any, range_m: float | None) -> None:
+    estimator, _, _ = scripted([answer(0.9)], [plain], [mirrored])
+    tracked(estimator, FrameMeta(0, 0, 0))
+    found = tracked(estimator, FrameMeta(1, 100_000_000, 0))
+    if range_m is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert np.linalg.norm(found.t_cam_target_m) == pytest.approx(range_m, rel=1e-6)
 
 
 @pytest.mark.parametrize(
