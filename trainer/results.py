@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -136,9 +137,14 @@ def read_history(path: Path) -> list[dict[str, Any]]:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
 
 
-def gathered(runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """The validations of run folders, each begun from the one before it. Raises ConfigError."""
-    history, before = [], 0
+def gathered(earlier: Sequence[dict[str, Any]], runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """A history up to the first of the run folders, and their validations, each begun from the one before.
+
+    Raises ConfigError.
+    """
+    names = {folder.name for folder in runs}
+    history = list(takewhile(lambda line: line["run"] not in names, earlier))
+    before = history[-1]["total_samples"] if history else 0
     for folder in runs:
         lines = [line for line in read_history(folder / "log.jsonl") if line["kind"] == "validation"]
         if not lines:
@@ -198,7 +204,11 @@ def register(commands: argparse._SubParsersAction) -> None:
     results.add_argument("--model", type=Path, action="append", default=[], help="an ONNX file to stand beside it")
     results.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
     results.add_argument(
-        "--runs", type=Path, nargs="+", metavar="DIR", help="run folders behind the shipped weights, oldest first, anew"
+        "--runs",
+        type=Path,
+        nargs="+",
+        metavar="DIR",
+        help="run folders to end the shipped weights' history with, oldest first; a run that it has begins anew",
     )
     results.set_defaults(run=run)
 
@@ -206,7 +216,8 @@ def register(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measure and write. Raises ConfigError."""
     if arguments.runs:
-        lines = "".join(json.dumps(line) + "\n" for line in gathered(arguments.runs))
+        history = gathered(read_history(HISTORY), arguments.runs)
+        lines = "".join(json.dumps(line) + "\n" for line in history)
         HISTORY.write_text(lines, encoding="utf-8")
     history = read_history(HISTORY)
     datasets = datasets_in(arguments.benchmark)

@@ -15,7 +15,7 @@ CROSSING = ROOT / "sim_replay" / "data" / "crossing"
 
 
 def run_folder(folder: Path, samples: list[int]) -> Path:
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     metrics = {"E_r_mean_deg": 30.0, "E_r_median_deg": 10.0, "depth_rel_mean": 0.1, "depth_rel_median": 0.05}
     metrics |= {"pose_10deg_5pct": 0.3, "rot_lt_10deg": 0.5}
     lines = [{"kind": "train", "samples": 1}]
@@ -25,13 +25,21 @@ def run_folder(folder: Path, samples: list[int]) -> Path:
 
 
 def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
-    history = gathered([run_folder(tmp_path / "a", [100, 250]), run_folder(tmp_path / "b", [40])])
+    history = gathered([], [run_folder(tmp_path / "a", [100, 250]), run_folder(tmp_path / "b", [40])])
     assert [line["total_samples"] for line in history] == [100, 250, 290]
     assert "290 rendered windows in 2 runs" in told(history)
     draw_history(history, tmp_path / "learning.png")
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="no validation"):
-        gathered([run_folder(tmp_path / "c", [])])
+        gathered([], [run_folder(tmp_path / "c", [])])
+
+
+def test_a_run_is_added_to_the_history_and_one_that_went_on_takes_its_place_and_all_after_it(tmp_path: Path) -> None:
+    a, b, c = (run_folder(tmp_path / name, samples) for name, samples in (("a", [100]), ("b", [40]), ("c", [5])))
+    history = gathered(gathered([], [a, b]), [c])
+    assert [line["total_samples"] for line in history] == [100, 140, 145]
+    run_folder(b, [40, 60])
+    assert [line["total_samples"] for line in gathered(history, [b])] == [100, 140, 160]
 
 
 def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
