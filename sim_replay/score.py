@@ -95,7 +95,8 @@ def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | N
 def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], list[TargetPose]]:
     """Give each truth at most one pose of its frame: pairs by growing bearing error, at most one diameter apart.
 
-    Association looks along the ray alone, so that a wrong depth or rotation is an error and not a miss.
+    Association looks along the ray alone, so that a wrong depth or rotation is an error and not a miss. A pose less
+    than a diameter away would hold the camera: it lies in no direction and is nobody's.
 
     Returns:
         One match for each truth, in their order, and the poses that belong to no target.
@@ -108,7 +109,8 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
         gate_deg = np.rad2deg(truth.diameter_m / np.linalg.norm(truth.t_cam_target_m))
         for estimate in by_frame.get(truth.frame, []):
             bearing_deg = float(metrics.bearing_error_deg(estimate.t_cam_target_m, truth.t_cam_target_m))
-            if bearing_deg <= gate_deg:
+            has_direction = np.linalg.norm(estimate.t_cam_target_m) >= truth.diameter_m
+            if has_direction and bearing_deg <= gate_deg:
                 pairs.append((bearing_deg, i, estimate))
     found: dict[int, TargetPose] = {}
     taken: set[int] = set()

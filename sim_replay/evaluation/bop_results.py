@@ -24,6 +24,7 @@ COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1
 UNKNOWN_TIME_S = -1.0
 _ROTATION_TOLERANCE = 0.02
+_LARGEST = 1e15  # beyond it squares and sums leave what JSON can tell
 
 Array = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ class ResultRow:
 def read_results(path: Path) -> list[ResultRow]:
     """All rows of a results file. Raises InputError, naming file, line and column."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before UTF-8
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
             if tuple(header) != COLUMNS:
@@ -63,8 +64,10 @@ def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
             values[name] = np.array([float(number) for number in cell.split()])
         except ValueError as error:
             raise InputError(f"{path} line {line}: {name} is not a number: {cell!r}") from error
-        if values[name].shape != (count,) or not np.isfinite(values[name]).all():
+        if values[name].shape != (count,) or not (np.abs(values[name]) < _LARGEST).all():
             raise InputError(f"{path} line {line}: {name} is not {count} finite number{'s' * (count > 1)}")
+        if name.endswith("_id") and values[name][0] % 1:
+            raise InputError(f"{path} line {line}: {name} is not a whole number: {cell!r}")
     R = values["R"].reshape(3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(f"{path} line {line}: R is not a rotation")

@@ -98,6 +98,14 @@ def test_a_pose_in_another_direction_is_false_and_the_target_missed() -> None:
     assert len(false_poses) == 1
 
 
+@pytest.mark.parametrize("t_m", [[0.0, 0.0, 0.0], [0.0, 0.0, 5.0]])
+def test_a_pose_at_the_camera_itself_finds_no_target(t_m: list[float]) -> None:
+    """Other methods write a translation of nil where they failed."""
+    matches, false_poses = match_poses([truth(0)], [TargetPose(0, np.eye(3), np.array(t_m))])
+    assert matches[0].estimate is None
+    assert len(false_poses) == 1
+
+
 def test_two_targets_each_get_their_own_pose_and_a_duplicate_is_false() -> None:
     left, right = truth(0, x_m=-5.0), truth(0, x_m=5.0)
     poses = [estimate(right), estimate(left), estimate(right, stretched=1.2)]
