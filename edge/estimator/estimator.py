@@ -41,8 +41,10 @@ class Estimator:
         width, height = frame.image_bgr.shape[1], frame.image_bgr.shape[0]
         self.acquire(frame)
         box = np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])
-        for _ in range(2 if self.has_track_stage else 0):  # plain and mirrored
-            self.track(frame, [box])
+        if self.has_track_stage:
+            for _ in range(2):  # plain and mirrored
+                self.track(frame, [box])
+            self._look_both_ways(frame, [box], FAINTEST)
         self._tracked = None
         self.refused.clear()
 
@@ -57,7 +59,7 @@ class Estimator:
             return self._whole(frame, known_boxes, self.model.contract.acquire_score_min, self.model.run, self.refused)
         places = self._whole(frame, known_boxes, self._worth_a_look, self.model.run, self.refused)
         faintest = min(FAINTEST, self.model.contract.track_score_min)
-        firsts = self._look(frame, [place.box_xyxy_px for place in places], faintest)
+        firsts = _each_once(self._look(frame, [place.box_xyxy_px for place in places], faintest))
         seen = [
             (place, first)
             for place, first in zip(places, firsts, strict=True)
@@ -65,7 +67,7 @@ class Estimator:
         ]
         if thrice:
             boxes = [first.box_xyxy_px for _, first in seen]
-            finer = [self._look(frame, boxes, faintest, mirror, looks_left=1) for mirror in (False, True)]
+            finer = self._look_both_ways(frame, boxes, faintest, looks_left=1)
             looks = [self._together(*one) for one in zip(seen, *finer, strict=True)]
         else:
             looks = [first if self.confirms(place, [first]) else None for place, first in seen]
@@ -125,19 +127,31 @@ class Estimator:
         self._mirror = not self._mirror
         score_min = self.model.contract.track_score_min
         if before is None or _interval_ns(before, frame.meta) < UNHURRIED_NS:
-            return self._look(frame, boxes_xyxy_px, score_min, self._mirror)
-        looks = [self._look(frame, boxes_xyxy_px, score_min, mirror) for mirror in (False, True)]
+            return _each_once(self._look(frame, boxes_xyxy_px, score_min, [self._mirror] * len(boxes_xyxy_px)))
+        looks = self._look_both_ways(frame, boxes_xyxy_px, score_min)
         return _each_once([_of_either(*pair) for pair in zip(*looks, strict=True)])
+
+    def _look_both_ways(
+        self, frame: Frame, boxes_xyxy_px: Sequence[Array], score_min: float, looks_left: int = LOOKS_MOST
+    ) -> tuple[list[Estimate | None], list[Estimate | None]]:
+        """What plain windows show and what mirrored ones do; one inference for all."""
+        count = len(boxes_xyxy_px)
+        mirrors = [False] * count + [True] * count
+        found = self._look(frame, [*boxes_xyxy_px, *boxes_xyxy_px], score_min, mirrors, looks_left)
+        return _each_once(found[:count]), _each_once(found[count:])
 
     def _look(
         self,
         frame: Frame,
         boxes_xyxy_px: Sequence[Array],
         score_min: float,
-        mirror: bool = False,
+        mirrors: Sequence[bool] = (),
         looks_left: int = LOOKS_MOST,
     ) -> list[Estimate | None]:
-        """As `track`; what a window's edge cuts is looked at again through a larger one, and is there or is not."""
+        """For each box the target in the window around it; `mirrors`, if any: which windows are looked at mirrored.
+
+        What a window's edge cuts is looked at again through a larger one, and is there or is not.
+        """
         contract = self.model.contract
         if contract.track_size_wh is None:
             raise ValueError("this model has no track stage")
@@ -151,7 +165,8 @@ class Estimator:
         shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
         images = np.stack([cut(frame.image_bgr, window, size_wh, lens) for window in windows])
         K = np.stack([one.K for one in shown])
-        peaks = unmirrored(self.model.run(*mirrored(images, K)), size_wh[0]) if mirror else self.model.run(images, K)
+        turned = np.array(mirrors, dtype=bool) if mirrors else np.zeros(len(images), dtype=bool)
+        peaks = unmirrored(self.model.run(*mirrored(images, K, turned)), size_wh[0], turned)
         found = [
             nearest_expected(decode(peaks, i, one, contract, "track", score_min, self.refused), boxes_xyxy_px[i])
             for i, one in enumerate(shown)
@@ -162,10 +177,10 @@ class Estimator:
             if estimate is not None and (box := grown(estimate.box_xyxy_px, one)) is not None
         }
         if beyond and looks_left > 1:
-            again = self._look(frame, list(beyond.values()), score_min, mirror, looks_left - 1)
+            again = self._look(frame, list(beyond.values()), score_min, turned[list(beyond)].tolist(), looks_left - 1)
             for i, estimate in zip(beyond, again, strict=True):
                 found[i] = estimate
-        return _each_once(found)
+        return found
 
 
 def _interval_ns(before: FrameMeta, after: FrameMeta) -> float:

@@ -29,24 +29,32 @@ DISAGREEING_RAD = np.radians(60.0)
 SUREST_NO, SUREST_YES = 0.01, 0.995
 
 
-def mirrored(images_bgr: NDArray[np.uint8], K: Array) -> tuple[NDArray[np.uint8], Array]:
-    """Images [N, H, W, 3] with left for right and the K [N, 3, 3] of these pixels."""
-    K = K.copy()
-    K[:, 0, 1:] *= -1.0
-    K[:, 0, 2] += images_bgr.shape[2] - 1
-    return np.stack([cv2.flip(image, 1) for image in images_bgr]), K
+def mirrored(images_bgr: NDArray[np.uint8], K: Array, turned: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], Array]:
+    """Images [N, H, W, 3], those that are `turned` [N] with left for right, and the K [N, 3, 3] of these pixels."""
+    images_bgr, K = images_bgr.copy(), K.copy()
+    for i in np.flatnonzero(turned):
+        images_bgr[i] = cv2.flip(images_bgr[i], 1)
+    K[turned, 0, 1:] *= -1.0
+    K[turned, 0, 2] += images_bgr.shape[2] - 1
+    return images_bgr, K
 
 
-def unmirrored(peaks: Peaks, width_px: int) -> Peaks:
-    """What the network says of mirrored images, for the images as they were; doing it twice gives the first back."""
+def unmirrored(peaks: Peaks, width_px: int, turned: NDArray[np.bool_]) -> Peaks:
+    """What the network says of images of which some are `turned` [N], for the images as they were; doing it twice gives
+    the first back."""
     last_px = np.array([width_px - 1, 0], dtype=np.float32)
     turn = np.array([-1.0, 1.0], dtype=np.float32)
+    at_peaks = turned[:, None, None]
     return replace(
         peaks,
-        center_px=last_px + turn * peaks.center_px,
-        origin_px=last_px + turn * peaks.origin_px,
-        t_cam_target_m=peaks.t_cam_target_m @ MIRROR_CAM.astype(np.float32),
-        R_cam_target=(MIRROR_CAM @ peaks.R_cam_target @ MIRROR_TARGET).astype(np.float32),
+        center_px=np.where(at_peaks, last_px + turn * peaks.center_px, peaks.center_px),
+        origin_px=np.where(at_peaks, last_px + turn * peaks.origin_px, peaks.origin_px),
+        t_cam_target_m=np.where(at_peaks, peaks.t_cam_target_m @ MIRROR_CAM.astype(np.float32), peaks.t_cam_target_m),
+        R_cam_target=np.where(
+            at_peaks[..., None],
+            (MIRROR_CAM @ peaks.R_cam_target @ MIRROR_TARGET).astype(np.float32),
+            peaks.R_cam_target,
+        ),
     )
 
 

@@ -37,10 +37,13 @@ class Scripted:
     contract: ModelContract
     asked: list[str] = field(default_factory=list)
 
-    def run(self, images: np.ndarray, K_image: np.ndarray) -> Peaks:
-        assert len(images) == 1
-        left, right = images[0, :, images.shape[2] // 3].mean(), images[0, :, 2 * images.shape[2] // 3].mean()
-        whole = images.shape[2::-1][:2] == self.contract.acquire_size_wh
+    def run(self, images: np.ndarray, K_images: np.ndarray) -> Peaks:
+        of_each = [self._one(image, K_image) for image, K_image in zip(images, K_images, strict=True)]
+        return Peaks(*(np.asarray(value, dtype=np.float32)[:, None] for value in zip(*of_each, strict=True)))
+
+    def _one(self, image: np.ndarray, K_image: np.ndarray) -> tuple[Any, ...]:
+        left, right = image[:, image.shape[1] // 3].mean(), image[:, 2 * image.shape[1] // 3].mean()
+        whole = image.shape[1::-1] == self.contract.acquire_size_wh
         kind = "whole" if whole else "plain" if left < right else "mirrored"
         self.asked.append(kind)
         answers = self.script[kind]
@@ -48,15 +51,10 @@ class Scripted:
         ray = np.linalg.inv(K) @ [*at_px, 1.0]
         if kind == "mirrored":
             ray[0] *= -1
-        center = (K_image[0] @ ray)[:2]
-        size = SIZE_PX * K_image[0, 0, 0] / K[0, 0]
+        center = (K_image @ ray)[:2]
+        size = SIZE_PX * K_image[0, 0] / K[0, 0]
         R = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])  # from behind, the same when mirrored
-        return Peaks(
-            *(
-                np.asarray(value, dtype=np.float32)[None, None]
-                for value in (score, center, size, center, range_m * ray / np.linalg.norm(ray), R, np.full(6, 0.05))
-            )
-        )
+        return score, center, size, center, range_m * ray / np.linalg.norm(ray), R, np.full(6, 0.05)
 
     infer = run
 

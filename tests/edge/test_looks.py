@@ -42,10 +42,12 @@ def peaks_of(R: np.ndarray, t_m: np.ndarray, origin_px: np.ndarray) -> Peaks:
 def test_a_mirrored_aircraft_is_seen_where_the_mirrored_picture_has_it(R: np.ndarray, t_m: np.ndarray) -> None:
     """What a perfect network says of the mirrored picture, turned back, is the truth of the picture as it was."""
     image = np.arange(WIDTH_PX * HEIGHT_PX * 3, dtype=np.uint32).astype(np.uint8).reshape(1, HEIGHT_PX, WIDTH_PX, 3)
-    flipped, K_flipped = mirrored(image, K[None])
+    flipped, K_flipped = mirrored(image, K[None], np.array([True]))
     np.testing.assert_array_equal(flipped[0, :, 0], image[0, :, -1])
     origin_px = (K @ t_m)[:2] / t_m[2]
-    said = unmirrored(peaks_of(R, t_m, origin_px), WIDTH_PX)  # of a picture: what is true of its mirrored one
+    said = unmirrored(
+        peaks_of(R, t_m, origin_px), WIDTH_PX, np.array([True])
+    )  # of a picture: what is true of its mirrored one
     R_flipped, t_flipped_m = said.R_cam_target[0, 0].astype(float), said.t_cam_target_m[0, 0].astype(float)
     assert np.linalg.det(R_flipped) == pytest.approx(1.0, abs=1e-5)
     there = seen_px(K_flipped[0], R_flipped, t_flipped_m)[LEFT_FOR_RIGHT]
@@ -53,9 +55,25 @@ def test_a_mirrored_aircraft_is_seen_where_the_mirrored_picture_has_it(R: np.nda
     expected[:, 0] = WIDTH_PX - 1 - expected[:, 0]
     np.testing.assert_allclose(there, expected, atol=0.02)
     np.testing.assert_allclose(said.origin_px[0, 0], (K_flipped[0] @ t_flipped_m)[:2] / t_flipped_m[2], atol=0.02)
-    back = unmirrored(said, WIDTH_PX)
+    back = unmirrored(said, WIDTH_PX, np.array([True]))
     np.testing.assert_allclose(back.R_cam_target[0, 0], R, atol=1e-6)
     np.testing.assert_allclose(back.center_px[0, 0], origin_px, atol=1e-3)
+
+
+def test_only_what_is_turned_is_mirrored_and_turned_back() -> None:
+    images = np.random.default_rng(0).integers(0, 256, (3, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    turned = np.array([False, True, False])
+    flipped, K_flipped = mirrored(images, np.stack([K] * 3), turned)
+    np.testing.assert_array_equal(flipped[1], images[1, :, ::-1])
+    np.testing.assert_array_equal(flipped[[0, 2]], images[[0, 2]])
+    np.testing.assert_array_equal(K_flipped[[0, 2]], [K, K])
+    one = peaks_of(np.eye(3), np.array([10.0, 5.0, 200.0]), np.array([30.0, 40.0]))
+    several = Peaks(*(np.concatenate([value] * 3) for value in vars(one).values()))
+    said = unmirrored(several, WIDTH_PX, turned)
+    for name, value in vars(said).items():
+        np.testing.assert_array_equal(value[[0, 2]], getattr(several, name)[[0, 2]], err_msg=name)
+    assert said.t_cam_target_m[1, 0, 0] == -10.0
+    assert said.center_px[1, 0, 0] == WIDTH_PX - 1 - 30.0
 
 
 def look(range_m: float, heading_rad: float, rotation_std_rad: float = 0.1, score: float = 0.8) -> Estimate:
