@@ -16,7 +16,7 @@ import tomli_w
 from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model
 from trainer.config import ConfigError, DataConfig, TrainerConfig, load_config, parse_config
 from trainer.data import Sampler, render_once
-from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.evaluate import measure, null_where_unknown, predict_all, torch_predictor
 from trainer.sources import window_sampler
 from trainer.train import run_training
 
@@ -123,7 +123,7 @@ def ablate(
                 say(f"{variant.name}: interrupted; the same command goes on from here")
                 break
         result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
-        (out / RESULT_NAME).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        (out / RESULT_NAME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         (out / "table.md").write_text(table(result), encoding="utf-8")
     return result
 
@@ -135,7 +135,7 @@ def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: Open
     data = config.data.model_copy(update={"acquire_share": 1.0 if only_frames else 0.0})
     batches = render_once(open_view(data, config.data.validation_seed, scale.size_px), scale.windows)
     metrics = measure(predict_all(torch_predictor(model), batches), batches)
-    return {"weights_sha256": sha256, "trained_samples": training["samples"], **metrics}
+    return {"weights_sha256": sha256, "trained_samples": training["samples"], **null_where_unknown(metrics)}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -143,7 +143,8 @@ def table(result: dict[str, Any]) -> str:
     head = ["variant", *(title for title, _, _ in COLUMNS.values()), "weights"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in result["rows"].values():
-        cells = [f"{scale * row[key]:.{digits}f}" for key, (_, scale, digits) in COLUMNS.items()]
+        values = ((row[key], scale, digits) for key, (_, scale, digits) in COLUMNS.items())
+        cells = ["–" if value is None else f"{scale * value:.{digits}f}" for value, scale, digits in values]
         lines.append("| " + " | ".join([row["says"], *cells, f"`{row['weights_sha256'][:12]}`"]) + " |")
     scale = (
         f"{result['samples']} training windows of {result['size_px']} px a variant (seed {result['seed']}), "

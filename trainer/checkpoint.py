@@ -64,11 +64,14 @@ def load_file(path: Path) -> dict[str, Any]:
     if path.is_dir():
         path = path / WEIGHTS_NAME
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except Exception as error:
         raise ConfigError(f"{path}: not a checkpoint of this program: {type(error).__name__}") from None
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: not a checkpoint of this program: holds a {type(content).__name__}")
+    return content
 
 
 def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int | float], str]:
@@ -79,5 +82,8 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
     config = parse_config(content["config"], f"{path} (config)")
     model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False}))
     weights = deployed_weights(content["weights"])
-    model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
+    try:
+        model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
+    except RuntimeError:  # its text is a line for each of some hundred tensors
+        raise ConfigError(f"{path}: its weights are not of the network that its [model] describes") from None
     return model.eval(), config, content["training"], weights_sha256(weights)

@@ -9,6 +9,7 @@ import os
 import sys
 from pathlib import Path
 
+from msgs.command_line import EXIT_BAD_INPUT, EXIT_INTERRUPTED, exit_code
 from trainer import evaluate_command, results, score_command
 from trainer.config import ConfigError, RenderingError, load_config
 
@@ -136,9 +137,9 @@ def _add_ablate(commands: argparse._SubParsersAction) -> None:
     ablate.add_argument("--config", type=Path, default=EDGE_CONFIG, help="what is varied (default: configs/edge.toml)")
     ablate.add_argument("--out", type=Path, required=True, help="folder of the runs and the table")
     ablate.add_argument("--variants", metavar="A,B", help="only these (default: all)")
-    ablate.add_argument("--samples", type=int, default=20000, help="training windows a variant (default %(default)s)")
-    ablate.add_argument("--size", type=int, default=128, metavar="PX", help="side of a window (default %(default)s)")
-    ablate.add_argument("--windows", type=int, default=512, help="held-out windows (default %(default)s)")
+    ablate.add_argument("--samples", type=count, default=20000, help="training windows a variant (default %(default)s)")
+    ablate.add_argument("--size", type=count, default=128, metavar="PX", help="side of a window (default %(default)s)")
+    ablate.add_argument("--windows", type=count, default=512, help="held-out windows (default %(default)s)")
     ablate.add_argument("--json", action="store_true", help="print JSON instead of the table")
     ablate.set_defaults(run=_ablate)
 
@@ -176,21 +177,26 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; 2 when something that a person gave must be corrected."""
+    """Exit codes: 0 done, 1 rendering failed, 2 bad input, told in a sentence, 130 interrupted, 141 unread."""
     arguments = _parser().parse_args(argv)
     # OpenMP threads that spin while they wait cost a busy machine most of its speed. Read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    return exit_code(lambda: _acted(arguments), ConfigError)
+
+
+def _acted(arguments: argparse.Namespace) -> int:
+    """The exit code, where standard output is read."""
     try:
         arguments.run(arguments)
     except ConfigError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
-        return 2
+        return EXIT_BAD_INPUT
     except RenderingError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("uavpose-trainer: interrupted", file=sys.stderr)
-        return 130
+        return EXIT_INTERRUPTED
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +28,15 @@ def made_folder(path: Path) -> Path:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
     return path
+
+
+def refuse_no_folder(path: Path) -> None:
+    """Raises ConfigError if made_folder could make none that can be written to: to be asked before long work."""
+    there = next(p for p in (path, *path.absolute().parents) if p.exists())
+    if not there.is_dir():
+        raise ConfigError(f"{path}: cannot be made a folder: {there} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"{path}: cannot be made a folder: {there} is not yours to write to")
 
 
 class ModelConfig(Section):

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from sim_replay.sample import SampleBatch
-from trainer.config import RenderingError
+from trainer.config import ConfigError, RenderingError
 from trainer.losses import Labels
 
 DENSE_STRIDE = 4
@@ -113,6 +113,8 @@ def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, str
                 except queue.Full:
                     if parent is None or not parent.is_alive():
                         return
+    except ConfigError as error:
+        out.put(error)
     except Exception:
         out.put(traceback.format_exc())
 
@@ -145,7 +147,7 @@ class Feed:
             self._processes.append(process)
 
     def next(self) -> TrainingBatch:
-        """The next batch in index order. Raises RenderingError when its renderer failed."""
+        """The next batch in index order. Raises RenderingError when its renderer failed, ConfigError for bad input."""
         source, process = self._queues[self._turn], self._processes[self._turn]
         while True:
             try:
@@ -154,6 +156,8 @@ class Feed:
             except queue.Empty:
                 if not process.is_alive():
                     raise RenderingError(f"{process.name} ended with exit code {process.exitcode}") from None
+        if isinstance(batch, ConfigError):
+            raise batch
         if isinstance(batch, str):
             raise RenderingError(f"{process.name} failed:\n{batch}")
         self._turn = (self._turn + 1) % len(self._queues)

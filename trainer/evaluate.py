@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -108,6 +109,11 @@ def measure(
         "score_auc": ranking_auc(est.score, empty),
         "score_median": float(np.median(est.score)),
     }
+
+
+def null_where_unknown(measured: Mapping[str, float]) -> dict[str, float | None]:
+    """The same for JSON, which has no NaN: None where there was nothing to measure on."""
+    return {name: value if math.isfinite(value) else None for name, value in measured.items()}
 
 
 def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -86,9 +85,11 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from sim_replay.evaluation.table import score_table
+    from trainer.config import refuse_no_folder
     from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
     asked = arguments
+    refuse_no_folder(asked.out)
     request = DatasetRequest(
         asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.own_ship, asked.score_min
     )
@@ -118,17 +119,20 @@ def _on_windows(arguments: argparse.Namespace) -> None:
 
     from sim_replay.offline import SHIPPED_MODEL
     from trainer.config import ConfigError, made_folder
+    from trainer.evaluate import null_where_unknown
     from trainer.held_out import Request, evaluate_file
 
-    for name in ("results", "dataset", "split"):
-        if getattr(arguments, name) is not None:
+    for name, unasked in {"results": None, "dataset": None, "split": None, "every": 1, "mode": "frames"}.items():
+        if getattr(arguments, name) != unasked:
             raise ConfigError(f"--{name}: is of a dataset, --windows of rendered pictures; give one of them")
+    if arguments.score_min is not None:
+        raise ConfigError("--score-min: --windows measures at what the file says")
     model = arguments.model or SHIPPED_MODEL
     request = Request(model, arguments.windows, arguments.seed, arguments.stage, arguments.size)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("rendering", total=arguments.windows)
         measured = evaluate_file(request, rendered=lambda count: progress.update(task, completed=count))
-    score = {name: value if math.isfinite(value) else None for name, value in measured.items()}
+    score = null_where_unknown(measured)
     made_folder(arguments.out)
     (arguments.out / "windows.json").write_text(json.dumps(score, indent=2) + "\n", encoding="utf-8")
     if arguments.json:

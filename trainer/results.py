@@ -152,7 +152,8 @@ def gathered(earlier: Sequence[dict[str, Any]], runs: Sequence[Path]) -> list[di
         kept = ("samples", "size_px", "windows", *(key for key in lines[0] if key.startswith(KEPT_METRICS)))
         for line in lines:
             total = before + line["samples"]
-            history.append({"run": folder.name, "total_samples": total, **{key: round(line[key], 5) for key in kept}})
+            values = {key: None if line[key] is None else round(line[key], 5) for key in kept}
+            history.append({"run": folder.name, "total_samples": total, **values})
         before = history[-1]["total_samples"]
     return history
 

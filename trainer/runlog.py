@@ -16,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
-from trainer.config import TrainerConfig, made_folder
+from trainer.config import ConfigError, TrainerConfig, made_folder
+from trainer.evaluate import null_where_unknown
 
 RUN_NAME = "run.json"
 
@@ -45,12 +46,25 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
 
 
 def starts_of(out: Path) -> list[dict[str, Any]]:
-    """What run.json in a run folder tells of each start of the run, the first first; none without the file."""
+    """What run.json in a run folder tells of each start of the run, the first first; none without the file.
+
+    Raises ConfigError for a file that was damaged.
+    """
     path = out / RUN_NAME
     if not path.exists():
         return []
-    told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from None
     return list(told.get("starts", [told]))  # older files are the record of one start
+
+
+def _write_whole(path: Path, text: str) -> None:
+    """Write beside it and rename, so that a crash leaves the last whole file."""
+    part = path.with_suffix(".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
 
 
 def _is_of_the_past(line: str, samples: int) -> bool:
@@ -74,15 +88,13 @@ class RunLog:
         (out / "config.toml").write_text(config_text, encoding="utf-8")
         digest = hashlib.sha256(config_text.encode()).hexdigest()
         starts = [*starts_of(out), {**start, "config_sha256": digest}]
-        (out / RUN_NAME).write_text(json.dumps({"starts": starts}, indent=2) + "\n", encoding="utf-8")
+        _write_whole(out / RUN_NAME, json.dumps({"starts": starts}, indent=2) + "\n")
         samples = int(start["from_samples"] or 0)
         log = out / "log.jsonl"
         lines = log.read_text(encoding="utf-8").splitlines(keepends=True) if log.exists() else []
         kept = [line for line in lines if _is_of_the_past(line, samples)]
         if len(kept) < len(lines):
-            part = log.with_suffix(".part")
-            part.write_text("".join(kept), encoding="utf-8")
-            part.replace(log)
+            _write_whole(log, "".join(kept))
         self._lines = log.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=samples + 1)
         self._started_s = time.monotonic()
@@ -138,7 +150,8 @@ class RunLog:
         print(text, flush=True)
 
     def _record(self, kind: str, samples: int, values: dict[str, float]) -> None:
-        self._lines.write(json.dumps({"kind": kind, "wall_s": time.monotonic() - self._started_s, **values}) + "\n")
+        record = {"kind": kind, "wall_s": time.monotonic() - self._started_s, **null_where_unknown(values)}
+        self._lines.write(json.dumps(record, allow_nan=False) + "\n")
         self._lines.flush()
         for name, value in values.items():
             self._board.add_scalar(f"{kind}/{name}", value, samples)

@@ -234,6 +234,8 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     """
     path = out / RESUME_NAME
     state = load_file(path)
+    if not {"config", "trainer", "used_s"} <= state.keys():
+        raise ConfigError(f"{path}: holds no run to go on with")
     earlier = parse_config(state["config"], f"{path} (config)")
     for section in ("model", "loss", "data", "schedule"):
         if getattr(earlier, section) != getattr(trainer.config, section):
@@ -312,6 +314,7 @@ class _Loop:
         last_step = None if max_steps is None else self.trainer.steps + max_steps
         reason = "the planned samples are done"
         try:
+            self.size_px = size_at(self.config.schedule, self.progress())  # a run may be resumed at its end
             while (progress := self.progress()) < 1.0:
                 size_px = size_at(self.config.schedule, progress)
                 if self._train_at(size_px, stopped, last_step):
@@ -320,7 +323,8 @@ class _Loop:
             if self.budget.total_s and self.used_s() >= self.budget.total_s:
                 reason = "the time budget is used up"
         finally:
-            self.save()
+            if self.trainer.steps > 0:  # what failed before it began is no run to go on with
+                self.save()
         self.validate(self.size_px)
         self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
         if self.log is not None:

@@ -89,6 +89,23 @@ def test_an_interrupted_variant_has_no_row_and_the_next_call_goes_on(tmp_path: P
     assert [row["trained_samples"] for row in whole["rows"].values()] == [8, 8]
 
 
+def test_where_every_window_holds_a_target_false_alarms_are_null_and_not_nan(tmp_path: Path) -> None:
+    def full_view(data: DataConfig, seed: int, size_px: int) -> partial:
+        return partial(synthetic_sampler.PlateSampler, seed, size_px, empty_share=0.0)
+
+    result = ablate(tiny.config(), [FULL], SCALE, tmp_path, lambda _: None, full_view)
+    assert result["rows"]["full"]["false_alarms"] is None
+    written = [(tmp_path / "ablation.json").read_text(), *(tmp_path / "full" / "log.jsonl").read_text().splitlines()]
+    assert all("NaN" not in line for line in written)
+    assert json.loads(written[-1])["score_auc"] is None
+
+
+def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(tmp_path: Path) -> None:
+    result = ablate(tiny.config(), [FULL], SCALE, tmp_path, lambda _: None, open_view)
+    result["rows"]["full"]["bearing_median_deg"] = None
+    assert "| – | `" in table(result)
+
+
 def test_an_unknown_variant_is_named_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match="'no-such'; there are full, no-ray"):
         chosen(["no-such"])

@@ -34,6 +34,13 @@ def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
         gathered([], [run_folder(tmp_path / "c", [])])
 
 
+def test_a_rate_that_a_run_could_not_measure_stays_unknown(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "a", [100])
+    log = folder / "log.jsonl"
+    log.write_text(log.read_text().replace('"windows": 256', '"windows": 256, "false_alarms": null'))
+    assert gathered([], [folder])[0]["false_alarms"] is None
+
+
 def test_a_run_is_added_to_the_history_and_one_that_went_on_takes_its_place_and_all_after_it(tmp_path: Path) -> None:
     a, b, c = (run_folder(tmp_path / name, samples) for name, samples in (("a", [100]), ("b", [40]), ("c", [5])))
     history = gathered(gathered([], [a, b]), [c])

@@ -51,6 +51,22 @@ def test_a_run_is_neither_overwritten_nor_resumed_with_other_losses(whole: tuple
         train(out, 1, tiny.TOML.replace("mask = 1.0", "mask = 2.0"), resume=True)
 
 
+@pytest.mark.parametrize("content", [[1], {"config": tiny.TOML}])
+def test_a_file_that_is_no_run_is_not_gone_on_with(tmp_path: Path, content: object) -> None:
+    torch.save(content, tmp_path / "resume.pt")
+    with pytest.raises(ConfigError, match=r"resume\.pt: (not a checkpoint|holds no run)"):
+        train(tmp_path, 1, resume=True)
+
+
+def test_a_run_resumed_at_its_end_stays_what_it_was(tmp_path: Path) -> None:
+    train(tmp_path, None)
+    before = load_model(tmp_path)
+    train(tmp_path, None, resume=True)
+    after = load_model(tmp_path)
+    assert after[2]["resolution_px"] == before[2]["resolution_px"] == 96
+    assert after[3] == before[3]
+
+
 def test_the_weights_file_is_the_averaged_network_in_half_precision(whole: tuple[Path, Trainer]) -> None:
     out, trainer = whole
     model, config, training, sha256 = load_model(out)

@@ -69,6 +69,12 @@ def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_p
     assert [event.step for event in board.Scalars("train/loss")] == [4, 8, 12, 16]
 
 
+def test_a_record_of_starts_that_was_damaged_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"starts": [')
+    with pytest.raises(ConfigError, match=r"run\.json: not JSON"):
+        RunLog(tmp_path, tiny.TOML, {"from_samples": 0})
+
+
 def test_a_resumed_run_keeps_its_plan(run: Path) -> None:
     assert load_file(run / "resume.pt")["trainer"]["samples"] == 20
 
@@ -131,6 +137,8 @@ def test_a_resumed_run_takes_no_other_weights(run: Path) -> None:
         ["train", "--budget-minutes", "-1"],
         ["train", "--budget-minutes", "nan"],
         ["train", "--samples", "0"],
+        ["ablate", "--windows", "0"],
+        ["ablate", "--samples", "-1"],
         ["export", "--checkpoint", "x", "--samples", "0"],
         ["export", "--checkpoint", "x", "--tolerance", "-1"],
         ["export", "--checkpoint", "x", "--tolerance-pose", "inf"],
