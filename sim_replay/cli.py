@@ -134,7 +134,7 @@ def _score_dataset(args: argparse.Namespace, console: Console) -> int:
         raise InputError(f"--every {args.every}: must be at least 1")
     model = load_model(args.model, DEFAULT_THREADS)
     dataset = open_dataset(args.dataset, args.split)
-    pictures = list(dataset.frames())[:: args.every]
+    pictures = dataset.labelled_frames()[:: args.every]
     with Progress(console=console, disable=args.json or not console.is_terminal) as progress:
         task = progress.add_task("scoring", total=len(pictures))
         judged = judge_frames(pictures, dataset.models, estimator_answers(model), lambda _: progress.advance(task))

@@ -44,6 +44,7 @@ class DatasetFrame:
     targets: tuple[BopTarget, ...]  # poses of body axes (FRD); boxes in the picture on disk
     scene: BopScene = field(repr=False)
     target_indices: tuple[int, ...]  # of each target among all that the scene lists for this picture
+    truth_known: bool = True  # as sim_replay.bop.BopFrame has it
 
     def image_bgr(self) -> Image:
         """The picture as it is on disk [H, W, 3]. Raises BopError."""
@@ -103,6 +104,19 @@ class Dataset:
                     indices = _chosen(frame.targets, wanted[scene.scene_id, frame.image_id])
                 yield self._frame(scene, frame, indices, sizes)
 
+    def labelled_frames(self) -> list[DatasetFrame]:
+        """Those of frames() whose truth is known: some datasets keep that of their test splits to themselves.
+
+        Raises BopError, also if it is known of none.
+        """
+        frames = list(self.frames())
+        labelled = [frame for frame in frames if frame.truth_known]
+        if frames and not labelled:
+            raise BopError(f"{self.root}: no scene_gt.json (or KEY.gt.json) tells what its pictures show")
+        if len(labelled) < len(frames):
+            _log.warning("%s: what %d pictures show is not told", self.root, len(frames) - len(labelled))
+        return labelled
+
     @cached_property
     def _wanted(self) -> Wanted | None:
         return _read_targets(self.root / TARGETS_FILE)
@@ -120,7 +134,15 @@ class Dataset:
             for t in targets
         )
         return DatasetFrame(
-            scene.scene_id, frame.image_id, frame.K, frame.distortion, path, placed, scene, tuple(indices)
+            scene.scene_id,
+            frame.image_id,
+            frame.K,
+            frame.distortion,
+            path,
+            placed,
+            scene,
+            tuple(indices),
+            frame.truth_known,
         )
 
 

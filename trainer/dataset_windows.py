@@ -33,7 +33,7 @@ class DatasetSampler:
         self.seed, self.size_px, self.acquire_share = seed, size_px, acquire_share
         try:
             dataset = open_dataset(root, split)
-            self._frames = list(dataset.frames())
+            self._frames = dataset.labelled_frames()
             self._diameter_m = {key: model.diameter_m for key, model in dataset.models.items()}
         except BopError as error:
             raise ConfigError(str(error)) from error

@@ -77,7 +77,7 @@ def evaluate_dataset(
         raise ConfigError(f"--every {request.every}: must be at least 1")
     try:
         dataset = open_dataset(request.dataset or BUNDLED_SEQUENCE, request.split)
-        pictures = list(dataset.frames())
+        pictures = dataset.labelled_frames()
         if request.mode == "frames":  # a tracker must see them all
             pictures = pictures[:: request.every]
         if not pictures:

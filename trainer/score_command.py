@@ -65,7 +65,7 @@ def calibrate_file(
 
     contract = read_contract(path)
     try:
-        pictures = [picture for folder in datasets for picture in open_dataset(folder).frames()]
+        pictures = [picture for folder in datasets for picture in open_dataset(folder).labelled_frames()]
         on_start(len(pictures))
         seen = list(candidates(load_model(path, DEFAULT_THREADS), pictures, on_frame))
     except InputError as error:

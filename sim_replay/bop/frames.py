@@ -21,7 +21,10 @@ class Source(NamedTuple):
 
 
 def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, models: ModelFrames) -> BopFrame:
-    """One picture's record; `poses` and `info` may be None. Targets' poses are of their body axes. Raises BopError."""
+    """One picture's record; `info` may be None, and `poses` where no file tells them. Raises BopError.
+
+    Targets' poses are of their body axes.
+    """
     key = str(image_id)
     K = matrix(source.camera, key, camera, "cam_K", (3, 3))
     if min(K[0, 0], K[1, 1]) <= 0:
@@ -34,6 +37,7 @@ def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, 
         R_cam_world=rotation(source.camera, key, camera, "cam_R_w2c") if has_world else None,
         t_cam_world_m=length_m(source.camera, key, camera, "cam_t_w2c", (3,)) if has_world else None,
         distortion=distortion_of(source.camera, key, camera),
+        truth_known=poses is not None,
     )
 
 

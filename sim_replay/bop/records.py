@@ -43,3 +43,4 @@ class BopFrame:
     R_cam_world: Array | None = None  # [3, 3]
     t_cam_world_m: Array | None = None  # [3]
     distortion: Distortion | None = None  # None: a pinhole camera
+    truth_known: bool = True  # False: no file tells what is in it, so no targets does not mean that it is empty

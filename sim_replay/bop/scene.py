@@ -44,8 +44,11 @@ class BopScene:
         poses, info = (by_number(path, load_object(path, optional=True)) for path in (gt, gt_info))
         camera_file, cameras = self._cameras(poses)
         source = Source(camera_file, gt, gt_info)
+        unlisted: list[Any] | None = [] if gt.is_file() else None  # a picture that the file leaves out shows no target
         return tuple(
-            frame_of(source, image_id, cameras[image_id], poses.get(image_id), info.get(image_id), self.models)
+            frame_of(
+                source, image_id, cameras[image_id], poses.get(image_id, unlisted), info.get(image_id), self.models
+            )
             for image_id in sorted(cameras)
         )
 

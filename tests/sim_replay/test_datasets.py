@@ -186,6 +186,20 @@ def test_listed_pictures_that_are_missing_are_left_out_and_told(root: Path, capl
         list(open_dataset(root, "train").frames())
 
 
+def test_pictures_whose_truth_is_kept_back_are_not_taken_for_empty_ones(
+    root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    every = ids(open_dataset(root, "test"))
+    (root / "test" / "000002" / "scene_gt.json").unlink()
+    write_json(root / "test" / "000048" / "scene_gt.json", {})  # a file that leaves a picture out
+    labelled = open_dataset(root, "test").labelled_frames()
+    assert [(frame.scene_id, frame.image_id) for frame in labelled] == [one for one in every if one[0] != 2]
+    assert "pictures show is not told" in caplog.text
+    (root / "test" / "000048" / "scene_gt.json").unlink()
+    with pytest.raises(BopError, match=r"no scene_gt\.json .* tells what its pictures show"):
+        open_dataset(root, "test").labelled_frames()
+
+
 def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> None:
     folder = root / "test" / "000002"
     poses = [{"obj_id": obj_id, "cam_R_m2c": UNIT, "cam_t_m2c": [x, 0, 2e5]} for x, obj_id in enumerate((1, 1, 8, 1))]

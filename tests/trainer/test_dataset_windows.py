@@ -96,6 +96,14 @@ def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
         parse_config(tiny.TOML.replace("[schedule]", shares), "own.toml")
 
 
+def test_a_run_on_a_dataset_that_is_not_there_says_so_and_leaves_nothing_to_resume(tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    text = tiny.TOML.replace("[schedule]", f'[[data.datasets]]\npath = "{nowhere}"\nshare = 1.0\n[schedule]')
+    with pytest.raises(ConfigError, match=rf"^{nowhere} is not a folder$"):
+        run_training(parse_config(text, "own.toml"), text, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("*.pt"))
+
+
 def test_held_out_windows_are_of_the_validation_split(dataset: Path) -> None:
     source = f'[[data.datasets]]\npath = "{dataset}"\nshare = 1.0\nvalidation_split = "val"\n[schedule]'
     data = parse_config(tiny.TOML.replace("[schedule]", source), "own.toml").data

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny
+import torch
 from scipy.spatial.transform import Rotation
 
 from trainer.checkpoint import save_weights
@@ -194,6 +197,8 @@ def test_a_checkpoint_scores_as_its_exported_file_does(dataset: Path, tmp_path: 
         (["--dataset", "DATASET", "--split", "val"], ["'val'"]),
         (["--results", "nowhere.csv", "--mode", "track", "--dataset", "DATASET"], ["--mode track"]),
         (["--windows", "64", "--dataset", "DATASET"], ["--dataset", "--windows"]),
+        (["--windows", "64", "--mode", "track"], ["--mode", "--windows"]),
+        (["--windows", "64", "--score-min", "0.5"], ["--score-min", "--windows"]),
     ],
 )
 def test_bad_input_is_told_in_a_sentence(
@@ -203,3 +208,49 @@ def test_bad_input_is_told_in_a_sentence(
     assert main(["evaluate", *given]) == 2
     said = capsys.readouterr().err
     assert all(word in said for word in words), said
+
+
+def test_a_test_split_without_public_truth_is_not_scored_as_if_it_were_empty(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = tmp_path / "secret"
+    shutil.copytree(dataset, secret)
+    (secret / "test" / "000002" / "scene_gt.json").unlink()
+    results = write_results(tmp_path / "truth_plane-test.csv", [(0, *true_pose(0))])
+    assert main(["evaluate", "--results", str(results), "--dataset", str(secret), "--out", str(tmp_path)]) == 2
+    assert f"{secret}: no scene_gt.json" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "out"
+    # The model is not there either: it would be asked for next.
+    assert main(["evaluate", "--model", "nowhere.onnx", "--dataset", str(dataset), "--out", str(out)]) == 2
+    assert f"{out}: cannot be made a folder: {tmp_path / 'file'} is a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [[1, 2], torch.zeros(2), {"weights": {}, "config": tiny.TOML, "training": {}}])
+def test_another_programs_checkpoint_is_told_in_a_sentence(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: object
+) -> None:
+    path = tmp_path / "other.pt"
+    torch.save(content, path)
+    assert main(["evaluate", "--checkpoint", str(path), "--dataset", str(dataset), "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"uavpose-trainer: {path}: ")
+    assert len(said.splitlines()) == 1
+
+
+def test_json_that_nobody_reads_ends_without_a_traceback(dataset: Path, tmp_path: Path) -> None:
+    results = write_results(tmp_path / "truth_plane-test.csv", [(0, *true_pose(0))])
+    read_end, write_end = os.pipe()
+    os.close(read_end)  # as `| head` does when it has enough
+    command = [sys.executable, "-m", "trainer.cli", "evaluate", "--json", "--results", results, "--dataset", dataset]
+    done = subprocess.run(
+        [*command, "--out", tmp_path / "out"], stdout=write_end, stderr=subprocess.PIPE, text=True, timeout=200
+    )
+    os.close(write_end)
+    assert done.returncode == 141
+    assert "Traceback" not in done.stderr
