@@ -123,6 +123,7 @@ def ablate(
                 say(f"{variant.name}: interrupted; the same command goes on from here")
                 break
         result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
+        result["windows"] = int(result["rows"][variant.name]["windows"])  # they are rendered in whole chunks
         (out / RESULT_NAME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         (out / "table.md").write_text(table(result), encoding="utf-8")
     return result

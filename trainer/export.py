@@ -206,8 +206,9 @@ def export_models(
 ) -> tuple[Path, Path]:
     """Write NAME-fp32.onnx into `float_out` (default `out`) and NAME-int8.onnx into `out`; returns their paths.
 
-    `contract` replaces the [contract] section that the checkpoint was trained with. Raises ConfigError, and leaves no
-    INT8 file, when INT8's poses differ from FP32's by more than the tolerance on windows not calibrated on.
+    `contract` replaces the [contract] section that the checkpoint was trained with. Raises ConfigError, and writes no
+    INT8 file (one from before stays), when INT8's poses differ from FP32's by more than the tolerance on windows not
+    calibrated on.
     """
     model, config, training, sha256 = load_model(checkpoint)
     if contract is not None:

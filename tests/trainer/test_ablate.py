@@ -100,6 +100,12 @@ def test_where_every_window_holds_a_target_false_alarms_are_null_and_not_nan(tmp
     assert json.loads(written[-1])["score_auc"] is None
 
 
+def test_the_table_says_how_many_windows_were_measured_and_not_how_many_were_asked_for(tmp_path: Path) -> None:
+    result = ablate(tiny.config(), [FULL], Scale(samples=8, size_px=64, windows=5), tmp_path, lambda _: None, open_view)
+    assert result["windows"] == result["rows"]["full"]["windows"] == 16
+    assert "16 held-out windows" in (tmp_path / "table.md").read_text()
+
+
 def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(tmp_path: Path) -> None:
     result = ablate(tiny.config(), [FULL], SCALE, tmp_path, lambda _: None, open_view)
     result["rows"]["full"]["bearing_median_deg"] = None
