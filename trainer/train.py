@@ -297,6 +297,7 @@ class _Loop:
         self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}
+        self.validated: tuple[int, int] | None = None  # samples and size of the last time
 
     def used_s(self) -> float:
         return self.budget.used_before_s + time.monotonic() - self.started_s
@@ -360,8 +361,9 @@ class _Loop:
 
     def validate(self, size_px: int) -> None:
         """Measure the averaged network on held-out windows of this size, rendered once, and show some."""
-        if self.log is None:
+        if self.log is None or self.validated == (self.trainer.samples, size_px):
             return
+        self.validated = (self.trainer.samples, size_px)
         if size_px not in self.held_out:
             data = self.config.data
             self.held_out[size_px] = render_once(self.opener(data.validation_seed, size_px), data.validation_samples)

@@ -75,6 +75,12 @@ def test_a_record_of_starts_that_was_damaged_is_named(tmp_path: Path) -> None:
         RunLog(tmp_path, tiny.TOML, {"from_samples": 0})
 
 
+def test_a_run_whose_end_is_a_time_to_validate_does_so_once(tmp_path: Path) -> None:
+    train(tmp_path, tiny.TOML.replace("threads = 1", "threads = 1\nvalidate_every_samples = 8"))
+    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [record["samples"] for record in records if record["kind"] == "validation"] == [8, 16]
+
+
 def test_a_resumed_run_keeps_its_plan(run: Path) -> None:
     assert load_file(run / "resume.pt")["trainer"]["samples"] == 20
 
