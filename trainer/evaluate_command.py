@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 DEFAULT_OUT = Path("out") / "evaluate"
+WINDOWS_SEED = 930001
 
 
 def register(commands: argparse._SubParsersAction) -> None:
@@ -65,7 +66,7 @@ def register(commands: argparse._SubParsersAction) -> None:
     )
     windows = evaluate.add_argument_group("rendered windows instead of a dataset")
     windows.add_argument("--windows", type=int, metavar="N", help="measure on N windows; a seed gives the same ones")
-    windows.add_argument("--seed", type=int, default=930001, help="seed of the windows (default %(default)s)")
+    windows.add_argument("--seed", type=int, default=WINDOWS_SEED, help="seed of the windows (default %(default)s)")
     windows.add_argument("--stage", choices=("track", "acquire"), default="track", help="windows as it sees them")
     windows.add_argument("--size", type=int, metavar="PX", help="side of the windows; default: the model's")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
@@ -85,10 +86,13 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from sim_replay.evaluation.table import score_table
-    from trainer.config import refuse_no_folder
+    from trainer.config import ConfigError, refuse_no_folder
     from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
     asked = arguments
+    for name, unasked in {"seed": WINDOWS_SEED, "stage": "track", "size": None}.items():
+        if getattr(asked, name) != unasked:
+            raise ConfigError(f"--{name}: is of rendered windows; say how many with --windows")
     refuse_no_folder(asked.out)
     request = DatasetRequest(
         asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.own_ship, asked.score_min

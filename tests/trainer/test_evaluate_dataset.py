@@ -199,6 +199,8 @@ def test_a_checkpoint_scores_as_its_exported_file_does(dataset: Path, tmp_path: 
         (["--windows", "64", "--dataset", "DATASET"], ["--dataset", "--windows"]),
         (["--windows", "64", "--mode", "track"], ["--mode", "--windows"]),
         (["--windows", "64", "--score-min", "0.5"], ["--score-min", "--windows"]),
+        (["--dataset", "DATASET", "--stage", "acquire"], ["--stage", "--windows"]),
+        (["--dataset", "DATASET", "--seed", "7"], ["--seed", "--windows"]),
     ],
 )
 def test_bad_input_is_told_in_a_sentence(
