@@ -25,12 +25,13 @@ def average(runs: Sequence[Path], out: Path) -> Path:
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
     last = contents[-1]
     weights = {
-        name: torch.stack([content["weights"][name].double() for content in contents]).mean(0).to(value.dtype)
+        # Files written before the training-only heads were kept have none of them: those heads are the others' mean.
+        name: torch.stack([c["weights"][name].double() for c in contents if name in c["weights"]])
+        .mean(0)
+        .to(value.dtype)
         if value.is_floating_point()
         else value
         for name, value in last["weights"].items()
-        # Files written before the training-only heads were kept have none of them.
-        if all(name in content["weights"] for content in contents)
     }
     training = last["training"] | {"mean_of": ", ".join(sha256[:16] for sha256 in hashes)}
     path = made_folder(out) / WEIGHTS_NAME

@@ -9,7 +9,7 @@ import tiny
 import torch
 
 from trainer.average import average
-from trainer.checkpoint import load_file, load_model, save_weights
+from trainer.checkpoint import deployed_weights, load_file, load_model, save_weights, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.model import PoseNet
@@ -31,6 +31,17 @@ def test_weights_are_halfway_and_the_origin_is_told(tmp_path: Path) -> None:
     _, _, training, _ = load_model(tmp_path / "mean")
     assert training["samples"] == 2
     assert training["mean_of"] == ", ".join(load_model(run)[3][:16] for run in runs)
+
+
+def test_training_only_heads_that_one_run_lacks_are_the_other_s(tmp_path: Path) -> None:
+    one, other = (write_run(tmp_path / name, seed) for seed, name in enumerate("ab", start=1))
+    content = load_file(one)
+    write_atomic(one / "weights.pt", content | {"weights": deployed_weights(content["weights"])})
+    average([one, other], tmp_path / "mean")
+    mean, kept = (load_file(folder)["weights"] for folder in (tmp_path / "mean", other))
+    dense = [name for name in kept if name.startswith("head_dense.")]
+    assert dense
+    assert all(torch.equal(mean[name], kept[name]) for name in dense)
 
 
 def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:
