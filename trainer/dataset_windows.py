@@ -21,7 +21,7 @@ from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
 TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
 TRACK_ZOOM = (0.75, 1.33)
-ACQUIRE_WIDTH_PX = 640  # of the whole frame when the acquire stage sees it
+ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_MIN = 0.35  # of the box inside the window, below which it counts as empty
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def _acquire_square(
     rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: tuple[int, int], size_px: int
 ) -> tuple[Array, float]:
     """The same of a window of the reduced frame, anywhere around the box, or anywhere at all."""
-    side = size_px * frame_wh[0] / ACQUIRE_WIDTH_PX
+    side = size_px * frame_wh[0] / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
     around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
     low = around - rng.uniform(0.0, 1.0, 2) * side
     return np.where(np.array(frame_wh) > side, np.clip(low, 0.0, np.maximum(np.array(frame_wh) - side, 0.0)), low), side

@@ -25,7 +25,7 @@ RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
 BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame; its mean area is then about 1.2 % of it
 WINDOW_SCALE = 1.8
-ACQUIRE_DOWNSCALE = 3.0
+ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_SHARE_MIN = 0.35
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
@@ -139,7 +139,7 @@ def _track_cut(rng: np.random.Generator, scene: Scene) -> tuple[float, float, fl
 
 def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[float, float, float]:
     """(x0, y0, side) on the frame of a window of the reduced frame with the target anywhere in it."""
-    side = size_px * ACQUIRE_DOWNSCALE
+    side = size_px * float(np.exp(rng.uniform(*np.log(ACQUIRE_DOWNSCALE))))
     pixel = outline_px(scene.targets[0], scene.camera).mean(axis=0)
     corner = pixel - rng.uniform(0.0, 1.0, 2) * side
     # Where the frame is larger than the window, the window lies inside the frame.
