@@ -163,7 +163,8 @@ class Estimator:
         windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh, lens) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
         shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
-        images = np.stack([cut(frame.image_bgr, window, size_wh, lens) for window in windows])
+        pixels = {window: cut(frame.image_bgr, window, size_wh, lens) for window in dict.fromkeys(windows)}
+        images = np.stack([pixels[window] for window in windows])
         K = np.stack([one.K for one in shown])
         turned = np.array(mirrors, dtype=bool) if mirrors else np.zeros(len(images), dtype=bool)
         peaks = unmirrored(self.model.run(*mirrored(images, K, turned)), size_wh[0], turned)
