@@ -7,21 +7,19 @@ points, and only what is seen there is a target.
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 from edge import clock
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
+from edge.threads import yield_to_the_loop
 from edge.types import Array, Estimate, Frame
 
 log = logging.getLogger(__name__)
 
-YIELDS = 10  # how much nicer than the loop its thread is
 STOP_TIMEOUT_S = 5.0  # a process that ends during an inference is aborted; on a busy machine one takes long
 PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
 
@@ -86,8 +84,7 @@ class Search:
             return dict(self._counts)
 
     def _run(self) -> None:
-        with suppress(OSError):  # where a sandbox forbids it, it competes with the loop and no more
-            os.nice(YIELDS)
+        yield_to_the_loop()
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._asked is not None or self._stopping)

@@ -1,9 +1,13 @@
-"""The table of threads: who does what, and whom nobody waits for."""
+"""The table of threads: who does what, whom nobody waits for, and which yield to the loop."""
 
 from __future__ import annotations
 
+import os
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
+
+YIELDS = 10  # how much nicer than the loop's threads are those that look over whole frames
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,12 @@ THREADS = (
     ThreadRow("reload", "while SIGHUP is obeyed: reads the configuration, loads and warms the model", "the loop"),
     ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
 )
+
+
+def yield_to_the_loop() -> None:
+    """Lower the priority of the calling thread and of those that it will start."""
+    with suppress(OSError):  # where a sandbox forbids it, they compete with the loop and no more
+        os.nice(YIELDS)
 
 
 def running() -> frozenset[str]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pydantic import ValidationError
 from edge import clock
 from edge.errors import InputError
 from edge.estimator.providers import ChosenProvider, Provider, choose_provider
+from edge.threads import yield_to_the_loop
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
 from msgs.settings import dotted, faults_of
 
@@ -121,7 +123,10 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
     except OSError as error:
         raise InputError(f"model {path} cannot be read: {error.strerror}") from error
     chosen = choose_provider(provider, ort.get_available_providers())
-    session = _open(content, path, session_options(threads, spinning), chosen)
+    with ThreadPoolExecutor(1, initializer=yield_to_the_loop) as opener:
+        # A session's threads have the priority of the thread that opens it: a search of the whole frame makes no pose
+        # late that a window of the same moment gives.
+        session = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
     chosen = chosen.confirmed(session.get_providers())
     contract = _contract(session.get_modelmeta().custom_metadata_map, path)
     _check_graph(session, contract, path)

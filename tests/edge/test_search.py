@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge import threads
-from edge.config import Config, ConfigFile
+from edge.config import SHIPPED_MODEL, Config, ConfigFile
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
@@ -31,6 +32,7 @@ from .toy_scene import SIZE_WH, TARGET_WH, K, draw
 
 HELD, OTHER = (500.5, 420.5), (1400.5, 700.5)
 PERIOD_NS = 33_000_000
+LOWEST = 19  # priority that the kernel knows
 
 
 def box_around(center_px: tuple[float, float]) -> Array:
@@ -96,6 +98,16 @@ class Gated(Estimator):
         if isinstance(self.sees, Exception):
             raise self.sees
         return self.sees
+
+
+def test_the_model_looks_over_whole_frames_at_a_lower_priority_than_through_windows() -> None:
+    before = set(os.listdir("/proc/self/task"))
+    model = load_model(SHIPPED_MODEL, 3)
+    begun = set(os.listdir("/proc/self/task")) - before
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    yielding = min(own + threads.YIELDS, LOWEST)
+    priorities = sorted(os.getpriority(os.PRIO_PROCESS, int(thread)) for thread in begun)
+    assert priorities == [own, own, yielding, yielding], model.path  # two beside the caller's for each kind
 
 
 @pytest.fixture
