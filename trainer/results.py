@@ -94,7 +94,8 @@ def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str
     lines = ["# Results", "", f"Made by `{command}`. Missed targets count as failures in every rate; means are over "]
     lines[-1] += (
         "found targets. Single frames, unless a row says *track*: then the daemon's tracker, "
-        "which is told own attitude with the errors that an autopilot usually has."
+        "which is told own attitude with the errors that an autopilot usually has. *False / 1,000*: false poses in "
+        "1,000 frames without a target, or with one of which nothing can be seen."
     )
     lines += ["", *(f"- `{name}`: {m['precision']}, sha256 `{m['sha256'][:16]}`" for name, m in models.items())]
     lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]
@@ -160,9 +161,10 @@ def gathered(earlier: Sequence[dict[str, Any]], runs: Sequence[Path]) -> list[di
 
 def told(history: Sequence[Mapping[str, Any]]) -> str:
     """How much training is behind the last line."""
-    runs = list(dict.fromkeys(line["run"] for line in history))
+    runs = len({line["run"] for line in history})
     return (
-        f"Trained on {history[-1]['total_samples']:,} rendered windows in {len(runs)} runs, each begun from the last."
+        f"Trained on {history[-1]['total_samples']:,} rendered windows in {runs} runs, each begun from the weights of "
+        "those before it: of the last, or of a mean."
     )
 
 
