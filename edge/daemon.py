@@ -17,6 +17,7 @@ from edge.cameras.source import EndOfStream
 from edge.clock import monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.estimator import Estimator
+from edge.estimator.pace import Pace, looked_at_twice
 from edge.health import HealthSnapshot
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
@@ -87,6 +88,7 @@ class Pipeline:
         self._reloader = reloader
         self._by_hand = ByHand()
         self._acquire_every_n = config.estimator.acquire_every_n
+        self._pace = Pace()
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
@@ -167,16 +169,18 @@ class Pipeline:
         self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock
     ) -> list[Estimate]:
         capture_ns = frame.meta.capture_ns
+        unhurried = self._pace.unhurried(frame.meta)
         searches = self._by_hand.searches(capture_ns)
         held = [track.box_xyxy_px for track in expected]
+        twice = [looked_at_twice(track.state, unhurried) for track in expected]
         places = self.search.places(capture_ns, held, self._max_targets - len(held)) if searches else []
-        found = self._look_into(held, places, frame, pointed_at, clock)
+        found = self._look_into(held, twice, places, frame, pointed_at, clock)
         self._since_acquire += 1
         if not searches:
             return found
         if not found:
-            # Windows looked into in vain have cost this frame its finer looks.
-            found = self._estimator.acquire(frame, thrice=not expected)
+            # The whole frame and windows looked into in vain leave no time for finer looks: the next frame has them.
+            found = self._estimator.acquire(frame, thrice=unhurried and not expected)
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (
@@ -188,14 +192,20 @@ class Pipeline:
         return found
 
     def _look_into(
-        self, held: list[Array], places: list[Estimate], frame: Frame, pointed_at: Array | None, clock: StageClock
+        self,
+        held: list[Array],
+        twice: list[bool],
+        places: list[Estimate],
+        frame: Frame,
+        pointed_at: Array | None,
+        clock: StageClock,
     ) -> list[Estimate]:
         boxes = [*held, *(place.box_xyxy_px for place in places)]
         if pointed_at is not None:
             boxes.append(pointed_at)
         if not boxes or not self._estimator.has_track_stage:
             return []
-        seen = self._estimator.track(frame, boxes)
+        seen = self._estimator.track(frame, boxes, twice)
         if pointed_at is not None and (there := seen[-1]) is not None:
             self._by_hand.found(there)
             self._tracker.make_room()

@@ -13,24 +13,22 @@ from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, window_around
-from edge.types import Array, Estimate, Frame, FrameMeta
+from edge.types import Array, Estimate, Frame
 
 WORTH_A_LOOK = 0.1  # where the whole frame has a target less probably, no window is spent on it
 FAINTEST = 0.02  # the least that a window says of a place that the whole frame has named
-UNHURRIED_NS = 60_000_000  # from one of the camera's frames to the next: time for two looks at each target
 LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
 
 
 class Estimator:
-    """Poses of the targets in single frames; between them it remembers only which was tracked last and whether that
-    one was looked at mirrored, and counts of what it refused."""
+    """Poses of the targets in single frames; between them it remembers only whether the last windows were looked at
+    mirrored, and counts of what it refused."""
 
     def __init__(self, model: Model, max_targets: int = 4) -> None:
         self.model = model
         self.refused: Counter[str] = Counter()
         self._max_targets = max_targets
         self._mirror = True
-        self._tracked: FrameMeta | None = None
 
     @property
     def has_track_stage(self) -> bool:
@@ -45,7 +43,6 @@ class Estimator:
             for _ in range(2):  # plain and mirrored
                 self.track(frame, [box])
             self._look_both_ways(frame, [box], FAINTEST)
-        self._tracked = None
         self.refused.clear()
 
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), thrice: bool = True) -> list[Estimate]:
@@ -117,19 +114,22 @@ class Estimator:
         found = decode(run(image[None], shown.K[None]), 0, shown, contract, "acquire", score_min, refused)
         return distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
 
-    def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array]) -> list[Estimate | None]:
+    def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows.
 
         Every other frame is looked at mirrored: what the network gets wrong of one it gets wrong otherwise of the next.
-        A camera of few frames a second has each looked at both ways.
+        `twice`, if any: which boxes are looked at both ways at once.
         """
-        before, self._tracked = self._tracked, frame.meta
         self._mirror = not self._mirror
-        score_min = self.model.contract.track_score_min
-        if before is None or _interval_ns(before, frame.meta) < UNHURRIED_NS:
-            return _each_once(self._look(frame, boxes_xyxy_px, score_min, [self._mirror] * len(boxes_xyxy_px)))
-        looks = self._look_both_ways(frame, boxes_xyxy_px, score_min)
-        return _each_once([_of_either(*pair) for pair in zip(*looks, strict=True)])
+        again = [i for i, both in enumerate(twice) if both]
+        boxes = [*boxes_xyxy_px, *(boxes_xyxy_px[i] for i in again)]
+        count = len(boxes_xyxy_px)
+        mirrors = [self._mirror] * count + [not self._mirror] * len(again)
+        found = self._look(frame, boxes, self.model.contract.track_score_min, mirrors)
+        looks, others = _each_once(found[:count]), _each_once(found[count:])
+        for i, other in zip(again, others, strict=True):
+            looks[i] = _of_either(looks[i], other)
+        return _each_once(looks)
 
     def _look_both_ways(
         self, frame: Frame, boxes_xyxy_px: Sequence[Array], score_min: float, looks_left: int = LOOKS_MOST
@@ -184,14 +184,9 @@ class Estimator:
         return found
 
 
-def _interval_ns(before: FrameMeta, after: FrameMeta) -> float:
-    """Between two frames of the source, those that were not looked at counted."""
-    return (after.capture_ns - before.capture_ns) / max(after.sequence - before.sequence, 1)
-
-
-def _of_either(plain: Estimate | None, mirrored: Estimate | None) -> Estimate | None:
+def _of_either(one: Estimate | None, other: Estimate | None) -> Estimate | None:
     """What two looks at one place say: both together if they show one aircraft, else the surer."""
-    looks = sorted(filter(None, (plain, mirrored)), key=lambda look: -look.score)
+    looks = sorted(filter(None, (one, other)), key=lambda look: -look.score)
     if not looks:
         return None
     return of_looks([look for look in looks if look is looks[0] or of_one_target(look, looks[0])])

@@ -18,6 +18,7 @@ from edge.config import EstimatorSettings, MavlinkSettings
 from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
+from edge.estimator.pace import Pace, looked_at_twice
 from edge.links.outgoing import sendable
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
@@ -47,6 +48,7 @@ class _Sequence:
     errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
+    pace: Pace = field(default_factory=Pace)
 
     @classmethod
     def of(cls, scene: BopScene, own_ship: OwnShipTold) -> _Sequence:
@@ -133,12 +135,15 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
     """Windows around what is expected; the whole frame where they show nothing, and now and then for more."""
     found: list[Estimate] = []
+    unhurried = sequence.pace.unhurried(frame.meta)
     if expected and estimator.has_track_stage:
-        seen = estimator.track(frame, [track.box_xyxy_px for track in expected])
+        twice = [looked_at_twice(track.state, unhurried) for track in expected]
+        seen = estimator.track(frame, [track.box_xyxy_px for track in expected], twice)
         found = [estimate for estimate in seen if estimate is not None]
     sequence.since_acquire += 1
     due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
     if not found or due:
-        found += estimator.acquire(frame, [estimate.box_xyxy_px for estimate in found], thrice=not expected)
+        held = [estimate.box_xyxy_px for estimate in found]
+        found += estimator.acquire(frame, held, thrice=unhurried and not expected)
         sequence.since_acquire = 0
     return found

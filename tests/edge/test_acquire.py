@@ -10,7 +10,8 @@ import pytest
 
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks
-from edge.types import Estimate, Frame, FrameMeta
+from edge.estimator.pace import Pace, looked_at_twice
+from edge.types import Frame, FrameMeta, TrackState
 from msgs.contract import ModelContract
 
 from .toy_model import CONTRACT
@@ -81,22 +82,16 @@ def test_a_place_is_looked_at_once_then_plain_and_mirrored_and_a_track_by_turns(
     assert model.asked == ["plain", "mirrored", "plain", "mirrored"]
 
 
-def tracked(estimator: Estimator, meta: FrameMeta) -> Estimate | None:
+def test_a_track_that_cannot_wait_is_looked_at_both_ways_in_one_frame() -> None:
+    estimator, model, frame = scripted([], [answer(0.9, range_m=200.0)], [answer(0.8, range_m=242.0)])
     box = np.concatenate([TARGET_PX - SIZE_PX / 2, TARGET_PX + SIZE_PX / 2])
-    return estimator.track(Frame(meta, SLOPE, K), [box])[0]
-
-
-def test_a_camera_of_few_frames_a_second_has_each_looked_at_both_ways() -> None:
-    estimator, model, _ = scripted([answer(0.9)], [answer(0.9, range_m=200.0)], [answer(0.8, range_m=242.0)])
-    tracked(estimator, FrameMeta(7, 1_000_000_000, 0))
-    both = tracked(estimator, FrameMeta(8, 1_100_000_000, 0))
-    assert model.asked[1:] == ["plain", "mirrored"]
-    assert both is not None
-    assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(220.0, rel=1e-3)
-    # A camera of thirty a second, of which two frames in three were dropped, is still in a hurry.
-    model.asked.clear()
-    tracked(estimator, FrameMeta(11, 1_200_000_000, 0))
-    assert len(model.asked) == 1
+    for _ in range(2):  # whichever way the turn is
+        (both,) = estimator.track(frame, [box], [True])
+        assert both is not None
+        assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(220.0, rel=1e-3)
+    assert sorted(model.asked) == ["mirrored", "mirrored", "plain", "plain"]
+    estimator.track(frame, [box], [False])
+    assert len(model.asked) == 5
 
 
 @pytest.mark.parametrize(
@@ -109,14 +104,29 @@ def test_a_camera_of_few_frames_a_second_has_each_looked_at_both_ways() -> None:
     ],
 )
 def test_what_one_of_two_looks_does_not_show_the_other_may(plain: Any, mirrored: Any, range_m: float | None) -> None:
-    estimator, _, _ = scripted([answer(0.9)], [plain], [mirrored])
-    tracked(estimator, FrameMeta(0, 0, 0))
-    found = tracked(estimator, FrameMeta(1, 100_000_000, 0))
+    estimator, _, frame = scripted([], [plain], [mirrored])
+    box = np.concatenate([TARGET_PX - SIZE_PX / 2, TARGET_PX + SIZE_PX / 2])
+    (found,) = estimator.track(frame, [box], [True])
     if range_m is None:
         assert found is None
     else:
         assert found is not None
         assert np.linalg.norm(found.t_cam_target_m) == pytest.approx(range_m, rel=1e-6)
+
+
+def test_a_camera_of_few_frames_a_second_leaves_time_for_both() -> None:
+    pace = Pace()
+    assert not pace.unhurried(FrameMeta(7, 1_000_000_000, 0))  # who knows
+    assert pace.unhurried(FrameMeta(8, 1_100_000_000, 0))
+    assert not pace.unhurried(FrameMeta(9, 1_133_000_000, 0))
+    # A camera of thirty a second, of which two frames in three were dropped, is still in a hurry.
+    assert not pace.unhurried(FrameMeta(12, 1_233_000_000, 0))
+
+
+@pytest.mark.parametrize("unhurried", [True, False])
+def test_what_few_frames_have_shown_is_looked_at_both_ways_at_any_rate(unhurried: bool) -> None:
+    assert looked_at_twice(TrackState.TENTATIVE, unhurried)
+    assert looked_at_twice(TrackState.CONFIRMED, unhurried) is unhurried
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
-"""Two processes under torchrun train one network: both hold the same weights, learned from both their samples, and a run
-that was broken off goes on as if it had not been."""
+"""Two processes under torchrun train one network: both hold the same weights, learned from both their samples, and a
+run that was broken off goes on as if it had not been."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from trainer.config import parse_config
 from trainer.train import run_training
 
 if __name__ == "__main__":
-    out, text, steps, resume = Path(sys.argv[1]), Path(sys.argv[2]).read_text(), int(sys.argv[3]), sys.argv[4] == "resume"
+    out, text, steps, begin = Path(sys.argv[1]), Path(sys.argv[2]).read_text(), int(sys.argv[3]), sys.argv[4]
     trainer = run_training(
         parse_config(text, "tiny.toml"), text, out,
-        max_steps=steps, resume=resume, open_sampler=synthetic_sampler.opener,
+        max_steps=steps, resume=begin == "resume", open_sampler=synthetic_sampler.opener,
     )
     Path(out, "hash" + os.environ["RANK"]).write_text(weights_sha256(trainer.model.state_dict()))
 """
