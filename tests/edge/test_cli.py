@@ -123,7 +123,15 @@ def test_a_command_that_a_person_interrupts_ends_without_a_traceback(tmp_path: P
     links = '[zenoh]\nlisten = ["tcp/127.0.0.1:0"]\n[mavlink]\nendpoints = ["udpin:127.0.0.1:0"]\n'
     (tmp_path / "config.toml").write_text(text + links)
     command = [sys.executable, "-m", "edge.cli", "doctor", "--config", "config.toml"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as doctor:
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell starts what runs in its background with SIGINT ignored, and these tests may run there.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as doctor:
         assert doctor.stdout is not None
         assert any("listened on" in line for line in doctor.stdout)  # it now listens for an autopilot, for seconds
         doctor.send_signal(signal.SIGINT)
