@@ -24,6 +24,7 @@ THREADS = (
     ThreadRow("decode", "reads a sequence's pictures ahead", "the loop"),
     ThreadRow("search", "looks over the whole frame for more targets, at a lower priority", "the loop", watched=True),
     ThreadRow("zenoh", "sends the newest report, events, diagnostics, pictures", "the loop", watched=True),
+    ThreadRow("closing", "when the daemon stops: closes the zenoh session, or is left with it", "anybody"),
     ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),
     ThreadRow("pictures", "makes JPEG of frames for who looks and for recordings", "the loop, the links"),
     ThreadRow("mavlink", "owns the sockets: sends, answers, hears the autopilot", "the loop", watched=True),

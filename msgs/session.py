@@ -19,6 +19,9 @@ import zenoh
 LEASE_MS = 2000
 # Whoever accepts a connection and then says nothing holds up an opening, or a closing meanwhile, for so long.
 OPEN_TIMEOUT_MS = 4000
+# QUIC sends what was lost again after 1, 3 and 7 s. A router takes one QUIC handshake at a time and waits 30 s for one
+# that was given up and whose farewell was lost, so on a bad radio who gives up sooner keeps it from hearing anyone.
+QUIC_OPEN_TIMEOUT_MS = 10_000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
 # On a link whose poses are capped: what a person needs beside them, and no more.
@@ -149,7 +152,8 @@ def _config(
     _insert(config, "scouting/gossip/enabled", discovery)
     _insert(config, "timestamping/enabled", True)
     _insert(config, "transport/link/tx/lease", LEASE_MS)
-    _insert(config, "transport/unicast/open_timeout", OPEN_TIMEOUT_MS)
+    by_quic = any(endpoint.startswith("quic/") for endpoint in connect)
+    _insert(config, "transport/unicast/open_timeout", QUIC_OPEN_TIMEOUT_MS if by_quic else OPEN_TIMEOUT_MS)
     _insert(config, "transport/shared_memory/enabled", False)
     if tls is not None:
         settings = {

@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 EVENTS_WAITING = 64
 PICTURES_WAITING = 4
 STOP_TIMEOUT_S = 5.0
+# Closing waits for a connection that is being tried; one to a router that does not answer is left to the process's end.
+CLOSE_TIMEOUT_S = 2.0
 SETTLE_TIMEOUT_S = 60.0
 
 
@@ -161,7 +163,9 @@ class ZenohLink:
             self._worker = None
         if self._session is not None:
             # An open session keeps the process from leaving.
-            self._session.close()
+            closer = threading.Thread(target=self._session.close, name="closing", daemon=True)
+            closer.start()
+            closer.join(CLOSE_TIMEOUT_S)
             self._session = None
 
     @property

@@ -41,6 +41,8 @@ from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Frame, Report, Track, TrackState
 from msgs.client import connect, subscribe
+from msgs.ground.keys import init_authority, issue
+from msgs.session import QUIC_OPEN_TIMEOUT_MS
 
 from .toy_scene import center_of, true_t_cam_target_m
 
@@ -118,6 +120,26 @@ def test_a_signal_stops_the_daemon(tmp_path: Path, scene: Path, toy_model: Path,
         daemon.send_signal(number)
         assert daemon.wait(timeout=60) == 0
         assert "stopped: " in daemon.stderr.read()
+
+
+def test_a_ground_that_does_not_answer_by_radio_does_not_keep_the_daemon_from_stopping(
+    tmp_path: Path, scene: Path, toy_model: Path
+) -> None:
+    init_authority(tmp_path)
+    files = issue(tmp_path, "uav1", ["127.0.0.1"])
+    with socket.socket(type=socket.SOCK_DGRAM) as silent:
+        silent.bind(("127.0.0.1", 0))
+        links = (
+            f'[zenoh]\nlisten = []\nconnect = ["quic/127.0.0.1:{silent.getsockname()[1]}?mixed_rel=1"]\n'
+            f'tls = {{ root_ca = "{files.root_ca}", certificate = "{files.certificate}", '
+            f'private_key = "{files.private_key}" }}\n[mavlink]\nenabled = false\n'
+        )
+        with flying(tmp_path, config_toml(scene, toy_model, camera="loop = true\n", links=links)) as (daemon, _):
+            silent.recv(2048)  # it calls the ground
+            told_s = time.monotonic()
+            daemon.terminate()
+            assert daemon.wait(timeout=60) == 0
+            assert time.monotonic() - told_s < QUIC_OPEN_TIMEOUT_MS / 2000  # the call itself goes on for longer
 
 
 def test_a_daemon_whose_camera_is_absent_starts_says_so_once_and_stops(tmp_path: Path, toy_model: Path) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
-import select
-import socket
 import subprocess
 import sys
 import threading
@@ -21,13 +18,11 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from msgs import cdr, topics
-from msgs.ground.router import load_router, open_router
 from msgs.publish import Node, TopicPublisher
-from msgs.session import TlsFiles, peer_config, router_config
+from msgs.session import peer_config, router_config
 from tests.waiting import until
 
 from ..conftest import Network, free_endpoint
-from .conftest import write_router_config
 
 R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
 R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -204,59 +199,3 @@ def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_
         assert len(poses) > 3
     assert [cdr.Log.decode(m.data).msg for name, m in came if name == "/uav1/events"] == ["before"]
     assert all(0 <= m.log_time - m.publish_time < 10**10 for _, m in came)
-
-
-class LossyRelay(threading.Thread):
-    """Passes datagrams between a vehicle and the ground and loses a fifth of them."""
-
-    def __init__(self, to_port: int) -> None:
-        super().__init__(daemon=True)
-        self.listening, self.asking = (socket.socket(type=socket.SOCK_DGRAM) for _ in range(2))
-        self.listening.bind(("127.0.0.1", 0))
-        self.asking.connect(("127.0.0.1", to_port))
-        self.port = self.listening.getsockname()[1]
-        self.lost = self.passed = 0
-        self.done = threading.Event()
-
-    def run(self) -> None:
-        chance, client = random.Random(7), None
-        while not self.done.is_set():
-            for ready in select.select([self.listening, self.asking], [], [], 0.1)[0]:
-                try:
-                    data, sender = ready.recvfrom(65536)
-                except ConnectionRefusedError:
-                    continue
-                if ready is self.listening:
-                    client = sender
-                if chance.random() < 0.2:
-                    self.lost += 1
-                elif ready is self.listening:
-                    self.asking.send(data)
-                    self.passed += 1
-                elif client is not None:
-                    self.listening.sendto(data, client)
-        self.listening.close()
-        self.asking.close()
-
-
-def test_over_a_radio_that_loses_a_fifth_poses_come_in_order_and_fresh(
-    tmp_path: Path, keys: dict[str, TlsFiles]
-) -> None:
-    secure, loopback = free_endpoint().replace("tcp/", "quic/") + "?mixed_rel=1", free_endpoint()
-    path = write_router_config(
-        tmp_path, [secure, loopback], keys["ground"], 'vehicles = ["uav1"]\nloopback_reads = true\n'
-    )
-    relay = LossyRelay(int(secure.partition("?")[0].rpartition(":")[2]))
-    relay.start()
-    with ExitStack() as stack:
-        stack.callback(relay.done.set)
-        stack.enter_context(open_router(load_router(path), tmp_path))
-        far = f"quic/127.0.0.1:{relay.port}?mixed_rel=1"
-        uav1 = Vehicle(stack.enter_context(zenoh.open(peer_config([], [far], tls=keys["uav1"]))), "uav1", stack)
-        _, lines = stack.enter_context(ground("watch", "--json", "-e", loopback))
-        until(lambda: len(lines.objects("pose")) >= 60, uav1.tell)
-        poses = lines.objects("pose")
-    stamps = [one["stamp_ns"] for one in poses]
-    assert stamps == sorted(stamps)  # type: ignore[type-var]
-    assert all(one["age_s"] < 2.0 for one in poses)  # type: ignore[operator]
-    assert relay.lost > 10
