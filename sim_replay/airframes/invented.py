@@ -1,15 +1,18 @@
-"""Aircraft that nobody built: the fleet's parts exchanged, stretched and resized, for training alone.
+"""Aircraft that nobody built: the fleet's parts exchanged, swept, stretched and resized, for training alone.
 
 A network that has only seen the fleet takes every stranger for the member that looks most like it, and is as sure of
-its size. Numbers from `len(AIRFRAMES)` on mean such aircraft; they never occur in a dataset's labels.
+its size; and one that has seen small wings at tails alone takes a canard's nose for its tail. Numbers from
+`len(AIRFRAMES)` on mean such aircraft; they never occur in a dataset's labels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_replay.airframes.fleet import AIRFRAMES, Airframe
 from sim_replay.airframes.mesh import Mesh, Part, merge, moved, scaled
@@ -19,6 +22,12 @@ SIZE_SIGMA = 0.35  # of the logarithm of span and length together
 STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
 SPAN_M = (1.5, 26.0)
 EXCHANGED_SHARE = 0.6
+# Slopes of x and z over the span, outside the cabin's width: sweep forwards to backwards, wings that droop or rise.
+SWEEP, DIHEDRAL = (-0.35, 0.15), (-0.12, 0.08)
+CABIN_SHARE = 0.06  # of the span, either side of the middle
+NOSE_STRETCH = 0.25  # of the logarithm, either way, of what lies ahead of the wing, and of what lies behind
+CANARD_SHARE = 0.2
+CANARD_SPAN, CANARD_CHORD = (0.25, 0.5), (0.3, 0.6)  # of the wing's
 _EXCHANGEABLE = (Part.WING, Part.TAIL)
 
 
@@ -47,6 +56,9 @@ def _invented(airframe_id: int) -> Airframe:
     original, other = AIRFRAMES[base], AIRFRAMES[donor]
     exchanged = [part for part in _EXCHANGEABLE if base != donor and rng.random() < EXCHANGED_SHARE]
     stretch = np.exp(rng.uniform(-STRETCH, STRETCH, 3))
+    slopes = rng.uniform(*SWEEP), rng.uniform(*DIHEDRAL)
+    ahead_behind = np.exp(rng.uniform(-NOSE_STRETCH, NOSE_STRETCH, 2))
+    canard = Canard.drawn(rng) if rng.random() < CANARD_SHARE else None
     low, high = np.log(np.array(SPAN_M) / (original.span_m * stretch[1]))
     size = float(np.exp(np.clip(rng.normal(0.0, SIZE_SIGMA), low, high)))
 
@@ -54,7 +66,9 @@ def _invented(airframe_id: int) -> Airframe:
         mesh = original.mesh()
         for part in exchanged:
             mesh = _with_part_of(mesh, other.mesh(), part)
-        return scaled(mesh, size * stretch)
+        if canard is not None:
+            mesh = _as_canard(mesh, canard)
+        return scaled(_bent(mesh, slopes, ahead_behind), size * stretch)
 
     extent = np.ptp(build().vertices_m, axis=0)
     return Airframe(
@@ -81,6 +95,58 @@ def _with_part_of(mesh: Mesh, other: Mesh, part: Part) -> Mesh:
     by_m = middle[0] - middle[1]
     by_m[1] = 0.0
     return merge([_only(mesh, mesh.part != part), moved(fitted, by_m)])
+
+
+@dataclass(frozen=True)
+class Canard:
+    """A small wing at the nose, the wing itself far back."""
+
+    span: float  # as a share of the wing's
+    chord: float
+    nose: float  # where it stands between the wing (0) and the nose (1)
+    wing: float  # where the wing then stands between where it was (0) and the tail's end (1)
+    keeps_tail: bool
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> Canard:
+        nose, wing = rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.7)
+        return cls(rng.uniform(*CANARD_SPAN), rng.uniform(*CANARD_CHORD), nose, wing, bool(rng.random() < 0.3))
+
+
+def _as_canard(mesh: Mesh, canard: Canard) -> Mesh:
+    """The mesh with its wing moved back and a small copy of it ahead; unchanged if it has no wing of its own."""
+    wing = _only(mesh, mesh.part == Part.WING)
+    if not len(wing.faces) or Part.FUSELAGE not in mesh.part:
+        return mesh
+    x_m = mesh.vertices_m[:, 0]
+    middle = 0.5 * (wing.vertices_m.min(axis=0) + wing.vertices_m.max(axis=0))
+    small = scaled(wing, [canard.chord, canard.span, canard.chord])
+    forwards_m = np.array([middle[0] + canard.nose * (x_m.max() - middle[0]), 0.0, middle[2]])
+    forwards_m -= middle * [canard.chord, 0.0, canard.chord]
+    # A wing that spans most of the aircraft's length cannot go back any more.
+    back_m = min(canard.wing * (x_m.min() - middle[0]) + 0.5 * float(np.ptp(wing.vertices_m[:, 0])), 0.0)
+    gone = (Part.WING,) if canard.keeps_tail else (Part.WING, Part.TAIL)
+    rest = _only(mesh, ~np.isin(mesh.part, gone))
+    return merge([rest, moved(wing, [back_m, 0.0, 0.0]), moved(small, forwards_m)])
+
+
+def _bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.float64]) -> Mesh:
+    """The mesh with what lies off the middle swept and raised by `slopes`, and stretched ahead of the wing's middle and
+    behind it by factors [2]. Nothing comes apart, as all of it is bent alike."""
+    vertices_m, normals = mesh.vertices_m.astype(np.float64), mesh.normals.astype(np.float64)
+    wing = vertices_m[mesh.part == Part.WING] if Part.WING in mesh.part else vertices_m
+    middle_x_m = 0.5 * (wing[:, 0].min() + wing[:, 0].max())
+    factor = np.where(vertices_m[:, 0] > middle_x_m, *ahead_behind)
+    x_m = middle_x_m + factor * (vertices_m[:, 0] - middle_x_m)
+    beyond_m = np.abs(vertices_m[:, 1]) - CABIN_SHARE * np.ptp(vertices_m[:, 1])
+    side = np.where(beyond_m > 0.0, np.sign(vertices_m[:, 1]), 0.0)
+    sweep, dihedral = slopes
+    out_m = beyond_m.clip(min=0.0)
+    bent_m = np.stack([x_m + sweep * out_m, vertices_m[:, 1], vertices_m[:, 2] + dihedral * out_m], axis=1)
+    nx, nz = normals[:, 0] / factor, normals[:, 2]
+    bent = np.stack([nx, normals[:, 1] - side * (sweep * nx + dihedral * nz), nz], axis=1)
+    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+    return Mesh(bent_m.astype(np.float32), bent.astype(np.float32), mesh.part, mesh.faces)
 
 
 def _only(mesh: Mesh, kept: np.ndarray) -> Mesh:

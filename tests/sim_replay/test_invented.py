@@ -7,6 +7,7 @@ import pytest
 
 from sim_replay.airframes import AIRFRAMES, Part, airframe_of
 from sim_replay.airframes.invented import SPAN_M, draw_invented
+from sim_replay.airframes.mesh import Mesh
 from sim_replay.sampler import WindowSampler
 
 FLEET = len(AIRFRAMES)
@@ -32,8 +33,32 @@ def test_invented_aircraft_are_sound_meshes_of_another_size_and_shape() -> None:
         assert (mesh.part[mesh.faces] == mesh.part[mesh.faces[:, :1]]).all(), "no face joins two parts"
         assert SPAN_M[0] * 0.99 <= airframe.span_m <= SPAN_M[1] * 1.01
         assert Part.FUSELAGE in mesh.part or Part.WING in mesh.part
+        assert _share_facing_outward(mesh) > 0.97
         sizes.append(airframe.length_m / airframe.span_m)
     assert np.ptp(sizes) > 0.3
+
+
+def _share_facing_outward(mesh: Mesh) -> float:
+    """Of the faces, how many turn the way that the normals of their corners do."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    return float(np.mean(np.sum(across * mesh.normals[mesh.faces].mean(axis=1), axis=1) >= 0.0))
+
+
+def test_some_have_a_small_wing_at_the_nose_as_no_member_of_the_fleet_that_trains_has() -> None:
+    def has_canard(mesh: Mesh) -> bool:
+        wing_m = mesh.vertices_m[mesh.part == Part.WING]
+        along_m = np.sort(wing_m[:, 0])
+        gap = int(np.argmax(np.diff(along_m)))
+        ahead, behind = (wing_m[sign * (wing_m[:, 0] - along_m[gap]) > 0.0] for sign in (1.0, -1.0))
+        apart = along_m[gap + 1] - along_m[gap] > 0.1 * np.ptp(mesh.vertices_m[:, 0])
+        return bool(apart and np.ptp(ahead[:, 1]) < 0.6 * np.ptp(behind[:, 1]))
+
+    given = [3, 5, 9, 12]
+    assert not any(has_canard(AIRFRAMES[k].mesh()) for k in given)
+    rng = np.random.default_rng(8)
+    drawn = [has_canard(airframe_of(draw_invented(rng, given)).mesh()) for _ in range(60)]
+    assert 0.08 < np.mean(drawn) < 0.35
 
 
 def test_only_parts_of_the_given_members_are_used() -> None:
