@@ -23,7 +23,9 @@ Kind = Literal["track", "acquire"]
 FRAME_WIDTH_PX, FRAME_HEIGHT_PX = 1920, 1080
 RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
-BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame; its mean area is then about 1.2 % of it
+BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly
+# A small aircraft far off: that many are drawn log-uniformly from these instead, or hardly any would be this small.
+SMALL_BOX_PX, SMALL_SHARE = (16.0, 130.0), 0.25
 WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_SHARE_MIN = 0.35
@@ -77,12 +79,14 @@ def _clipped_normal(rng: np.random.Generator, sigma_deg: float, limit_deg: float
 
 
 def _lens_for(rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, los: Array, range_m: float) -> float:
-    """Focal length, pixels, that shows the target as large as BOX_PX, within the lenses there are."""
+    """Focal length, pixels, that shows the target as large as BOX_PX or SMALL_BOX_PX, within the lenses there are."""
     if rng.random() < 0.12:
         return float(np.exp(rng.uniform(*np.log(FOCAL_PX))))
     across = vertices_m @ R_ned_body.T @ looking_along(los, 0.0, np.array([0.0, 0.0, 1.0]))
     size_m = np.ptp(across[:, :2], axis=0).max()
-    return float(np.clip(rng.uniform(*BOX_PX) * range_m / size_m, *FOCAL_PX))
+    small = rng.random() < SMALL_SHARE
+    box_px = np.exp(rng.uniform(*np.log(SMALL_BOX_PX))) if small else rng.uniform(*BOX_PX)
+    return float(np.clip(box_px * range_m / size_m, *FOCAL_PX))
 
 
 def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int], invented_share: float = 0.0) -> Scene:
