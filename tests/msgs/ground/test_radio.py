@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import zenoh
@@ -39,17 +39,21 @@ class Relay(threading.Thread):
     def run(self) -> None:
         while not self.done.is_set():
             for ready in select.select([self.listening, self.asking], [], [], 0.1)[0]:
-                data, sender = ready.recvfrom(65536)
-                if ready is self.listening and sender not in self.callers:
-                    self.callers.append(sender)
-                if self.loses():
-                    self.lost += 1
-                elif ready is self.listening:
-                    self.asking.send(data)
-                else:
-                    self.listening.sendto(data, self.callers[-1])
+                with suppress(ConnectionRefusedError):  # the other end is gone, and so is what was for it
+                    self._pass_on(ready)
         self.listening.close()
         self.asking.close()
+
+    def _pass_on(self, ready: socket.socket) -> None:
+        data, sender = ready.recvfrom(65536)
+        if ready is self.listening and sender not in self.callers:
+            self.callers.append(sender)
+        if self.loses():
+            self.lost += 1
+        elif ready is self.listening:
+            self.asking.send(data)
+        else:
+            self.listening.sendto(data, self.callers[-1])
 
 
 class Radio:
