@@ -17,6 +17,7 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation.bop_results import file_answers
 from sim_replay.evaluation.consistency import consistency
 from sim_replay.evaluation.files import write_files
+from sim_replay.evaluation.filtering import filtering
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.tracked import OwnShipTold, tracker_answers
 from sim_replay.offline import (
@@ -90,7 +91,12 @@ def evaluate_dataset(
     except InputError as error:
         raise ConfigError(str(error)) from error
     name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
-    score = {"mode": request.mode, **score_of(dataset, method, judged), "consistency": consistency(judged)}
+    score = {
+        "mode": request.mode,
+        **score_of(dataset, method, judged),
+        "consistency": consistency(judged),
+        "filtering": filtering(judged),
+    }
     return Evaluation(score, name, dataset, judged, dataset.models)
 
 

@@ -18,6 +18,7 @@ class Answer:
 
     poses: tuple[TargetPose, ...]
     time_ms: float | None  # it took; None: not known
+    measured: tuple[TargetPose, ...] = ()  # what a tracker was given of this picture, where it is one that answers
 
 
 Answerer = Callable[[int, DatasetFrame], Answer]  # the index is what the poses name as their frame
@@ -31,6 +32,7 @@ class JudgedFrame:
     matches: tuple[Match, ...]  # of the targets of which something is seen, in the order of picture.targets
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
+    measured: tuple[Match, ...] = ()  # of the same targets, what a tracker was given of them; empty without one
 
 
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
@@ -69,8 +71,12 @@ def judge_frames(
     judged = []
     for index, picture in enumerate(pictures):
         answered = answer(index, picture)
-        matches, false_poses = match_poses(truths_of(index, picture, models), answered.poses)
-        judged.append(JudgedFrame(picture, tuple(matches), tuple(false_poses), answered.time_ms))
+        truths = truths_of(index, picture, models)
+        matches, false_poses = match_poses(truths, answered.poses)
+        measured, _ = match_poses(truths, answered.measured)
+        judged.append(
+            JudgedFrame(picture, tuple(matches), tuple(false_poses), answered.time_ms, measured=tuple(measured))
+        )
         on_frame(judged[-1])
     return judged
 

@@ -41,6 +41,8 @@ def score_table(score: dict[str, Any]) -> Group:
     caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
     if score.get("consistency") is not None:
         caption += f"\n{_consistency(score['consistency'])}"
+    if score.get("filtering") is not None:
+        caption += f"\n{_filtering(score['filtering'])}"
     table = Table("", title=title, caption=caption, title_justify="left", caption_justify="left")
     groups = {"all": overall}
     groups |= {f"{band} m": group for band, group in score["by_range"].items() if group["targets"]}
@@ -69,6 +71,15 @@ def _consistency(found: dict[str, Any]) -> str:
     means = ", ".join(f"{name} {found[name]['nees_mean']:.2f}" for name in ("position", "rotation"))
     return (
         f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
+    )
+
+
+def _filtering(found: dict[str, Any]) -> str:
+    translation_m, rotation_deg = found["translation_error_m"], found["rotation_error_deg"]
+    return (
+        f"the tracker beside what it was given, {found['targets']} targets: "
+        f"E_t {translation_m['measured']:.2f} to {translation_m['track']:.2f} m, "
+        f"E_r {rotation_deg['measured']:.2f} to {rotation_deg['track']:.2f}°"
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -124,12 +125,16 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
         time_ms = (time.monotonic_ns() - started_ns) * 1e-6
         report = Report(frame.meta, picture.K, size_wh, tracks, told_own_ship, model.sha256)
         told = sendable(report, capture_ns, _MAX_AGE_MS)
-        poses = (
-            TargetPose(index, t.R_cam_target, t.t_cam_target_m, score=t.score, covariance=t.covariance) for t in told
-        )
-        return Answer(tuple(poses), time_ms)
+        return Answer(_poses(index, told), time_ms, _poses(index, estimates))
 
     return answer
+
+
+def _poses(index: int, told: Sequence[Track | Estimate]) -> tuple[TargetPose, ...]:
+    return tuple(
+        TargetPose(index, one.R_cam_target, one.t_cam_target_m, score=one.score, covariance=one.covariance)
+        for one in told
+    )
 
 
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:

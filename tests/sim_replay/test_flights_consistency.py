@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from edge.tracking import view
 from sim_replay.bop import BopScene
 from sim_replay.datasets import DatasetFrame
 from sim_replay.evaluation.consistency import bounds_95, consistency
+from sim_replay.evaluation.filtering import filtering
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import Match, TargetPose, Truth
@@ -80,6 +82,28 @@ def test_nothing_is_said_where_no_pose_tells_how_sure_it_is() -> None:
         consistency([JudgedFrame(first.picture, (Match(match.truth, bare), Match(match.truth, None)), (), None)])
         is None
     )
+
+
+def test_what_a_tracker_was_given_is_held_against_what_it_told_of_the_same_targets() -> None:
+    (frame, *_) = flights(1.0)
+    (match,) = frame.matches
+    truth_m = match.truth.t_cam_target_m
+
+    def off(metres: float, degrees: float) -> TargetPose:
+        R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        return TargetPose(0, R, truth_m + np.array([0.0, metres, 0.0]))
+
+    def judged(given: TargetPose | None, told: TargetPose | None) -> JudgedFrame:
+        return replace(frame, matches=(Match(match.truth, told),), measured=(Match(match.truth, given),))
+
+    one_side = [judged(off(50.0, 90.0), None), judged(None, off(60.0, 80.0))]
+    found = filtering([judged(off(4.0, 30.0), off(1.0, 2.0)), judged(off(2.0, 10.0), off(3.0, 4.0)), *one_side])
+    assert found == {
+        "targets": 2,
+        "translation_error_m": {"measured": pytest.approx(3.0), "track": pytest.approx(2.0)},
+        "rotation_error_deg": {"measured": pytest.approx(20.0), "track": pytest.approx(3.0)},
+    }
+    assert filtering([frame, *one_side]) is None
 
 
 def test_own_ship_errors_are_a_flights_own_and_of_the_size_that_the_tracker_allows_for() -> None:

@@ -66,7 +66,9 @@ def told(results: list[JudgedFrame]) -> list[bool]:
 def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, dark_spot_model: Path) -> None:
     for scene in ("000000", "000001"):
         write_scene(tmp_path / "data" / "test" / scene, [0.5] * 5)
-    assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, True, True, True] * 2
+    results = flown(tmp_path / "data", dark_spot_model)
+    assert told(results) == [False, False, True, True, True] * 2
+    assert all(frame.measured[0].estimate is not None for frame in results)
 
 
 def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(tmp_path: Path, dark_spot_model: Path) -> None:
