@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import os
 import signal
 import sys
 import threading
@@ -78,10 +80,16 @@ def _run(options: argparse.Namespace) -> int:
     from edge.config import load_config
     from edge.daemon import run
     from edge.reload import Reloader
+    from edge.threads import still_closing
 
     stop, reloader = threading.Event(), Reloader()
     on_signals({signal.SIGHUP: reloader.ask, signal.SIGTERM: stop.set, signal.SIGINT: stop.set})
-    return run(load_config(options.config), stop, reloader)
+    code = run(load_config(options.config), stop, reloader)
+    if still_closing():
+        # It would come back from zenoh while the interpreter is taken down, and abort the process.
+        logging.shutdown()
+        os._exit(code)
+    return code
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -49,6 +49,11 @@ def running() -> frozenset[str]:
     return frozenset(row.name for row in THREADS if row.watched and row.name in alive)
 
 
+def still_closing() -> bool:
+    """Whether a session has not ended in the time that stopping gives it."""
+    return any(thread.name == "closing" for thread in threading.enumerate())
+
+
 def table_markdown() -> str:
     """The table as the documents show it."""
     lines = ["| thread | does | never waits for |", "|---|---|---|"]

@@ -116,7 +116,8 @@ def router_config(
 
 
 def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
-    """A tool's session. Opening it raises zenoh.ZError at once if none of the endpoints answers."""
+    """A tool's session. Opening it raises zenoh.ZError if none of the endpoints answers: at once where nobody listens,
+    over QUIC after QUIC_OPEN_TIMEOUT_MS."""
     return _config("client", [], connect, False, tls)
 
 

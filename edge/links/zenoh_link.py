@@ -162,7 +162,7 @@ class ZenohLink:
             self._worker.join(STOP_TIMEOUT_S)
             self._worker = None
         if self._session is not None:
-            # An open session keeps the process from leaving.
+            # An open session keeps the process from leaving, a thread that is still closing it does not.
             closer = threading.Thread(target=self._session.close, name="closing", daemon=True)
             closer.start()
             closer.join(CLOSE_TIMEOUT_S)

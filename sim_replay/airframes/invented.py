@@ -22,7 +22,8 @@ SIZE_SIGMA = 0.35  # of the logarithm of span and length together
 STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
 SPAN_M = (1.5, 26.0)
 EXCHANGED_SHARE = 0.6
-# Slopes of x and z over the span, outside the cabin's width: sweep forwards to backwards, wings that droop or rise.
+# Slopes of x and z over the span, outside the cabin's width: swept back (below 0) to forwards, raised (below 0) to
+# drooping.
 SWEEP, DIHEDRAL = (-0.35, 0.15), (-0.12, 0.08)
 CABIN_SHARE = 0.06  # of the span, either side of the middle
 NOSE_STRETCH = 0.25  # of the logarithm, either way, of what lies ahead of the wing, and of what lies behind
@@ -68,7 +69,7 @@ def _invented(airframe_id: int) -> Airframe:
             mesh = _with_part_of(mesh, other.mesh(), part)
         if canard is not None:
             mesh = _as_canard(mesh, canard)
-        return scaled(_bent(mesh, slopes, ahead_behind), size * stretch)
+        return scaled(bent(mesh, slopes, ahead_behind), size * stretch)
 
     extent = np.ptp(build().vertices_m, axis=0)
     return Airframe(
@@ -99,40 +100,64 @@ def _with_part_of(mesh: Mesh, other: Mesh, part: Part) -> Mesh:
 
 @dataclass(frozen=True)
 class Canard:
-    """A small wing at the nose, the wing itself far back."""
+    """A small wing at the nose, the wing itself far back. Shares, 0..1."""
 
-    span: float  # as a share of the wing's
-    chord: float
+    span: float  # of the wing's
+    chord: float  # of the wing's
     nose: float  # where it stands between the wing (0) and the nose (1)
-    wing: float  # where the wing then stands between where it was (0) and the tail's end (1)
+    tail: float  # what is left of the length behind the wing
     keeps_tail: bool
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Canard:
-        nose, wing = rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.7)
-        return cls(rng.uniform(*CANARD_SPAN), rng.uniform(*CANARD_CHORD), nose, wing, bool(rng.random() < 0.3))
+        nose, tail = rng.uniform(0.55, 0.9), rng.uniform(0.15, 0.5)
+        return cls(rng.uniform(*CANARD_SPAN), rng.uniform(*CANARD_CHORD), nose, tail, bool(rng.random() < 0.3))
 
 
 def _as_canard(mesh: Mesh, canard: Canard) -> Mesh:
-    """The mesh with its wing moved back and a small copy of it ahead; unchanged if it has no wing of its own."""
-    wing = _only(mesh, mesh.part == Part.WING)
+    """The mesh with all that lies behind its wing shortened, all ahead of it lengthened by as much, and a small copy of
+    the wing ahead; unchanged if it has no wing on a fuselage."""
+    wing = _lifting(_only(mesh, mesh.part == Part.WING))
     if not len(wing.faces) or Part.FUSELAGE not in mesh.part:
         return mesh
-    x_m = mesh.vertices_m[:, 0]
-    middle = 0.5 * (wing.vertices_m.min(axis=0) + wing.vertices_m.max(axis=0))
+    x_m = mesh.vertices_m[:, 0].astype(np.float64)
+    nose_m, tail_m = x_m.max(), x_m.min()
+    leading_m, trailing_m = wing.vertices_m[:, 0].max(), wing.vertices_m[:, 0].min()
+    if nose_m - leading_m < 1e-3 or trailing_m - tail_m < 1e-3:  # a wing as long as the aircraft
+        return mesh
+    back_m = (1.0 - canard.tail) * (trailing_m - tail_m)
+    # The wing and what hangs on it go back as they are.
+    knots_m = np.array([tail_m, trailing_m, leading_m, nose_m])
+    moved_m = np.interp(x_m, knots_m, [tail_m, trailing_m - back_m, leading_m - back_m, nose_m])
+    slope = np.diff([tail_m, trailing_m - back_m, leading_m - back_m, nose_m]) / np.diff(knots_m)
+    normals = mesh.normals / np.stack([slope[np.digitize(x_m, knots_m[1:3])], np.ones(len(x_m)), np.ones(len(x_m))], 1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    vertices_m = np.column_stack([moved_m, mesh.vertices_m[:, 1:]]).astype(np.float32)
+    longer = Mesh(vertices_m, normals.astype(np.float32), mesh.part, mesh.faces)
+    body_m = vertices_m[mesh.part == Part.FUSELAGE]
+    stands_m = leading_m - back_m + canard.nose * (nose_m - leading_m + back_m)
+    near_m = body_m[np.argsort(np.abs(body_m[:, 0] - stands_m))[:40]]
     small = scaled(wing, [canard.chord, canard.span, canard.chord])
-    forwards_m = np.array([middle[0] + canard.nose * (x_m.max() - middle[0]), 0.0, middle[2]])
-    forwards_m -= middle * [canard.chord, 0.0, canard.chord]
-    # A wing that spans most of the aircraft's length cannot go back any more.
-    back_m = min(canard.wing * (x_m.min() - middle[0]) + 0.5 * float(np.ptp(wing.vertices_m[:, 0])), 0.0)
-    gone = (Part.WING,) if canard.keeps_tail else (Part.WING, Part.TAIL)
-    rest = _only(mesh, ~np.isin(mesh.part, gone))
-    return merge([rest, moved(wing, [back_m, 0.0, 0.0]), moved(small, forwards_m)])
+    middle_m = 0.5 * (small.vertices_m.min(axis=0) + small.vertices_m.max(axis=0))
+    small = moved(small, [stands_m - middle_m[0], 0.0, 0.5 * (near_m[:, 2].min() + near_m[:, 2].max()) - middle_m[2]])
+    rest = longer if canard.keeps_tail else _only(longer, longer.part != Part.TAIL)
+    return merge([rest, small])
 
 
-def _bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.float64]) -> Mesh:
-    """The mesh with what lies off the middle swept and raised by `slopes`, and stretched ahead of the wing's middle and
-    behind it by factors [2]. Nothing comes apart, as all of it is bent alike."""
+def _lifting(wing: Mesh) -> Mesh:
+    """Of a wing's surfaces those alone that reach from the body to its tips, without fairings and struts."""
+    if not len(wing.faces):
+        return wing
+    surface = np.arange(len(wing.vertices_m))
+    while not np.array_equal(least := surface[wing.faces].min(axis=1), surface[wing.faces].max(axis=1)):
+        np.minimum.at(surface, wing.faces, least[:, None])
+    spans_m = {k: float(np.ptp(wing.vertices_m[surface == k, 1])) for k in np.unique(surface).tolist()}
+    return _only(wing, np.isin(surface, [k for k, span_m in spans_m.items() if span_m > 0.6 * max(spans_m.values())]))
+
+
+def bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.float64]) -> Mesh:
+    """The mesh with what lies off the middle moved by `slopes` of its distance from there along x and z, and stretched
+    ahead of the wings' middle and behind it by factors [2]. What is joined stays so, as all of it is bent alike."""
     vertices_m, normals = mesh.vertices_m.astype(np.float64), mesh.normals.astype(np.float64)
     wing = vertices_m[mesh.part == Part.WING] if Part.WING in mesh.part else vertices_m
     middle_x_m = 0.5 * (wing[:, 0].min() + wing[:, 0].max())
@@ -140,13 +165,13 @@ def _bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.floa
     x_m = middle_x_m + factor * (vertices_m[:, 0] - middle_x_m)
     beyond_m = np.abs(vertices_m[:, 1]) - CABIN_SHARE * np.ptp(vertices_m[:, 1])
     side = np.where(beyond_m > 0.0, np.sign(vertices_m[:, 1]), 0.0)
-    sweep, dihedral = slopes
+    along_x, along_z = slopes
     out_m = beyond_m.clip(min=0.0)
-    bent_m = np.stack([x_m + sweep * out_m, vertices_m[:, 1], vertices_m[:, 2] + dihedral * out_m], axis=1)
+    bent_m = np.stack([x_m + along_x * out_m, vertices_m[:, 1], vertices_m[:, 2] + along_z * out_m], axis=1)
     nx, nz = normals[:, 0] / factor, normals[:, 2]
-    bent = np.stack([nx, normals[:, 1] - side * (sweep * nx + dihedral * nz), nz], axis=1)
-    bent /= np.linalg.norm(bent, axis=1, keepdims=True)
-    return Mesh(bent_m.astype(np.float32), bent.astype(np.float32), mesh.part, mesh.faces)
+    turned = np.stack([nx, normals[:, 1] - side * (along_x * nx + along_z * nz), nz], axis=1)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return Mesh(bent_m.astype(np.float32), turned.astype(np.float32), mesh.part, mesh.faces)
 
 
 def _only(mesh: Mesh, kept: np.ndarray) -> Mesh:

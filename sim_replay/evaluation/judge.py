@@ -18,7 +18,7 @@ class Answer:
 
     poses: tuple[TargetPose, ...]
     time_ms: float | None  # it took; None: not known
-    measured: tuple[TargetPose, ...] = ()  # what a tracker was given of this picture, where it is one that answers
+    measured: tuple[TargetPose, ...] | None = None  # what a tracker was given of this picture; None: no tracker
 
 
 Answerer = Callable[[int, DatasetFrame], Answer]  # the index is what the poses name as their frame
@@ -73,7 +73,7 @@ def judge_frames(
         answered = answer(index, picture)
         truths = truths_of(index, picture, models)
         matches, false_poses = match_poses(truths, answered.poses)
-        measured, _ = match_poses(truths, answered.measured)
+        measured = match_poses(truths, answered.measured)[0] if answered.measured is not None else ()
         judged.append(
             JudgedFrame(picture, tuple(matches), tuple(false_poses), answered.time_ms, measured=tuple(measured))
         )

@@ -24,8 +24,8 @@ FRAME_WIDTH_PX, FRAME_HEIGHT_PX = 1920, 1080
 RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
 BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly
-# A small aircraft far off: that many are drawn log-uniformly from these instead, or hardly any would be this small.
-SMALL_BOX_PX, SMALL_SHARE = (16.0, 130.0), 0.25
+# A small aircraft far off: that many are log-uniformly of these sizes, as far as lenses go, or hardly any would be so.
+SMALL_BOX_PX, SMALL_RANGE_M, SMALL_SHARE = (16.0, 130.0), (250.0, 550.0), 0.25
 WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_SHARE_MIN = 0.35
@@ -78,15 +78,18 @@ def _clipped_normal(rng: np.random.Generator, sigma_deg: float, limit_deg: float
     return float(np.radians(np.clip(rng.normal(0.0, sigma_deg), -limit_deg, limit_deg)))
 
 
-def _lens_for(rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, los: Array, range_m: float) -> float:
+def _lens_for(
+    rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, los: Array, range_m: float, small: bool
+) -> float:
     """Focal length, pixels, that shows the target as large as BOX_PX or SMALL_BOX_PX, within the lenses there are."""
-    if rng.random() < 0.12:
+    if not small and rng.random() < 0.16:
         return float(np.exp(rng.uniform(*np.log(FOCAL_PX))))
     across = vertices_m @ R_ned_body.T @ looking_along(los, 0.0, np.array([0.0, 0.0, 1.0]))
     size_m = np.ptp(across[:, :2], axis=0).max()
-    small = rng.random() < SMALL_SHARE
-    box_px = np.exp(rng.uniform(*np.log(SMALL_BOX_PX))) if small else rng.uniform(*BOX_PX)
-    return float(np.clip(box_px * range_m / size_m, *FOCAL_PX))
+    if not small:
+        return float(np.clip(rng.uniform(*BOX_PX) * range_m / size_m, *FOCAL_PX))
+    low_px, high_px = np.clip(SMALL_BOX_PX, *(np.array(FOCAL_PX) * size_m / range_m))
+    return float(np.exp(rng.uniform(np.log(low_px), np.log(high_px))) * range_m / size_m)
 
 
 def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int], invented_share: float = 0.0) -> Scene:
@@ -96,10 +99,14 @@ def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int], invented_
     else:
         airframe_id = int(rng.choice(np.asarray(airframe_ids)))
     vertices_m = solid_vertices_m(airframe_id)
-    range_m = rng.uniform(*RANGE_M) if rng.random() < 0.5 else np.exp(rng.uniform(*np.log(RANGE_M)))
+    small = bool(rng.random() < SMALL_SHARE)
+    if small:
+        range_m = rng.uniform(*SMALL_RANGE_M)
+    else:
+        range_m = rng.uniform(*RANGE_M) if rng.random() < 0.5 else np.exp(rng.uniform(*np.log(RANGE_M)))
     R_ned_body = R_from_euler(_clipped_normal(rng, 25, 75), _clipped_normal(rng, 8, 30), rng.uniform(-np.pi, np.pi))
     los = direction_ned(_clipped_normal(rng, 13, 40), rng.uniform(-np.pi, np.pi))
-    focal = _lens_for(rng, vertices_m, R_ned_body, los, float(range_m))
+    focal = _lens_for(rng, vertices_m, R_ned_body, los, float(range_m), small)
     anisotropy = np.exp(rng.normal(0.0, 0.003))
     fx, fy = focal * anisotropy, focal / anisotropy
     K = np.array(
