@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge.cameras.device import DeviceSource
@@ -67,6 +67,7 @@ def test_what_a_stalled_stream_held_back_keeps_its_age(stall_s: float, drain_s: 
         assert abs(stamp_ns - exposed_ns) < 10_000_000
 
 
+@example(waited_s=0.109375, fps=5, speed=2.0, jitter_s=0.03, seed=14550)
 @given(
     waited_s=st.floats(0.1, 4.0),
     fps=st.sampled_from([5, 30, 60]),
@@ -79,15 +80,19 @@ def test_what_waited_in_a_stream_before_it_was_read_is_not_told_as_that_of_now(
 ) -> None:
     """Opened, and read first when the model was loaded: the frames of that time come at the decoder's speed."""
     rng, clock, now_ns, told = np.random.default_rng(seed), StreamClock(), 0, 0
+    jitters_ns: list[int] = []  # of frames that neither waited nor stood behind one that did
     for k in range(12 * fps):
         exposed_ns = 10 * S + k * S // fps
-        ready_ns = max(10 * S + round(waited_s * S), exposed_ns + round(jitter_s * S * rng.exponential()))
-        now_ns = max(ready_ns, now_ns + round(S / fps / speed))
+        sent_ns = exposed_ns + round(jitter_s * S * rng.exponential())
+        now_ns = max(10 * S + round(waited_s * S), sent_ns, now_ns + round(S / fps / speed))
+        if now_ns == sent_ns:
+            jitters_ns.append(sent_ns - exposed_ns)
         stamp_ns = clock.monotonic_ns(k * S // fps, now_ns)
         assert stamp_ns is not None
         if clock.caught_up and now_ns < (14.9 + waited_s) * S:
             told += 1
-            assert stamp_ns - exposed_ns < 0.1 * S
+            # That a frame is late shows only beside one that is less so.
+            assert stamp_ns - exposed_ns < 0.1 * S + min(jitters_ns, default=0)
     assert clock.caught_up
     assert told > 0 or waited_s / (speed - 1) > 3.0
 
