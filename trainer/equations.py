@@ -19,43 +19,44 @@ def soft_argmax(log_P: Tensor, peaks_xy: Tensor, sigma_g: Tensor | float) -> tup
     log_P [N, H_f, W_f] is log P_hm, peaks_xy [N, M, 2] are cells, sigma_g cells.
     Returns W [N, M, H_f W_f] and the anchor [N, M, 2] in pixels. A softmax of log A is A / sum A without underflow.
     """
-    rows, columns = log_P.shape[-2], log_P.shape[-1]
-    x = torch.arange(columns, device=log_P.device, dtype=log_P.dtype)
-    y = torch.arange(rows, device=log_P.device, dtype=log_P.dtype)
-    log_Gx = -((x - peaks_xy[..., 0:1]) ** 2) / (2 * sigma_g**2)
-    log_Gy = -((y - peaks_xy[..., 1:2]) ** 2) / (2 * sigma_g**2)
-    log_A = SHARPENING * log_P[:, None] + log_Gy[..., :, None] + log_Gx[..., None, :]
-    W = torch.softmax(log_A.flatten(2), dim=-1)
-    W_map = W.reshape(log_A.shape)
-    cell = torch.stack([(W_map.sum(-2) * x).sum(-1), (W_map.sum(-1) * y).sum(-1)], dim=-1)
-    return W, STRIDE * (cell + 0.5) - 0.5
+    columns = log_P.shape[-1]
+    index = torch.arange(log_P.shape[-2] * columns, device=log_P.device)
+    cells_xy = torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1).to(log_P.dtype)
+    away = cells_xy - peaks_xy[:, :, None]
+    log_G = (away * away).sum(-1) * (-0.5 / sigma_g**2)
+    W = torch.softmax(SHARPENING * log_P.flatten(1)[:, None] + log_G, dim=-1)
+    return W, STRIDE * (W @ cells_xy) + (0.5 * STRIDE - 0.5)
 
 
 def image_plane_point(point_px: Tensor, K: Tensor) -> Tensor:
     """(x/z, y/z) [..., 2] of the ray through point_px [..., 2]; K [..., 3, 3] without skew."""
-    f = torch.stack([K[..., 0, 0], K[..., 1, 1]], dim=-1)
-    c = torch.stack([K[..., 0, 2], K[..., 1, 2]], dim=-1)
-    return (point_px - c) / f
+    return (point_px - K[..., :2, 2]) / _focal_lengths(K)
+
+
+def _focal_lengths(K: Tensor) -> Tensor:
+    """(f_x, f_y) [..., 2] of K [..., 3, 3] without skew, whose other values beside them are zeros."""
+    return K[..., :2, :2].sum(-1)
+
+
+def _unit(vector: Tensor) -> Tensor:
+    """Vectors [..., 3] made one long; F.normalize exports twice the nodes."""
+    return vector / torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp(min=1e-12)
 
 
 def unit_ray(plane_xy: Tensor) -> Tensor:
     """Unit observation ray d [..., 3] in `cam` through (x/z, y/z) [..., 2] (paper: d = K^-1 [u v 1]^T / norm)."""
-    return F.normalize(torch.cat([plane_xy, torch.ones_like(plane_xy[..., :1])], dim=-1), dim=-1)
+    return _unit(F.pad(plane_xy, (0, 1), value=1.0))
 
 
 def ray_rotation(d: Tensor) -> Tensor:
     """R_ray [..., 3, 3]: the smallest rotation that takes the optical axis z to the unit ray d [..., 3].
 
-    I + [v]x + [v]x^2 / (1 + c) with v = z x d and c = z . d, written out; needs d_z > -1.
+    I + [v]x + [v]x^2 / (1 + c) with v = z x d and c = z . d, which is I + 2 d z^T - (d + z) (d + z)^T / (1 + c); needs
+    d_z > -1.
     """
-    dx, dy, c = d.unbind(-1)
-    k = 1.0 / (1.0 + c)
-    rows = [
-        torch.stack([1 - k * dx * dx, -k * dx * dy, dx], dim=-1),
-        torch.stack([-k * dx * dy, 1 - k * dy * dy, dy], dim=-1),
-        torch.stack([-dx, -dy, c], dim=-1),
-    ]
-    return torch.stack(rows, dim=-2)
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype, device=d.device)
+    both = d + z
+    return torch.eye(3).to(d) + d[..., None] * (2.0 * z) - both[..., None] * (both / both[..., 2:])[..., None, :]
 
 
 def gram_schmidt(r_6d: Tensor) -> Tensor:
@@ -63,17 +64,11 @@ def gram_schmidt(r_6d: Tensor) -> Tensor:
 
     The two vectors are the body's z and x axes, z first: an aircraft's down axis varies least, so it leads.
     """
-    z = F.normalize(r_6d[..., :3], dim=-1)
-    x = r_6d[..., 3:] - (z * r_6d[..., 3:]).sum(-1, keepdim=True) * z
-    x = F.normalize(x, dim=-1)
-    y = torch.stack(
-        [
-            z[..., 1] * x[..., 2] - z[..., 2] * x[..., 1],
-            z[..., 2] * x[..., 0] - z[..., 0] * x[..., 2],
-            z[..., 0] * x[..., 1] - z[..., 1] * x[..., 0],
-        ],
-        dim=-1,
-    )
+    z = _unit(r_6d[..., :3])
+    x = _unit(r_6d[..., 3:] - (z * r_6d[..., 3:]).sum(-1, keepdim=True) * z)
+    next_axis, last_axis = torch.tensor([1, 2, 0], device=z.device), torch.tensor([2, 0, 1], device=z.device)
+    y = z.index_select(-1, next_axis) * x.index_select(-1, last_axis)
+    y = y - z.index_select(-1, last_axis) * x.index_select(-1, next_axis)
     return torch.stack([x, y, z], dim=-1)
 
 
@@ -86,8 +81,8 @@ def heading_anchors(count: int) -> Tensor:
 
 def focal_length(K: Tensor, kind: str) -> Tensor:
     """f [...] in pixels: the paper's "mean", or "geometric", with which APDD survives an anisotropic resize."""
-    fx, fy = K[..., 0, 0], K[..., 1, 1]
-    return 0.5 * (fx + fy) if kind == "mean" else torch.sqrt(fx * fy)
+    f = _focal_lengths(K)
+    return f.mean(-1) if kind == "mean" else torch.sqrt(f.prod(-1))
 
 
 def seen_scale(extents_m: Tensor, R_allo: Tensor) -> Tensor:
@@ -95,18 +90,18 @@ def seen_scale(extents_m: Tensor, R_allo: Tensor) -> Tensor:
 
     sqrt of its projected width times height: half-width_x = sqrt(sum_j (R_1j e_j)^2), half-height_y likewise.
     """
-    half = torch.sqrt(((R_allo[..., :2, :] * extents_m[..., None, :]) ** 2).sum(-1) + 1e-9)
-    return 2.0 * torch.sqrt(half[..., 0] * half[..., 1])
+    along = R_allo[..., :2, :] * extents_m[..., None, :]
+    return 2.0 * ((along * along).sum(-1) + 1e-9).prod(-1) ** 0.25
 
 
 def apdd_depth(f_px: Tensor, S_m: Tensor, size_px: Tensor) -> Tensor:
     """Z = f S / S_img [...] in metres, S_img = sqrt(w h + eps) (paper: APDD); size_px [..., 2]."""
-    return f_px * S_m / torch.sqrt(size_px[..., 0] * size_px[..., 1] + 1e-6)
+    return f_px * S_m / torch.sqrt(size_px.prod(-1) + 1e-6)
 
 
 def back_project(plane_xy: Tensor, Z_m: Tensor) -> Tensor:
     """T [..., 3] = (x/z Z, y/z Z, Z) in metres, `cam`."""
-    return torch.cat([plane_xy * Z_m[..., None], Z_m[..., None]], dim=-1)
+    return F.pad(plane_xy, (0, 1), value=1.0) * Z_m[..., None]
 
 
 def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:
@@ -128,5 +123,4 @@ def heatmap_peaks(P: Tensor, count: int) -> tuple[Tensor, Tensor]:
     kept = torch.where(highest == P, P, torch.zeros_like(P))
     values, index = torch.topk(kept.flatten(1), count, dim=1)
     columns = P.shape[-1]
-    row = torch.div(index, columns, rounding_mode="floor")
-    return values, torch.stack([index - row * columns, row], dim=-1)
+    return values, torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1)

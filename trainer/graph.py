@@ -23,6 +23,7 @@ from trainer.evaluate import Predictions, Predictor
 from trainer.half_storage import store_halved
 from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
+from trainer.pixel_quads import take_quads
 
 OPSET = 17
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
@@ -115,6 +116,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
         )
     quantised = onnx.load(str(destination))
     feed_pixels(quantised.graph, INPUT_NAMES[0])
+    take_quads(quantised.graph, INPUT_NAMES[0])
     store_halved(quantised.graph)
     onnx.save(quantised, str(destination))
 

@@ -41,7 +41,7 @@ def fold_normalisation(graph: onnx.GraphProto, image: str) -> str:
     zero = numpy_helper.from_array(np.array(PIXEL_ZERO, np.float32), "pixel_zero")
     graph.initializer.append(zero)
     sub.input[1] = zero.name
-    _reader(graph, div.output[0]).input[0] = div.input[0]
+    reader(graph, div.output[0]).input[0] = div.input[0]
     graph.node.remove(div)
     return str(entry.conv.input[0])
 
@@ -53,10 +53,10 @@ def quantised_as_pixels(tensor: str) -> dict[str, list[dict[str, object]]]:
 
 def feed_pixels(graph: onnx.GraphProto, image: str) -> None:
     """Put the uint8 picture where a graph quantised with `quantised_as_pixels` computes the same bytes from it."""
-    node, path = _reader(graph, image), []
+    node, path = reader(graph, image), []
     while node.op_type != "QuantizeLinear":
         path.append(node)
-        node = _reader(graph, node.output[0])
+        node = reader(graph, node.output[0])
     turns = [step for step in path if step.op_type == "Transpose"]
     for step in path:
         graph.node.remove(step)
@@ -82,17 +82,17 @@ def drop_unread(graph: onnx.GraphProto) -> None:
 
 def _entry(graph: onnx.GraphProto, image: str, constants: dict[str, onnx.TensorProto]) -> _Entry:
     before: list[onnx.NodeProto] = []
-    node = _reader(graph, image)
+    node = reader(graph, image)
     while node.op_type in ("Cast", "Transpose", "Sub", "Div"):
         before.append(node)
-        node = _reader(graph, node.output[0])
+        node = reader(graph, node.output[0])
     kinds = sorted(step.op_type for step in before if step.op_type in ("Sub", "Div"))
     if node.op_type != "Conv" or kinds != ["Div", "Sub"] or len(node.input) != 3:
         raise ValueError("the graph does not begin with (pixel - mean) / std and a convolution with a bias")
     return _Entry(before, node)
 
 
-def _reader(graph: onnx.GraphProto, tensor: str) -> onnx.NodeProto:
+def reader(graph: onnx.GraphProto, tensor: str) -> onnx.NodeProto:
     """The only node that computes with a tensor; its shape may be asked for by others."""
     readers = [node for node in graph.node if tensor in node.input and node.op_type != "Shape"]
     if len(readers) != 1:

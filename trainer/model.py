@@ -62,7 +62,7 @@ class PerspectiveAwareModule(nn.Module):
     def forward(self, f_c: Tensor, plane_xy: Tensor) -> Tensor:
         if self.ray_encoder is None:
             return self.project(f_c)
-        gamma, beta = self.ray_encoder(plane_xy).chunk(2, dim=-1)
+        gamma, beta = self.ray_encoder(plane_xy).split(self.project.out_features, dim=-1)
         return self.project(f_c) * torch.sigmoid(gamma) + beta
 
 
@@ -75,24 +75,22 @@ class DynamicTopologicalSampling(nn.Module):
         grid = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).reshape(-1, 2)
         offsets = torch.cat([torch.tensor(OCT_OFFSETS, dtype=torch.float32), grid])
         self.register_buffer("offsets", offsets, persistent=False)
+        self.channels = channels
         narrow = channels // 2
         self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, channels, 3, stride=2))
         self.region = nn.Linear(channels * 16, hidden)
 
-    def forward(self, F_global: Tensor, center_px: Tensor, size_px: Tensor) -> tuple[Tensor, Tensor]:
-        """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px to f_oct [N, M, 8 C] and f_reg [N, M, hidden]."""
-        offsets = self.get_buffer("offsets")
-        points_px = center_px[:, :, None] + 0.5 * size_px[:, :, None] * offsets
-        extent = eq.STRIDE * torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
+    def forward(self, F_global: Tensor, center_px: Tensor, size_px: Tensor, extent_px: Tensor) -> tuple[Tensor, Tensor]:
+        """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px in an image of `extent_px` [2], to f_oct [N M, 8 C]
+        and f_reg [N M, hidden]."""
         # align_corners=False puts -1 and 1 on the outer edges of the border pixels.
-        normalised = (2.0 * points_px + 1.0) / extent - 1.0
-        sampled = F.grid_sample(F_global, normalised, mode="bilinear", padding_mode="zeros", align_corners=False)
-        sampled = sampled.permute(0, 2, 3, 1)  # [N, M, 57, C]
-        peaks, channels = sampled.shape[1], sampled.shape[3]
-        f_oct = sampled[:, :, :8].flatten(2)
-        grid = sampled[:, :, 8:].reshape(-1, REGION, REGION, channels).permute(0, 3, 1, 2)
-        f_reg = F.relu(self.region(self.convs(grid).flatten(1)))
-        return f_oct, f_reg.reshape(-1, peaks, f_reg.shape[-1])
+        center, size = (2.0 * center_px + 1.0) / extent_px - 1.0, size_px / extent_px
+        points = center[:, :, None] + size[:, :, None] * self.get_buffer("offsets")
+        sampled = F.grid_sample(F_global, points, mode="bilinear", padding_mode="zeros", align_corners=False)
+        sampled = sampled.permute(0, 2, 3, 1).reshape(-1, len(OCT_OFFSETS) + REGION**2, self.channels)
+        f_oct = sampled[:, : len(OCT_OFFSETS)].reshape(-1, len(OCT_OFFSETS) * self.channels)
+        grid = sampled[:, len(OCT_OFFSETS) :].reshape(-1, REGION, REGION, self.channels).permute(0, 3, 1, 2)
+        return f_oct, F.relu(self.region(self.convs(grid).flatten(1)))
 
 
 class GatedFusion(nn.Module):
@@ -178,24 +176,32 @@ class PoseNet(nn.Module):
         return F.pixel_shuffle(self.head_dense(F_global), 2)
 
     def decode(self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None) -> Decoded:
-        """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box."""
+        """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box.
+
+        Inside, the peaks of all images are rows: layers of two dimensions export as one node each.
+        """
         F_global, log_P = seen.F_global, F.logsigmoid(seen.heat_logits)
-        K = K[:, None]
+        M = int(peaks_xy.shape[1])
+        K = K[:, None].expand(-1, M, -1, -1).reshape(-1, 3, 3)
         f_c, center_px = self._anchor_of(F_global, log_P, peaks_xy)
         f_pam = self.pam(f_c, eq.image_plane_point(center_px, K))
-        log_size = self.mlp_wh(f_pam) + torch.log(self._anchor(F_global))
+        log_size = self.mlp_wh(f_pam) + torch.log(self._anchor(log_P))
         size_px = torch.exp(log_size)
         grid_size = size_px.detach()
         if guide_size_px is not None:
+            guide_size_px = guide_size_px.reshape(-1, 2)
             grid_size = torch.where(guide_size_px > 0, guide_size_px, grid_size)
-        f_oct, f_reg = self.dts(F_global, center_px.detach(), grid_size)
+        boxes = (center_px.detach().reshape(-1, M, 2), grid_size.reshape(-1, M, 2))
+        f_oct, f_reg = self.dts(F_global, *boxes, _extent_px(log_P))
         # The grid is normalised by the box, so the context says which box it was.
         f_geo = torch.cat([f_c, f_oct, f_pam, torch.log(grid_size / 32.0)], dim=-1)
         f_trans = self.mlp_t(self.fuse_t(f_reg, f_geo))
         f_rot = self.mlp_r(self.fuse_r(f_reg, f_geo))
 
-        R_allo_k = eq.gram_schmidt(self.head_rot(f_rot).unflatten(-1, (self.config.hypotheses, 6)))
-        logits, R_allo = self._likeliest(f_rot, R_allo_k)
+        count = self.config.hypotheses
+        r_6d = self.head_rot(f_rot)
+        R_allo_k = eq.gram_schmidt(r_6d.reshape(-1, count, 6))
+        logits, R_allo = self._likeliest(f_rot, r_6d)
         o_xy, s = self.head_trans(f_trans).split([2, 1], dim=-1)
         origin_px = center_px + self.config.origin_range * size_px * torch.tanh(o_xy)
         S = torch.exp(s[..., 0])
@@ -207,26 +213,36 @@ class PoseNet(nn.Module):
             log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
         plane_xy = eq.image_plane_point(origin_px, K)
         R_ray = eq.ray_rotation(eq.unit_ray(plane_xy if self.config.ray else torch.zeros_like(plane_xy)))
-        log_sigma = self._log_sigma(f_trans, f_rot)
-        R_ego_k = R_ray[:, :, None] @ R_allo_k
-        return Decoded(center_px, log_size, origin_px, log_Z, logits, R_allo_k, R_ego_k, R_ray @ R_allo, log_sigma)
+        return Decoded(
+            center_px.reshape(-1, M, 2),
+            log_size.reshape(-1, M, 2),
+            origin_px.reshape(-1, M, 2),
+            log_Z.reshape(-1, M),
+            logits.reshape(-1, M, count),
+            R_allo_k.reshape(-1, M, count, 3, 3),
+            (R_ray[:, None] @ R_allo_k).reshape(-1, M, count, 3, 3),
+            (R_ray @ R_allo).reshape(-1, M, 3, 3),
+            self._log_sigma(f_trans, f_rot).reshape(-1, M, 6),
+        )
 
     def _anchor_of(self, F_global: Tensor, log_P: Tensor, peaks_xy: Tensor) -> tuple[Tensor, Tensor]:
-        """Features [N, M, C] and centre [N, M, 2] px of each peak, or of the whole image if centres are regressed."""
+        """Features [N M, C] and centre [N M, 2] px of each peak, or of the whole image if centres are regressed."""
+        channels = self.config.channels
         if self.head_center is None:
             W, center_px = eq.soft_argmax(log_P, peaks_xy.to(log_P.dtype), self._sigma_g(log_P))
-            return W @ F_global.flatten(2).transpose(1, 2), center_px
-        f_c = F_global.mean((2, 3))[:, None].expand(-1, peaks_xy.shape[1], -1)
-        extent = eq.STRIDE * torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
-        return f_c, 0.5 * (extent - 1) + 0.5 * extent * torch.tanh(self.head_center(f_c))
+            cells = F_global.reshape(peaks_xy.shape[0], channels, -1)
+            return (W @ cells.transpose(1, 2)).reshape(-1, channels), center_px.reshape(-1, 2)
+        f_c = F_global.mean((2, 3))[:, None].expand(-1, peaks_xy.shape[1], -1).reshape(-1, channels)
+        extent_px = _extent_px(log_P)
+        return f_c, 0.5 * (extent_px - 1) + 0.5 * extent_px * torch.tanh(self.head_center(f_c))
 
-    def _likeliest(self, f_rot: Tensor, R_allo_k: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits [N, M, K] and the rotation [N, M, 3, 3] of the highest: one mode, never a mean of two."""
+    def _likeliest(self, f_rot: Tensor, r_6d: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits [P, K] and the rotation [P, 3, 3] of the highest: one mode, never a mean of two."""
         if self.head_hypothesis is None:
-            return torch.zeros_like(R_allo_k[..., 0, 0]), R_allo_k[:, :, 0]
+            return torch.zeros_like(r_6d[:, :1]), eq.gram_schmidt(r_6d)
         logits = self.head_hypothesis(f_rot)
-        best = logits.argmax(-1)[..., None, None, None].expand(-1, -1, 1, 3, 3)
-        return logits, torch.gather(R_allo_k, 2, best)[:, :, 0]
+        of_best = 6 * logits.argmax(-1, keepdim=True) + torch.arange(6, device=r_6d.device)
+        return logits, eq.gram_schmidt(torch.gather(r_6d, 1, of_best))
 
     def _log_sigma(self, f_trans: Tensor, f_rot: Tensor) -> Tensor:
         """From detached features: the uncertainty never pulls at the means."""
@@ -239,11 +255,11 @@ class PoseNet(nn.Module):
         cells = self.config.soft_argmax_sigma_cells
         return cells if cells is not None else _float(log_P.shape[-1], log_P) / 32.0
 
-    def _anchor(self, F_global: Tensor) -> Tensor:
+    def _anchor(self, log_P: Tensor) -> Tensor:
+        """Sides in pixels of the box that boxes are told beside, [1] or [2]."""
         if self.config.box_anchor_px is not None:
-            return torch.full_like(F_global[0, 0, 0, :1], self.config.box_anchor_px)
-        sides = torch.stack([_float(F_global.shape[3], F_global), _float(F_global.shape[2], F_global)])
-        return 0.1 * eq.STRIDE * sides
+            return torch.tensor([self.config.box_anchor_px], device=log_P.device)
+        return 0.1 * _extent_px(log_P)
 
     def forward(self, image: Tensor, K: Tensor) -> tuple[Tensor, ...]:
         """The exported graph: the outputs of msgs.contract.OUTPUT_NAMES, in that order."""
@@ -256,9 +272,14 @@ class PoseNet(nn.Module):
         size_px = torch.exp(out.log_size)
         # A Laplace law of scale b has the standard deviation sqrt(2) b.
         sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
-        side_px = torch.sqrt(size_px[..., :1] * size_px[..., 1:])
+        side_px = torch.sqrt(size_px.prod(-1, keepdim=True))
         sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
         return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
+
+
+def _extent_px(log_P: Tensor) -> Tensor:
+    """Width and height [2] of the image in pixels, from its heatmap [N, H_f, W_f]: export keeps them dynamic."""
+    return eq.STRIDE * torch.stack([_float(log_P.shape[2], log_P), _float(log_P.shape[1], log_P)])
 
 
 def _float(length: int, like: Tensor) -> Tensor:
