@@ -34,8 +34,8 @@ def image_plane_point(point_px: Tensor, K: Tensor) -> Tensor:
 
 
 def _focal_lengths(K: Tensor) -> Tensor:
-    """(f_x, f_y) [..., 2] of K [..., 3, 3] without skew, whose other values beside them are zeros."""
-    return K[..., :2, :2].sum(-1)
+    """(f_x, f_y) [..., 2] of K [..., 3, 3]; a skew is nobody's focal length."""
+    return (K[..., :2, :2] * torch.eye(2).to(K)).sum(-1)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -178,7 +178,8 @@ class PoseNet(nn.Module):
     def decode(self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None) -> Decoded:
         """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box.
 
-        Inside, the peaks of all images are rows: layers of two dimensions export as one node each.
+        K [N, 3, 3]. Inside, the peaks of all images are rows: a linear layer over a matrix exports as one node, over
+        three dimensions as several.
         """
         F_global, log_P = seen.F_global, F.logsigmoid(seen.heat_logits)
         M = int(peaks_xy.shape[1])
@@ -256,7 +257,7 @@ class PoseNet(nn.Module):
         return cells if cells is not None else _float(log_P.shape[-1], log_P) / 32.0
 
     def _anchor(self, log_P: Tensor) -> Tensor:
-        """Sides in pixels of the box that boxes are told beside, [1] or [2]."""
+        """Sides in pixels, [1] or [2], of the box that sizes are told as multiples of."""
         if self.config.box_anchor_px is not None:
             return torch.tensor([self.config.box_anchor_px], device=log_P.device)
         return 0.1 * _extent_px(log_P)

@@ -2,7 +2,9 @@
 
 ONNX Runtime gathers the pixels under a window one by one, and of three channels each that takes longer than multiplying
 them. Four neighbours of a row are one pixel of twelve channels, as the picture's bytes lie in memory anyway. From those
-a convolution with the same weights, and zeros between, makes two columns of the output at once: the same bytes, sooner.
+a convolution makes two columns of the output at once, its weights being the first ones twice, two pixels apart, and
+zeros elsewhere: the same bytes, sooner. (Where a processor has no 8-bit dot products ONNX Runtime's sums may overflow,
+in either graph.)
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ def wide_weights(weights: NDArray[np.int8], pixels_left: int) -> WideWeights:
 def take_quads(graph: onnx.GraphProto, image: str) -> None:
     """Let the first convolution of a QDQ graph that `image_input.feed_pixels` was applied to take quads of pixels.
 
-    The picture's width must then be a multiple of four. Raises ValueError if the convolution is not one with stride 2
-    over bytes, whose output has half the picture's width.
+    The picture's width must then be a multiple of four; rows stay as they are. Raises ValueError, the graph as it was,
+    if the convolution's output has not half the picture's width or is not bytes again.
     """
     turn = reader(graph, image)
     conv = reader(graph, reader(graph, turn.output[0]).output[0])
@@ -60,7 +62,9 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     weights = numpy_helper.to_array(constants[weight.input[0]])
     attributes = {attribute.name: attribute for attribute in conv.attribute}
     top, left, bottom, right = attributes["pads"].ints
-    columns = weights.shape[3]
+    columns, quantise = weights.shape[3], reader(graph, conv.output[0])
+    if quantise.op_type != "QuantizeLinear":
+        raise ValueError(f"{conv.name}: its output is not quantised")
     if list(attributes["strides"].ints) != [STRIDE, STRIDE] or columns - STRIDE not in (left + right, left + right - 1):
         raise ValueError(f"{conv.name}: its output has not half the picture's width")
     wide = wide_weights(weights, left)
@@ -78,7 +82,6 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     quads = helper.make_node("Reshape", [image, "quads_shape"], ["quads"], "/pixels/Reshape")
     graph.node.insert(list(graph.node).index(turn), quads)
     # The bytes of the output, channels last: there too the two columns lie side by side.
-    quantise = reader(graph, conv.output[0])
     output, quantise.output[0] = quantise.output[0], "column_pairs"
     steps = [
         helper.make_node("Transpose", ["column_pairs"], ["pairs_last"], "/pixels/Transpose_pairs", perm=[0, 2, 3, 1]),
@@ -88,3 +91,4 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     at = list(graph.node).index(quantise) + 1
     for k, step in enumerate(steps):
         graph.node.insert(at + k, step)
+    del graph.value_info[:]  # shapes that were inferred of the graph as it was

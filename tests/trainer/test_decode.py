@@ -49,6 +49,29 @@ def decoded(K: torch.Tensor, **changes: object) -> tuple:
         return network.decode(seen, K, torch.tensor([[[2.0, 3.0], [6.0, 5.0]]]))
 
 
+@pytest.mark.parametrize(
+    "changes", [{}, {"center": "regressed", "hypotheses": 1, "depth": "direct", "uncertainty": False}]
+)
+def test_every_peak_of_every_image_is_decoded_as_if_it_were_alone(changes: dict) -> None:
+    torch.manual_seed(4)
+    network = PoseNet(tiny.config().model.model_copy(update=changes)).eval()
+    F_global, heat_logits = torch.randn(2, 16, 8, 8), torch.randn(2, 8, 8)
+    K = torch.cat([intrinsics(900.0), intrinsics(1300.0, 20.0, 44.0)])
+    K[1, 0, 0] = 1100.0
+    peaks_xy = torch.tensor([[[2.0, 3.0], [6.0, 5.0], [1.0, 1.0]], [[4.0, 4.0], [0.0, 7.0], [5.0, 2.0]]])
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape))
+        together = network.decode(Perception(F_global, heat_logits), K, peaks_xy)
+        for n in range(2):
+            for m in range(3):
+                own = slice(n, n + 1)
+                seen = Perception(F_global[own], heat_logits[own])
+                alone = network.decode(seen, K[own], peaks_xy[own, m : m + 1])
+                for name, one, all_of_them in zip(alone._fields, alone, together, strict=True):
+                    torch.testing.assert_close(one[0, 0], all_of_them[n, m], rtol=1e-4, atol=1e-4, msg=name)
+
+
 def intrinsics(f: float, cx: float = 31.5, cy: float = 31.5) -> torch.Tensor:
     return torch.tensor([[[f, 0, cx], [0, f, cy], [0, 0, 1]]])
 

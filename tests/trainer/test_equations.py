@@ -42,6 +42,15 @@ def test_soft_argmax_weighs_sharpened_probability_by_the_window() -> None:
 
 
 @given(plane, plane)
+def test_a_skew_is_no_focal_length(x: float, y: float) -> None:
+    K = torch.tensor([[1000.0, 5.0, 320.0], [0.0, 1100.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.double)
+    point = torch.tensor([320.0 + 1000.0 * x, 240.0 + 1100.0 * y], dtype=torch.double)
+    torch.testing.assert_close(eq.image_plane_point(point, K), torch.tensor([x, y], dtype=torch.double))
+    assert eq.focal_length(K, "mean").item() == pytest.approx(1050.0)
+    assert eq.focal_length(K, "geometric").item() == pytest.approx(math.sqrt(1.1e6))
+
+
+@given(plane, plane)
 def test_ray_rotation_takes_the_axis_to_the_ray_by_the_smallest_angle(x: float, y: float) -> None:
     d = eq.unit_ray(torch.tensor([x, y], dtype=torch.double))
     R = eq.ray_rotation(d)
