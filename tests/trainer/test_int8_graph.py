@@ -54,11 +54,15 @@ def test_it_is_of_standard_operators_alone(graph: Graph) -> None:
 
 def test_the_pictures_bytes_go_into_the_first_convolution_as_they_are(graph: Graph) -> None:
     assert graph.inputs == {"image": TensorProto.UINT8, "K": TensorProto.FLOAT}
-    (turned,) = [node for node in graph.readers["image"] if node.op_type != "Shape"]
+    (quads,) = [node for node in graph.readers["image"] if node.op_type != "Shape"]
+    assert quads.op_type == "Reshape"
+    (turned,) = graph.readers[quads.output[0]]
     assert turned.op_type == "Transpose"
     (scaled,) = [node for node in graph.readers[turned.output[0]] if node.op_type != "Shape"]
     assert scaled.op_type == "DequantizeLinear"
     assert graph.constants[scaled.input[1]] == 1.0
+    (conv,) = graph.readers[scaled.output[0]]
+    assert next(list(a.ints) for a in conv.attribute if a.name == "strides") == [2, 1], "four pixels at a time"
 
 
 def test_it_says_what_it_was_made_from(graph: Graph) -> None:
