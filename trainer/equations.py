@@ -21,7 +21,7 @@ def soft_argmax(log_P: Tensor, peaks_xy: Tensor, sigma_g: Tensor | float) -> tup
     """
     columns = log_P.shape[-1]
     index = torch.arange(log_P.shape[-2] * columns, device=log_P.device)
-    cells_xy = torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1).to(log_P.dtype)
+    cells_xy = _cells_xy(index, columns).to(log_P.dtype)
     away = cells_xy - peaks_xy[:, :, None]
     log_G = (away * away).sum(-1) * (-0.5 / sigma_g**2)
     W = torch.softmax(SHARPENING * log_P.flatten(1)[:, None] + log_G, dim=-1)
@@ -123,4 +123,10 @@ def heatmap_peaks(P: Tensor, count: int) -> tuple[Tensor, Tensor]:
     kept = torch.where(highest == P, P, torch.zeros_like(P))
     values, index = torch.topk(kept.flatten(1), count, dim=1)
     columns = P.shape[-1]
-    return values, torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1)
+    return values, _cells_xy(index, columns)
+
+
+def _cells_xy(index: Tensor, columns: int) -> Tensor:
+    """Cells (x, y) [..., 2] of places [...], zero or more, in a flattened map."""
+    # To floor the division as well, which changes nothing of such numbers, exports as eight nodes.
+    return torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1)

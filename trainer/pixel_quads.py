@@ -68,9 +68,10 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     if list(attributes["strides"].ints) != [STRIDE, STRIDE] or columns - STRIDE not in (left + right, left + right - 1):
         raise ValueError(f"{conv.name}: its output has not half the picture's width")
     wide = wide_weights(weights, left)
+    copies = len(wide.weights) // len(weights)
     constants[weight.input[0]].CopyFrom(numpy_helper.from_array(wide.weights, weight.input[0]))
     for name in {*weight.input[1:], *bias.input}:
-        constants[name].CopyFrom(numpy_helper.from_array(np.tile(numpy_helper.to_array(constants[name]), 2), name))
+        constants[name].CopyFrom(numpy_helper.from_array(np.tile(numpy_helper.to_array(constants[name]), copies), name))
     attributes["kernel_shape"].ints[:] = wide.weights.shape[2:]
     attributes["strides"].ints[:] = [STRIDE, 1]
     attributes["pads"].ints[:] = [top, wide.quads_left, bottom, wide.quads_right]
