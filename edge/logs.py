@@ -33,7 +33,7 @@ class PatientStream(io.TextIOBase):
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._waiting: queue.Queue[str | threading.Event] = queue.Queue(LINES_WAITING)
-        self._lost = 0
+        self._lost = 0  # in all; counted by who writes alone, so that no count is lost between two threads
         threading.Thread(target=self._work, name="log", daemon=True).start()
 
     def write(self, text: str) -> int:
@@ -51,12 +51,14 @@ class PatientStream(io.TextIOBase):
             written.wait(DRAIN_S)
 
     def _work(self) -> None:
+        told = 0
         while True:
             line = self._waiting.get()
             if isinstance(line, threading.Event):
                 line.set()
                 continue
-            lost, self._lost = self._lost, 0
+            lost = self._lost - told
+            told += lost
             said = f"{lost} lines of the log were lost: nobody read it\n" if lost else ""
             with contextlib.suppress(OSError, ValueError):  # the reader is gone, or the stream closed
                 self._stream.write(said + line)
