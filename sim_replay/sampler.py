@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES, airframe_of
-from sim_replay.render.distractors import add_distractors
+from sim_replay.render.distractors import add_decoy, add_distractors
 from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
 from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
 from sim_replay.render.projection import extents_px
@@ -137,6 +137,8 @@ class WindowSampler:
         clear = int(np.count_nonzero(coverage)) / max(whole_px, 1)
         if window.distractors:
             image = add_distractors(image, coverage, rng)
+        if window.decoy:
+            image = add_decoy(image, window.decoy, rng)
         image = exposed(image, sensor_from(rng, window.quality), window.native_scale, rng)
         camera = window.scene.camera
         if side < size:

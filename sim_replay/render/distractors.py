@@ -12,6 +12,17 @@ from sim_replay.render.scene import Scene
 
 _SPAN_PX = (5.0, 60.0)
 _MARGIN_PX = 80
+_WINDOW_SPAN_PX, _WINDOW_SPAN_SHARE = 3.0, 0.35  # in a window: from so many pixels to so much of its side
+_PALE_SHARE = 0.15
+_RUFFLED = 0.012  # 1-sigma of an outline's corners, share of the span
+
+
+@dataclass(frozen=True)
+class Decoy:
+    """A bird to be looked at as a target is."""
+
+    center_px: tuple[float, float]
+    span_px: float
 
 
 def bird_outline(span_px: float, flap: float, chord: float, bend: float, turn_rad: float) -> NDArray[np.float64]:
@@ -40,11 +51,23 @@ def _filled(points: NDArray[np.float64], width: int, height: int) -> NDArray[np.
     return alpha.astype(np.float32) / np.float32(255)
 
 
-def _bird(rng: np.random.Generator, side: int) -> NDArray[np.float32]:
-    span = rng.uniform(3.0, 0.22 * side)
+def _bird(
+    rng: np.random.Generator, side: int, decoy: Decoy | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Cover [side, side] in 0..1 and colour [3] of a bird; without a `decoy` of any size anywhere.
+
+    No two are of one shape: what tells birds from aircraft is not to be learned from one drawing of a bird.
+    """
+    span = decoy.span_px if decoy else rng.uniform(_WINDOW_SPAN_PX, _WINDOW_SPAN_SHARE * side)
+    center = np.array(decoy.center_px) if decoy else rng.uniform(0, side, 2)
     flap, turn = rng.uniform(-0.5, 0.5), rng.uniform(0, 2 * np.pi)
     outline = bird_outline(span, flap, rng.uniform(0.08, 0.2), rng.uniform(0.0, 0.25), turn)
-    return _filled(outline + rng.uniform(0, side, 2), side, side)
+    outline += rng.normal(0.0, _RUFFLED * span, outline.shape)
+    along, narrower = rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)  # seen aslant
+    across = np.array([np.cos(along), np.sin(along)])
+    outline -= (1.0 - narrower) * np.outer(outline @ across, across)
+    level = rng.uniform(110, 235) if rng.random() < _PALE_SHARE else rng.uniform(10, 110)
+    return _filled(outline + center, side, side), level * (1.0 + 0.05 * rng.normal(size=3))
 
 
 def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) -> NDArray[np.float32]:
@@ -57,6 +80,13 @@ def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) ->
     return np.exp(-0.5 * (u * u + v * v)).astype(np.float32)
 
 
+def add_decoy(image_bgr: NDArray[np.uint8], decoy: Decoy, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A bird on a square picture [S, S, 3]."""
+    alpha, level = _bird(rng, image_bgr.shape[0], decoy)
+    image = image_bgr + alpha[..., None] * (level.astype(np.float32) - image_bgr)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
 def add_distractors(
     image_bgr: NDArray[np.uint8], coverage: NDArray[np.uint8], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
@@ -66,7 +96,7 @@ def add_distractors(
     for _ in range(int(rng.integers(1, 5))):
         kind = rng.random()
         if kind < 0.6:
-            alpha, level = _bird(rng, side), rng.uniform(10, 110) * np.ones(3)
+            alpha, level = _bird(rng, side)
         elif kind < 0.8:
             alpha, level = blob(rng, side, (0.6, 2.5)), rng.uniform(0, 255) * np.ones(3)
         else:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from msgs.geometry import R_from_euler, so3_exp
 from sim_replay.airframes.invented import draw_invented
+from sim_replay.render.distractors import Decoy
 from sim_replay.render.environment import direction_ned
 from sim_replay.render.frame import outline_px
 from sim_replay.render.projection import extents_px, solid_vertices_m
@@ -25,10 +26,15 @@ RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
 BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly
 # A small aircraft far off: that many are log-uniformly of these sizes, as far as lenses go, or hardly any would be so.
-SMALL_BOX_PX, SMALL_RANGE_M, SMALL_SHARE = (16.0, 130.0), (250.0, 550.0), 0.25
+# Windows without a target are so more often: of what is large, its shape tells that it is none.
+SMALL_BOX_PX, SMALL_RANGE_M, SMALL_SHARE, SMALL_EMPTY_SHARE = (16.0, 130.0), (250.0, 550.0), 0.25, 0.7
 WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_SHARE_MIN = 0.35
+DISTRACTORS_SHARE, DISTRACTORS_EMPTY_SHARE = 0.2, 0.5  # of windows with a target, and of those without
+# Of windows without a target: a bird where it would be. What the whole frame takes for a target and is none is a bird
+# more often than anything else, and the window around it shows it as large as a target.
+DECOY_SHARE = 0.75
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
 
@@ -44,6 +50,7 @@ class Window:
     visible_share: float  # share of the target's outline inside the window; 0 without a target
     distractors: bool
     quality: Quality
+    decoy: Decoy | None  # rendered pixels
 
 
 def crop_K(K: Array, x0_px: float, y0_px: float, scale: float) -> Array:
@@ -92,14 +99,19 @@ def _lens_for(
     return float(np.exp(rng.uniform(np.log(low_px), np.log(high_px))) * range_m / size_m)
 
 
-def frame_scene(rng: np.random.Generator, airframe_ids: Sequence[int], invented_share: float = 0.0) -> Scene:
+def frame_scene(
+    rng: np.random.Generator,
+    airframe_ids: Sequence[int],
+    invented_share: float = 0.0,
+    small_share: float = SMALL_SHARE,
+) -> Scene:
     """A whole 1920 x 1080 frame with one target wholly inside it where the lens allows."""
     if invented_share > 0.0 and rng.random() < invented_share:
         airframe_id = draw_invented(rng, airframe_ids)
     else:
         airframe_id = int(rng.choice(np.asarray(airframe_ids)))
     vertices_m = solid_vertices_m(airframe_id)
-    small = bool(rng.random() < SMALL_SHARE)
+    small = bool(rng.random() < small_share)
     if small:
         range_m = rng.uniform(*SMALL_RANGE_M)
     else:
@@ -159,6 +171,16 @@ def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[
     return float(corner[0]), float(corner[1]), side
 
 
+def _decoy(rng: np.random.Generator, target: Target, camera: Camera) -> Decoy | None:
+    """A bird in the place of a target, about as large."""
+    box = extents_px(outline_px(target, camera))
+    if box is None:
+        return None
+    left, top, right, bottom = box
+    size = max(right - left, bottom - top)
+    return Decoy((0.5 * (left + right), 0.5 * (top + bottom)), size * float(rng.uniform(0.8, 1.25)))
+
+
 def draw_window(
     seed: int,
     index: int,
@@ -172,8 +194,8 @@ def draw_window(
     rng = np.random.default_rng([seed, index, size_px])
     kind: Kind = "acquire" if rng.random() < acquire_share else "track"
     empty = bool(rng.random() < empty_share)
-    distractors = bool(rng.random() < (0.5 if empty else 0.12))
-    frame = frame_scene(rng, airframe_ids, invented_share)
+    distractors = bool(rng.random() < (DISTRACTORS_EMPTY_SHARE if empty else DISTRACTORS_SHARE))
+    frame = frame_scene(rng, airframe_ids, invented_share, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
     x0, y0, side = _acquire_cut(rng, frame, size_px) if kind == "acquire" else _track_cut(rng, frame)
     rendered_px = int(np.clip(round(side), 24, size_px))
     scale = rendered_px / side
@@ -190,4 +212,5 @@ def draw_window(
         targets = ()
     scene = Scene(camera, targets, frame.environment, int(rng.integers(2**31)), index)
     quality = QUALITIES[int(rng.choice(len(QUALITIES), p=QUALITY_SHARES))]
-    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors, quality)
+    decoy = _decoy(rng, frame.targets[0], camera) if empty and rng.random() < DECOY_SHARE else None
+    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors, quality, decoy)
