@@ -1,7 +1,8 @@
 """Whether a long flight drifts: memory, descriptors, threads, log, drops and age, early against late. Pure functions.
 
 The first quarter is left out: caches fill, allocators grow, links come up. The rest is parted into thirds, and the last
-is set against the first. Medians are compared, so that one odd sample is no trend.
+is set against the first. Medians are compared, so that one odd sample is no trend; of memory the floor is, for what
+leaks lifts it and what comes and goes with each picture does not.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from sim_replay.pipeline.flight import Flight
 
 WARM_UP_SHARE = 0.25
 SAMPLES_MIN = 12  # fewer seconds show no trend
-MEMORY_MB = 16.0  # where threads share a busy machine, the allocator's plateau wavers by half of it
+# Three pictures of 1080p and a half: a busy machine has more of them in hand at once than an idle one, and the
+# allocator keeps the places of as many as there ever were.
+MEMORY_MB = 22.0
+FLOOR_QUANTILE = 0.1
 DESCRIPTORS, THREADS = 3.0, 2.0
 LOG_BYTES_PER_MINUTE = 6000.0
 DROPPED_SHARE = 0.01  # of the frames of a third
@@ -47,7 +51,8 @@ def trends(flight: Flight, fps: float) -> list[Trend]:
     def medians(values: Sequence[float], times: Array) -> tuple[float | None, float | None]:
         return _within(np.median, values, times, early), _within(np.median, values, times, late)
 
-    memory = medians([sample.rss_mb for sample in samples], times_ns)
+    resident_mb = [sample.rss_mb for sample in samples]
+    memory = (_within(_floor, resident_mb, times_ns, early), _within(_floor, resident_mb, times_ns, late))
     descriptors = medians([sample.descriptors for sample in samples], times_ns)
     threads = medians([sample.threads for sample in samples], times_ns)
     log_times = np.array([heard_ns for heard_ns, _ in flight.logged])
@@ -84,6 +89,10 @@ def _thirds(times_ns: Array) -> tuple[tuple[float, float], tuple[float, float]]:
     first += WARM_UP_SHARE * (last - first)
     length = (last - first) / 3.0
     return (first, first + length), (last - length, last)
+
+
+def _floor(values: Array) -> np.floating:
+    return np.float64(np.quantile(values, FLOOR_QUANTILE))
 
 
 def _within(

@@ -49,6 +49,13 @@ def test_what_wavers_does_not_grow() -> None:
     assert all(trend.grows is False for trend in told), told
 
 
+def test_pictures_in_flight_are_no_leak() -> None:
+    flight = steady()
+    waiting = np.random.default_rng(4).integers(0, 8, len(flight.usage))
+    flight.usage = [replace(u, rss_mb=u.rss_mb + 6.2 * int(waiting[k]) * (k > 150)) for k, u in enumerate(flight.usage)]
+    assert growing(flight) == set()
+
+
 def test_a_leak_of_some_kilobytes_a_frame_is_found_in_minutes() -> None:
     flight = steady()
     flight.usage = [replace(u, rss_mb=u.rss_mb + 0.2 * k) for k, u in enumerate(flight.usage)]
