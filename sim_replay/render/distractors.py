@@ -17,9 +17,12 @@ _PALE_SHARE = 0.15
 _RUFFLED = 0.012  # 1-sigma of an outline's corners, share of the span
 
 
+_WISP_SHARE = 0.25  # of decoys; the others are birds
+
+
 @dataclass(frozen=True)
 class Decoy:
-    """A bird to be looked at as a target is."""
+    """A bird or a wisp of cloud to be looked at as a target is."""
 
     center_px: tuple[float, float]
     span_px: float
@@ -80,9 +83,25 @@ def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) ->
     return np.exp(-0.5 * (u * u + v * v)).astype(np.float32)
 
 
+def _wisp(rng: np.random.Generator, side: int, decoy: Decoy) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Cover [side, side] in 0..1 and colour [3] of a ragged shred of cloud, or of a gap in one."""
+    y, x = np.mgrid[:side, :side].astype(np.float32) - np.array(decoy.center_px, np.float32)[::-1, None, None]
+    turn = rng.uniform(0, np.pi)
+    long_px = decoy.span_px / 4.0  # of a bell, whose edges lie two sigma from its middle
+    wide_px = long_px * rng.uniform(0.15, 0.7)
+    u = (np.cos(turn) * x + np.sin(turn) * y) / np.float32(long_px)
+    v = (np.cos(turn) * y - np.sin(turn) * x) / np.float32(wide_px)
+    cells = np.clip(side / long_px * rng.uniform(0.5, 2.5, 2), 4, side).astype(int)
+    coarse = rng.normal(size=cells).astype(np.float32)
+    ragged = np.asarray(cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC))
+    alpha = rng.uniform(0.15, 0.5) * np.clip(np.exp(-0.5 * (u * u + v * v)) * (1.0 + ragged), 0.0, 1.0)
+    return alpha.astype(np.float32), rng.uniform(0, 255) * (1.0 + 0.08 * rng.normal(size=3))
+
+
 def add_decoy(image_bgr: NDArray[np.uint8], decoy: Decoy, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A bird on a square picture [S, S, 3]."""
-    alpha, level = _bird(rng, image_bgr.shape[0], decoy)
+    """A bird or a wisp of cloud on a square picture [S, S, 3]."""
+    draw = _wisp if rng.random() < _WISP_SHARE else _bird
+    alpha, level = draw(rng, image_bgr.shape[0], decoy)
     image = image_bgr + alpha[..., None] * (level.astype(np.float32) - image_bgr)
     return np.clip(image, 0, 255).astype(np.uint8)
 

@@ -32,8 +32,8 @@ WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
 VISIBLE_SHARE_MIN = 0.35
 DISTRACTORS_SHARE, DISTRACTORS_EMPTY_SHARE = 0.2, 0.5  # of windows with a target, and of those without
-# Of windows without a target: a bird where it would be. What the whole frame takes for a target and is none is a bird
-# more often than anything else, and the window around it shows it as large as a target.
+# Of windows without a target: a bird or a wisp where it would be. What the whole frame takes for a target and is none
+# is one of these more often than not, and the window around it shows it as large as a target.
 DECOY_SHARE = 0.75
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
@@ -172,7 +172,7 @@ def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[
 
 
 def _decoy(rng: np.random.Generator, target: Target, camera: Camera) -> Decoy | None:
-    """A bird in the place of a target, about as large."""
+    """What is no target in the place of one, about as large."""
     box = extents_px(outline_px(target, camera))
     if box is None:
         return None

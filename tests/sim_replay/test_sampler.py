@@ -147,20 +147,20 @@ def test_windows_show_targets_as_large_as_the_stages_will() -> None:
     assert max(acquire) * 128 > 80
 
 
-def test_most_windows_without_a_target_show_a_bird_as_large_as_one() -> None:
+def test_most_windows_without_a_target_show_a_decoy_as_large_as_one() -> None:
     sampler = WindowSampler(seed=4, size_px=64, acquire_share=0.0, empty_share=1.0)
     batch = sampler.batch(0, 200)
     assert not batch.present.any()
-    birds = 0
+    decoys = 0
     for index in range(200):
         window = draw_window(4, index, 64, range(len(AIRFRAMES)), 0.0, 1.0)
         if window.decoy is None:
             continue
-        birds += 1
+        decoys += 1
         side = window.scene.camera.width_px
         assert 0.8 / (1.8 * 1.34) < window.decoy.span_px / side < 1.25 / (1.8 * 0.74)
         assert np.all(np.abs(np.array(window.decoy.center_px) / side - 0.5) < 0.18)
-    assert 0.65 < birds / 200 < 0.85
+    assert 0.65 < decoys / 200 < 0.85
 
 
 def test_a_decoy_is_drawn_where_it_is_meant_to_be_and_no_two_alike() -> None:
@@ -171,7 +171,7 @@ def test_a_decoy_is_drawn_where_it_is_meant_to_be_and_no_two_alike() -> None:
         rows, columns = np.nonzero(cover)
         assert 40 <= columns.mean() <= 80
         assert 20 <= rows.mean() <= 60
-        assert 15 < max(np.ptp(rows), np.ptp(columns)) < 46
+        assert 12 < max(np.ptp(rows), np.ptp(columns)) < 64
     assert len({cover.tobytes() for cover in covers}) == 20
 
 
