@@ -45,6 +45,7 @@ class TrainingBatch(NamedTuple):
     size_px: NDArray[np.float32]
     coverage: NDArray[np.float32]  # [N, H/4, W/4]; NaN where the mask is not known
     noc: NDArray[np.float32]  # [N, 3, H/4, W/4]; NaN where not known
+    others: NDArray[np.bool_]  # [N, H/4, W/4], where aircraft lie that are not the labelled one
     diameter_m: NDArray[np.float32]
 
 
@@ -65,6 +66,7 @@ def training_batch(sample: SampleBatch) -> TrainingBatch:
         size_px=box[:, 2:] - box[:, :2],
         coverage=visible,
         noc=np.ascontiguousarray(noc.transpose(0, 3, 1, 2)),
+        others=np.zeros(visible.shape, np.bool_),
         diameter_m=sample.diameter_m,
     )
 
@@ -88,6 +90,7 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
         size_px=put(batch.size_px),
         coverage=put(batch.coverage),
         noc=put(batch.noc),
+        others=put(batch.others),
     )
     return put(batch.image_bgr), labels
 

@@ -66,6 +66,9 @@ class DatasetSampler:
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None:
             self._label(out, frame, chosen, to_window)
+        for k, other in enumerate(boxes):
+            if other is not None and k != chosen:
+                _mark(out.others[0], other, to_window)
         return out
 
     def _label(self, out: TrainingBatch, frame: DatasetFrame, chosen: int, to_window: Array) -> None:
@@ -126,6 +129,14 @@ def _coverage(mask: NDArray[np.bool_], to_window: Array, size_px: int) -> NDArra
     return window.reshape(side, DENSE_STRIDE, side, DENSE_STRIDE).mean((1, 3))
 
 
+def _mark(others: NDArray[np.bool_], box_xyxy_px: Array, to_window: Array) -> None:
+    """Set the cells [S/4, S/4] that a box on the frame touches."""
+    corners = box_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
+    first = np.floor((corners[0] + 0.5) / DENSE_STRIDE).astype(int).clip(min=0)
+    stop = np.ceil((corners[1] + 0.5) / DENSE_STRIDE).astype(int).clip(min=0)
+    others[first[1] : stop[1], first[0] : stop[0]] = True
+
+
 def _blank(image_bgr: NDArray[np.uint8], K: Array) -> TrainingBatch:
     side = image_bgr.shape[0] // DENSE_STRIDE
     return TrainingBatch(
@@ -138,6 +149,7 @@ def _blank(image_bgr: NDArray[np.uint8], K: Array) -> TrainingBatch:
         size_px=np.zeros((1, 2), np.float32),
         coverage=np.zeros((1, side, side), np.float32),
         noc=np.full((1, 3, side, side), np.nan, np.float32),
+        others=np.zeros((1, side, side), np.bool_),
         diameter_m=np.zeros(1, np.float32),
     )
 

@@ -19,6 +19,7 @@ from trainer.config import LossConfig
 from trainer.model import Decoded
 
 SMALLEST_SIZE_PX = 2.0
+UNJUDGED = 1.0 - 1e-3  # of the heatmap's target: the focal loss asks next to nothing there
 HYPOTHESIS_SPREAD_RAD = 0.35
 
 
@@ -33,6 +34,7 @@ class Labels(NamedTuple):
     size_px: Tensor  # [N, 2]
     coverage: Tensor  # [N, H/4, W/4], share of visible target pixels
     noc: Tensor  # [N, 3, H/4, W/4]
+    others: Tensor  # [N, H/4, W/4], bool: other aircraft, of which nothing is asked
 
 
 def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
@@ -54,13 +56,18 @@ def center_cell(center_px: Tensor, rows: int, columns: int) -> Tensor:
 
 
 def heatmap_target(labels: Labels, rows: int, columns: int) -> Tensor:
-    """P [N, rows, columns]: a Gaussian with a peak of exactly 1 at the centre's cell, zeros without a target."""
+    """P [N, rows, columns]: a Gaussian with a peak of exactly 1 at the centre's cell, zeros without a target.
+
+    Where another aircraft lies it is UNJUDGED, so that a peak there is neither asked for nor held to be wrong.
+    """
     cell = center_cell(labels.center_px, rows, columns)
     sigma = (2 * gaussian_radius(labels.size_px / eq.STRIDE) + 1) / 6
     x = torch.arange(columns, device=cell.device)
     y = torch.arange(rows, device=cell.device)
     squared = (x[None, None] - cell[:, 0, None, None]) ** 2 + (y[None, :, None] - cell[:, 1, None, None]) ** 2
-    return torch.exp(-squared / (2 * sigma[:, None, None] ** 2)) * labels.present[:, None, None]
+    target = torch.exp(-squared / (2 * sigma[:, None, None] ** 2)) * labels.present[:, None, None]
+    unjudged = UNJUDGED * F.max_pool2d(labels.others.to(target.dtype)[:, None], 2)[:, 0]
+    return torch.maximum(target, unjudged)
 
 
 def heatmap_loss(logits: Tensor, target: Tensor) -> Tensor:
@@ -143,9 +150,9 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
 def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
     """Training-only heads [N, 4, H/4, W/4]: mask over all windows, object coordinates where the target is seen.
 
-    Where a label is NaN, not known, nothing is asked.
+    Where a label is NaN, not known, nothing is asked, nor where another aircraft lies.
     """
-    known = labels.coverage.isfinite()
+    known = labels.coverage.isfinite() & ~labels.others
     coverage = torch.where(known, labels.coverage, 0.0)
     mask = F.binary_cross_entropy_with_logits(dense[:, 0], coverage, reduction="none") * known
     seen = (coverage > 0.3) & labels.noc.isfinite().all(dim=1)

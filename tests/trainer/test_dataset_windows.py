@@ -16,7 +16,7 @@ from trainer.config import ConfigError, parse_config
 from trainer.data import to_tensors, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 from trainer.export import stage_sampler
-from trainer.losses import dense_terms
+from trainer.losses import dense_terms, heatmap_loss, heatmap_target
 from trainer.train import run_training
 
 K = np.array([[1500.0, 0, 320], [0, 1480, 180], [0, 0, 1]])
@@ -45,6 +45,54 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 targets = (BopTarget(1, np.eye(3), t, box, box, pixels, pixels),)
             writer.add(BopFrame(image_id, K, targets), image, [mask > 0][: len(targets)])
     return root
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames with two red discs, 60 pixels apart."""
+    root = tmp_path_factory.mktemp("pairs")
+    with SceneWriter(root / "train" / "000001", jpeg_quality=98) as writer:
+        for image_id in range(4):
+            image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+            masks, targets = [], []
+            for x in (200 + 40 * image_id, 260 + 40 * image_id):
+                mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+                cv2.circle(image, (x, 180), 12, DOT_BGR, -1)
+                cv2.circle(mask, (x, 180), 12, 255, -1)
+                box = np.array([x - 12.5, 167.5, x + 12.5, 192.5])
+                t = 260.0 * np.linalg.solve(K, [x, 180, 1.0])
+                pixels = int((mask > 0).sum())
+                targets.append(BopTarget(1, np.eye(3), t, box, box, pixels, pixels))
+                masks.append(mask > 0)
+            writer.add(BopFrame(image_id, K, tuple(targets)), image, masks)
+    return root
+
+
+def test_of_a_second_aircraft_in_the_window_nothing_is_asked(pairs: Path) -> None:
+    batch = DatasetSampler(pairs, "train", 5, 192, 1.0).batch(0, 40)
+    _, labels = to_tensors(batch, torch.device("cpu"))
+    target = heatmap_target(labels, 24, 24).numpy()
+    both = 0
+    for k in np.flatnonzero(batch.present):
+        red = batch.image_bgr[k, ..., 2].astype(float) - batch.image_bgr[k, ..., 1] > 100
+        *_, centres = cv2.connectedComponentsWithStats(red.astype(np.uint8))
+        away = np.linalg.norm(centres[1:] - batch.center_px[k], axis=1)
+        for x, y in centres[1:][away > 15]:
+            both += 1
+            assert batch.others[k, int(y / 4), int(x / 4)]
+            assert 0.99 < target[k, int(y / 8), int(x / 8)] < 1.0
+    assert both > 8
+    assert (target == 1.0).sum() == batch.present.sum()
+    logits = torch.zeros(40, 24, 24, requires_grad=True)
+    dense = torch.zeros(40, 4, 48, 48, requires_grad=True)
+    (heatmap_loss(logits, torch.from_numpy(target)) + dense_terms(dense, labels)["mask"].sum()).backward()
+    assert logits.grad is not None
+    assert dense.grad is not None
+    elsewhere = ~labels.others
+    assert (dense.grad[:, 0][labels.others] == 0).all()
+    assert (dense.grad[:, 0][elsewhere] != 0).all()
+    unjudged = (target > 0.99) & (target < 1.0)
+    assert logits.grad.abs().numpy()[unjudged].max() < 1e-9 < logits.grad.abs().numpy()[target == 0.0].min()
 
 
 @pytest.mark.parametrize("acquire_share", [0.0, 1.0])

@@ -34,7 +34,7 @@ def labels_at(center_px: tuple[float, float], size_px: tuple[float, float], pres
     R = torch.from_numpy(Rotation.from_euler("xyz", [90, 20, 40], degrees=True).as_matrix()).float()[None]
     empty = torch.zeros(1, 16, 16)
     sizes = torch.tensor([center_px]), torch.tensor([size_px])
-    return Labels(K, torch.tensor([present]), R, t, *sizes, empty, empty[:, None].repeat(1, 3, 1, 1))
+    return Labels(K, torch.tensor([present]), R, t, *sizes, empty, empty[:, None].repeat(1, 3, 1, 1), empty > 0)
 
 
 def test_focal_loss_by_hand() -> None:
