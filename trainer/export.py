@@ -26,7 +26,7 @@ COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
 ANY_SIZE_PX = (0.0, 1e6)  # of what nobody has measured: nothing is untrained
 UNREACHABLE_SCORE = 1.0
-EMPTY_SHARE_MIN = 0.12
+EMPTY_SHARE = 0.12
 
 OpenView = Callable[[int, int, float], Callable[[], Sampler]]  # (seed, size_px, acquire_share) to a picklable opener
 
@@ -58,9 +58,11 @@ def stage_sampler(
 ) -> Callable[[], Sampler]:
     """An opener of windows as one stage sees them: 0 for track, 1 for acquire.
 
-    Some hold no target, whatever was trained on: without them no score means anything.
+    Some hold no target, whatever was trained on: without them no score means anything. `held_out` ones are drawn alike
+    whatever was trained on, so that what is measured on them can be compared.
     """
-    shares = {"acquire_share": acquire_share, "empty_share": max(data.empty_share, EMPTY_SHARE_MIN)}
+    empty_share = EMPTY_SHARE if held_out else max(data.empty_share, EMPTY_SHARE)
+    shares = {"acquire_share": acquire_share, "empty_share": empty_share}
     return window_sampler(data.model_copy(update=shares), seed, size_px, held_out)
 
 

@@ -163,10 +163,12 @@ def test_the_constant_guess_lies_midway() -> None:
     assert got == pytest.approx({"constant_E_r_mean_deg": 20.0, "constant_depth_rel_mean": 0.5}, abs=1e-4)
 
 
-def test_windows_without_a_target_are_measured_on_whatever_was_trained_on() -> None:
-    data = tiny.config().data.model_copy(update={"empty_share": 0.0})
-    present = stage_sampler(data, 5, 64, 0.0)().batch(0, 40).present
-    assert 20 < present.sum() < 40
+def test_windows_are_measured_on_alike_whatever_was_trained_on() -> None:
+    data = tiny.config().data
+    shares = {"empty_share": 0.0, "invented_share": 0.0}, {"empty_share": 0.4, "invented_share": 0.9}
+    drawn = [stage_sampler(data.model_copy(update=s), 5, 64, 0.0)().batch(0, 40) for s in shares]
+    np.testing.assert_array_equal(drawn[0].image_bgr, drawn[1].image_bgr)
+    assert 20 < drawn[0].present.sum() < 40
 
 
 def test_where_every_window_holds_a_target_the_threshold_is_the_usual_one(exported: Exported) -> None:
