@@ -16,18 +16,20 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
+from sim_replay.benchmark.manifest import PACKAGES, package_version
 from trainer.config import ConfigError, TrainerConfig, made_folder
 from trainer.evaluate import null_where_unknown
 
 RUN_NAME = "run.json"
+# What makes the windows and what learns from them.
+SOURCES = ("trainer", "sim_replay", "msgs")
 
 
-def _commit() -> str:
-    """The source tree's commit, with `+` when it has uncommitted changes; "unknown" outside a repository."""
-    here = Path(__file__).parent
+def commit_of(tree: Path) -> str:
+    """The commit of a source tree, with `+` where one of SOURCES is not as committed; "unknown" outside of git."""
     try:
-        ask = lambda *words: subprocess.check_output(["git", *words], cwd=here, stderr=subprocess.DEVNULL, text=True)  # noqa: E731
-        head, changed = ask("rev-parse", "HEAD").strip(), ask("status", "--porcelain", "-uno", "--", ".").strip()
+        ask = lambda *words: subprocess.check_output(["git", *words], cwd=tree, stderr=subprocess.DEVNULL, text=True)  # noqa: E731
+        head, changed = ask("rev-parse", "HEAD").strip(), ask("status", "--porcelain", "--", *SOURCES).strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return head + ("+" if changed else "")
@@ -37,9 +39,9 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
     """What is needed to make the run again, beside its configuration."""
     return {
         "seed": config.data.seed,
-        "commit": _commit(),
+        "commit": commit_of(Path(__file__).parent.parent),
         "torch": str(torch.__version__),
-        "numpy": np.__version__,
+        **{name: package_version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
     }

@@ -230,7 +230,9 @@ class Plan(NamedTuple):
 def resume_run(out: Path, trainer: Trainer) -> Plan:
     """Restore `trainer` from the run folder and return its plan. Raises ConfigError.
 
-    Only what the weights do not depend on, [run] and [contract], may differ from the configuration of the checkpoint.
+    Of the checkpoint's configuration only [contract] and [run] may differ, of the latter not the arithmetic. As many
+    processes as before repeat what an unbroken run would have done; another number goes on with batches of another
+    size, and run.json tells of it.
     """
     path = out / RESUME_NAME
     state = load_file(path)
@@ -240,6 +242,8 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     for section in ("model", "loss", "data", "schedule"):
         if getattr(earlier, section) != getattr(trainer.config, section):
             raise ConfigError(f"{path}: [{section}] differs from --config; give the same one or another --out")
+    if earlier.run.bf16 != trainer.config.run.bf16:
+        raise ConfigError(f"{path}: [run] bf16 differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
     # Files written before the plan was kept had the configuration's.
     return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]))

@@ -77,11 +77,12 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
         if chosen:
             frames = sum(len(job.frames(plan)) for plan in chosen)
             lines += ["", f"[splits.{name}]", f"sequences = {len(chosen)}", f"frames = {frames}"]
-    lines += ["", "[packages]", *(f'{name} = "{_version(name)}"' for name in PACKAGES), ""]
+    lines += ["", "[packages]", *(f'{name} = "{package_version(name)}"' for name in PACKAGES), ""]
     replace_text(job.out / FILE, "\n".join(lines))
 
 
-def _version(package: str) -> str:
+def package_version(package: str) -> str:
+    """As installed, or that it is not."""
     try:
         return version(package)
     except PackageNotFoundError:

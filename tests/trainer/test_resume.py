@@ -49,6 +49,8 @@ def test_a_run_is_neither_overwritten_nor_resumed_with_other_losses(whole: tuple
         train(out, 1)
     with pytest.raises(ConfigError, match=r"resume\.pt: \[loss\] differs"):
         train(out, 1, tiny.TOML.replace("mask = 1.0", "mask = 2.0"), resume=True)
+    with pytest.raises(ConfigError, match=r"resume\.pt: \[run\] bf16 differs"):
+        train(out, 1, tiny.TOML.replace("[run]", "[run]\nbf16 = false"), resume=True)
 
 
 @pytest.mark.parametrize("content", [[1], {"config": tiny.TOML}])

@@ -7,6 +7,8 @@ import json
 import math
 import re
 import signal
+import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -15,11 +17,12 @@ import tiny
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from tests.waiting import until
 from trainer.checkpoint import load_file, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
-from trainer.runlog import RunLog
+from trainer.runlog import RunLog, commit_of
 from trainer.train import Trainer, run_training
 
 LONG = tiny.TOML.replace("samples = 16\nw", "samples = 1000000\nw")
@@ -52,6 +55,24 @@ def test_the_folder_tells_how_each_start_was_asked_for(run: Path) -> None:
     assert (run / "config.toml").read_text() == tiny.TOML
 
 
+def test_a_commit_is_marked_where_what_makes_or_learns_the_windows_was_changed(tmp_path: Path) -> None:
+    assert commit_of(tmp_path) == "unknown"
+    for name in ("trainer/train.py", "sim_replay/sampler.py", "msgs/contract.py", "docs/page.md"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("as committed\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "all"]):
+        subprocess.run([*git, *words], check=True)
+    head = subprocess.check_output([*git, "rev-parse", "HEAD"], text=True).strip()
+    (tmp_path / "docs/page.md").write_text("changed\n")
+    assert commit_of(tmp_path) == head
+    (tmp_path / "sim_replay/sampler.py").write_text("changed\n")
+    assert commit_of(tmp_path) == head + "+"
+    subprocess.run([*git, "checkout", "-q", "sim_replay"], check=True)
+    (tmp_path / "msgs/new.py").write_text("not committed\n")
+    assert commit_of(tmp_path) == head + "+"
+
+
 def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_path: Path) -> None:
     def told(from_samples: int, *samples: int) -> list[int]:
         log = RunLog(tmp_path, tiny.TOML, {"from_samples": from_samples})
@@ -64,6 +85,9 @@ def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_p
     assert told(0, 4, 8, 12) == [4, 8, 12]
     with (tmp_path / "log.jsonl").open("a") as file:
         file.write('{"kind": "tr')  # the power went
+    # TensorBoard reads event files by name: the second they were opened in, and within one a counter as text.
+    began = int(time.time())
+    until(lambda: int(time.time()) > began, what="the next second")
     assert told(8, 12, 16) == [4, 8, 12, 16]
     board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [event.step for event in board.Scalars("train/loss")] == [4, 8, 12, 16]
