@@ -20,11 +20,14 @@ def engine(
     path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
 ) -> Callable[[], object] | None:
     """`edge.bench.engines.Engine`: the float network of the file's configuration as the configs of this package build
-    it. Its weights are random, since they change nothing of the time. None for an INT8 file.
+    it. Its weights are random, since they change nothing of the time. None for an INT8 file, and for a file of another
+    backbone than that configuration's.
     """
     if contract.precision != "fp32":
         return None
     config = load_config(Path(str(files("trainer") / "configs" / f"{contract.configuration}.toml")))
+    if contract.backbone != config.model.backbone:
+        return None
     lean = config.model.model_copy(update={"pretrained": False, "dense": False})
     model = fuse_branches(PoseNet(lean).eval())
     inputs = torch.from_numpy(image), torch.from_numpy(K)

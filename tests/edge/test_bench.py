@@ -126,16 +126,18 @@ def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) 
 
 
 def test_other_engines_infer_the_same_files(cli: Cli, tmp_path: Path) -> None:
-    small = {"acquire_size_wh": (96, 64), "track_size_wh": (64, 64)}
+    # PyTorch builds the network of that backbone; of any other it has none to compare.
+    small = {"acquire_size_wh": (96, 64), "track_size_wh": (64, 64), "backbone": "efficientnet_lite0"}
+    other = write_toy_model(tmp_path / "other.onnx", **{**small, "backbone": "none"})
     fp32 = write_toy_model(tmp_path / "fp32.onnx", **small)
     int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8", **small)
-    done = cli("bench", fp32, int8, "--runs", "1", "--threads", "1", "--json", timeout_s=200.0)
+    done = cli("bench", fp32, int8, other, "--runs", "1", "--threads", "1", "--json", timeout_s=200.0)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     p10 = {(Path(r["file"]).stem, r["engine"]): r["ms"]["p10"] for r in result["rows"] if r["stage"] == "track"}
     assert set(p10) == {
         *(("fp32", engine) for engine in ("onnxruntime", "openvino", "pytorch")),
-        *(("int8", engine) for engine in ("onnxruntime", "openvino")),
+        *((name, engine) for name in ("int8", "other") for engine in ("onnxruntime", "openvino")),
     }
     ratios = result["ratios"]
     assert ratios["ort_over_openvino"] == pytest.approx(p10["int8", "onnxruntime"] / p10["int8", "openvino"])
