@@ -24,6 +24,7 @@ PAPER = {
     "pose_10deg_5pct": 0.828,
     "add_0_5d": 0.885,
 }
+TEST_SPLIT = "test"  # what is trained on and chosen by lies beside it
 KEPT_METRICS = ("E_", "rot_", "depth_", "pose_", "bearing_", "recall", "false_alarms")
 HISTORY = Path(__file__).parent / "checkpoints" / "history.jsonl"
 Cell = Callable[[Mapping[str, Any]], float | None]
@@ -76,9 +77,11 @@ def measure(
         for model in models:
             # Only a sequence that has every frame can be followed.
             for mode in ("frames", "track") if manifest.get("every", 1) == 1 else ("frames",):
-                request = DatasetRequest(model=model, dataset=dataset, mode=mode)
+                split = TEST_SPLIT if (dataset / TEST_SPLIT).is_dir() else None
+                request = DatasetRequest(model=model, dataset=dataset, split=split, mode=mode)
                 score = evaluate_dataset(request).score
-                scores.append({**score, "dataset": dataset.name, "recipe": manifest.get("command", "")})
+                recipe = " ".join([manifest.get("command", ""), *(["--split", split] if split else [])])
+                scores.append({**score, "dataset": dataset.name, "recipe": recipe if manifest else ""})
                 say(f"{dataset.name}, {mode}: {score['overall']['frames']} frames, {score['method']['file']}")
     return scores
 
