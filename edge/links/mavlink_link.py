@@ -105,7 +105,8 @@ class MavlinkLink:
 
     def settle(self) -> None:
         """In lock-step: a turn on the caller's thread: send what was left, hear what came, let time pass."""
-        self._turn()
+        for part in self._turn():
+            part()
         self._counted = self._count()
 
     def stop(self) -> None:
@@ -139,25 +140,34 @@ class MavlinkLink:
     def _run(self) -> None:
         stopping = False
         while not stopping:
-            self._wait(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e9))
-            stopping = self._stopping.is_set()  # asked before the turn, which so sends all that was told before
             try:
-                self._turn()
+                self._wait(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e9))
             except Exception:
-                # One turn is lost; without this the aircraft would fly on with a link that is silently dead.
-                self._station.counters["failed"] += 1
-                log.exception("mavlink: a turn of the link failed")
-                self._next_tick_ns = clock.monotonic_ns() + round(TICK_S * 1e9)
+                self._failed("waiting")
+                self._stopping.wait(TICK_S)
+            stopping = self._stopping.is_set()  # asked before the turn, which so sends all that was told before
+            for part in self._turn():
+                try:
+                    part()
+                except Exception:
+                    self._failed("a turn")
         self._counted = self._count()
 
-    def _turn(self) -> None:
-        self._deliver()
+    def _failed(self, what: str) -> None:
+        """This part is lost; without that the aircraft would fly on with a link that is silently dead."""
+        self._station.counters["failed"] += 1
+        log.exception("mavlink: %s of the link failed", what)
+
+    def _turn(self) -> Iterator[Callable[[], None]]:
+        """The parts of a turn. None depends on another: an endpoint that fails silences neither the rest nor the
+        heartbeat."""
+        yield self._deliver
         for number, endpoint in enumerate(self._endpoints):
-            self._hear(number, endpoint)
+            yield partial(self._hear, number, endpoint)
         now_ns = clock.monotonic_ns()
         if now_ns >= self._next_tick_ns:
             self._next_tick_ns = now_ns + round(TICK_S * 1e9)
-            self._tick(now_ns)
+            yield partial(self._tick, now_ns)
             self._counted = self._count()
 
     def _wait(self, timeout_s: float) -> None:

@@ -7,6 +7,7 @@ import os
 import pty
 import select
 import socket
+import struct
 import time
 import tty
 from pathlib import Path
@@ -23,7 +24,7 @@ from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint, parse_
 from edge.links.mavlink_link import MavlinkLink
 from edge.links.transports.backoff import FIRST_WAIT_NS, LONGEST_WAIT_NS, STEADY_NS, Backoff
 from edge.links.transports.medium import PENDING_MAX
-from edge.links.transports.tcp import CALLERS_MAX, TcpServer
+from edge.links.transports.tcp import CALLERS_MAX, TcpClient, TcpServer
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
@@ -292,3 +293,48 @@ def test_a_caller_that_floods_does_not_keep_poses_from_the_autopilot() -> None:
                 flood_on()
                 peer.named("TARGET_RELATIVE", lambda: link.publish(report(track(time.monotonic_ns()))))
         flooder.close()
+
+
+def test_callers_that_leave_beside_one_that_floods_do_not_end_the_link() -> None:
+    server = TcpServer(NetworkEndpoint("tcpin", "127.0.0.1", 0, "tcpin:127.0.0.1:0"))
+    with contextlib.closing(server), contextlib.ExitStack() as calling:
+        leaving, flooder = (
+            calling.enter_context(socket.create_connection(("127.0.0.1", server.port))) for _ in range(2)
+        )
+        flooder.setblocking(False)
+        until(lambda: len(server.filenos()) == 3, server.receive, what="both callers")
+        leaving.close()
+
+        def flood() -> None:
+            with contextlib.suppress(BlockingIOError):
+                flooder.send(bytes(100_000))
+            server.receive()
+            assert -1 not in server.filenos(), "poll takes no closed socket"
+
+        until(lambda: len(server.filenos()) == 2, flood, what="the end of one")
+
+
+def test_a_connection_that_ends_while_it_is_written_to_does_not_end_the_link() -> None:
+    with contextlib.closing(listening()) as server:
+        port = server.getsockname()[1]
+        client = TcpClient(NetworkEndpoint("tcpout", "127.0.0.1", port, f"tcpout:127.0.0.1:{port}"))
+        with contextlib.closing(client):
+            until(client.filenos, lambda: client.tick(time.monotonic_ns()), what="the connection")
+            accepted, _ = server.accept()
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            accepted.close()  # a reset, not an end
+            until(lambda: not client.filenos(), lambda: client.send(b"pose", ()), what="the reset")
+            assert client.filenos() == ()
+
+
+def test_an_endpoint_that_fails_silences_neither_the_others_nor_the_heartbeat(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with linked("tcpin:127.0.0.1:0", "udpin:127.0.0.1:0") as (link, own_ship):
+        monkeypatch.setattr(TcpServer, "receive", lambda _: 1 // 0)
+        with Peer(Udp(link.ports[1])) as peer:
+            exchanges(link, own_ship, peer)
+        until(lambda: link.counters().get("failed", 0) > 0, what="the failure to be counted")
+        monkeypatch.undo()
+        with Peer(Tcp(socket.create_connection(("127.0.0.1", link.ports[0])))) as peer:
+            peer.named("HEARTBEAT", lambda: link.set_health(SEARCHING))

@@ -125,7 +125,9 @@ class TcpClient:
         return self._address if self._connection is not None else None
 
     def filenos(self) -> Sequence[int]:
-        return () if self._connection is None else (self._connection.fileno(),)
+        # A connection may have closed since anybody looked: the other side is gone, and sending found it.
+        connection = self._connection
+        return (connection.fileno(),) if connection is not None and connection.open else ()
 
     def tick(self, now_ns: int) -> None:
         if self._connection is not None:
@@ -234,7 +236,7 @@ class TcpServer:
         return local_port(self._socket)
 
     def filenos(self) -> Sequence[int]:
-        return (self._socket.fileno(), *(caller.fileno() for caller in self._callers.values()))
+        return (self._socket.fileno(), *(caller.fileno() for caller in self._callers.values() if caller.open))
 
     def tick(self, now_ns: int) -> None:
         for caller in self._callers.values():
@@ -242,6 +244,7 @@ class TcpServer:
         self._forget_closed()
 
     def receive(self) -> Received | None:
+        self._forget_closed()  # first: one that never stops must not keep those that have gone
         self._accept()
         for caller in list(self._callers.values()):
             received = caller.receive()
@@ -249,7 +252,6 @@ class TcpServer:
                 # Next time the others come first: one that never stops must not silence them.
                 self._callers[caller.address] = self._callers.pop(caller.address)
                 return received
-        self._forget_closed()
         return None
 
     def send(self, data: bytes, peer: Address) -> bool:
@@ -258,7 +260,8 @@ class TcpServer:
         return caller is not None and caller.send(data)
 
     def reaches(self, peer: Address) -> bool:
-        return peer in self._callers
+        caller = self._callers.get(peer)
+        return caller is not None and caller.open
 
     def close(self) -> None:
         for caller in self._callers.values():
