@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Chunk, DataEnd, Footer
+from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from msgs.definitions import definition
@@ -136,6 +136,19 @@ def finish_unfinished(path: Path) -> bool:
     return True
 
 
+def _is_whole(opcode: int, record: bytes) -> bool:
+    stream = ReadDataStream(io.BytesIO(record))
+    try:
+        if opcode == Opcode.HEADER:
+            Header.read(stream)
+            return True
+        chunk = Chunk.read(stream)
+    except Exception:  # whatever the reader makes of bytes that are not what they say
+        return False
+    # Zeros are a chunk with nothing in it, whose checksum is right.
+    return stream.count == len(record) and zlib.crc32(chunk.data) == chunk.uncompressed_crc
+
+
 def _whole_bytes(file: BinaryIO, size: int) -> int:
     """Where the last whole chunk, or else the header, ends; 0 without one. A file system may have left zeros in the
     place of what was never written."""
@@ -148,11 +161,9 @@ def _whole_bytes(file: BinaryIO, size: int) -> int:
         end += _RECORD_HEAD.size + length
         if opcode not in (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX) or end > size:
             break
-        if opcode == Opcode.CHUNK:
-            chunk = Chunk.read(ReadDataStream(io.BytesIO(file.read(length))))
-            if zlib.crc32(chunk.data) != chunk.uncompressed_crc:
-                break
         if opcode != Opcode.MESSAGE_INDEX:
+            if not _is_whole(opcode, file.read(length)):
+                break
             whole = end
         file.seek(end)
     return whole

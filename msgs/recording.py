@@ -238,7 +238,11 @@ class Store:
     def finish_unfinished(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         for path in self.files():
-            finish_unfinished(path)
+            try:
+                finish_unfinished(path)
+            except OSError as error:
+                # What cannot be mended is no reason to record no more.
+                log.warning("%s is left unfinished: %s", path, error)
 
     def new_file(self) -> McapFile:
         files = self.files()

@@ -146,6 +146,31 @@ def test_a_file_cut_anywhere_is_readable_once_finished(tmp_path: Path, whole: by
     assert set(lengths) == {0, 1, 2, 3}
 
 
+def test_a_file_with_zeros_for_what_was_never_written_is_readable_once_finished(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "torn.mcap"
+    counts = []
+    opening = len(MCAP0_MAGIC) + 9 + int.from_bytes(whole[9:17], "little")  # written whole when recording begins
+    for size in range(len(whole)):
+        # A hole, where blocks came to the disk in another order, and all that follows.
+        for end in (min(size + 40, len(whole)) if size >= opening else len(whole), len(whole)):
+            path.write_bytes(whole[:size] + bytes(end - size) + whole[end:-4])
+            assert finish_unfinished(path)
+            counts.append(len(read(path)) if path.exists() else 0)
+    assert counts[1::2] == sorted(counts[1::2])
+    assert set(counts) == {0, 1, 2, 3}
+
+
+def test_a_recording_that_cannot_be_mended_does_not_keep_the_next_from_being_made(tmp_path: Path) -> None:
+    broken = tmp_path / "uav1_000000_20260101T000000Z.mcap"
+    broken.symlink_to(tmp_path / "nowhere")
+    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder.start()
+    recorder.record(topics.EVENTS, "uav1", None, b"next", time.time_ns())
+    recorder.stop()
+    (made,) = (path for path in tmp_path.iterdir() if path != broken)
+    assert [data for *_, data, _ in read(made)] == [b"next"]
+
+
 @pytest.mark.parametrize("torn", [False, True], ids=["closed", "torn and finished"])
 def test_rosbags_reads_it_as_a_ros_2_bag(tmp_path: Path, torn: bool) -> None:
     file = McapFile(tmp_path / "one.mcap")
