@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from edge import clock
 from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.findings import Finding, device_fault, good, poor, wrong
 from edge.links.mavlink_endpoints import NetworkEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
+from edge.links.signing import ahead_of_clock
 from edge.links.transports.medium import resolve
 from edge.requests import RequestQueue
 from edge.status import ask, loopback_endpoints
@@ -109,7 +111,11 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
 
 
 def signing_finding(state: Path) -> Finding:
-    """Whether the daemon can keep the last timestamp that it signed with."""
+    """Whether the daemon can keep the last timestamp that it signed with, and what is kept is of no time to come."""
+    ahead = ahead_of_clock(state, clock.utc_ns())
+    if ahead is not None:
+        advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
+        return wrong("signing", f"{ahead}: an autopilot that knows the time is refused", advice)
     with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
         return good("signing", f"the last timestamp is kept in {state}")
     advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"

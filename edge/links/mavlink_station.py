@@ -162,6 +162,9 @@ class Station:
             condition = self._health[0]
             out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
             out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
+        frameless = self._reported_ns is not None and now_ns - self._reported_ns > FRAMELESS_NS
+        if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
+            out.everywhere.append(self._image_status(words.idle_image_status()))
         if self.vehicle.contact is not Contact.HEARD:
             return out
         if self._schedule.due(COMPUTER_STATUS, 0, now_ns):
@@ -169,25 +172,29 @@ class Station:
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns = now_ns + TIMESYNC_NS
             out.home.append(self._packed(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
-        frameless = self._reported_ns is not None and now_ns - self._reported_ns > FRAMELESS_NS
-        if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
-            out.everywhere.append(self._image_status(words.idle_image_status()))
         wanted = self.vehicle.request(now_ns)
         if wanted is not None:
             out.home.append(self._packed(self._interval_request(*wanted)))
         return out
 
     def report(self, report: Report, now_ns: int) -> list[bytes]:
-        """What goes out for one frame, as far as each message's rate allows."""
-        if self.vehicle.contact is not Contact.HEARD:
+        """What goes out for one frame, as far as each message's rate allows.
+
+        Nothing before there is a vehicle. While its autopilot is silent, what is seen in the picture alone: who draws
+        the target's box on another link would else draw the last one for ever.
+        """
+        if self.vehicle.contact is Contact.WAITING:
             return []
         self._reported_ns = now_ns
         tracks = sendable(report, now_ns, self._settings.max_age_ms)
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
-        out = [self._target_relative(report, track) for track in tracks if self._wants_target_relative(track, now_ns)]
         first = words.primary(tracks, report.chosen_id)
-        if self._schedule.due(IMAGE_STATUS, 0, now_ns):
-            out.append(self._image_status(words.image_status(report, first)))
+        seen = words.image_status(report, first) if self._schedule.due(IMAGE_STATUS, 0, now_ns) else None
+        if self.vehicle.contact is not Contact.HEARD:
+            return [self._image_status(seen)] if seen is not None else []
+        out = [self._target_relative(report, track) for track in tracks if self._wants_target_relative(track, now_ns)]
+        if seen is not None:
+            out.append(self._image_status(seen))
         geo_due = first is not None and self._schedule.due(GEO_STATUS, 0, now_ns)
         place = words.geo_status(report, first) if first is not None and geo_due else None
         if place is not None:

@@ -10,6 +10,7 @@ import hashlib
 import hmac
 import logging
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,25 @@ UNIT_NS = 10_000
 NEW_STREAM_BEHIND_MAX = 60 * 100_000  # one minute
 HELD_BACK_MAX_NS = 1_500_000_000
 RESERVED_AHEAD = 60 * 100_000  # so often the state is saved; after a crash these are skipped
+AHEAD_MAX_S = 600.0  # of the clock, what was saved; beyond it one of the two is wrong
 
 
 def timestamp_of(utc_ns: int) -> int:
     """Signing timestamp of a UTC time; 0 before 2015."""
     return max((utc_ns - EPOCH_S * 1_000_000_000) // UNIT_NS, 0)
+
+
+def ahead_of_clock(state_file: Path, utc_ns: int) -> str | None:
+    """A sentence where the timestamp that a file keeps lies far beyond a UTC time, nanoseconds; else None.
+
+    Nobody can tell whether the clock was wrong then or is now. An autopilot with the right time is refused all the
+    while in the first case, and believing it would let old messages pass in the second.
+    """
+    ahead_s = (_load_state(state_file) - timestamp_of(utc_ns)) * UNIT_NS / 1e9
+    if ahead_s <= AHEAD_MAX_S:
+        return None
+    day = datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d")
+    return f"{state_file} is {ahead_s / 86400.0:.1f} days ahead of this computer's clock ({day})"
 
 
 class Signing:
@@ -116,6 +131,9 @@ def _stamp(message: Any) -> tuple[tuple[int, int, int], int]:
 
 def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) -> Signing:
     """Signing with the key of a file, its timestamps kept in another. Raises InputError for a key file that is none."""
+    ahead = ahead_of_clock(state_file, utc_ns())
+    if ahead is not None:
+        log.warning("mavlink: %s: until it is caught up with, an autopilot that stamps earlier is refused", ahead)
     return Signing(load_key(key_file), _load_state(state_file), lambda stamp: _save_state(state_file, stamp), utc_ns)
 
 

@@ -4,6 +4,7 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
+from edge.links.signing import timestamp_of
 from edge.status import ask
 from tests.waiting import until
 
@@ -192,3 +194,6 @@ def test_a_signing_timestamp_that_cannot_be_kept_is_a_fault(tmp_path: Path) -> N
         found = signing_finding(lost)
         assert (found.verdict, str(lost) in found.says) == ("wrong", True)
         assert "signing_state" in found.advice
+    kept.write_text(str(timestamp_of(time.time_ns() + 3 * 86400 * 10**9)))
+    found = signing_finding(kept)
+    assert (found.verdict, "3.0 days ahead" in found.says, "clock" in found.advice) == ("wrong", True, True)

@@ -211,6 +211,34 @@ def test_an_autopilot_that_still_speaks_is_not_replaced_when_its_heartbeats_are_
     assert station.vehicle.system_id == SYSTEM_ID + 1
 
 
+def test_who_draws_the_box_hears_on_while_the_autopilot_is_silent() -> None:
+    station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
+    reader = FrameReader(datagram=True)
+
+    def heard(frames: list[bytes]) -> list[Any]:
+        return [message for data in frames for message in reader.feed(data)]
+
+    def seen(second: float) -> list[Any]:
+        now_ns = round(second * 1e9)
+        return heard(station.report(report(track(now_ns)), now_ns))
+
+    assert seen(1.0) == [], "there is no vehicle yet"
+    vehicle = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1)
+    beat = dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3
+    )
+    station.take(FrameReader(datagram=True).feed(bytes(beat.pack(vehicle))), 0, 2_000_000_000)
+    assert "TARGET_RELATIVE" in {message.get_type() for message in seen(3.0)}
+    station.tick(20_000_000_000)
+    assert station.vehicle.contact is Contact.LOST
+    (status,) = seen(20.1)
+    assert status.get_type() == "CAMERA_TRACKING_IMAGE_STATUS"
+    assert status.tracking_status == dialect.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+    # The camera falls silent too.
+    (idle,) = (m for m in heard(station.tick(22_000_000_000).everywhere) if m.get_msgId() == status.get_msgId())
+    assert idle.tracking_status == dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
+
+
 def test_only_commanders_command_where_they_are_named() -> None:
     requests = RequestQueue()
     with linked(commanders=[255], requests=requests) as (link, _), Peer(link.ports[0]) as peer:

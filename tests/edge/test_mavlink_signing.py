@@ -239,6 +239,17 @@ def test_a_restart_repeats_no_timestamp_even_without_a_clock(tmp_path: Path) -> 
     assert open_signing(key, state, lambda: NOW_NS).next_timestamp() == timestamp_of(NOW_NS)
 
 
+def test_a_state_from_a_time_to_come_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    key, state = tmp_path / "key", tmp_path / "state"
+    write_new_key(key)
+    open_signing(key, state, lambda: NOW_NS).next_timestamp()
+    open_signing(key, state, lambda: NOW_NS + 10**9)
+    assert not caplog.messages, "a restart is no wrong clock"
+    open_signing(key, state, lambda: NOW_NS - 30 * 86400 * 10**9)
+    (told,) = caplog.messages
+    assert f"{state} is 30.0 days ahead of this computer's clock" in told
+
+
 def test_a_state_that_cannot_be_saved_does_not_stop_the_link(tmp_path: Path) -> None:
     write_new_key(tmp_path / "key")
     one = open_signing(tmp_path / "key", tmp_path / "absent" / "state", time.time_ns)
