@@ -23,6 +23,7 @@ from edge.links.transports import open_transport
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report
+from msgs.mavlink import dialect
 
 log = logging.getLogger(__name__)
 
@@ -246,6 +247,9 @@ class MavlinkLink:
             self._told = (vehicle.system_id, vehicle.autopilot)
             for sentence in self._station.withheld():
                 log.warning("mavlink: %s", sentence)
+        for sentence in self._station.rivals(now_ns):
+            log.warning("mavlink: %s", sentence)
+            self.event(dialect.MAV_SEVERITY_WARNING, sentence)
         self._send(out.everywhere)
         home = self._station.home
         if home is not None:

@@ -61,6 +61,7 @@ GIMBAL_HZ = 50.0
 FOLLOW_TARGET_HZ = 10.0
 ADSB_VEHICLE_HZ = 2.0
 COMPUTER_STATUS_HZ = 1.0
+RIVAL_NS = 8_000_000_000  # of heartbeats beside those of the own autopilot; one that takes its place needs less
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
@@ -105,6 +106,7 @@ class Station:
         self._reported_ns: int | None = None
         self._text_id = 0
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
+        self._rivals: dict[int, int | None] = {}  # since when another system's autopilot is heard; None: told
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """Those that carry a valid signature; all of them where nothing is signed."""
@@ -141,7 +143,12 @@ class Station:
                 if link == self.home:
                     self._home_heard_ns = now_ns
             if is_autopilot_heartbeat(message):
-                self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
+                ours = self._meet(message, link, now_ns)
+                self._count(message, None if ours else "not_our_autopilot")
+                if ours:
+                    self._rivals.pop(message.get_srcSystem(), None)
+                else:
+                    self._rivals.setdefault(message.get_srcSystem(), now_ns)
                 continue
             reason = self._misdirected(message, link)
             self._count(message, reason)
@@ -218,6 +225,18 @@ class Station:
         if self._traffic_ids and self._virtual.srcSystem == self.vehicle.system_id:
             found.append(f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {self._system_id}")
         return found
+
+    def rivals(self, now_ns: int) -> list[str]:
+        """Sentences, each once: who else could be the own autopilot, where the settings do not tell."""
+        if self._settings.system_id is not None or self.vehicle.contact is not Contact.HEARD:
+            return []
+        found = [system for system, since in self._rivals.items() if since is not None and now_ns - since > RIVAL_NS]
+        self._rivals.update(dict.fromkeys(found))
+        ours = self.vehicle.system_id
+        return [
+            f"autopilots {ours} and {system} are heard; {ours}, the first, is taken for our own: set system_id"
+            for system in found
+        ]
 
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
         before = self.vehicle.system_id

@@ -211,6 +211,28 @@ def test_an_autopilot_that_still_speaks_is_not_replaced_when_its_heartbeats_are_
     assert station.vehicle.system_id == SYSTEM_ID + 1
 
 
+@pytest.mark.parametrize(
+    ("system_id", "ours_until_s", "told"),
+    [(None, 30, [f"autopilots {SYSTEM_ID} and {SYSTEM_ID + 1} are heard"]), (SYSTEM_ID, 30, []), (None, 5, [])],
+    ids=["two at once", "named", "one after the other"],
+)
+def test_a_second_autopilot_on_the_network_is_told_once(
+    system_id: int | None, ours_until_s: int, told: list[str]
+) -> None:
+    station = Station(MavlinkSettings(system_id=system_id), OwnShipBuffer(), CAMERA, RequestQueue())
+    ours, other = (MAVLink(None, srcSystem=system, srcComponent=1) for system in (SYSTEM_ID, SYSTEM_ID + 1))
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    sentences: list[str] = []
+    for second in range(30):
+        now_ns = second * 1_000_000_000
+        speaking = [ours] if second < ours_until_s else []
+        for mav in [*speaking, other] if ours_until_s == 30 else speaking or [other]:
+            station.take(FrameReader(datagram=True).feed(bytes(beat.pack(mav))), 0, now_ns)
+        station.tick(now_ns)
+        sentences += station.rivals(now_ns)
+    assert [sentence.partition(";")[0] for sentence in sentences] == told
+
+
 def test_who_draws_the_box_hears_on_while_the_autopilot_is_silent() -> None:
     station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
     reader = FrameReader(datagram=True)
