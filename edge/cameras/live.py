@@ -9,11 +9,14 @@ from collections import Counter
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.cameras.intrinsics import Intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
+
+UNDECODABLE_MAX = 10  # pictures in a row, beyond which the camera is opened anew
 
 
 class LiveSource(ABC):
@@ -27,7 +30,7 @@ class LiveSource(ABC):
         self._capture: cv2.VideoCapture | None = None
         self._sequence = 0
         self._fitted = intrinsics
-        self.counts: Counter[str] = Counter(unstamped=0)
+        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0)
 
     def nominal(self) -> CameraInfo:
         """What is known before the camera answers: the calibration's."""
@@ -49,25 +52,31 @@ class LiveSource(ABC):
         return CameraInfo(self._name, size_wh, self._fitted.K, fps if fps > 0 else None)
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next frame. Raises SourceLost when none comes."""
+        """The next frame that can be decoded; the others are left out, counted, and have their sequence numbers.
+
+        Raises SourceLost when none comes, or none that can be decoded.
+        """
         assert self._capture is not None
-        grabbed = self._capture.grab()
-        arrival_ns = time.monotonic_ns()
-        if stop.is_set():
-            raise EndOfStream
-        position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-        try:
-            retrieved, image_bgr = self._capture.retrieve() if grabbed else (False, None)
-        except cv2.error as error:
-            raise SourceLost(f"a picture cannot be decoded: {error}") from error
-        if not retrieved or image_bgr is None:
-            raise SourceLost("the camera gives no more frames")
-        size_wh = (image_bgr.shape[1], image_bgr.shape[0])
-        if size_wh != self._fitted.image_size_wh:
-            self._fitted = self._refitted(size_wh)
-        meta = FrameMeta(self._sequence, self._exposure_ns(arrival_ns, position_ms), arrival_ns)
-        self._sequence += 1
-        return Frame(meta, np.asarray(image_bgr, dtype=np.uint8), self._fitted.K, self._fitted.distortion)
+        for _ in range(UNDECODABLE_MAX):
+            grabbed = self._capture.grab()
+            arrival_ns = time.monotonic_ns()
+            if stop.is_set():
+                raise EndOfStream
+            if not grabbed:
+                raise SourceLost("the camera gives no more frames")
+            position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            image_bgr = _retrieved(self._capture)
+            sequence = self._sequence
+            self._sequence += 1
+            if image_bgr is None:
+                self.counts["undecodable"] += 1
+                continue
+            size_wh = (image_bgr.shape[1], image_bgr.shape[0])
+            if size_wh != self._fitted.image_size_wh:
+                self._fitted = self._refitted(size_wh)
+            meta = FrameMeta(sequence, self._exposure_ns(arrival_ns, position_ms), arrival_ns)
+            return Frame(meta, image_bgr, self._fitted.K, self._fitted.distortion)
+        raise SourceLost(f"{UNDECODABLE_MAX} pictures in a row cannot be decoded")
 
     def close(self) -> None:
         if self._capture is not None:
@@ -88,3 +97,12 @@ class LiveSource(ABC):
     @abstractmethod
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
         """Monotonic time of the exposure of the frame just grabbed; position_ms is OpenCV's CAP_PROP_POS_MSEC."""
+
+
+def _retrieved(capture: cv2.VideoCapture) -> NDArray[np.uint8] | None:
+    """The picture just grabbed; None where it cannot be decoded, as when a cable or a radio tore it."""
+    try:
+        retrieved, image_bgr = capture.retrieve()
+    except cv2.error:
+        return None
+    return np.asarray(image_bgr, dtype=np.uint8) if retrieved and image_bgr is not None else None

@@ -1,18 +1,29 @@
-"""What a V4L2 device is asked for when it is opened. No driver is here: a stand-in for OpenCV's capture is asked."""
+"""What a V4L2 device is asked for, and what becomes of its frames. No driver is here: a stand-in for OpenCV's capture
+answers."""
 
 from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from threading import Event
 
 import cv2
 import numpy as np
 import pytest
 
 from edge.cameras.device import EXPOSURE_MANUAL, DeviceSource
+from edge.cameras.live import UNDECODABLE_MAX
+from edge.cameras.source import SourceLost
 from edge.config_camera import DeviceCamera
 
 from .pictures import INTRINSICS, SIZE_WH
 
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 EXPOSURES = {cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_EXPOSURE}
+
+
+PICTURE = np.full((SIZE_WH[1], SIZE_WH[0], 3), 90, np.uint8)
+TORN, EMPTY, GONE = object(), object(), object()
 
 
 class Driver:
@@ -23,9 +34,13 @@ class Driver:
         self.opened: tuple[str, int] | None = None
         self.held: dict[int, float] = {}
         self.asked: list[int] = []
+        self.opens = 0
+        self.comes: Iterator[object] = iter(())  # for each grab a picture, TORN, or GONE
+        self._grabbed: object = None
 
     def __call__(self, device: str, api: int) -> Driver:
         self.opened = (device, api)
+        self.opens += 1
         return self
 
     def isOpened(self) -> bool:
@@ -41,6 +56,81 @@ class Driver:
     def get(self, prop: int) -> float:
         return self.held.get(prop, 0.0)
 
+    def grab(self) -> bool:
+        self._grabbed = next(self.comes)
+        return self._grabbed is not GONE
+
+    def retrieve(self) -> tuple[bool, object]:
+        if self._grabbed is TORN:
+            raise cv2.error("cannot decode")
+        return self._grabbed is not EMPTY, self._grabbed
+
+    def release(self) -> None:
+        pass
+
+
+def settings(exposure_ms: float | None = None, latency_ms: float = 0.0) -> DeviceCamera:
+    width, height = SIZE_WH
+    return DeviceCamera(
+        type="device",
+        device="/dev/video3",
+        width=width,
+        height=height,
+        fps=60,
+        exposure_ms=exposure_ms,
+        latency_ms=latency_ms,
+        intrinsics=INTRINSICS,
+    )
+
+
+@pytest.fixture
+def driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
+    driver = Driver(set(), 1000.0)
+    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", driver)
+    return driver
+
+
+def test_a_picture_that_cannot_be_decoded_is_left_out_and_the_device_stays_open(driver: Driver) -> None:
+    source = DeviceSource(settings())
+    source.open()
+    driver.comes = iter([PICTURE, TORN, EMPTY, PICTURE])
+    frames = [source.read(Event()) for _ in range(2)]
+    assert [frame.meta.sequence for frame in frames] == [0, 3]
+    assert source.counts["undecodable"] == 2
+    assert driver.opens == 1
+
+
+def test_a_device_that_is_pulled_out_or_gives_nothing_but_torn_pictures_is_lost_and_opened_again(
+    driver: Driver,
+) -> None:
+    source = DeviceSource(settings())
+    for comes, why in ([PICTURE, GONE], "no more frames"), ([PICTURE, *[TORN] * UNDECODABLE_MAX], "cannot be decoded"):
+        source.open()
+        driver.comes = iter(comes)
+        source.read(Event())
+        with pytest.raises(SourceLost, match=why):
+            source.read(Event())
+        source.close()
+    source.open()
+    driver.comes = iter([PICTURE])
+    assert source.read(Event()).meta.sequence == UNDECODABLE_MAX + 2
+    assert driver.opens == 3
+
+
+def test_the_drivers_stamp_is_the_exposure_less_the_latency_and_without_one_the_arrival_is(driver: Driver) -> None:
+    stamped, unstamped = DeviceSource(settings(latency_ms=7.0)), DeviceSource(settings(latency_ms=7.0))
+    driver.comes = iter([PICTURE, PICTURE])
+    exposed_ns = time.monotonic_ns() - 25_000_000
+    stamped.open()
+    driver.held[cv2.CAP_PROP_POS_MSEC] = exposed_ns / 1e6
+    assert stamped.read(Event()).meta.capture_ns == pytest.approx(exposed_ns - 7_000_000, abs=2000)
+    assert stamped.counts["unstamped"] == 0
+    unstamped.open()
+    driver.held[cv2.CAP_PROP_POS_MSEC] = 0.0
+    meta = unstamped.read(Event()).meta
+    assert meta.capture_ns == meta.arrival_ns - 7_000_000
+    assert unstamped.counts["unstamped"] == 1
+
 
 def opened(
     monkeypatch: pytest.MonkeyPatch,
@@ -50,17 +140,7 @@ def opened(
 ) -> Driver:
     driver = Driver(lacks or set(), exposure_most)
     monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", driver)
-    width, height = SIZE_WH
-    settings = DeviceCamera(
-        type="device",
-        device="/dev/video3",
-        width=width,
-        height=height,
-        fps=60,
-        exposure_ms=exposure_ms,
-        intrinsics=INTRINSICS,
-    )
-    info = DeviceSource(settings).open()
+    info = DeviceSource(settings(exposure_ms)).open()
     assert (info.name, info.image_size_wh, info.frame_rate_hz) == ("/dev/video3", SIZE_WH, 60)
     np.testing.assert_array_equal(info.K[0], [300, 0, 159.5])
     return driver
