@@ -80,6 +80,16 @@ def add_within(add: ArrayLike, diameter_m: ArrayLike, fraction: float) -> Boolea
     return np.asarray(add, dtype=np.float64) < fraction * np.asarray(diameter_m, dtype=np.float64)
 
 
+def recall(found: int, targets: int) -> float | None:
+    """Detection recall, 0..1: of the targets in all frames those with a pose, right or wrong; None without targets."""
+    return found / targets if targets else None
+
+
+def false_positives_per_1000(false_poses: int, empty_frames: int) -> float | None:
+    """False poses in 1,000 frames without a target; None without such frames."""
+    return 1000.0 * false_poses / empty_frames if empty_frames else None
+
+
 def depth_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
     """[...]: whether the true depth lies within `sigmas` standard deviations of the estimated one."""
     variance = np.asarray(covariance, dtype=np.float64)[..., 2, 2]

@@ -18,7 +18,6 @@ from sim_replay import metrics
 
 RANGE_BANDS_M = ((100.0, 200.0), (200.0, 300.0), (300.0, 400.0), (400.0, 500.0))  # the paper's
 ADD_FRACTIONS = {"add_0_5d": 0.5, "add_0_1d": 0.1}
-FALSE_POSITIVES_PER = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +130,7 @@ def statistics(frames: int, matches: Sequence[Match], false_poses: Sequence[Targ
     with_target = {match.truth.frame for match in matches}
     in_empty = [pose for pose in false_poses if pose.frame not in with_target]
     empty = frames - len(with_target)
-    false_rate = lambda poses: _share(FALSE_POSITIVES_PER * len(poses), empty)  # noqa: E731
+    false_rate = lambda poses: metrics.false_positives_per_1000(len(poses), empty)  # noqa: E731
     overall = pose_statistics(frames, matches, false_rate(in_empty))
     overall["false_poses"] = len(false_poses)
     by_range = {}
@@ -154,7 +153,7 @@ def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1
     return {
         "frames": frames,
         "targets": len(matches),
-        "recall": _share(len(found), len(matches)),
+        "recall": metrics.recall(len(found), len(matches)),
         "false_positives_per_1000": false_positives_per_1000,
         "rotation_error_deg": _mean_median(metrics.rotation_error_deg(R_est, R_gt)),
         "translation_error_m": _mean_median(metrics.translation_error_m(t_est, t_gt)),

@@ -48,7 +48,7 @@ VARIANTS = (
         "no-dense", "no dense heads while training", {"model": {"dense": False}, "loss": {"mask": 0.0, "noc": 0.0}}
     ),
     Variant("no-uncertainty", "no uncertainty heads", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
-    Variant("no-window", "whole reduced frames only, no native window", {"data": {"acquire_share": 1.0}}),
+    Variant("no-window", "whole reduced frames only, and measured on such", {"data": {"acquire_share": 1.0}}),
     Variant("paper", "the paper's network and loss, on the same windows", {}, PAPER_CONFIG),
 )
 COLUMNS = {
@@ -102,7 +102,9 @@ def ablate(
     say: Callable[[str], None],
     open_view: OpenView = window_sampler,
 ) -> dict[str, Any]:
-    """Train what is not trained yet, measure all on the same held-out windows, write ablation.json and table.md.
+    """Train what is not trained yet, measure all on held-out windows, write ablation.json and table.md.
+
+    The windows are the same for all, but for a variant that is trained on whole reduced frames alone: of those.
 
     Stops where a run is interrupted, with the rows that are whole; the same call goes on from there. Raises ConfigError
     where `out` holds runs of another scale.

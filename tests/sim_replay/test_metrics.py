@@ -100,6 +100,11 @@ def test_every_error_agrees_with_scipy_and_plain_loops(seed: int) -> None:
         assert metrics.bearing_error_deg(t_est, t_gt)[k] == pytest.approx(
             np.degrees(np.arccos(min(cosine, 1))), abs=1e-4
         )
+        depth_rel = abs(t_est[k, 2] / t_gt[k, 2] - 1.0)
+        assert metrics.depth_error_rel(t_est, t_gt)[k] == pytest.approx(depth_rel)
+        assert bool(metrics.depth_5pct(t_est, t_gt)[k]) == (depth_rel < 0.05)
+        assert bool(metrics.add_within(add, 4.0 * add + 0.1, 0.5))
+        assert not bool(metrics.add_within(add, 2.0 * add - 0.1, 0.5))
         assert metrics.add_m(*at, points) == pytest.approx(add)
         assert metrics.add_m(R_est, t_est, R_gt, t_gt, points)[k] == pytest.approx(add)
         expected = angle_deg < 10 and apart_m / range_m < 0.05
@@ -156,3 +161,11 @@ def test_truth_drawn_from_the_covariance_is_inside_as_often_as_a_gaussian_is() -
             metrics.rotation_inside(R_est.as_matrix(), R_gt, covariance, k),
         ):
             assert inside.mean() == pytest.approx(expected, abs=0.03)
+
+
+def test_recall_and_false_positives_count_what_their_names_say() -> None:
+    assert metrics.recall(3, 4) == 0.75
+    assert metrics.recall(0, 0) is None
+    assert metrics.false_positives_per_1000(3, 54) == pytest.approx(55.5556, abs=1e-3)
+    assert metrics.false_positives_per_1000(0, 54) == 0.0
+    assert metrics.false_positives_per_1000(2, 0) is None
