@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from edge.clock import UtcClock
@@ -190,6 +190,8 @@ class Station:
         Nothing before there is a vehicle. While its autopilot is silent, what is seen in the picture alone: who draws
         the target's box on another link would else draw the last one for ever.
         """
+        # A camera that was not there at the start was known by its calibration alone.
+        self._camera = replace(self._camera, image_size_wh=report.image_size_wh, K=report.K)
         if self.vehicle.contact is Contact.WAITING:
             return []
         self._reported_ns = now_ns

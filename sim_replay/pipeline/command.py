@@ -34,7 +34,7 @@ def register(commands: Any) -> None:
         description="Start the daemon on a looped sequence with a simulated autopilot (MAVLink over UDP) and a zenoh "
         "subscriber, in real time, and print latency by stage, drops, CPU and memory beside the budgets.",
     )
-    _add_arguments(bench, 2.0, "pipeline")
+    _add_arguments(bench, 10.0, "pipeline")
     bench.set_defaults(run=run)
     soak = commands.add_parser(
         "soak",

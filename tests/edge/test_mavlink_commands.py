@@ -131,6 +131,17 @@ def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> 
             assert information.sensor_size_v == pytest.approx(6.4 * SIZE_WH[1] / SIZE_WH[0])
 
 
+def test_a_camera_that_opens_at_another_size_than_its_calibrations_is_told_as_it_is() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        half = (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
+        link.publish(replace(report(track(time.monotonic_ns())), image_size_wh=half))
+        peer.named("CAMERA_TRACKING_IMAGE_STATUS")
+        peer.command(512, 259.0)
+        information = peer.named("CAMERA_INFORMATION")
+        assert (information.resolution_h, information.resolution_v) == half
+
+
 def test_a_message_switched_off_stays_off_until_it_is_asked_for_or_switched_on() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
