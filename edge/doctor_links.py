@@ -112,12 +112,12 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
 
 def signing_finding(state: Path) -> Finding:
     """Whether the daemon can keep the last timestamp that it signed with, and what is kept is of no time to come."""
-    ahead = ahead_of_clock(state, clock.utc_ns())
-    if ahead is not None:
-        advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
-        return wrong("signing", f"{ahead}: an autopilot that knows the time is refused", advice)
     with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
-        return good("signing", f"the last timestamp is kept in {state}")
+        ahead = ahead_of_clock(state, clock.utc_ns())
+        if ahead is None:
+            return good("signing", f"the last timestamp is kept in {state}")
+        advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
+        return poor("signing", f"{ahead}: an autopilot that knows the time may be refused", advice)
     advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
     return wrong("signing", f"{state} cannot be written: after a restart old messages would pass as new", advice)
 

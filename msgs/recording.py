@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -257,10 +258,18 @@ class Store:
         while self._is_full():
             if self._limits.when_full == "stop" or not files:
                 raise OSError("no room left for recordings")
-            files.pop(0).unlink()
+            with suppress(OSError):  # of what cannot be removed the next may be
+                files.pop(0).unlink()
 
     def _is_full(self) -> bool:
         if shutil.disk_usage(self._folder).free < self._limits.free_bytes_min:
             return True
         total_max = self._limits.total_bytes_max
-        return total_max is not None and sum(path.stat().st_size for path in self.files()) > total_max
+        return total_max is not None and sum(map(_size_of, self.files())) > total_max
+
+
+def _size_of(path: Path) -> int:
+    """Bytes; 0 for what cannot be looked at."""
+    with suppress(OSError):
+        return path.stat().st_size
+    return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,11 +74,21 @@ def ranking_auc(positive: NDArray, negative: NDArray) -> float:
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
 
+def _judged(batches: Sequence[TrainingBatch]) -> NDArray[np.bool_]:
+    """Windows [N] whose highest peak can be the labelled target's alone."""
+    return np.concatenate([~batch.others.any(axis=(1, 2)) for batch in batches])
+
+
 def measure(
     predicted: Predictions, batches: list[TrainingBatch], threshold: float = SCORE_THRESHOLD
 ) -> dict[str, float]:
-    """Metrics of one set of windows. Pose metrics are over every window with a target, found or not."""
-    labels = TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
+    """Metrics of one set of windows. Pose metrics are over every window with a target, found or not.
+
+    Windows with a second aircraft are left out: the highest peak may be its own.
+    """
+    judged = _judged(batches)
+    labels = TrainingBatch(*(np.concatenate(values)[judged] for values in zip(*batches, strict=True)))
+    predicted = Predictions(*(np.compress(judged, value, axis=0) for value in predicted))
     on = labels.present
     est = Predictions(*(value[on] for value in predicted))
     R, t = labels.R_cam_target[on], labels.t_cam_target_m[on]
@@ -133,12 +143,14 @@ def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> fl
 
     SCORE_THRESHOLD where all windows or none hold a target: they tell of no threshold.
     """
-    present = np.concatenate([batch.present for batch in batches])
+    judged = _judged(batches)
+    present = np.concatenate([batch.present for batch in batches])[judged]
+    score = predicted.score[judged]
     if present.all() or not present.any():
         return SCORE_THRESHOLD
     steps = np.arange(5, 96) / 100.0
-    recall = (predicted.score[present][:, None] >= steps).mean(axis=0)
-    alarms = (predicted.score[~present][:, None] >= steps).mean(axis=0)
+    recall = (score[present][:, None] >= steps).mean(axis=0)
+    alarms = (score[~present][:, None] >= steps).mean(axis=0)
     gain = recall - alarms
     return float(np.median(steps[gain >= gain.max() - 1e-9]))
 

@@ -58,8 +58,8 @@ def stage_sampler(
 ) -> Callable[[], Sampler]:
     """An opener of windows as one stage sees them: 0 for track, 1 for acquire.
 
-    Some hold no target, whatever was trained on: without them no score means anything. `held_out` ones are drawn alike
-    whatever was trained on, so that what is measured on them can be compared.
+    Some hold no target, whatever was trained on: without them no score means anything. The shares of `held_out`
+    ones do not follow those trained on, so that what is measured on them can be compared.
     """
     empty_share = EMPTY_SHARE if held_out else max(data.empty_share, EMPTY_SHARE)
     shares = {"acquire_share": acquire_share, "empty_share": empty_share}

@@ -74,14 +74,16 @@ def measure(
     scores = []
     for dataset in datasets:
         manifest = _manifest(dataset)
+        split = TEST_SPLIT if (dataset / TEST_SPLIT).is_dir() else None
+        recipe = manifest.get("command", "")
+        if recipe and split:
+            recipe += f" --split {split}"
         for model in models:
             # Only a sequence that has every frame can be followed.
             for mode in ("frames", "track") if manifest.get("every", 1) == 1 else ("frames",):
-                split = TEST_SPLIT if (dataset / TEST_SPLIT).is_dir() else None
                 request = DatasetRequest(model=model, dataset=dataset, split=split, mode=mode)
                 score = evaluate_dataset(request).score
-                recipe = " ".join([manifest.get("command", ""), *(["--split", split] if split else [])])
-                scores.append({**score, "dataset": dataset.name, "recipe": recipe if manifest else ""})
+                scores.append({**score, "dataset": dataset.name, "recipe": recipe})
                 say(f"{dataset.name}, {mode}: {score['overall']['frames']} frames, {score['method']['file']}")
     return scores
 

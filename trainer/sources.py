@@ -22,7 +22,7 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
             shares.append(source.share)
     if sum(shares) < 1.0:
-        # What is measured on stays comparable whatever is trained on.
+        # What is measured on holds the fleet alone, however many invented aircraft are trained on.
         invented = 0.0 if validating or held_out else config.invented_share
         samplers.append(
             WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented)

@@ -57,6 +57,7 @@ class LiveSource(ABC):
         Raises SourceLost when none comes, or none that can be decoded.
         """
         assert self._capture is not None
+        why = ""
         for _ in range(UNDECODABLE_MAX):
             grabbed = self._capture.grab()
             arrival_ns = time.monotonic_ns()
@@ -65,7 +66,7 @@ class LiveSource(ABC):
             if not grabbed:
                 raise SourceLost("the camera gives no more frames")
             position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-            image_bgr = _retrieved(self._capture)
+            image_bgr, why = _retrieved(self._capture)
             sequence = self._sequence
             self._sequence += 1
             if image_bgr is None:
@@ -76,7 +77,7 @@ class LiveSource(ABC):
                 self._fitted = self._refitted(size_wh)
             meta = FrameMeta(sequence, self._exposure_ns(arrival_ns, position_ms), arrival_ns)
             return Frame(meta, image_bgr, self._fitted.K, self._fitted.distortion)
-        raise SourceLost(f"{UNDECODABLE_MAX} pictures in a row cannot be decoded")
+        raise SourceLost(f"{UNDECODABLE_MAX} pictures in a row cannot be decoded{why}")
 
     def close(self) -> None:
         if self._capture is not None:
@@ -99,10 +100,10 @@ class LiveSource(ABC):
         """Monotonic time of the exposure of the frame just grabbed; position_ms is OpenCV's CAP_PROP_POS_MSEC."""
 
 
-def _retrieved(capture: cv2.VideoCapture) -> NDArray[np.uint8] | None:
-    """The picture just grabbed; None where it cannot be decoded, as when a cable or a radio tore it."""
+def _retrieved(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, str]:
+    """The picture just grabbed; None where it cannot be decoded, as when a cable or a radio tore it, and why."""
     try:
         retrieved, image_bgr = capture.retrieve()
-    except cv2.error:
-        return None
-    return np.asarray(image_bgr, dtype=np.uint8) if retrieved and image_bgr is not None else None
+    except cv2.error as error:
+        return None, f": {error}"
+    return (np.asarray(image_bgr, dtype=np.uint8) if retrieved and image_bgr is not None else None), ""

@@ -141,23 +141,23 @@ class MavlinkLink:
     def _run(self) -> None:
         stopping = False
         while not stopping:
-            try:
-                self._wait(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e9))
-            except Exception:
-                self._failed("waiting")
-                self._stopping.wait(TICK_S)
+            waited = self._tried(self._wait)
             stopping = self._stopping.is_set()  # asked before the turn, which so sends all that was told before
-            for part in self._turn():
-                try:
-                    part()
-                except Exception:
-                    self._failed("a turn")
+            done = [self._tried(part) for part in self._turn()]
+            if not (waited and all(done)):
+                self._stopping.wait(TICK_S)  # it may fail at every turn
         self._counted = self._count()
 
-    def _failed(self, what: str) -> None:
-        """This part is lost; without that the aircraft would fly on with a link that is silently dead."""
-        self._station.counters["failed"] += 1
-        log.exception("mavlink: %s of the link failed", what)
+    def _tried(self, part: Callable[[], None]) -> bool:
+        """Whether it went well. What did not is lost; else the aircraft would fly on with a link that is silently
+        dead."""
+        try:
+            part()
+        except Exception:
+            self._station.counters["failed"] += 1
+            log.exception("mavlink: a part of the link failed")
+            return False
+        return True
 
     def _turn(self) -> Iterator[Callable[[], None]]:
         """The parts of a turn. None depends on another: an endpoint that fails silences neither the rest nor the
@@ -168,17 +168,19 @@ class MavlinkLink:
         now_ns = clock.monotonic_ns()
         if now_ns >= self._next_tick_ns:
             self._next_tick_ns = now_ns + round(TICK_S * 1e9)
+            for endpoint in self._endpoints:
+                yield partial(endpoint.tick, now_ns)
             yield partial(self._tick, now_ns)
             self._counted = self._count()
 
-    def _wait(self, timeout_s: float) -> None:
-        """Until something is to be read or told, or the time is over."""
+    def _wait(self) -> None:
+        """Until something is to be read or told, or the next tick is due."""
         poll = select.poll()  # a new one each time, as connections come and go; it holds nothing in the kernel
         poll.register(self._woken, select.POLLIN)
         for endpoint in self._endpoints:
             for fileno in endpoint.transport.filenos():
                 poll.register(fileno, select.POLLIN)
-        poll.poll(timeout_s * 1000.0)
+        poll.poll(max(0.0, (self._next_tick_ns - clock.monotonic_ns()) / 1e6))
 
     def _count(self) -> dict[str, int]:
         station = self._station
@@ -236,8 +238,6 @@ class MavlinkLink:
                 self._station.counters["send_failed"] += not endpoint.send(reply)
 
     def _tick(self, now_ns: int) -> None:
-        for endpoint in self._endpoints:
-            endpoint.tick(now_ns)
         was = self._station.vehicle.contact
         out = self._station.tick(now_ns)
         if was is Contact.HEARD and self._station.vehicle.contact is Contact.LOST:
@@ -247,7 +247,7 @@ class MavlinkLink:
             self._told = (vehicle.system_id, vehicle.autopilot)
             for sentence in self._station.withheld():
                 log.warning("mavlink: %s", sentence)
-        for sentence in self._station.rivals(now_ns):
+        for sentence in self._station.rivals():
             log.warning("mavlink: %s", sentence)
             self.event(dialect.MAV_SEVERITY_WARNING, sentence)
         self._send(out.everywhere)

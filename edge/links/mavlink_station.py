@@ -40,7 +40,7 @@ from edge.links.mavlink_table import (
 )
 from edge.links.mavlink_telemetry import Telemetry, uptime_ms
 from edge.links.mavlink_traffic import adsb_vehicle, follow_target
-from edge.links.mavlink_vehicle import Contact, Vehicle
+from edge.links.mavlink_vehicle import LOST_NS, Contact, Vehicle
 from edge.links.outgoing import sendable
 from edge.links.signing import Signing
 from edge.requests import RequestQueue
@@ -61,7 +61,7 @@ GIMBAL_HZ = 50.0
 FOLLOW_TARGET_HZ = 10.0
 ADSB_VEHICLE_HZ = 2.0
 COMPUTER_STATUS_HZ = 1.0
-RIVAL_NS = 8_000_000_000  # of heartbeats beside those of the own autopilot; one that takes its place needs less
+RIVAL_NS = 8_000_000_000  # of heartbeats, without a long gap; one that takes the own autopilot's place needs less
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
@@ -106,7 +106,8 @@ class Station:
         self._reported_ns: int | None = None
         self._text_id = 0
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
-        self._rivals: dict[int, int | None] = {}  # since when another system's autopilot is heard; None: told
+        self._rivals: dict[int, tuple[int, int]] = {}  # since when another system's autopilot is heard, and until when
+        self._rivals_told: set[int] = set()
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """Those that carry a valid signature; all of them where nothing is signed."""
@@ -148,7 +149,9 @@ class Station:
                 if ours:
                     self._rivals.pop(message.get_srcSystem(), None)
                 else:
-                    self._rivals.setdefault(message.get_srcSystem(), now_ns)
+                    since_ns, last_ns = self._rivals.get(message.get_srcSystem(), (now_ns, now_ns))
+                    gone = now_ns - last_ns > LOST_NS
+                    self._rivals[message.get_srcSystem()] = (now_ns if gone else since_ns, now_ns)
                 continue
             reason = self._misdirected(message, link)
             self._count(message, reason)
@@ -228,12 +231,13 @@ class Station:
             found.append(f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {self._system_id}")
         return found
 
-    def rivals(self, now_ns: int) -> list[str]:
+    def rivals(self) -> list[str]:
         """Sentences, each once: who else could be the own autopilot, where the settings do not tell."""
         if self._settings.system_id is not None or self.vehicle.contact is not Contact.HEARD:
             return []
-        found = [system for system, since in self._rivals.items() if since is not None and now_ns - since > RIVAL_NS]
-        self._rivals.update(dict.fromkeys(found))
+        lasting = {system for system, (since_ns, last_ns) in self._rivals.items() if last_ns - since_ns > RIVAL_NS}
+        found = sorted(lasting - self._rivals_told)
+        self._rivals_told |= lasting
         ours = self.vehicle.system_id
         return [
             f"autopilots {ours} and {system} are heard; {ours}, the first, is taken for our own: set system_id"

@@ -38,10 +38,11 @@ def ahead_of_clock(state_file: Path, utc_ns: int) -> str | None:
     """A sentence where the timestamp that a file keeps lies far beyond a UTC time, nanoseconds; else None.
 
     Nobody can tell whether the clock was wrong then or is now. An autopilot with the right time is refused all the
-    while in the first case, and believing it would let old messages pass in the second.
+    while in the first case, and in the second believing earlier stamps would let old messages pass.
     """
-    ahead_s = (_load_state(state_file) - timestamp_of(utc_ns)) * UNIT_NS / 1e9
-    if ahead_s <= AHEAD_MAX_S:
+    stamp = load_state(state_file)
+    ahead_s = (stamp * UNIT_NS - utc_ns) / 1e9 + EPOCH_S
+    if stamp == 0 or ahead_s <= AHEAD_MAX_S:
         return None
     day = datetime.fromtimestamp(utc_ns / 1e9, UTC).strftime("%Y-%m-%d")
     return f"{state_file} is {ahead_s / 86400.0:.1f} days ahead of this computer's clock ({day})"
@@ -134,10 +135,10 @@ def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) ->
     ahead = ahead_of_clock(state_file, utc_ns())
     if ahead is not None:
         log.warning("mavlink: %s: until it is caught up with, an autopilot that stamps earlier is refused", ahead)
-    return Signing(load_key(key_file), _load_state(state_file), lambda stamp: _save_state(state_file, stamp), utc_ns)
+    return Signing(load_key(key_file), load_state(state_file), lambda stamp: _save_state(state_file, stamp), utc_ns)
 
 
-def _load_state(path: Path) -> int:
+def load_state(path: Path) -> int:
     try:
         stamp = int(path.read_text(encoding="ascii"))
     except FileNotFoundError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -212,12 +213,17 @@ def test_an_autopilot_that_still_speaks_is_not_replaced_when_its_heartbeats_are_
 
 
 @pytest.mark.parametrize(
-    ("system_id", "ours_until_s", "told"),
-    [(None, 30, [f"autopilots {SYSTEM_ID} and {SYSTEM_ID + 1} are heard"]), (SYSTEM_ID, 30, []), (None, 5, [])],
-    ids=["two at once", "named", "one after the other"],
+    ("system_id", "ours_beats", "other_beats", "told"),
+    [
+        (None, range(30), range(30), [f"autopilots {SYSTEM_ID} and {SYSTEM_ID + 1} are heard"]),
+        (SYSTEM_ID, range(30), range(30), []),
+        (None, range(5), range(5, 30), []),
+        (None, range(30), (3, 20), []),
+    ],
+    ids=["two at once", "named", "one after the other", "passing by"],
 )
 def test_a_second_autopilot_on_the_network_is_told_once(
-    system_id: int | None, ours_until_s: int, told: list[str]
+    system_id: int | None, ours_beats: Sequence[int], other_beats: Sequence[int], told: list[str]
 ) -> None:
     station = Station(MavlinkSettings(system_id=system_id), OwnShipBuffer(), CAMERA, RequestQueue())
     ours, other = (MAVLink(None, srcSystem=system, srcComponent=1) for system in (SYSTEM_ID, SYSTEM_ID + 1))
@@ -225,11 +231,11 @@ def test_a_second_autopilot_on_the_network_is_told_once(
     sentences: list[str] = []
     for second in range(30):
         now_ns = second * 1_000_000_000
-        speaking = [ours] if second < ours_until_s else []
-        for mav in [*speaking, other] if ours_until_s == 30 else speaking or [other]:
-            station.take(FrameReader(datagram=True).feed(bytes(beat.pack(mav))), 0, now_ns)
+        for mav, beats in ((ours, ours_beats), (other, other_beats)):
+            if second in beats:
+                station.take(FrameReader(datagram=True).feed(bytes(beat.pack(mav))), 0, now_ns)
         station.tick(now_ns)
-        sentences += station.rivals(now_ns)
+        sentences += station.rivals()
     assert [sentence.partition(";")[0] for sentence in sentences] == told
 
 

@@ -332,6 +332,7 @@ def test_an_endpoint_that_fails_silences_neither_the_others_nor_the_heartbeat(
 ) -> None:
     with linked("tcpin:127.0.0.1:0", "udpin:127.0.0.1:0") as (link, own_ship):
         monkeypatch.setattr(TcpServer, "receive", lambda _: 1 // 0)
+        monkeypatch.setattr(TcpServer, "tick", lambda *_: 1 // 0)
         with Peer(Udp(link.ports[1])) as peer:
             exchanges(link, own_ship, peer)
         until(lambda: link.counters().get("failed", 0) > 0, what="the failure to be counted")

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -160,10 +161,13 @@ def test_a_file_with_zeros_for_what_was_never_written_is_readable_once_finished(
     assert set(counts) == {0, 1, 2, 3}
 
 
-def test_a_recording_that_cannot_be_mended_does_not_keep_the_next_from_being_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize("total_bytes_max", [None, 10**9])
+def test_a_recording_that_cannot_be_mended_does_not_keep_the_next_from_being_made(
+    tmp_path: Path, total_bytes_max: int | None
+) -> None:
     broken = tmp_path / "uav1_000000_20260101T000000Z.mcap"
     broken.symlink_to(tmp_path / "nowhere")
-    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder = Recorder(tmp_path, "uav1", replace(ROOM, total_bytes_max=total_bytes_max), print)
     recorder.start()
     recorder.record(topics.EVENTS, "uav1", None, b"next", time.time_ns())
     recorder.stop()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sim_replay.cli import main as replay
 from trainer.config import ConfigError
 from trainer.results import HISTORY, PAPER, datasets_in, draw_history, gathered, measure, page, read_history, told
 
@@ -68,6 +69,17 @@ def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
     paper = next(line for line in text.splitlines() if "the paper, FP32" in line)
     assert f"{100 * PAPER['pose_10deg_5pct']:.1f}" in paper
     assert "the command" in text
+
+
+def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None:
+    dataset = tmp_path / "two_splits"
+    command = ["generate", "--preset", "fw-uav6d", "--seed", "3", "--every", "50", "--out", str(dataset)]
+    for sequences in (["--sequences", "88"], ["--split", "test", "--sequences", "114"]):
+        assert replay([*command, *sequences, "--workers", "1", "--resume"][: None if dataset.exists() else -1]) == 0
+    assert {path.name for path in dataset.iterdir()} >= {"train", "test"}
+    (score,) = measure([None], [dataset], lambda _: None)
+    assert score["overall"]["frames"] == len(list((dataset / "test").glob("*/rgb/*")))
+    assert score["recipe"].endswith("--every 50 --split test")
 
 
 def test_a_folder_without_datasets_is_named(tmp_path: Path) -> None:
