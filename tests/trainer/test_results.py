@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -56,6 +57,18 @@ def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
 
     training = load_model(SHIPPED_MODEL, 1).contract.training
     assert read_history(HISTORY)[-1]["samples"] == training["samples"]
+
+
+def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
+    from edge.config import SHIPPED_MODEL
+
+    sha256 = hashlib.sha256(SHIPPED_MODEL.read_bytes()).hexdigest()
+    windows = f"{read_history(HISTORY)[-1]['total_samples']:,} "
+    readme, card = (path.read_text() for path in (ROOT / "README.md", SHIPPED_MODEL.parent / "README.md"))
+    assert f"`{sha256[:8]}…`" in readme
+    assert sha256 in card
+    assert windows in readme
+    assert windows in card
 
 
 def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
