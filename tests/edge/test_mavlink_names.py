@@ -117,8 +117,8 @@ def test_name_service_that_never_answers_keeps_nothing_waiting(monkeypatch: pyte
         with linked("tcpout:ground.test:5760", "udpout:ground.test:14550", "udpin:127.0.0.1:0") as (link, own_ship):
             with Peer(link.ports[0]) as peer:
                 meet(link, peer)
-                peer.attitude(Rotation.identity())
-                peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+                level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
+                peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
             asking = [thread.name for thread in threading.enumerate()].count("lookup")
         assert asking == 2, "each is asked once, not at every turn"
     finally:

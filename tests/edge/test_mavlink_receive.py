@@ -82,11 +82,11 @@ def test_a_megabyte_of_junk_from_the_autopilots_own_address_is_counted_and_the_l
 
 
 def test_a_truncated_header_does_not_swallow_what_follows() -> None:
-    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
         peer.wire.send(b"\xfd\xff\x00\x00")
         peer.attitude(Rotation.identity())
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+        peer.settle(lambda: link.counters().get("received_ATTITUDE_QUATERNION", 0) == 1, "attitude")
 
 
 def hostile() -> dict[str, list[Any]]:
@@ -123,8 +123,9 @@ def test_nonsense_with_a_valid_checksum_is_counted_and_changes_nothing(reason: s
         expected = len(hostile()[reason])
         peer.settle(lambda: link.counters().get(f"refused_{reason}", 0) == expected, "refusal")
         assert own_ship.at(time.monotonic_ns()) is None
-        peer.attitude(Rotation.identity())
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "good attitude after it")
+        # Told again and again: a single attitude holds for a fraction of a second, and the machine may be busy.
+        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "good attitude after it", level)
         assert link.counters().get("failed", 0) == 0
 
 
@@ -139,13 +140,13 @@ def test_another_vehicles_telemetry_from_the_autopilots_address_is_refused() -> 
 
 
 def test_a_message_no_dialect_knows_is_counted_and_dropped() -> None:
-    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
         # Id 0x030201 is nobody's, so that neither its checksum nor a signature could be judged.
         unknown = b"\xfd\x01\x00\x00\x00" + bytes([SYSTEM_ID, 1]) + b"\x01\x02\x03" + b"\x00" + b"\x00\x00"
         attitude = dialect.MAVLink_attitude_quaternion_message(peer.boot_ms(), 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         peer.wire.send(unknown + peer.packed(attitude))
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude behind it")
+        peer.settle(lambda: link.counters().get("received_ATTITUDE_QUATERNION", 0) == 1, "attitude behind it")
         peer.settle(lambda: link.counters()["refused_message_id"] == 1, "count of it")
 
 

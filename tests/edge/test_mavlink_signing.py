@@ -56,8 +56,8 @@ def test_both_ways_over_the_link_with_pymavlink_verifying() -> None:
         verifier = MAVLink(None)
         verifier.signing.secret_key = KEY
         meet(link, peer)
-        peer.attitude(Rotation.identity())
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
         peer.received.clear()
         link.publish(report(track(time.monotonic_ns())))
         peer.named("TARGET_RELATIVE")

@@ -49,8 +49,8 @@ def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
         link.set_health(TRACKING)
         peer.until(asks_for_attitude, "first request")
         meet(link, peer)
-        peer.attitude(Rotation.identity())
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude")
+        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
         before_ns = time.monotonic_ns()
         peer.boot_at_ns = before_ns
         peer.attitude(Rotation.from_euler("x", 1.0))
