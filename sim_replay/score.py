@@ -130,7 +130,7 @@ def statistics(frames: int, matches: Sequence[Match], false_poses: Sequence[Targ
     with_target = {match.truth.frame for match in matches}
     in_empty = [pose for pose in false_poses if pose.frame not in with_target]
     empty = frames - len(with_target)
-    false_rate = lambda poses: metrics.false_positives_per_1000(len(poses), empty)  # noqa: E731
+    false_rate = lambda poses: _told(metrics.false_positives_per_1000(len(poses), empty))  # noqa: E731
     overall = pose_statistics(frames, matches, false_rate(in_empty))
     overall["false_poses"] = len(false_poses)
     by_range = {}
@@ -153,7 +153,7 @@ def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1
     return {
         "frames": frames,
         "targets": len(matches),
-        "recall": metrics.recall(len(found), len(matches)),
+        "recall": _told(metrics.recall(len(found), len(matches))),
         "false_positives_per_1000": false_positives_per_1000,
         "rotation_error_deg": _mean_median(metrics.rotation_error_deg(R_est, R_gt)),
         "translation_error_m": _mean_median(metrics.translation_error_m(t_est, t_gt)),
@@ -238,7 +238,12 @@ def _add_rates(matches: Sequence[Match]) -> dict[str, float | None]:
 
 
 def _share(part: int, whole: int) -> float | None:
-    return _rounded(part / whole) if whole else None
+    return _told(part / whole if whole else None)
+
+
+def _told(value: float | None) -> float | None:
+    """As all figures are told; None stays what it is."""
+    return None if value is None else _rounded(value)
 
 
 def _mean_median(values: Array) -> dict[str, float | None]:
