@@ -18,7 +18,9 @@ from edge.links import mavlink_messages as words
 from edge.links.allowance import Allowance
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
+from edge.links.mavlink_rates import sent_rates_hz, wanted_rates_hz
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
+from edge.links.mavlink_rivals import Rivals
 from edge.links.mavlink_schedule import Schedule
 from edge.links.mavlink_table import (
     ADSB_VEHICLE,
@@ -29,18 +31,14 @@ from edge.links.mavlink_table import (
     COMPUTER_STATUS,
     FOLLOW_TARGET,
     GEO_STATUS,
-    GIMBAL_ATTITUDE,
-    GLOBAL_POSITION_INT,
     HEARTBEAT,
     IMAGE_STATUS,
-    LOCAL_POSITION_NED,
-    SYSTEM_TIME,
     TARGET_RELATIVE,
     TIMESYNC,
 )
 from edge.links.mavlink_telemetry import Telemetry, uptime_ms
 from edge.links.mavlink_traffic import adsb_vehicle, follow_target
-from edge.links.mavlink_vehicle import LOST_NS, Contact, Vehicle
+from edge.links.mavlink_vehicle import Contact, Vehicle
 from edge.links.outgoing import sendable
 from edge.links.signing import Signing
 from edge.requests import RequestQueue
@@ -55,13 +53,6 @@ HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stu
 HOME_SILENT_NS = 3_000_000_000
 FRAMELESS_NS = 1_000_000_000  # no report for longer: nothing is tracked, and who draws the box is told so
 TIMESYNC_NS = 200_000_000
-GLOBAL_POSITION_HZ = 5.0
-SYSTEM_TIME_HZ = 1.0
-GIMBAL_HZ = 50.0
-FOLLOW_TARGET_HZ = 10.0
-ADSB_VEHICLE_HZ = 2.0
-COMPUTER_STATUS_HZ = 1.0
-RIVAL_NS = 8_000_000_000  # of heartbeats, without a long gap; one that takes the own autopilot's place needs less
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
@@ -88,7 +79,7 @@ class Station:
         self.counters: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.timesync = TimesyncEstimator()
-        self.vehicle = Vehicle(settings.system_id, _wanted_rates_hz(settings, own_ship), STANDS_IN)
+        self.vehicle = Vehicle(settings.system_id, wanted_rates_hz(settings, own_ship), STANDS_IN)
         self.home: int | None = None
         self._settings = settings
         self._camera = camera
@@ -99,15 +90,14 @@ class Station:
         self._components = (settings.component_id, settings.camera_component_id)
         self._packers = {component: MAVLink(None, srcComponent=component) for component in self._components}
         self._virtual = MAVLink(None, settings.virtual_system_id, settings.component_id)
-        self._schedule = Schedule(_rates_hz(settings))
+        self._schedule = Schedule(sent_rates_hz(settings))
         self._computer = ComputerReader()
         self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
         self._health: tuple[Condition, int] | None = None
         self._reported_ns: int | None = None
         self._text_id = 0
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
-        self._rivals: dict[int, tuple[int, int]] = {}  # since when another system's autopilot is heard, and until when
-        self._rivals_told: set[int] = set()
+        self._rivals = Rivals()
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """Those that carry a valid signature; all of them where nothing is signed."""
@@ -147,11 +137,9 @@ class Station:
                 ours = self._meet(message, link, now_ns)
                 self._count(message, None if ours else "not_our_autopilot")
                 if ours:
-                    self._rivals.pop(message.get_srcSystem(), None)
+                    self._rivals.forget(message.get_srcSystem())
                 else:
-                    since_ns, last_ns = self._rivals.get(message.get_srcSystem(), (now_ns, now_ns))
-                    gone = now_ns - last_ns > LOST_NS
-                    self._rivals[message.get_srcSystem()] = (now_ns if gone else since_ns, now_ns)
+                    self._rivals.heard(message.get_srcSystem(), now_ns)
                 continue
             reason = self._misdirected(message, link)
             self._count(message, reason)
@@ -235,13 +223,10 @@ class Station:
         """Sentences, each once: who else could be the own autopilot, where the settings do not tell."""
         if self._settings.system_id is not None or self.vehicle.contact is not Contact.HEARD:
             return []
-        lasting = {system for system, (since_ns, last_ns) in self._rivals.items() if last_ns - since_ns > RIVAL_NS}
-        found = sorted(lasting - self._rivals_told)
-        self._rivals_told |= lasting
         ours = self.vehicle.system_id
         return [
             f"autopilots {ours} and {system} are heard; {ours}, the first, is taken for our own: set system_id"
-            for system in found
+            for system in self._rivals.news()
         ]
 
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
@@ -397,28 +382,3 @@ class Station:
             self.counters[f"received_{message.get_type()}"] += 1
         else:
             self.refused[refusal] += 1
-
-
-def _wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict[int, float]:
-    """What is asked of the autopilot."""
-    gimbal = {GIMBAL_ATTITUDE: GIMBAL_HZ} if own_ship.gimballed else {}
-    return {
-        ATTITUDE_QUATERNION: settings.attitude_rate_hz,
-        ATTITUDE: settings.attitude_rate_hz,
-        LOCAL_POSITION_NED: settings.position_rate_hz,
-        GLOBAL_POSITION_INT: GLOBAL_POSITION_HZ,
-        SYSTEM_TIME: SYSTEM_TIME_HZ,
-        **gimbal,
-    }
-
-
-def _rates_hz(settings: MavlinkSettings) -> dict[int, float]:
-    """What may go out, and how often."""
-    optional = {
-        TARGET_RELATIVE: (settings.target_relative, settings.target_relative_rate_hz),
-        FOLLOW_TARGET: (settings.follow_target, FOLLOW_TARGET_HZ),
-        ADSB_VEHICLE: (settings.adsb_icao_address is not None, ADSB_VEHICLE_HZ),
-        COMPUTER_STATUS: (settings.onboard_computer_status, COMPUTER_STATUS_HZ),
-    }
-    always = {IMAGE_STATUS: settings.tracking_rate_hz, GEO_STATUS: settings.tracking_rate_hz}
-    return always | {message_id: hz for message_id, (enabled, hz) in optional.items() if enabled}

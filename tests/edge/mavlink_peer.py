@@ -211,6 +211,16 @@ def meet(link: MavlinkLink, peer: Peer) -> None:
     peer.settle(lambda: "timesync_uncertainty_us" in link.counters(), "time synchronisation")
 
 
+def hear(own_ship: OwnShipBuffer, peer: Peer, rotation: Rotation) -> None:
+    """Until own attitude is that which the peer tells, again and again: one alone holds for a fraction of a second."""
+
+    def heard() -> bool:
+        now = own_ship.at(time.monotonic_ns())
+        return now is not None and np.allclose(now.R_ned_body, rotation.as_matrix(), atol=1e-6)
+
+    peer.settle(heard, "attitude", lambda: peer.attitude(rotation))
+
+
 def alone(wire: Udp) -> bool:
     """Whether nothing was sent here."""
     wire.socket.settimeout(0.0)

@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import pytest
 from scipy.spatial.transform import Rotation
 
-from .mavlink_peer import DEADLINE_S, Peer, Tcp, Udp, linked, meet
+from .mavlink_peer import DEADLINE_S, Peer, Tcp, Udp, hear, linked, meet
 
 FLYING = """
 import logging, sys, threading
@@ -117,8 +116,7 @@ def test_name_service_that_never_answers_keeps_nothing_waiting(monkeypatch: pyte
         with linked("tcpout:ground.test:5760", "udpout:ground.test:14550", "udpin:127.0.0.1:0") as (link, own_ship):
             with Peer(link.ports[0]) as peer:
                 meet(link, peer)
-                level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
-                peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
+                hear(own_ship, peer, Rotation.identity())
             asking = [thread.name for thread in threading.enumerate()].count("lookup")
         assert asking == 2, "each is asked once, not at every turn"
     finally:

@@ -24,7 +24,7 @@ from edge.requests import RequestQueue, StopTracking
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, alone, linked, meet
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, alone, hear, linked, meet
 from .reports import TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
@@ -123,9 +123,7 @@ def test_nonsense_with_a_valid_checksum_is_counted_and_changes_nothing(reason: s
         expected = len(hostile()[reason])
         peer.settle(lambda: link.counters().get(f"refused_{reason}", 0) == expected, "refusal")
         assert own_ship.at(time.monotonic_ns()) is None
-        # Told again and again: a single attitude holds for a fraction of a second, and the machine may be busy.
-        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "good attitude after it", level)
+        hear(own_ship, peer, Rotation.identity())
         assert link.counters().get("failed", 0) == 0
 
 

@@ -24,7 +24,7 @@ from edge.links.signing import RESERVED_AHEAD, TIMESTAMP_MAX, Signing, open_sign
 from edge.links.signing_key import load_key, write_new_key
 from msgs.mavlink import FrameReader, MAVLink, dialect, pack
 
-from .mavlink_peer import SYSTEM_ID, Peer, Udp, alone, linked, meet
+from .mavlink_peer import SYSTEM_ID, Peer, Udp, alone, hear, linked, meet
 from .reports import TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
@@ -56,8 +56,7 @@ def test_both_ways_over_the_link_with_pymavlink_verifying() -> None:
         verifier = MAVLink(None)
         verifier.signing.secret_key = KEY
         meet(link, peer)
-        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
+        hear(own_ship, peer, Rotation.identity())
         peer.received.clear()
         link.publish(report(track(time.monotonic_ns())))
         peer.named("TARGET_RELATIVE")

@@ -20,7 +20,7 @@ from edge.types import Mount
 from msgs.geometry import rotation_angle
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, hear, linked, meet
 from .reports import TRACKING
 
 
@@ -49,8 +49,7 @@ def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
         link.set_health(TRACKING)
         peer.until(asks_for_attitude, "first request")
         meet(link, peer)
-        level = lambda: peer.attitude(Rotation.identity())  # noqa: E731
-        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "attitude", level)
+        hear(own_ship, peer, Rotation.identity())
         before_ns = time.monotonic_ns()
         peer.boot_at_ns = before_ns
         peer.attitude(Rotation.from_euler("x", 1.0))

@@ -12,7 +12,6 @@ import time
 import tty
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,7 +29,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 from tests.waiting import until
 
-from .mavlink_peer import CAMERA, DEADLINE_S, Peer, Pty, Tcp, Udp, alone, linked, meet
+from .mavlink_peer import CAMERA, DEADLINE_S, Peer, Pty, Tcp, Udp, alone, hear, linked, meet
 from .reports import SEARCHING, TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
@@ -41,16 +40,6 @@ def exchanges(link: MavlinkLink, own_ship: OwnShipBuffer, peer: Peer) -> None:
     meet(link, peer)
     hear(own_ship, peer, Rotation.identity())
     peer.named("TARGET_RELATIVE", lambda: link.publish(report(track(time.monotonic_ns()))))
-
-
-def hear(own_ship: OwnShipBuffer, peer: Peer, rotation: Rotation) -> None:
-    """Until own attitude is that which the peer tells."""
-
-    def heard() -> bool:
-        now = own_ship.at(time.monotonic_ns())
-        return now is not None and np.allclose(now.R_ned_body, rotation.as_matrix(), atol=1e-6)
-
-    peer.settle(heard, "attitude", lambda: peer.attitude(rotation))
 
 
 def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
