@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+AcquireView = Literal["crop", "frame"]  # a window of the reduced frame, or the whole frame squashed into a square
 
 
 @dataclass(frozen=True)

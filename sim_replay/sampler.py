@@ -23,7 +23,7 @@ from sim_replay.render.projection import extents_px
 from sim_replay.render.renderer import Rendered, Renderer
 from sim_replay.render.scene import Camera, Target
 from sim_replay.render.sensor import exposed, sensor_from
-from sim_replay.sample import SampleBatch
+from sim_replay.sample import AcquireView, SampleBatch
 
 __all__ = ["WindowSampler", "render_frame"]
 
@@ -97,11 +97,12 @@ class WindowSampler:
         acquire_share: float = 0.3,
         empty_share: float = 0.12,
         invented_share: float = 0.0,
+        acquire_view: AcquireView = "crop",
     ) -> None:
         self.seed, self.size_px = seed, size_px
         self.airframe_ids = tuple(range(len(AIRFRAMES)) if airframe_ids is None else airframe_ids)
         self.acquire_share, self.empty_share = acquire_share, empty_share
-        self.invented_share = invented_share
+        self.invented_share, self.acquire_view = invented_share, acquire_view
         self._renderer: Renderer | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -125,7 +126,7 @@ class WindowSampler:
 
     def _window(self, index: int) -> Window:
         shares = self.acquire_share, self.empty_share, self.invented_share
-        return draw_window(self.seed, index, self.size_px, self.airframe_ids, *shares)
+        return draw_window(self.seed, index, self.size_px, self.airframe_ids, *shares, self.acquire_view)
 
     def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:
         side, size = window.scene.camera.width_px, self.size_px
@@ -144,7 +145,8 @@ class WindowSampler:
         if side < size:
             image = np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.uint8)
             coverage, noc = _enlarged(coverage, noc, size)
-            camera = Camera(crop_K(camera.K, 0.0, 0.0, size / side), size, size, camera.R_ned_cam, camera.t_ned_cam_m)
+            K = crop_K(camera.K, 0.0, 0.0, size / side, size / side)
+            camera = Camera(K, size, size, camera.R_ned_cam, camera.t_ned_cam_m)
         out["image_bgr"][k], out["K"][k] = image, camera.K
         if window.visible_share * clear >= VISIBLE_SHARE_MIN:
             _write_target(out, k, window, camera, coverage >= MASK_COVERAGE_MIN, noc, hidden=clear < 1.0)

@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from msgs.settings import Section, load_settings, parse_settings
+from sim_replay.sample import AcquireView
 
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
@@ -104,6 +105,9 @@ class DataConfig(Section):
     validation_seed: int = Field(ge=0)
     airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
     acquire_share: float = Field(0.3, ge=0, le=1, description="share of views as the acquire stage sees them")
+    acquire_view: AcquireView = Field(
+        "crop", description="a window of the reduced frame, or the whole frame squashed, as contract.acquire_fit has it"
+    )
     empty_share: float = Field(0.12, ge=0, lt=1, description="share of windows without a target")
     invented_share: float = Field(0.0, ge=0, le=1, description="of targets that are no member of the fleet")
     batch_size: int = Field(ge=2)
@@ -187,6 +191,19 @@ class TrainerConfig(Section):
     schedule: ScheduleConfig
     run: RunConfig
     contract: ContractConfig
+
+    @model_validator(mode="after")
+    def _trained_as_used(self) -> TrainerConfig:
+        squashed = self.contract.acquire_fit == "squash"
+        if squashed != (self.data.acquire_view == "frame"):
+            raise ValueError(
+                'data.acquire_view = "frame" and contract.acquire_fit = "squash" belong together: '
+                "the acquire stage must see what it was trained on"
+            )
+        width_px, height_px = self.contract.acquire_size_wh
+        if squashed and width_px != height_px:
+            raise ValueError("contract.acquire_size_wh must be square where frames are squashed: training windows are")
+        return self
 
 
 def parse_config(text: str, source: str) -> TrainerConfig:

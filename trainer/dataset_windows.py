@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
-from sim_replay.sample import SampleBatch
+from sim_replay.sample import AcquireView, SampleBatch
 from trainer.config import ConfigError
 from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
 
@@ -29,8 +29,16 @@ Array = NDArray[np.float64]
 class DatasetSampler:
     """Window i is a pure function of (seed, i, size) and the dataset. Raises ConfigError where that is unreadable."""
 
-    def __init__(self, root: Path, split: str | None, seed: int, size_px: int, acquire_share: float) -> None:
-        self.seed, self.size_px, self.acquire_share = seed, size_px, acquire_share
+    def __init__(
+        self,
+        root: Path,
+        split: str | None,
+        seed: int,
+        size_px: int,
+        acquire_share: float,
+        acquire_view: AcquireView = "crop",
+    ) -> None:
+        self.seed, self.size_px, self.acquire_share, self.acquire_view = seed, size_px, acquire_share, acquire_view
         try:
             dataset = open_dataset(root, split)
             self._frames = dataset.labelled_frames()
@@ -55,14 +63,10 @@ class DatasetSampler:
         seen = [k for k, box in enumerate(boxes) if box is not None]
         chosen = int(rng.choice(seen)) if seen else None
         box = None if chosen is None else boxes[chosen]
-        height, width = picture.shape[:2]
-        if box is not None and rng.random() >= self.acquire_share:
-            low, side = _track_square(rng, box)
-        else:
-            low, side = _acquire_square(rng, box, (width, height), self.size_px)
-        scale = self.size_px / side
-        to_window = np.array([[scale, 0, (0.5 - low[0]) * scale - 0.5], [0, scale, (0.5 - low[1]) * scale - 0.5]])
-        image = _resampled(picture, to_window, scale, self.size_px)
+        low, sides = self._cut(rng, box, (picture.shape[1], picture.shape[0]))
+        scale = self.size_px / sides
+        to_window = np.column_stack([np.diag(scale), (0.5 - low) * scale - 0.5])
+        image = _resampled(picture, to_window, self.size_px)
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None:
             self._label(out, frame, chosen, to_window)
@@ -70,6 +74,18 @@ class DatasetSampler:
             if other is not None and k != chosen:
                 _mark(out.others[0], other, to_window)
         return out
+
+    def _cut(
+        self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: tuple[int, int]
+    ) -> tuple[Array, Array]:
+        """First pixel's place [2] and sides [2], frame pixels, of what the window shows."""
+        if box_xyxy_px is not None and rng.random() >= self.acquire_share:
+            low, side = _track_square(rng, box_xyxy_px)
+        elif self.acquire_view == "frame":
+            return np.zeros(2), np.array(frame_wh, dtype=np.float64)
+        else:
+            low, side = _acquire_square(rng, box_xyxy_px, frame_wh, self.size_px)
+        return low, np.full(2, side)
 
     def _label(self, out: TrainingBatch, frame: DatasetFrame, chosen: int, to_window: Array) -> None:
         target = frame.targets[chosen]
@@ -104,16 +120,18 @@ def _acquire_square(
     return np.where(np.array(frame_wh) > side, np.clip(low, 0.0, np.maximum(np.array(frame_wh) - side, 0.0)), low), side
 
 
-def _resampled(picture: NDArray[np.uint8], to_window: Array, scale: float, size_px: int) -> NDArray[np.uint8]:
+def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int) -> NDArray[np.uint8]:
     """Averages where it shrinks: the picture is blurred to the window's pixel before it is sampled."""
-    if scale < 1.0:
-        margin = np.array([2.0, 2.0]) / scale
+    scale = np.diag(to_window)
+    if (scale < 1.0).any():
+        margin = 2.0 / scale
         start = np.floor(-(to_window[:, 2] + 0.5) / scale - margin).astype(int)
         stop = start + np.ceil(size_px / scale + 2 * margin).astype(int) + 1
         start, stop = np.maximum(start, 0), np.minimum(stop, [picture.shape[1], picture.shape[0]])
         if (stop > start).all():
             crop = picture[start[1] : stop[1], start[0] : stop[0]]
-            picture = np.asarray(cv2.GaussianBlur(crop, (0, 0), 0.4 / scale), np.uint8)
+            sigma_x, sigma_y = np.where(scale < 1.0, 0.4 / scale, 1e-3)
+            picture = np.asarray(cv2.GaussianBlur(crop, (0, 0), sigma_x, sigmaY=sigma_y), np.uint8)
             to_window = to_window.copy()
             to_window[:, 2] += to_window[:, :2] @ start
     return np.asarray(

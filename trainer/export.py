@@ -66,12 +66,18 @@ def stage_sampler(
     return window_sampler(data.model_copy(update=shares), seed, size_px, held_out)
 
 
+def acquire_window_px(contract: ContractConfig | ModelContract) -> int:
+    """Side of the windows that the acquire stage is measured on: whole frames where it was trained on such."""
+    smaller_px = min(contract.acquire_size_wh)
+    return smaller_px if contract.acquire_fit == "squash" else min(ACQUIRE_CROP_PX, smaller_px)
+
+
 def render_views(config: TrainerConfig, seed: int, samples: int, open_view: OpenView) -> Views:
     """`samples` windows of the track stage and half as many of the acquire stage."""
     track = config.contract.track_size_wh
     windows = render_once(open_view(seed, track[0], 0.0), samples) if track else []
-    crop_px = min(ACQUIRE_CROP_PX, *config.contract.acquire_size_wh)
-    return Views(windows, render_once(open_view(seed + 1, crop_px, 1.0), max(samples // 2, 16)))
+    acquire_px = acquire_window_px(config.contract)
+    return Views(windows, render_once(open_view(seed + 1, acquire_px, 1.0), max(samples // 2, 16)))
 
 
 def _predict(predict: Predictor, views: Views) -> Measured:

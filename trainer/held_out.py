@@ -19,7 +19,7 @@ from trainer.evaluate import (
     predict_all,
     torch_predictor,
 )
-from trainer.export import ACQUIRE_CROP_PX, OpenView, airframe_names, stage_sampler
+from trainer.export import OpenView, acquire_window_px, airframe_names, stage_sampler
 from trainer.graph import onnx_predictor, read_contract
 
 
@@ -47,24 +47,26 @@ class _Subject(NamedTuple):
 
 def _checkpoint(path: Path) -> _Subject:
     model, config, _, _ = load_model(path)
-    track, acquire = config.contract.track_size_wh, config.contract.acquire_size_wh
+    track = config.contract.track_size_wh
+    track_px = track[0] if track else None
     thresholds = {"track": SCORE_THRESHOLD, "acquire": SCORE_THRESHOLD}
-    return _Subject(
-        torch_predictor(model), config.data, config.data.seed, track[0] if track else None, min(acquire), thresholds, {}
-    )
+    acquire_px = acquire_window_px(config.contract)
+    return _Subject(torch_predictor(model), config.data, config.data.seed, track_px, acquire_px, thresholds, {})
 
 
 def _model_file(path: Path, seed: int) -> _Subject:
     contract = read_contract(path)
+    view = "frame" if contract.acquire_fit == "squash" else "crop"
     every = airframe_names(None)
     ids = [every.index(name) for name in contract.airframes if name in every] or None
-    data = DataConfig.model_validate({"seed": seed, "validation_seed": seed + 1, "batch_size": 16, "airframe_ids": ids})
+    said = {"seed": seed, "validation_seed": seed + 1, "batch_size": 16, "airframe_ids": ids, "acquire_view": view}
+    data = DataConfig.model_validate(said)
     trained = contract.training.get("seed")
     thresholds = {"track": contract.track_score_min, "acquire": contract.acquire_score_min}
     track = contract.track_size_wh[0] if contract.track_size_wh else None
     training_seed = trained if isinstance(trained, int) else None
     calibrations = {"track": contract.track_score, "acquire": contract.acquire_score}
-    acquire_px = min(contract.acquire_size_wh)
+    acquire_px = acquire_window_px(contract)
     return _Subject(onnx_predictor(path), data, training_seed, track, acquire_px, thresholds, calibrations)
 
 
@@ -77,7 +79,7 @@ def evaluate_file(
     if request.seed == subject.training_seed:
         raise ConfigError(f"--seed {request.seed}: is the training seed; give another")
     size_px = request.size_px or (subject.track_px if request.stage == "track" else None)
-    size_px = size_px or min(ACQUIRE_CROP_PX, subject.acquire_px)
+    size_px = size_px or subject.acquire_px
     if size_px < 32 or size_px % 32:
         raise ConfigError(f"--size {size_px}: must be a multiple of 32")
     if request.samples < 16:

@@ -14,18 +14,19 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
     from sim_replay.sampler import WindowSampler  # needs the renderer's packages
 
     validating = seed == config.validation_seed
+    view = config.acquire_view
     samplers: list[Sampler] = []
     shares: list[float] = []
     for source in config.datasets:
         split = source.validation_split if validating or held_out else source.split
         if split is not None:
-            samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share))
+            samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
             shares.append(source.share)
     if sum(shares) < 1.0:
         # What is measured on holds the fleet alone, however many invented aircraft are trained on.
         invented = 0.0 if validating or held_out else config.invented_share
         samplers.append(
-            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented)
+            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented, view)
         )
         shares.append(1.0 - sum(shares))
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)

@@ -18,6 +18,7 @@ from sim_replay.render.frame import outline_px
 from sim_replay.render.projection import extents_px, solid_vertices_m
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
 from sim_replay.render.sensor import Quality
+from sim_replay.sample import AcquireView
 
 Array = NDArray[np.float64]
 Kind = Literal["track", "acquire"]
@@ -53,12 +54,13 @@ class Window:
     decoy: Decoy | None  # rendered pixels
 
 
-def crop_K(K: Array, x0_px: float, y0_px: float, scale: float) -> Array:
-    """Intrinsics of a window whose first pixel is (x0, y0) of the frame, resized by `scale`: c' = (c+0.5)s-0.5."""
+def crop_K(K: Array, x0_px: float, y0_px: float, scale_x: float, scale_y: float) -> Array:
+    """Intrinsics of a window whose first pixel is (x0, y0) of the frame, resized by the scales: c' = (c+0.5)s-0.5."""
     out = K.copy()
-    out[:2] *= scale
-    out[0, 2] = (K[0, 2] - x0_px + 0.5) * scale - 0.5
-    out[1, 2] = (K[1, 2] - y0_px + 0.5) * scale - 0.5
+    out[0] *= scale_x
+    out[1] *= scale_y
+    out[0, 2] = (K[0, 2] - x0_px + 0.5) * scale_x - 0.5
+    out[1, 2] = (K[1, 2] - y0_px + 0.5) * scale_y - 0.5
     return out
 
 
@@ -189,6 +191,7 @@ def draw_window(
     acquire_share: float,
     empty_share: float,
     invented_share: float = 0.0,
+    acquire_view: AcquireView = "crop",
 ) -> Window:
     """Window number `index`: a pure function of its arguments."""
     rng = np.random.default_rng([seed, index, size_px])
@@ -196,11 +199,15 @@ def draw_window(
     empty = bool(rng.random() < empty_share)
     distractors = bool(rng.random() < (DISTRACTORS_EMPTY_SHARE if empty else DISTRACTORS_SHARE))
     frame = frame_scene(rng, airframe_ids, invented_share, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
-    x0, y0, side = _acquire_cut(rng, frame, size_px) if kind == "acquire" else _track_cut(rng, frame)
-    rendered_px = int(np.clip(round(side), 24, size_px))
-    scale = rendered_px / side
+    if kind == "acquire" and acquire_view == "frame":
+        rendered_px = size_px
+        x0, y0, scale_x, scale_y = 0.0, 0.0, size_px / FRAME_WIDTH_PX, size_px / FRAME_HEIGHT_PX
+    else:
+        x0, y0, side = _acquire_cut(rng, frame, size_px) if kind == "acquire" else _track_cut(rng, frame)
+        rendered_px = int(np.clip(round(side), 24, size_px))
+        scale_x = scale_y = rendered_px / side
     camera = Camera(
-        crop_K(frame.camera.K, x0, y0, scale),
+        crop_K(frame.camera.K, x0, y0, scale_x, scale_y),
         rendered_px,
         rendered_px,
         frame.camera.R_ned_cam,
@@ -213,4 +220,5 @@ def draw_window(
     scene = Scene(camera, targets, frame.environment, int(rng.integers(2**31)), index)
     quality = QUALITIES[int(rng.choice(len(QUALITIES), p=QUALITY_SHARES))]
     decoy = _decoy(rng, frame.targets[0], camera) if empty and rng.random() < DECOY_SHARE else None
-    return Window(scene, kind, size_px, min(scale, 1.0), share, distractors, quality, decoy)
+    native_scale = min(float(np.sqrt(scale_x * scale_y)), 1.0)
+    return Window(scene, kind, size_px, native_scale, share, distractors, quality, decoy)

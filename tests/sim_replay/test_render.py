@@ -168,5 +168,5 @@ def test_a_window_is_the_same_camera() -> None:
     scene = _scene(2, 7)
     points = solid_vertices_m(2)
     whole = _opencv_px(points, scene)
-    window = replace(scene, camera=replace(scene.camera, K=crop_K(scene.camera.K, 31.5, 12.25, 1.7)))
+    window = replace(scene, camera=replace(scene.camera, K=crop_K(scene.camera.K, 31.5, 12.25, 1.7, 1.7)))
     np.testing.assert_allclose(_opencv_px(points, window), (whole - [31.5, 12.25] + 0.5) * 1.7 - 0.5, atol=1e-6)

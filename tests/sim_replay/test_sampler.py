@@ -147,6 +147,29 @@ def test_windows_show_targets_as_large_as_the_stages_will() -> None:
     assert max(acquire) * 128 > 80
 
 
+def test_whole_frames_are_squashed_with_their_camera() -> None:
+    """A whole frame's outline, scaled by hand, is where the squashed picture shows the target."""
+    seed, size = 9, 320
+    batch = WindowSampler(seed, size, range(3), 1.0, 0.0, acquire_view="frame").batch(0, 16)
+    whole = 0
+    for index in np.flatnonzero(batch.present):
+        window = draw_window(seed, int(index), size, range(3), 1.0, 0.0, acquire_view="frame")
+        rng = np.random.default_rng([seed, index, size])
+        rng.random(3)  # which stage, whether empty, whether birds are about
+        frame = frame_scene(rng, range(3))
+        x0, y0, x1, y1 = extents_px(outline_px(frame.targets[0], frame.camera))
+        if min(x0, y0) < 0 or x1 > FRAME_WIDTH_PX - 1 or y1 > FRAME_HEIGHT_PX - 1:
+            continue
+        whole += 1
+        by_hand = (np.array([x0, y0, x1, y1]) + 0.5) * ([size / FRAME_WIDTH_PX, size / FRAME_HEIGHT_PX] * 2) - 0.5
+        np.testing.assert_allclose(
+            extents_px(outline_px(window.scene.targets[0], window.scene.camera)), by_hand, atol=0.01
+        )
+        y, x = np.nonzero(batch.mask[index])
+        np.testing.assert_allclose([x.min(), y.min(), x.max(), y.max()], by_hand, atol=2.0)
+    assert whole > 8
+
+
 def test_most_windows_without_a_target_show_a_decoy_as_large_as_one() -> None:
     sampler = WindowSampler(seed=4, size_px=64, acquire_share=0.0, empty_share=1.0)
     batch = sampler.batch(0, 200)

@@ -19,6 +19,7 @@ def test_shipped_configurations_are_valid_and_say_which_they_are() -> None:
     paper = load_config(CONFIGS / "paper.toml")
     assert paper.model.backbone == "repvit_m0_9"
     assert (paper.loss.heatmap, paper.loss.size, paper.loss.translation, paper.loss.rotation) == (50, 4, 4, 25)
+    assert paper.data.airframe_ids == load_config(CONFIGS / "edge.toml").data.airframe_ids
     assert (paper.loss.depth, paper.loss.planar, paper.loss.rotation_6d, paper.model.origin_range) == (20, 50, 5, 1.25)
 
 
@@ -31,6 +32,8 @@ def test_shipped_configurations_are_valid_and_say_which_they_are() -> None:
         ("size_px = 96", "size_px = 100", "schedule.sizes.1.size_px"),
         ("pretrained = false", "pretrained = true", "repvit_small"),
         ("[contract]", "[contract", "not valid TOML"),
+        ('acquire_fit = "letterbox"', 'acquire_fit = "squash"', 'data.acquire_view = "frame"'),
+        ("batch_size = 4", 'batch_size = 4\nacquire_view = "frame"', 'contract.acquire_fit = "squash"'),
     ],
 )
 def test_a_mistake_is_named_with_its_file_and_key(old: str, new: str, named: str) -> None:

@@ -11,7 +11,10 @@ import synthetic_sampler
 import tiny
 import torch
 
+from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
+from sim_replay.datasets import open_dataset
+from sim_replay.sample import AcquireView
 from trainer.config import ConfigError, parse_config
 from trainer.data import to_tensors, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
@@ -95,9 +98,11 @@ def test_of_a_second_aircraft_in_the_window_nothing_is_asked(pairs: Path) -> Non
     assert logits.grad.abs().numpy()[unjudged].max() < 1e-9 < logits.grad.abs().numpy()[target == 0.0].min()
 
 
-@pytest.mark.parametrize("acquire_share", [0.0, 1.0])
-def test_the_target_is_seen_where_its_pose_and_K_project_it(dataset: Path, acquire_share: float) -> None:
-    batch = DatasetSampler(dataset, "train", 5, 96, acquire_share).batch(0, 48)
+@pytest.mark.parametrize(("acquire_share", "view"), [(0.0, "crop"), (1.0, "crop"), (1.0, "frame")])
+def test_the_target_is_seen_where_its_pose_and_K_project_it(
+    dataset: Path, acquire_share: float, view: AcquireView
+) -> None:
+    batch = DatasetSampler(dataset, "train", 5, 96, acquire_share, view).batch(0, 48)
     assert 0 < batch.present.sum() < 48
     for k in np.flatnonzero(batch.present):
         projected = batch.K[k] @ batch.t_cam_target_m[k]
@@ -108,7 +113,18 @@ def test_the_target_is_seen_where_its_pose_and_K_project_it(dataset: Path, acqui
             np.testing.assert_allclose(projected, [x.mean(), y.mean()], atol=0.6)
             np.testing.assert_allclose(batch.center_px[k], projected, atol=1.5)
         assert np.isnan(batch.noc[k]).all()
-        assert batch.coverage[k].max() > 0.9
+        assert batch.coverage[k].max() > (0.2 if view == "frame" else 0.9)  # a squashed disc is smaller than a cell
+
+
+def test_a_squashed_frame_is_what_the_daemon_squashes(dataset: Path) -> None:
+    batch = DatasetSampler(dataset, "train", 5, 96, 1.0, "frame").batch(0, 8)
+    np.testing.assert_allclose(batch.K[:, 0, 0], K[0, 0] * 96 / WIDTH)
+    np.testing.assert_allclose(batch.K[:, 1, 1], K[1, 1] * 96 / HEIGHT)
+    pictures = [fit_frame(f.image_bgr(), (96, 96), "squash") for f in open_dataset(dataset, "train").labelled_frames()]
+    for image, K_window in zip(batch.image_bgr, batch.K, strict=True):
+        nearest = min(pictures, key=lambda p: float(np.abs(p[0].astype(float) - image).mean()))
+        assert np.abs(nearest[0].astype(float) - image).mean() < 1.0
+        np.testing.assert_allclose(nearest[1].intrinsics(K), K_window, rtol=1e-6)
 
 
 def test_a_window_depends_on_its_index_alone(dataset: Path) -> None:
