@@ -66,9 +66,11 @@ def method_of(model: Model) -> dict[str, Any]:
     """How a score names the model that was judged."""
     contract = model.contract
     return {
+        "name": contract.name,
         "file": model.path.name,
         "sha256": model.sha256,
         "precision": contract.precision,
         "acquire_score_min": contract.acquire_score_min,
         "track_score_min": contract.track_score_min,
+        "training_samples": contract.training.get("samples"),
     }

@@ -88,13 +88,48 @@ def measure(
     return scores
 
 
+def read_beside(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Scores that `evaluate` wrote of other models or methods. Raises ConfigError where a file is none."""
+    beside = []
+    for path in paths:
+        try:
+            score = json.loads(path.read_text(encoding="utf-8"))
+            _pictures(score), _called(score["method"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise ConfigError(f"{path}: is no metrics.json of evaluate: {error}") from error
+        beside.append(score)
+    return beside
+
+
+def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], scores: Sequence[Mapping[str, Any]]) -> None:
+    """Raises ConfigError where one beside does not tell of the same pictures as any of the scores."""
+    known = {_pictures(score) for score in scores}
+    for score in beside:
+        if _pictures(score) not in known:
+            raise ConfigError(f"{_called(score['method'])}: was measured on other pictures: {_pictures(score)}")
+
+
+def _pictures(score: Mapping[str, Any]) -> tuple[str, str, str | None, int, int]:
+    overall = score["overall"]
+    return score["dataset"], score["mode"], score["split"], overall["frames"], overall["targets"]
+
+
+def _called(method: Mapping[str, Any]) -> str:
+    """A model of one's own is told by its name and how long it learnt, another method by its file."""
+    if method.get("name") is None:
+        return str(method["file"])
+    return f"{method['name']}, {method['precision']}, after {method['training_samples']:,} windows"
+
+
 def _manifest(dataset: Path) -> dict[str, Any]:
     path = dataset / "dataset.toml"
     return read_toml(path, ConfigError) if path.is_file() else {}
 
 
-def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str:
-    """Markdown: overall beside the paper, then each dataset by distance and by airframe."""
+def page(
+    scores: Sequence[Mapping[str, Any]], command: str, trained: str, beside: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """Markdown: overall beside the paper and what else was measured, then each dataset by distance and by airframe."""
     models = {score["method"]["file"]: score["method"] for score in scores}
     lines = ["# Results", "", f"Made by `{command}`. Missed targets count as failures in every rate; means are over "]
     lines[-1] += (
@@ -103,10 +138,16 @@ def page(scores: Sequence[Mapping[str, Any]], command: str, trained: str) -> str
         "1,000 frames without a target, or with one of which nothing can be seen."
     )
     lines += ["", *(f"- `{name}`: {m['precision']}, sha256 `{m['sha256'][:16]}`" for name, m in models.items())]
+    for score in beside:
+        sha256 = score["method"].get("sha256", "")
+        lines.append(f"- {_called(score['method'])}" + (f": sha256 `{sha256[:16]}`" if sha256 else ""))
     lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]
     lines += ["", "## Overall", "", *_header("dataset", "model", "frames")]
-    for score in scores:
-        first = [f"{score['dataset']}{', track' if score['mode'] == 'track' else ''}", score["method"]["precision"]]
+    rows = [(score, score["method"]["precision"]) for score in scores]
+    rows += [(score, _called(score["method"])) for score in beside]
+    names = [score["dataset"] for score in scores]
+    for score, called in sorted(rows, key=lambda row: names.index(row[0]["dataset"])):
+        first = [f"{score['dataset']}{', track' if score['mode'] == 'track' else ''}", called]
         lines.append(_row([*first, str(score["overall"]["frames"])], score["overall"]))
     lines.append(_row(["FW-UAV6DPose (the paper's own data)", "the paper, FP32", "4,500"], PAPER))
     for score in scores:
@@ -210,6 +251,14 @@ def register(commands: argparse._SubParsersAction) -> None:
     )
     results.add_argument("--benchmark", type=Path, required=True, metavar="DIR", help="folder of generated datasets")
     results.add_argument("--model", type=Path, action="append", default=[], help="an ONNX file to stand beside it")
+    results.add_argument(
+        "--beside",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="metrics.json that evaluate wrote of another model or method on one of the datasets: one more row",
+    )
     results.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
     results.add_argument(
         "--runs",
@@ -228,11 +277,13 @@ def run(arguments: argparse.Namespace) -> None:
         lines = "".join(json.dumps(line) + "\n" for line in history)
         HISTORY.write_text(lines, encoding="utf-8")
     history = read_history(HISTORY)
-    datasets = datasets_in(arguments.benchmark)
+    datasets, beside = datasets_in(arguments.benchmark), read_beside(arguments.beside)
     scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
+    refuse_other_pictures(beside, scores)
     arguments.out.mkdir(parents=True, exist_ok=True)
     extra = "".join(f" --model {path}" for path in arguments.model)
+    extra += "".join(f" --beside {path}" for path in arguments.beside)
     command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"
-    (arguments.out / "results.md").write_text(page(scores, command, told(history)), encoding="utf-8")
-    (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
+    (arguments.out / "results.md").write_text(page(scores, command, told(history), beside), encoding="utf-8")
+    (arguments.out / "results.json").write_text(json.dumps([*scores, *beside], indent=1) + "\n", encoding="utf-8")
     draw_history(history, arguments.out / "learning.png")

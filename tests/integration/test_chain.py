@@ -146,7 +146,7 @@ def test_the_score_is_complete(demo: DemoRun) -> None:
     assert set(score["by_airframe"]) == {"twin_boom_inverted_v"}
     assert 0 < score["latency_ms"]["p50"] <= score["latency_ms"]["p95"] <= score["latency_ms"]["p99"]
     assert score["dropped_frames"] >= 0
-    assert set(score["model"]) == {"file", "sha256", "precision", "acquire_score_min", "track_score_min"}
+    assert set(score["model"]) >= {"name", "file", "sha256", "precision", "acquire_score_min", "track_score_min"}
 
 
 def test_the_autopilot_heard_the_daemon_as_a_component_of_its_vehicle(demo: DemoRun) -> None:

@@ -8,9 +8,22 @@ from pathlib import Path
 
 import pytest
 
+from edge.config import SHIPPED_MODEL
 from sim_replay.cli import main as replay
 from trainer.config import ConfigError
-from trainer.results import HISTORY, PAPER, datasets_in, draw_history, gathered, measure, page, read_history, told
+from trainer.results import (
+    HISTORY,
+    PAPER,
+    datasets_in,
+    draw_history,
+    gathered,
+    measure,
+    page,
+    read_beside,
+    read_history,
+    refuse_other_pictures,
+    told,
+)
 
 ROOT = Path(__file__).parents[2]
 CROSSING = ROOT / "sim_replay" / "data" / "crossing"
@@ -52,7 +65,6 @@ def test_a_run_is_added_to_the_history_and_one_that_went_on_takes_its_place_and_
 
 
 def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
-    from edge.config import SHIPPED_MODEL
     from edge.estimator.model import load_model
 
     training = load_model(SHIPPED_MODEL, 1).contract.training
@@ -60,7 +72,6 @@ def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
 
 
 def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
-    from edge.config import SHIPPED_MODEL
 
     sha256 = hashlib.sha256(SHIPPED_MODEL.read_bytes()).hexdigest()
     windows = f"{read_history(HISTORY)[-1]['total_samples']:,} "
@@ -82,6 +93,49 @@ def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
     paper = next(line for line in text.splitlines() if "the paper, FP32" in line)
     assert f"{100 * PAPER['pose_10deg_5pct']:.1f}" in paper
     assert "the command" in text
+
+
+def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_path: Path) -> None:
+    scores = measure([None], [CROSSING], lambda _: None)
+    other = {**scores[0], "method": {"file": "other_crossing-all.csv", "precision": None}}
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(other))
+    beside = read_beside([path])
+    refuse_other_pictures(beside, scores)
+    rows = [line for line in page(scores, "the command", "", beside).splitlines() if line.startswith("| ")]
+    first = [row.split(" | ")[:2] for row in rows[1:5]]
+    assert [row[0] for row in first] == [
+        "| crossing",
+        "| crossing, track",
+        "| crossing",
+        "| FW-UAV6DPose (the paper's own data)",
+    ]
+    assert first[2][1] == "other_crossing-all.csv"
+
+    fewer = {**other, "overall": {**other["overall"], "frames": 3}}
+    with pytest.raises(ConfigError, match="other pictures"):
+        refuse_other_pictures([fewer], scores)
+    for text in ("no json", "{}", "[]"):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=str(path)):
+            read_beside([path])
+
+
+def test_a_model_beside_is_told_by_its_name_and_how_long_it_learnt() -> None:
+    from sim_replay.offline import load_model, method_of
+
+    method = method_of(load_model(SHIPPED_MODEL, 1))
+    samples = read_history(HISTORY)[-1]["samples"]
+    score = {
+        "dataset": "d",
+        "mode": "frames",
+        "overall": {"frames": 1},
+        "by_range": {},
+        "by_airframe": {},
+        "recipe": "",
+    }
+    text = page([{**score, "method": method}], "the command", "", [{**score, "method": method}])
+    assert f"| d | mf-uavpose6d-edge, int8, after {samples:,} windows | 1 |" in text
 
 
 def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None:
