@@ -114,7 +114,7 @@ class EstimatorSettings(Section):
 class MavlinkSettings(Section):
     enabled: bool = Field(default=True, description="speak MAVLink to the autopilot")
     endpoints: list[Endpoint] = Field(
-        default_factory=lambda: ["udpin:127.0.0.1:14550"],
+        default=["udpin:127.0.0.1:14550"],
         min_length=1,
         description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD; spoken on at once",
     )

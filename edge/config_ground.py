@@ -31,9 +31,7 @@ class ZenohTlsSettings(Section):
 
 class ZenohSettings(Section):
     enabled: bool = Field(default=True, description="publish over zenoh")
-    listen: list[str] = Field(
-        default_factory=lambda: ["tcp/127.0.0.1:7448"], description="endpoints for tools on board"
-    )
+    listen: list[str] = Field(default=["tcp/127.0.0.1:7448"], description="endpoints for tools on board")
     connect: list[str] = Field(
         default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447?mixed_rel=1; retried for ever"
     )
@@ -50,7 +48,7 @@ class ZenohSettings(Section):
         le=10,
         description="upper bound for live pictures, sent while somebody looks, never on tls/ and quic/ links; 0: none",
     )
-    commands: bool = Field(default=True, description="obey commands: track, stop, record, rate")
+    commands: bool = Field(default=True, description="obey commands: track, stop, select, record, rate, reload")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
         default="jazzy", description="whose keys and type hashes"

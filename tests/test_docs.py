@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from edge import cli, stages, threads
+from edge import cli, config_reference, stages, threads
 from edge.config import load_config
 from msgs import topics
 
@@ -35,6 +35,15 @@ def test_the_tables_of_the_architecture_are_the_code_s(name: str, table: str) ->
     between = re.search(rf"<!-- {name}: .*?-->\n(.*?)<!-- {name}: end -->", ARCHITECTURE, re.DOTALL)
     assert between is not None
     assert between[1] == table
+
+
+def test_the_configuration_s_page_is_the_code_s() -> None:
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    assert page == config_reference.reference()
+    for example in EXAMPLES:
+        text = example.read_text()
+        for key in re.findall(r"^(\w+) *=", text, re.MULTILINE):
+            assert key == "type" or f"| `{key}` |" in page, (example, key)
 
 
 def test_every_thread_of_the_daemon_is_in_the_table() -> None:

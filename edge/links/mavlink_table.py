@@ -90,10 +90,14 @@ READ_IDS = frozenset(read.message_id for read in READ)
 def tables() -> str:
     """Both tables as Markdown."""
     lines = ["| sent | id | by | default | rate | says |", "|---|---|---|---|---|---|"]
-    lines += [f"| {s.name} | {s.message_id} | {s.sender} | {s.default} | {s.rate} | {s.says} |" for s in SENT]
+    lines += [f"| {s.name} | {s.message_id} | {s.sender} | {s.default} | {_rate(s)} | {s.says} |" for s in SENT]
     lines += ["", "| read | id | rate | used for |", "|---|---|---|---|"]
     lines += [f"| {r.name} | {r.message_id} | {r.rate} | {r.used_for} |" for r in READ]
     return "\n".join(lines)
+
+
+def _rate(sent: Sent) -> str:
+    return sent.rate if sent.limits_hz is None else "{}, bounds {:g} to {:g} Hz".format(sent.rate, *sent.limits_hz)
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def vehicle_keys(vehicle: str, domain: int) -> list[str]:
 
 
 def _readable_keys(domain: int) -> list[str]:
-    ours = [f"uavpose/@v1/*/{name}" for name in ("alive", "info", "config")]
+    ours = [f"uavpose/@v1/*/{name}" for name in ("alive", "info", "config", "model")]
     return [f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**", *ours]
 
 

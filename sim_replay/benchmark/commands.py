@@ -58,7 +58,7 @@ def _extra_packages() -> Iterator[None]:
         if error.name not in RENDER_PACKAGES:
             raise
         raise InputError(
-            f"the package {error.name} is missing; install the render extra: pip install 'mf-uavpose6d-edge[render]'"
+            f"the package {error.name} is missing; install the render extra: pip install '.[render]'"
         ) from error
 
 

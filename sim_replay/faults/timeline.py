@@ -150,7 +150,7 @@ class ExpectState(Section):
     """The daemon's state and its reasons, as its diagnostics tell them to a subscriber."""
 
     do: Literal["expect_state"]
-    pattern: str = Field(description="regular expression, e.g. 'fault: no frame'")
+    pattern: str = Field(description="regular expression, of the state as diagnostics have it, e.g. 'fault; no frame'")
     within_s: Seconds = WITHIN_S
 
 

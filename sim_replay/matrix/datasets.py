@@ -15,8 +15,8 @@ FIXED = "fixed"
 def flyable(dataset: Path, count: int) -> list[Path]:
     """Folders of the first `count` test sequences that can be flown.
 
-    Those whose camera is fixed to the own ship come first: a gimbal's motion is told in no telemetry, so poses in ned
-    are off there. Raises InputError if there are too few.
+    Those whose camera is fixed to the own ship come first: nothing but the daemon then decides how a cell ends.
+    Raises InputError if there are too few.
     """
     scenes = [scene for scene in find_scenes(dataset) if scene.split is None or scene.split.startswith(SPLIT)]
     folders = [

@@ -68,6 +68,20 @@ def test_a_late_reader_gets_the_history_of_events(ground: Ground) -> None:
         until(lambda: [r for r in reader.liveliness().get("uavpose/@v1/*/alive") if r.ok] != [])
 
 
+@pytest.mark.parametrize("name", ["info", "config", "model"])
+def test_whoever_may_read_is_told_what_a_daemon_tells_of_itself(ground: Ground, name: str) -> None:
+    key = f"uavpose/@v1/uav1/{name}"
+    handler = zenoh.handlers.Callback(lambda query: query.reply(query.key_expr, b"{}"), indirect=False)
+    with ExitStack() as stack:
+        uav1 = vehicle(stack, ground, "uav1")
+        stack.enter_context(uav1.declare_queryable(key, handler))
+        for reader in (
+            stack.enter_context(client.connect(ground.secure, tls=ground.keys["screen"])),
+            stack.enter_context(client.connect(ground.loopback)),
+        ):
+            until(lambda reader=reader: any(reply.ok for reply in reader.get(key, timeout=1.0)))
+
+
 def test_readers_cannot_publish_nor_command_and_operators_can_command(ground: Ground) -> None:
     commands: list[str] = []
 
