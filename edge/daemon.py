@@ -164,6 +164,8 @@ class Pipeline:
             self._by_hand.take(request, capture_ns)
             if isinstance(request, StopTracking):
                 self._tracker.drop_all()
+        if self._requests.too_late():
+            self._outlets.event(logging.WARNING, "what was pointed at is too long ago: no frame came since")
 
     def _estimate(
         self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock

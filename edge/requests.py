@@ -6,7 +6,10 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from edge import clock
+
 WAITING_MAX = 8
+POINTED_AGE_MAX_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -47,22 +50,35 @@ AskReload = Callable[[Callable[[ReloadOutcome], None]], bool]
 
 
 class RequestQueue:
-    """Bounded, and safe to use from several threads; neither side ever waits for the other."""
+    """Bounded, and safe to use from several threads; neither side ever waits for the other.
+
+    What was pointed at longer than POINTED_AGE_MAX_NS ago is dropped: the picture is another one by then.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: list[Request] = []
+        self._waiting: list[tuple[Request, int]] = []
+        self._too_late = 0
 
     def put(self, request: Request) -> bool:
         """Leave a request; False, and it is not taken, if too many wait."""
         with self._lock:
             if len(self._waiting) >= WAITING_MAX:
                 return False
-            self._waiting.append(request)
+            self._waiting.append((request, clock.monotonic_ns()))
             return True
 
     def take(self) -> list[Request]:
-        """All that wait, oldest first."""
+        """All that wait and are not too late, oldest first."""
         with self._lock:
-            taken, self._waiting = self._waiting, []
+            waiting, self._waiting = self._waiting, []
+            oldest_ns = clock.monotonic_ns() - POINTED_AGE_MAX_NS
+            taken = [one for one, put_ns in waiting if isinstance(one, StopTracking) or put_ns >= oldest_ns]
+            self._too_late += len(waiting) - len(taken)
             return taken
+
+    def too_late(self) -> int:
+        """How many were dropped since the last call."""
+        with self._lock:
+            count, self._too_late = self._too_late, 0
+            return count

@@ -96,6 +96,7 @@ class Track:
     state: TrackState
     time_ns: int  # monotonic time the state is valid for
     measured_ns: int  # monotonic time of the last measurement in it: its age is what a receiver judges
+    born_ns: int  # monotonic time of the first: a number is used again
     score: float
     box_xyxy_px: Array  # [4], where the target is, or should be, on the frame
     R_cam_target: Array  # [3, 3]

@@ -37,7 +37,9 @@ class Schedule:
         if hz == 0.0:
             return False
         interval_ns = round(1e9 / hz)
-        due_ns = self._due_ns.get((message_id, instance), now_ns)
+        # A rate that was raised since holds from now on.
+        due_ns = min(self._due_ns.get((message_id, instance), now_ns), now_ns + interval_ns)
+        self._due_ns[message_id, instance] = due_ns
         if now_ns < due_ns - EARLY_SHARE * interval_ns:
             return False
         self._due_ns[message_id, instance] = max(due_ns, now_ns - interval_ns) + interval_ns

@@ -18,6 +18,7 @@ from msgs.mavlink import dialect
 
 CALLSIGN = "UAVPOSE"  # and the target's number: 8 characters at most
 POSITION_KNOWN, VELOCITY_KNOWN, ATTITUDE_KNOWN = 1, 2, 8  # est_capabilities, by the bit numbers of its definition
+VELOCITY_STD_MAX_MPS = 10.0  # 1-sigma, along the worst axis: neither message can tell how sure a velocity is
 SPEED_MAX_CMPS = 32_767
 NS_PER_MS = 1_000_000
 
@@ -91,7 +92,10 @@ def _place(own_ship: OwnShip | None, track: Track) -> tuple[float, float, float]
 
 
 def _velocity_mps(own_ship: OwnShip | None, track: Track) -> list[float] | None:
-    """Over ground; without own position the track's is relative to the own ship, and of no use here."""
+    """Over ground, once it is known. Without own position the track's is relative to the own ship, and of no use."""
     if own_ship is None or own_ship.t_ned_body_m is None or track.v_ned_target_mps is None:
+        return None
+    P = track.covariance_ned
+    if P is None or np.linalg.eigvalsh(P[3:6, 3:6])[-1] > VELOCITY_STD_MAX_MPS**2:
         return None
     return [float(v) for v in track.v_ned_target_mps]

@@ -9,6 +9,7 @@ import numpy as np
 from edge.types import Array
 
 RANGE_MIN_M = 1.0  # nearer, a projection is meaningless
+SAME_BOX_IOU = 0.3  # above it two boxes are of one target
 
 
 @dataclass(frozen=True)

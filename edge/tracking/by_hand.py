@@ -11,15 +11,17 @@ from collections.abc import Iterable
 import numpy as np
 
 from edge.requests import Request, SelectTarget, TrackBox
+from edge.tracking.boxes import SAME_BOX_IOU, iou
 from edge.types import Array, Estimate, Track
 
 LOOK_NS = 1_000_000_000
 REST_NS = 10_000_000_000
+NOTHING_THERE = "no target found where pointed"
 
 
 class ByHand:
     def __init__(self) -> None:
-        self.chosen_id: int | None = None
+        self._chosen: tuple[int, int] | None = None  # track_id and born_ns
         self._box_share: Array | None = None
         self._wanted_id: int | None = None  # of a target that was chosen by its name
         self._look_until_ns = 0
@@ -27,9 +29,13 @@ class ByHand:
         self._found: Array | None = None  # [4] box_xyxy_px of the estimate that is to become the chosen track
         self._news: list[str] = []
 
+    @property
+    def chosen_id(self) -> int | None:
+        return None if self._chosen is None else self._chosen[0]
+
     def take(self, request: Request, now_ns: int) -> None:
         """Take a request that came before the frame of `now_ns`."""
-        self.chosen_id = self._wanted_id = None
+        self._chosen = self._wanted_id = None
         if isinstance(request, SelectTarget):
             self._box_share, self._wanted_id, self._rest_until_ns = None, request.track_id, now_ns
         elif isinstance(request, TrackBox):
@@ -42,7 +48,7 @@ class ByHand:
         """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
         if self._box_share is not None and now_ns > self._look_until_ns:
             self._box_share = None
-            self._news.append("no target found where pointed")
+            self._news.append(NOTHING_THERE)
         if self._box_share is None:
             return None
         box = self._box_share * np.tile(image_size_wh, 2) - 0.5
@@ -68,13 +74,11 @@ class ByHand:
         if self._wanted_id is not None:
             self._choose_by_id(tracks, self._wanted_id)
             self._wanted_id = None
-        if self._found is not None and tracks:
-            center = 0.5 * (self._found[:2] + self._found[2:])
-            nearest = min(tracks, key=lambda t: float(np.linalg.norm(_center(t.box_xyxy_px) - center)))
-            self._choose(nearest)
-        self._found = None
-        if all(track.track_id != self.chosen_id for track in tracks):
-            self.chosen_id = None
+        if self._found is not None:
+            self._choose_where(tracks, self._found)
+            self._found = None
+        if self._chosen not in [(track.track_id, track.born_ns) for track in tracks]:
+            self._chosen = None
 
     def news(self) -> list[str]:
         """What the person should hear of it since the last call."""
@@ -88,8 +92,17 @@ class ByHand:
         self._news.append(f"target {track_id} is gone: not chosen")
         return None
 
+    def _choose_where(self, tracks: Iterable[Track], found_xyxy_px: Array) -> None:
+        """The track that took the estimate in; another one near it is not what was pointed at."""
+        seen = [track for track in tracks if track.measured_ns == track.time_ns]
+        best = max(seen, key=lambda track: iou(track.box_xyxy_px, found_xyxy_px), default=None)
+        if best is not None and iou(best.box_xyxy_px, found_xyxy_px) > SAME_BOX_IOU:
+            self._choose(best)
+        else:
+            self._news.append(NOTHING_THERE)
+
     def _choose(self, track: Track) -> None:
-        self.chosen_id = track.track_id
+        self._chosen = track.track_id, track.born_ns
         self._news.append(f"target {track.track_id} chosen")
 
 

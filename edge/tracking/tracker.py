@@ -14,7 +14,7 @@ import numpy as np
 from edge.tracking import motion as ekf
 from edge.tracking import rotation
 from edge.tracking.association import associate
-from edge.tracking.boxes import RANGE_MIN_M, BoxModel, inside, iou
+from edge.tracking.boxes import RANGE_MIN_M, SAME_BOX_IOU, BoxModel, inside, iou
 from edge.tracking.heading import Flight
 from edge.tracking.motion import Innovation, Motion
 from edge.tracking.rotation import Attitude
@@ -25,7 +25,6 @@ CONFIRM_HITS = 3
 TENTATIVE_MISSES = 2  # in a row: gone
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
-SAME_BOX_IOU = 0.3
 
 Size = tuple[int, int]
 
@@ -40,6 +39,7 @@ class Target:
     box: BoxModel
     score: float
     measured_ns: int
+    born_ns: int
     state: TrackState = TrackState.TENTATIVE
     hits: int = 1
     misses: int = 0
@@ -66,7 +66,7 @@ class Tracker:
         """
         view = View.of(capture_ns, own_ship, self.mount, self._view)
         expected = []
-        for target in sorted(self._targets, key=lambda t: t.measured_ns):
+        for target in sorted(self._within_reach(capture_ns), key=lambda t: t.measured_ns):
             track = _track(target, *self._advanced(target, view), view, K)
             if track.t_cam_target_m[2] > RANGE_MIN_M and inside(track.box_xyxy_px, image_size_wh):
                 expected.append(track)
@@ -102,6 +102,8 @@ class Tracker:
             self.out_of_order += 1
             return self._tracks
         view = View.of(capture_ns, own_ship, self.mount, self._view)
+        # Before anything is paired: after a gap a prediction is so wide that whatever is seen would fit it.
+        self._targets = self._within_reach(capture_ns)
         for target in self._targets:
             target.motion, target.attitude = self._advanced(target, view)
         self._view = view
@@ -125,6 +127,10 @@ class Tracker:
         self._targets.sort(key=lambda t: t.track_id)
         self._tracks = tuple(_track(target, target.motion, target.attitude, view, K) for target in self._targets)
         return self._tracks
+
+    def _within_reach(self, time_ns: int) -> list[Target]:
+        """Targets that were seen lately enough to be told from others."""
+        return [t for t in self._targets if (time_ns - t.measured_ns) / NS_PER_S <= COAST_MAX_S]
 
     def _forget_motion(self) -> None:
         for target in self._targets:
@@ -158,7 +164,7 @@ class Tracker:
                 continue  # two windows saw one target
             motion, attitude = ekf.begin(estimate, K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, K)
-            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns))
+            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:
@@ -217,9 +223,9 @@ def _miss(target: Target) -> None:
 
 
 def _alive(target: Target, K: Array, view: View, image_size_wh: Size) -> bool:
-    if target.state is TrackState.TENTATIVE:
-        return target.misses < TENTATIVE_MISSES and inside(_box(target, view, K), image_size_wh)
-    return (view.time_ns - target.measured_ns) / NS_PER_S <= COAST_MAX_S
+    if target.state is not TrackState.TENTATIVE:
+        return True
+    return target.misses < TENTATIVE_MISSES and inside(_box(target, view, K), image_size_wh)
 
 
 def _box(target: Target, view: View, K: Array) -> Array:
@@ -239,6 +245,7 @@ def _track(target: Target, motion: Motion, attitude: Attitude, view: View, K: Ar
         state=target.state,
         time_ns=motion.time_ns,
         measured_ns=target.measured_ns,
+        born_ns=target.born_ns,
         score=target.score,
         box_xyxy_px=target.box.box_xyxy_px(t_cam, K),
         R_cam_target=R @ attitude.R_frame_target,

@@ -59,6 +59,7 @@ def report(sequence: int, targets: int, uav_number: int = 0) -> Report:
             state=TrackState.CONFIRMED,
             time_ns=now_ns,
             measured_ns=now_ns,
+            born_ns=now_ns,
             score=0.9,
             box_xyxy_px=np.array([950.0, 530.0, 970.0, 550.0]),
             R_cam_target=_R_NED_CAM.T,

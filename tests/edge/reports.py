@@ -37,6 +37,7 @@ def make_track(now_ns: int, **changed: Any) -> Track:
         state=TrackState.CONFIRMED,
         time_ns=now_ns,
         measured_ns=now_ns,
+        born_ns=now_ns,
         score=0.87,
         box_xyxy_px=BOX_XYXY_PX,
         R_cam_target=R_CAM_TARGET,

@@ -12,8 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge.requests import SelectTarget, StopTracking, TrackBox
-from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
+from edge import clock
+from edge.requests import POINTED_AGE_MAX_NS, RequestQueue, SelectTarget, StopTracking, TrackBox
+from edge.tracking.by_hand import LOOK_NS, NOTHING_THERE, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount
 from msgs.mavlink import dialect
@@ -150,3 +151,37 @@ def test_a_target_pointed_at_takes_the_place_of_the_one_not_seen_for_longest() -
     assert see(7, 0.0, 40.0) == [0, 40]
     tracker.drop_all()
     assert see(8) == []
+
+
+def test_the_choice_ends_with_its_target_though_another_has_its_number_at_once() -> None:
+    by_hand, first = ByHand(), track(0)
+    by_hand.take(SelectTarget(0), 0)
+    by_hand.settle([first])
+    assert by_hand.chosen_id == 0
+    by_hand.settle([track(1)])
+    assert by_hand.chosen_id is None
+
+
+def test_a_target_found_where_pointed_that_got_no_track_chooses_no_other() -> None:
+    by_hand, elsewhere = ByHand(), track(0, box_xyxy_px=np.array([700.0, 300.0, 760.0, 330.0]))
+    by_hand.take(TrackBox((0.0, 0.0, 0.1, 0.1)), 0)
+    by_hand.found(seen_at(0.0))
+    by_hand.settle([elsewhere])
+    assert (by_hand.chosen_id, by_hand.news()) == (None, [NOTHING_THERE])
+    by_hand.found(seen_at(0.0))
+    by_hand.settle([elsewhere, track(0, track_id=1, box_xyxy_px=seen_at(0.0).box_xyxy_px + 2.0)])
+    assert by_hand.chosen_id == 1
+
+
+def test_what_was_pointed_at_before_the_frames_stopped_is_not_looked_for_when_they_come_again() -> None:
+    requests = RequestQueue()
+    try:
+        clock.step_to(0)
+        for request in (TrackBox((0.0, 0.0, 0.1, 0.1)), SelectTarget(1), StopTracking()):
+            assert requests.put(request)
+        clock.step_to(POINTED_AGE_MAX_NS + 1)
+        assert requests.put(SelectTarget(2))
+        assert requests.take() == [StopTracking(), SelectTarget(2)]
+        assert [requests.too_late(), requests.too_late()] == [2, 0]
+    finally:
+        clock.run_freely()

@@ -168,7 +168,7 @@ def test_a_daemon_whose_camera_is_absent_starts_says_so_once_and_stops(tmp_path:
 
 def track_in(state: TrackState) -> Track:
     zero = np.zeros(3)
-    return Track(0, state, 0, 0, 1.0, np.zeros(4), np.eye(3), zero, np.eye(6), None, None, None, None)
+    return Track(0, state, 0, 0, 0, 1.0, np.zeros(4), np.eye(3), zero, np.eye(6), None, None, None, None)
 
 
 @pytest.mark.parametrize(

@@ -61,3 +61,12 @@ def test_what_is_allowed_is_so_many_at_once_and_one_a_period(
     assert went <= (now_ns - began_ns) / period_ns + 1
     now_ns += (at_once + 1) * period_ns
     assert [allowance.take(now_ns) for _ in range(at_once + 1)] == [True] * at_once + [False]
+
+
+def test_a_rate_that_is_raised_holds_from_now_on() -> None:
+    schedule = Schedule({MESSAGE: 10.0})
+    schedule.set_rate(MESSAGE, 0.1)
+    assert schedule.due(MESSAGE, 0, 0)
+    schedule.set_rate(MESSAGE, 50.0)
+    sent = [ms for ms in range(1, 101) if schedule.due(MESSAGE, 0, ms * 1_000_000)]
+    assert 4 <= len(sent) <= 6

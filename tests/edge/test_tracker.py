@@ -228,6 +228,25 @@ def test_states_follow_what_is_seen() -> None:
     assert COAST_MAX_S < (lost_at_ns - last_seen_ns) / 1e9 < COAST_MAX_S + 0.1
 
 
+@pytest.mark.parametrize("kind", ["ned", "cam"])
+@pytest.mark.parametrize("gap_s", [3.0, 10.0, 60.0])
+def test_after_a_gap_in_the_frames_what_is_seen_is_a_new_target(kind: str, gap_s: float) -> None:
+    tracker = Tracker(4, FORWARD)
+    for now in flight(9, frames=60):
+        update(tracker, now, kind)
+    gap_ns = round(gap_s * 1e9)
+    later = replace(
+        now,
+        time_ns=now.time_ns + gap_ns,
+        own_ship=replace(now.own_ship, time_ns=now.own_ship.time_ns + gap_ns),
+        estimate=replace(now.estimate, t_cam_target_m=now.t_cam_target_m + np.array([-60.0, -30.0, 120.0])),
+    )
+    assert predict(tracker, later, kind) == []
+    (track,) = update(tracker, later, kind)
+    assert track.state is TrackState.TENTATIVE
+    np.testing.assert_allclose(track.t_cam_target_m, later.estimate.t_cam_target_m, atol=1e-6)
+
+
 def test_uncertainty_grows_while_coasting() -> None:
     tracker = Tracker(4, FORWARD)
     sizes = [

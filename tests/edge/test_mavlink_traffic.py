@@ -1,0 +1,32 @@
+"""What targets are told as traffic claims no more than is known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge.links.mavlink_traffic import VELOCITY_KNOWN, VELOCITY_STD_MAX_MPS, adsb_vehicle, follow_target
+from msgs.mavlink import dialect
+
+from .reports import make_report, make_track
+
+MOVING = (
+    dialect.ADSB_FLAGS_VALID_HEADING
+    | dialect.ADSB_FLAGS_VALID_VELOCITY
+    | dialect.ADSB_FLAGS_VERTICAL_VELOCITY_VALID
+)  # fmt: skip
+NOW_NS = 5_000_000_000
+
+
+@pytest.mark.parametrize(("worst_mps", "told"), [(0.9 * VELOCITY_STD_MAX_MPS, True), (60.0, False)])
+def test_a_velocity_is_told_once_it_is_known(worst_mps: float, told: bool) -> None:
+    turned = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    covariance = np.diag([4.0, 9.0, 16.0, 1.0, 1.0, 1.0, 0.01, 0.02, 0.09])
+    covariance[3:6, 3:6] = turned @ np.diag([1.0, 4.0, worst_mps**2]) @ turned.T
+    track = make_track(NOW_NS, covariance_ned=covariance)
+    report = make_report(track, now_ns=NOW_NS)
+    follow, traffic = follow_target(report, track), adsb_vehicle(report, track, 0xF00000, NOW_NS)
+    assert bool(follow.est_capabilities & VELOCITY_KNOWN) is told
+    assert (traffic.flags & MOVING) == (MOVING if told else 0)
+    assert any(follow.vel) is told
+    assert (traffic.hor_velocity > 0) is told
