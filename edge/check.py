@@ -5,7 +5,6 @@ from __future__ import annotations
 from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
 from edge.reload import load_configured
-from edge.status_board import no_password
 
 
 def check(file: ConfigFile) -> list[str]:
@@ -16,7 +15,7 @@ def check(file: ConfigFile) -> list[str]:
         source, camera, opened = open_source(config.camera)
         source.close()
     contract = model.contract
-    name, (width, height) = no_password(camera.name), camera.image_size_wh
+    name, (width, height) = camera.name, camera.image_size_wh
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
     if contract.track_size_wh is not None:
         stages += f", track {contract.track_size_wh[0]}x{contract.track_size_wh[1]}"

@@ -80,13 +80,13 @@ def _run(options: argparse.Namespace) -> int:
     from edge.config import load_config
     from edge.daemon import run
     from edge.reload import Reloader
-    from edge.threads import still_closing
+    from edge.threads import left_behind
 
     stop, reloader = threading.Event(), Reloader()
     on_signals({signal.SIGHUP: reloader.ask, signal.SIGTERM: stop.set, signal.SIGINT: stop.set})
     code = run(load_config(options.config), stop, reloader)
-    if still_closing():
-        # It would come back from zenoh while the interpreter is taken down, and abort the process.
+    if left_behind():
+        # It would come back from its library while the interpreter is taken down, and abort the process.
         logging.shutdown()
         os._exit(code)
     return code

@@ -142,7 +142,7 @@ class MavlinkSettings(Section):
     target_relative_to_px4: bool = Field(
         default=False, description="send it to PX4 too: with VTE_EN=0 it is a landing target there"
     )
-    target_relative_rate_hz: float = Field(default=50.0, gt=0, le=50, description="upper bound of its rate")
+    target_relative_rate_hz: float = Field(default=50.0, ge=0.1, le=50, description="upper bound of its rate")
     tracking_rate_hz: float = Field(default=10.0, ge=5, le=20, description="rate of CAMERA_TRACKING_* messages")
     follow_target: bool = Field(default=False, description="send FOLLOW_TARGET from virtual_system_id")
     adsb_icao_address: int | None = Field(
@@ -159,10 +159,14 @@ class MavlinkSettings(Section):
         default=None, gt=0, le=100, description="of the part that makes the picture; CAMERA_INFORMATION's lens needs it"
     )
     gimbal_component_id: int | None = Field(
-        default=None, ge=1, le=255, description="whose gimbal attitude is the camera's; default: the first heard"
+        default=None,
+        ge=1,
+        le=255,
+        description="whose gimbal attitude is the camera's: a component, or 1 to 6 of a gimbal that the autopilot "
+        "speaks for; default: the first heard",
     )
-    attitude_rate_hz: float = Field(default=50.0, gt=0, le=400, description="asked of the autopilot")
-    position_rate_hz: float = Field(default=20.0, gt=0, le=100, description="asked of the autopilot")
+    attitude_rate_hz: float = Field(default=50.0, ge=1, le=400, description="asked of the autopilot")
+    position_rate_hz: float = Field(default=20.0, ge=0.1, le=100, description="asked of the autopilot")
     max_age_ms: float = Field(
         default=200.0, gt=0, allow_inf_nan=False, description="an older measurement is never sent"
     )

@@ -71,7 +71,7 @@ class Camera(Section):
 class SequenceCamera(Camera):
     type: Literal["sequence"]
     path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
-    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
+    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
     start_at_ns: int | None = Field(
         default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
     )
@@ -86,7 +86,7 @@ class SequenceCamera(Camera):
 class FolderCamera(Camera):
     type: Literal["folder"]
     path: ConfigPath = Field(description="folder of pictures, played in the order of their names")
-    fps: float = Field(default=30.0, gt=0, le=240, description="frames a second")
+    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
     start_at_ns: int | None = Field(
         default=None, description="monotonic ns of the first picture's exposure; default: when all is ready"
     )
@@ -102,10 +102,10 @@ class FileCamera(Camera):
 
 class DeviceCamera(Camera):
     type: Literal["device"]
-    device: str = Field(default="/dev/video0", description="V4L2 device")
+    device: str = Field(default="/dev/video0", min_length=1, description="V4L2 device")
     width: int = Field(default=1920, gt=0, description="pixels asked of the device")
     height: int = Field(default=1080, gt=0, description="pixels asked of the device")
-    fps: float = Field(default=30.0, gt=0, le=1000, description="rate asked of the device")
+    fps: float = Field(default=30.0, ge=0.01, le=1000, description="rate asked of the device")
     fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
     exposure_ms: float | None = Field(
         default=None, gt=0, le=1000, description="fixed exposure, where the driver has it; default: left as it is"

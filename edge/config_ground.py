@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from edge.config_path import ConfigPath
 from msgs.recording import RecordingLimits
@@ -13,6 +13,16 @@ from msgs.session import TlsFiles, check_endpoint
 from msgs.settings import Section
 
 _MB = 1_000_000
+SELDOM_HZ = 0.001
+
+
+def _seldom_or_never(hz: float) -> float:
+    if 0 < hz < SELDOM_HZ:
+        raise ValueError(f"is 0, for none, or at least {SELDOM_HZ:g}")
+    return hz
+
+
+RateOrNone = Annotated[float, AfterValidator(_seldom_or_never)]
 
 
 class ZenohTlsSettings(Section):
@@ -38,11 +48,11 @@ class ZenohSettings(Section):
     tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
     pose_rate_max_hz: float | None = Field(
         default=None,
-        gt=0,
+        ge=0.1,
         le=240,
         description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
     )
-    image_max_hz: float = Field(
+    image_max_hz: RateOrNone = Field(
         default=1.0,
         ge=0,
         le=10,
@@ -76,7 +86,7 @@ class RecorderSettings(Section):
 
     enabled: bool = Field(default=False, description="record from the start on")
     folder: ConfigPath = Field(default=Path("recordings"), validate_default=True, description="made if it is not there")
-    image_max_hz: float = Field(
+    image_max_hz: RateOrNone = Field(
         default=0.0, ge=0, le=240, description="pictures recorded a second, so that the recording can be flown again"
     )
     file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="then the next file begins")

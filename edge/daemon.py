@@ -24,7 +24,7 @@ from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
 from edge.search import Search
 from edge.stages import StageClock
-from edge.status_board import StatusBoard, no_password
+from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
 from edge.tracking.by_hand import ByHand
 from edge.tracking.own_ship import OwnShipBuffer
@@ -101,7 +101,7 @@ class Pipeline:
         """Warmed up: say so, and what is not as it was asked for."""
         model = self._estimator.model
         name = f"{model.contract.name} ({model.contract.precision}) on {model.provider}"
-        log.info("ready: %s, camera %s", name, no_password(self._board.camera.name))
+        log.info("ready: %s, camera %s", name, self._board.camera.name)
         if model.fallback_reason is not None:
             log.warning("model: %s", model.fallback_reason)
             self._outlets.event(logging.WARNING, f"model: {model.fallback_reason}")

@@ -22,7 +22,6 @@ from edge.estimator.model import Model
 from edge.findings import Finding, device_fault, good, poor, wrong
 from edge.health import percentiles_ms
 from edge.reload import load_configured
-from edge.status_board import no_password
 
 FRAME_S = 8.0
 TIMED_RUNS = 10
@@ -82,7 +81,7 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
     except InputError as error:
         yield wrong("camera", str(error), "mend what is named in [camera]"), None
         return
-    name = no_password(info.name)
+    name = info.name
     capture = Capture(source, opened)
     capture.start()
     try:

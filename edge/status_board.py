@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
-import re
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -18,6 +17,7 @@ import zenoh
 from zenoh import handlers
 
 from edge import clock
+from edge.addresses import no_password
 from edge.config import ConfigFile
 from edge.estimator.model import Model
 from edge.health import HealthSnapshot
@@ -25,7 +25,6 @@ from edge.types import CameraInfo
 from msgs.topics import check_uav_name
 
 DISTRIBUTION = "mf-uavpose6d-edge"
-_USER_INFO = re.compile(r"//[^/@\s]*@")
 
 
 class StatusBoard:
@@ -50,7 +49,7 @@ class StatusBoard:
             "vehicle": self.file.config.vehicle.name,
             "pid": os.getpid(),
             "uptime_s": round((now_ns - self._start_ns) / 1e9, 3),
-            "camera": f"{no_password(self.camera.name)} {width}x{height}",
+            "camera": f"{self.camera.name} {width}x{height}",
             **self.facts(),
         }
         if snapshot is not None:
@@ -109,8 +108,3 @@ def _answer(key: str, tell: Callable[[], dict[str, Any]]) -> Callable[[zenoh.Que
             query.reply(key, json.dumps(tell()), encoding=zenoh.Encoding.APPLICATION_JSON)
 
     return on_query
-
-
-def no_password(text: str) -> str:
-    """An address without the user and password that may stand in it."""
-    return _USER_INFO.sub("//***@", text)

@@ -36,6 +36,9 @@ THREADS = (
     ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
 )
 
+# These run libraries' code that must not come back while the interpreter is taken down.
+FOREIGN = frozenset({"capture", "search", "closing", "pictures", "lookup", "reload"})
+
 
 def yield_to_the_loop() -> None:
     """Lower the priority of the calling thread and of those that it will start."""
@@ -49,9 +52,9 @@ def running() -> frozenset[str]:
     return frozenset(row.name for row in THREADS if row.watched and row.name in alive)
 
 
-def still_closing() -> bool:
-    """Whether a session has not ended in the time that stopping gives it."""
-    return any(thread.name == "closing" for thread in threading.enumerate())
+def left_behind() -> bool:
+    """Whether a thread that must not outlive the interpreter has not ended in the time that stopping gives it."""
+    return any(thread.name in FOREIGN for thread in threading.enumerate())
 
 
 def table_markdown() -> str:

@@ -74,6 +74,8 @@ class OwnShip:
     R_body_gimbal: Array | None = None  # [3, 3]; None: the camera is fixed to the body
     clock_std_s: float = 0.0  # of the autopilot's stamps on our clock
     attitude_std_rad: float = 0.0  # about each axis, of an attitude that was gone on from by its rates
+    axes_epoch: int = 0  # another number, other ned axes: the autopilot has begun anew, or its filter has
+    origin_epoch: int = 0  # the same of ned's origin
 
     def camera(self, mount: Mount) -> Mount:
         """How the camera sits on the body now; on a gimbal, `mount` says how it sits on that."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 from edge.cameras.reconnect import LinkState, Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
 from edge.cameras.watch import FrameWatch
+from edge.errors import InputError
 from edge.health import Reason
 from edge.types import Frame
 
@@ -99,7 +100,7 @@ class Capture:
             try:
                 if not self._opened:
                     wait_until(self._link.retry_at_ns, self._stop)
-                    self._source.open()
+                    self._open_again()
                     self._opened = True
                 frame = self._source.read(self._stop)
             except SourceLost as error:
@@ -114,6 +115,15 @@ class Capture:
                 if self._lives(frame):
                     jumps = self._counts["time_jumps"]
                     self._offer(replace(frame, meta=replace(frame.meta, time_jumps=jumps)))
+
+    def _open_again(self) -> None:
+        """Raises SourceLost. A camera that fitted once may come back in another mode, and the next time in its own."""
+        try:
+            self._source.open()
+        except InputError as error:
+            if not self._counts["captured"]:
+                raise
+            raise SourceLost(str(error)) from error
 
     def _lose(self, error: SourceLost) -> None:
         if self._opened:

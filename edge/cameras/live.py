@@ -46,8 +46,12 @@ class LiveSource(ABC):
         if min(size_wh) <= 0:
             capture.release()
             raise SourceLost(f"{self._name} does not say the size of its picture")
+        try:
+            self._fitted = self._intrinsics.scaled_to(size_wh)
+        except InputError:
+            capture.release()
+            raise
         self._capture = capture
-        self._fitted = self._intrinsics.scaled_to(size_wh)
         fps = capture.get(cv2.CAP_PROP_FPS)
         return CameraInfo(self._name, size_wh, self._fitted.K, fps if fps > 0 else None)
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 import cv2
 
+from edge.addresses import no_password
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
 from edge.cameras.source import SourceLost
@@ -27,7 +28,7 @@ class StreamSource(LiveSource):
     """Stamped by the stream's own clock, as it advances between frames, laid on ours by the fastest arrivals."""
 
     def __init__(self, settings: StreamCamera) -> None:
-        super().__init__(settings.url, load_intrinsics(settings.intrinsics))
+        super().__init__(no_password(settings.url), load_intrinsics(settings.intrinsics))
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()

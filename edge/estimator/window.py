@@ -121,7 +121,7 @@ def window_around(
     """
     seen = whole_frame(image_size_wh, lens)
     box = np.asarray(box_xyxy_px, dtype=np.float64)
-    x0, y0, x1, y1 = box if lens is None else lens.box_to_pinhole(_clipped(box, image_size_wh))
+    x0, y0, x1, y1 = box if lens is None else _straight(lens, _clipped(box, image_size_wh))
     side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(seen.width, seen.height)))
     shorter = min(size_wh)
     width, height = (_halvable(max(round(side * size / shorter), 2), size) for size in size_wh)
@@ -197,6 +197,12 @@ def _span(coordinates: Array, margin_px: float, limit: int, step: int) -> tuple[
     last = int(np.clip(np.ceil(coordinates.max() + margin_px) + 1, first + 1, limit))
     length = -(-(last - first) // step) * step
     return (min(first, limit - length), min(first, limit - length) + length) if length <= limit else (first, last)
+
+
+def _straight(lens: Lens, box_xyxy_px: Array) -> Array:
+    """The box [4] on the pinhole's picture; as it is where the lens cannot be inverted, as in some lenses' corners."""
+    straight = lens.box_to_pinhole(box_xyxy_px)
+    return straight if np.isfinite(straight).all() else box_xyxy_px
 
 
 def _clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:

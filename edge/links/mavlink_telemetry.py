@@ -62,12 +62,12 @@ def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
 
 
 class Telemetry:
-    """`gimbal_component` None: the first that tells, until it falls silent."""
+    """`gimbal_id`: a component, or 1 to 6 of one that the autopilot speaks for; None: the first heard, until silent."""
 
-    def __init__(self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, gimbal_component: int | None) -> None:
+    def __init__(self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, gimbal_id: int | None) -> None:
         self._own_ship = own_ship
         self._timesync = timesync
-        self._gimbal_component = gimbal_component
+        self._gimbal_id = gimbal_id
         self.attitude_jumps = self.position_jumps = self.gimbal_jumps = 0
         self._forget()
         self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
@@ -83,7 +83,7 @@ class Telemetry:
         self._boot_clock = BootClock(self._timesync)
         self._forget_gimbal_clock()
         self._quaternion_ns: int | None = None
-        self._gimbal: tuple[int, int] | None = None  # component, heard ns
+        self._gimbal: tuple[int, int] | None = None  # its id, heard ns
 
     def take(self, message: Any, now_ns: int) -> str | None:
         """Take in a message that was found sound; why it was not, or None."""
@@ -123,13 +123,15 @@ class Telemetry:
         t_ned_m, v_ned_mps = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
         if self._jumps.position(time_ns, t_ned_m, v_ned_mps):
             self.position_jumps += 1
-            self._own_ship.clear()
+            self._own_ship.clear(same_axes=True)
             self._positions_from_ns = now_ns + JUMP_REST_NS
         return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
 
     def _take_gimbal(self, message: Any, now_ns: int) -> str | None:
+        # One that an autopilot speaks for has a number from 1 to 6, by which it is told from the others there.
         component = message.get_srcComponent()
-        if not self._heeds(component, now_ns):
+        gimbal_id = message.gimbal_device_id or component
+        if not self._heeds(gimbal_id, now_ns):
             return "other_gimbal"
         if message.failure_flags & GIMBAL_FAILURES:
             return "gimbal_failure"
@@ -138,9 +140,9 @@ class Telemetry:
             return "gimbal_frame"
         if component != AUTOPILOT_COMPONENT and self._gimbal_boot.rebooted(message.time_boot_ms):
             self._forget_gimbal_clock()
-        if self._gimbal is not None and self._gimbal[0] != component:
+        if self._gimbal is not None and self._gimbal[0] != gimbal_id:
             self._forget_gimbal_clock()
-        self._gimbal = (component, now_ns)
+        self._gimbal = (gimbal_id, now_ns)
         if component == AUTOPILOT_COMPONENT:
             time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
         else:
@@ -160,7 +162,7 @@ class Telemetry:
         # A gimbal that is a device of its own counts from its own start.
         self._gimbal_clock, self._gimbal_boot = BootClock(TimesyncEstimator()), RebootDetector()
 
-    def _heeds(self, component: int, now_ns: int) -> bool:
-        if self._gimbal_component is not None:
-            return component == self._gimbal_component
-        return self._gimbal is None or component == self._gimbal[0] or now_ns - self._gimbal[1] > FALLBACK_NS
+    def _heeds(self, gimbal_id: int, now_ns: int) -> bool:
+        if self._gimbal_id is not None:
+            return gimbal_id == self._gimbal_id
+        return self._gimbal is None or gimbal_id == self._gimbal[0] or now_ns - self._gimbal[1] > FALLBACK_NS

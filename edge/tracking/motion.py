@@ -158,7 +158,7 @@ def reframe(motion: Motion, old: View, new: View, attitude_age_s: float) -> Moti
 
     `attitude_age_s`: how long ago the attitude that links the frames was measured.
     """
-    through_cam = "cam" in (old.kind, new.kind)
+    through_cam = old.linked_by_cam(new)
     R_new_old = between(old, new)
     relative_m = R_new_old @ (motion.t_m - old.t_frame_cam_m)
     zero = np.zeros(3)
@@ -187,7 +187,7 @@ def reframe(motion: Motion, old: View, new: View, attitude_age_s: float) -> Moti
 
 def between(old: View, new: View) -> Array:
     """R_new_old [3, 3] between the frames of two views of one instant; ned's axes are those of ned_relative."""
-    if "cam" in (old.kind, new.kind):
+    if old.linked_by_cam(new):
         return new.R_frame_cam @ old.R_frame_cam.T
     return so3.IDENTITY
 

@@ -22,6 +22,7 @@ ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the
 ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
 USUAL_OF = 5  # so many samples tell how far they usually lie apart: one that is lost or late changes nothing
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
+GIMBAL_STEP_MIN_NS = 5_000_000  # nearer, what lies between two is rounding, and no rate to go on by
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
 GLOBAL_AGE_MAX_NS = 5_000_000_000
@@ -78,6 +79,7 @@ class OwnShipBuffer:
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
         self._positions: deque[_Position] = deque(maxlen=KEPT)
         self._global: _Global | None = None
+        self._axes_epoch = self._origin_epoch = 0
 
     def add_attitude(
         self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike, clock_std_s: float = 0.0
@@ -109,9 +111,14 @@ class OwnShipBuffer:
             self._global = _Global(time_ns, lat_lon_alt, np.array(v_ned_mps, dtype=np.float64))
             return True
 
-    def clear(self) -> None:
-        """Forget all: the autopilot has started again, and its local origin with it."""
+    def clear(self, *, same_axes: bool = False) -> None:
+        """Forget all: the autopilot, or its filter, has started again, and its local origin with it.
+
+        `same_axes`: what is attitude now was so before. Else north may have been another, or the gimbal's zero.
+        """
         with self._lock:
+            self._origin_epoch += 1
+            self._axes_epoch += not same_axes
             self._attitudes.clear()
             self._gimbals.clear()
             self._positions.clear()
@@ -135,7 +142,16 @@ class OwnShipBuffer:
             origin = self._origin(time_ns, t_ned_m is not None)
             clock_std_s, attitude_std_rad = self._attitudes[-1].clock_std_s, self._attitude_std_rad(time_ns)
             return OwnShip(
-                time_ns, R_ned_body, t_ned_m, v_ned_mps, origin, R_body_gimbal, clock_std_s, attitude_std_rad
+                time_ns,
+                R_ned_body,
+                t_ned_m,
+                v_ned_mps,
+                origin,
+                R_body_gimbal,
+                clock_std_s,
+                attitude_std_rad,
+                self._axes_epoch,
+                self._origin_epoch,
             )
 
     def _attitude_std_rad(self, time_ns: int) -> float:
@@ -221,7 +237,8 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
     if after == 0 or reach_ns is None or (after == len(samples) and time_ns - samples[-1].time_ns > reach_ns):
         return None
     a, b = samples[max(min(after, len(samples) - 1) - 1, 0)], samples[min(after, len(samples) - 1)]
-    if a.frame is not b.frame or not 0 < b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
+    least_ns = GIMBAL_STEP_MIN_NS if after == len(samples) else 1
+    if a.frame is not b.frame or not least_ns <= b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
         if after < len(samples) or time_ns - b.time_ns > ATTITUDE_AHEAD_NS[0]:
             return None
         a, share = b, 0.0  # the last sample stands alone

@@ -143,12 +143,12 @@ class Tracker:
         turn = ekf.turning(target.motion, view.time_ns)
         motion = ekf.propagate(target.motion, view.time_ns)
         attitude = rotation.propagate(target.attitude, turn, (view.time_ns - target.motion.time_ns) / NS_PER_S)
-        if motion.kind == view.kind:
+        if self._view.same_frame(view):
             return ekf.untangled(motion, view), attitude
         old = self._view.moved_to(view.time_ns)
+        through_cam = old.linked_by_cam(view)
         # Leaving ned, the attitude is the last one known; entering it, the new one belongs to this very frame.
-        stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if view.kind == "cam" else 0.0
-        through_cam = "cam" in (motion.kind, view.kind)
+        stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if through_cam and old.kind != "cam" else 0.0
         return (
             ekf.untangled(ekf.reframe(motion, old, view, stale_s), view),
             rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,

@@ -41,6 +41,8 @@ class View:
     turning_radps: float = 0.0  # how fast the camera turns
     clock_std_s: float = EXPOSURE_STD_S  # of exposure against attitude and position
     attitude_std_rad: float = 0.0  # of this frame's attitude, beyond what its clock and jitter make of it
+    axes_epoch: int = 0  # see OwnShip
+    origin_epoch: int = 0
 
     @classmethod
     def of(cls, time_ns: int, own_ship: OwnShip | None, mount: Mount, before: View | None = None) -> View:
@@ -50,15 +52,29 @@ class View:
         camera = own_ship.camera(mount)
         R_ned_cam = own_ship.R_ned_body @ camera.R_body_cam
         lever_ned_m = own_ship.R_ned_body @ camera.t_body_cam_m
+        epochs = own_ship.axes_epoch, own_ship.origin_epoch
+        if before is not None and before.axes_epoch != own_ship.axes_epoch:
+            before = None
         nose, turning = own_ship.R_ned_body[:, 0], _turning_radps(before, time_ns, R_ned_cam)
-        doubts = float(np.hypot(EXPOSURE_STD_S, own_ship.clock_std_s)), own_ship.attitude_std_rad
+        doubts = float(np.hypot(EXPOSURE_STD_S, own_ship.clock_std_s)), own_ship.attitude_std_rad, *epochs
         if own_ship.t_ned_body_m is None:
             return cls("ned_relative", time_ns, R_ned_cam, lever_ned_m, np.zeros(3), nose, turning, *doubts)
         t_m = own_ship.t_ned_body_m + lever_ned_m
         v_mps = own_ship.v_ned_body_mps
-        if v_mps is None and before is not None and before.kind == "ned":
+        if v_mps is None and before is not None and before.kind == "ned" and before.origin_epoch == epochs[1]:
             v_mps = _moved_mps(before, time_ns, t_m)
         return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning, *doubts)
+
+    def same_frame(self, other: View) -> bool:
+        """Whether coordinates of one are coordinates of the other."""
+        if self.kind != other.kind or self.kind == "cam":
+            return self.kind == other.kind
+        same_origin = self.kind == "ned_relative" or self.origin_epoch == other.origin_epoch
+        return same_origin and self.axes_epoch == other.axes_epoch
+
+    def linked_by_cam(self, other: View) -> bool:
+        """Whether only the camera's own axes are common to both."""
+        return "cam" in (self.kind, other.kind) or self.axes_epoch != other.axes_epoch
 
     @property
     def attitude_variance(self) -> float:

@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from edge.cameras.capture import Capture
 from edge.cameras.device import EXPOSURE_MANUAL, DeviceSource
 from edge.cameras.live import UNDECODABLE_MAX
 from edge.cameras.source import SourceLost
 from edge.config_camera import DeviceCamera
+from edge.errors import InputError
 
 from .pictures import INTRINSICS, SIZE_WH
 
@@ -115,6 +117,48 @@ def test_a_device_that_is_pulled_out_or_gives_nothing_but_torn_pictures_is_lost_
     driver.comes = iter([PICTURE])
     assert source.read(Event()).meta.sequence == UNDECODABLE_MAX + 2
     assert driver.opens == 3
+
+
+class Modes(Driver):
+    """Gives twenty pictures each time it is opened, and is of another shape the times that are told."""
+
+    def __init__(self, misfits: tuple[int, ...]) -> None:
+        super().__init__(set(), 1000.0)
+        self._misfits = misfits
+
+    def __call__(self, device: str, api: int) -> Driver:
+        super().__call__(device, api)
+        self.comes = iter([*(np.full_like(PICTURE, shade) for shade in range(20)), GONE])
+        return self
+
+    def get(self, prop: int) -> float:
+        lower = prop == cv2.CAP_PROP_FRAME_HEIGHT and self.opens in self._misfits
+        return super().get(prop) - 100 * lower
+
+
+def test_a_device_that_comes_back_in_another_mode_is_opened_until_it_is_in_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    modes, told = Modes((2, 3)), set()
+    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", modes)
+    capture = Capture(DeviceSource(settings()), False)
+    capture.start()
+    try:
+        while modes.opens < 4 or capture.newest(20.0) is None:
+            told |= {reason.text for reason in capture.reasons(0)}
+            capture.newest(0.05)
+    finally:
+        capture.stop()
+    assert any("these intrinsics are for" in text for text in told)
+
+
+def test_a_device_that_never_fitted_ends_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", Modes((1, 2)))
+    capture = Capture(DeviceSource(settings()), False)
+    capture.start()
+    with pytest.raises(InputError, match="these intrinsics are for"):
+        capture.newest(20.0)
+    capture.stop()
 
 
 def test_the_drivers_stamp_is_the_exposure_less_the_latency_and_without_one_the_arrival_is(driver: Driver) -> None:

@@ -11,8 +11,10 @@ from fractions import Fraction
 import av
 import cv2
 import numpy as np
+import pytest
 
 from edge.cameras.capture import Capture
+from edge.cameras.source import SourceLost
 from edge.cameras.stream import StreamSource
 from edge.config_camera import StreamCamera
 from edge.types import Frame
@@ -136,7 +138,7 @@ def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends(
     capture.start()
     try:
         assert capture.newest(0.3) is None
-        TcpCamera(fps=20, frames=frames, port=port, calls=3).start()
+        TcpCamera(fps=20, frames=frames, port=port, calls=10).start()
         last = capture.newest(20.0)
         assert last is not None
         while last.meta.sequence <= frames:  # it was opened again
@@ -147,3 +149,13 @@ def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends(
     finally:
         capture.stop()
     assert capture.counters()["reconnects"] >= 2
+
+
+def test_a_stream_is_named_without_its_password() -> None:
+    port = free_port()
+    settings = StreamCamera(type="stream", url=f"http://pilot:se@cret@127.0.0.1:{port}/x", intrinsics=INTRINSICS)
+    source = StreamSource(settings)
+    assert source.nominal().name == f"http://***@127.0.0.1:{port}/x"
+    with closing(source), pytest.raises(SourceLost) as lost:
+        source.open()
+    assert "cret" not in str(lost.value)

@@ -24,7 +24,8 @@ def write(tmp_path: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        (CAMERA + "fps = -3", "config.toml:4: [camera] fps: Input should be greater than 0"),
+        (CAMERA + "fps = -3", "config.toml:4: [camera] fps: Input should be greater than or equal to 0.01"),
+        (CAMERA + "[zenoh]\nimage_max_hz = 1e-300", "config.toml:5: [zenoh] image_max_hz: is 0, for none, or at least"),
         (CAMERA + "[zenoh]\nlisten_on = 3", "config.toml:5: [zenoh] listen_on: unknown key"),
         (CAMERA + "lockstep = 'uav:5'", "config.toml:4: [camera] lockstep: 'uav:5' is neither 127.0.0.1:PORT"),
         ("[vehicle]\nname = 'uav1'", "config.toml: [camera]: is missing"),

@@ -52,13 +52,12 @@ class Autopilot:
         if k_ms % 50 == 7:
             self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
 
-    def gimbal(self, k_ms: int, pan_rad: float) -> None:
+    def gimbal(self, k_ms: int, pan_rad: float, device_id: int = 0) -> None:
         """Level, in the earth's frame."""
         now_ns = BEGIN_NS + k_ms * MS
         q_wxyz = [np.cos(0.5 * pan_rad), 0.0, 0.0, np.sin(0.5 * pan_rad)]
-        self.tell(
-            dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, now_ns // MS, 64, q_wxyz, 0, 0, 0, 0), now_ns
-        )
+        status = dialect.MAVLink_gimbal_device_attitude_status_message
+        self.tell(status(0, 0, now_ns // MS, 64, q_wxyz, 0, 0, 0, 0, 0.0, 0.0, device_id), now_ns)
 
 
 def seen(rng: np.random.Generator) -> Estimate:
@@ -68,8 +67,9 @@ def seen(rng: np.random.Generator) -> Estimate:
     return Estimate(0.9, box, R_CAM_TARGET, t_m, np.diag([0.3, 0.3, 9.0, 0.01, 0.01, 0.01]), "track")
 
 
+@pytest.mark.parametrize("frameless_ms", [0, 450])
 @pytest.mark.parametrize(("jump_m", "jump_deg"), [(10.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (0.0, 8.0), (0.0, -90.0)])
-def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump_deg: float) -> None:
+def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump_deg: float, frameless_ms: int) -> None:
     autopilot, rng = Autopilot(), np.random.default_rng(0)
     tracker = Tracker(4, MountSettings().mount())
     own: OwnShip | None = None
@@ -77,7 +77,7 @@ def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump
         jumped = k_ms > 4000
         t_ned_m = V_NED_MPS * k_ms / 1000 + np.array([jump_m * jumped, 0.0, -300.0])
         autopilot.turn(k_ms, t_ned_m, V_NED_MPS, np.deg2rad(jump_deg) * jumped)
-        if k_ms % 33 != 30:
+        if k_ms % 33 != 30 or 0 <= k_ms - 4000 < frameless_ms:
             continue
         capture_ns = BEGIN_NS + (k_ms - 15) * MS
         own = autopilot.own_ship.at(capture_ns)
@@ -87,6 +87,10 @@ def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump
             off_m = np.linalg.norm(track.t_cam_target_m - T_CAM_TARGET_M)
             assert off_m < 4.0 * np.sqrt(track.covariance[2, 2]), f"{off_m:.1f} m off at {k_ms} ms"
             assert off_m < 15.0
+            if own is not None and own.t_ned_body_m is not None and track.v_ned_target_mps is not None:
+                off_mps = track.v_ned_target_mps - V_NED_MPS
+                P_v = track.covariance_ned[3:6, 3:6]
+                assert off_mps @ np.linalg.solve(P_v, off_mps) < 40.0, f"{off_mps} m/s off at {k_ms} ms"
     assert autopilot.station.counters["position_jumps"] == (jump_m > 0.0)
     assert autopilot.station.counters["attitude_jumps"] == (jump_deg != 0.0)
     assert own is not None
@@ -136,3 +140,19 @@ def test_a_gimbal_that_slews_is_no_jump() -> None:
             autopilot.gimbal(k_ms, 2.0 * np.sin(4.0 * k_ms / 1000))  # 8 rad/s at most
     assert autopilot.station.counters["gimbal_jumps"] == 0
     assert autopilot.own_ship.at(BEGIN_NS + 2999 * MS) is not None
+
+
+@pytest.mark.parametrize("apart_deg", [5.0, 15.0, 60.0])
+@pytest.mark.parametrize("later_ms", [0, 1, 7])
+def test_of_two_gimbals_that_an_autopilot_speaks_for_one_is_the_camera_s(apart_deg: float, later_ms: int) -> None:
+    autopilot, known = Autopilot(gimballed=True), 0
+    for k_ms in range(3000):
+        autopilot.turn(k_ms, V_NED_MPS * k_ms / 1000, V_NED_MPS)
+        for device_id in (1, 2):
+            if k_ms % 20 == 4 + (device_id - 1) * later_ms:
+                autopilot.gimbal(k_ms, 0.3 + (device_id - 1) * np.deg2rad(apart_deg), device_id)
+        if k_ms > 500 and (own := autopilot.own_ship.at(BEGIN_NS + k_ms * MS)) is not None:
+            known += 1
+            np.testing.assert_allclose(np.arctan2(own.R_body_gimbal[1, 0], own.R_body_gimbal[0, 0]), 0.3, atol=1e-6)
+    assert known > 2400
+    assert autopilot.station.refused["other_gimbal"] > 100

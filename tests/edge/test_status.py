@@ -119,7 +119,9 @@ def test_diagnostics_carry_each_stage_and_the_model_s_hash(ports: tuple[int, int
 
 
 def test_passwords_in_addresses_are_not_told() -> None:
-    from edge.status_board import no_password
+    from edge.addresses import no_password
 
     assert no_password("rtsp://pilot:secret@10.0.0.2:554/main") == "rtsp://***@10.0.0.2:554/main"
+    assert no_password("rtsp://pilot:p@ss@10.0.0.2/main does not open") == "rtsp://***@10.0.0.2/main does not open"
+    assert no_password('{"url":"rtsp://10.0.0.2","mail":"a@b"}') == '{"url":"rtsp://10.0.0.2","mail":"a@b"}'
     assert no_password("rtsp://10.0.0.2/a@b") == "rtsp://10.0.0.2/a@b"

@@ -221,3 +221,15 @@ def test_only_a_window_cuts_a_target_in_the_middle_of_the_frame(distortion: tupl
         assert (larger is None) == (moved_px == 0.0)
         if larger is not None:
             assert larger[2] - larger[0] == pytest.approx(320.0)
+
+
+def test_a_corner_where_the_lens_cannot_be_inverted_has_a_window_all_the_same() -> None:
+    distortion = (-1.62, -0.25, 0.0, 0.0, 0.0, 0.54, 0.02, -0.19)
+    lens = Lens(np.array([[549.0, 0, 960], [0, 549.0, 540], [0, 0, 1]]), distortion)
+    corners = [[0, 0, 40, 20], [1880, 0, 1919, 20], [0, 1060, 40, 1079], [1880, 1060, 1919, 1079]]
+    straight = lens.box_to_pinhole(np.array(corners, dtype=float))
+    assert not np.isfinite(straight).all(), "there is such a corner"
+    image = np.full((1080, 1920, 3), 90, np.uint8)
+    for corner in corners:
+        window = window_around(np.array(corner, dtype=float), 1.8, NETWORK_WH, SIZE_WH, lens)
+        assert cut(image, window, NETWORK_WH, lens).shape == (160, 160, 3)
