@@ -84,7 +84,8 @@ def _run(options: argparse.Namespace) -> int:
 
     stop, reloader = threading.Event(), Reloader()
     on_signals({signal.SIGHUP: reloader.ask, signal.SIGTERM: stop.set, signal.SIGINT: stop.set})
-    code = run(load_config(options.config), stop, reloader)
+    config = load_config(options.config)
+    code = exit_code(lambda: run(config, stop, reloader), InputError)
     if left_behind():
         # It would come back from its library while the interpreter is taken down, and abort the process.
         logging.shutdown()

@@ -165,7 +165,7 @@ class Pipeline:
             if isinstance(request, StopTracking):
                 self._tracker.drop_all()
         if self._requests.too_late():
-            self._outlets.event(logging.WARNING, "what was pointed at is too long ago: no frame came since")
+            self._outlets.event(logging.WARNING, "what was pointed at is too long ago: no frame came in time")
 
     def _estimate(
         self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock

@@ -63,6 +63,7 @@ class RequestQueue:
     def put(self, request: Request) -> bool:
         """Leave a request; False, and it is not taken, if too many wait."""
         with self._lock:
+            self._drop_old()
             if len(self._waiting) >= WAITING_MAX:
                 return False
             self._waiting.append((request, clock.monotonic_ns()))
@@ -71,14 +72,18 @@ class RequestQueue:
     def take(self) -> list[Request]:
         """All that wait and are not too late, oldest first."""
         with self._lock:
+            self._drop_old()
             waiting, self._waiting = self._waiting, []
-            oldest_ns = clock.monotonic_ns() - POINTED_AGE_MAX_NS
-            taken = [one for one, put_ns in waiting if isinstance(one, StopTracking) or put_ns >= oldest_ns]
-            self._too_late += len(waiting) - len(taken)
-            return taken
+            return [request for request, _ in waiting]
 
     def too_late(self) -> int:
         """How many were dropped since the last call."""
         with self._lock:
             count, self._too_late = self._too_late, 0
             return count
+
+    def _drop_old(self) -> None:
+        oldest_ns = clock.monotonic_ns() - POINTED_AGE_MAX_NS
+        lasting = [(r, put_ns) for r, put_ns in self._waiting if isinstance(r, StopTracking) or put_ns >= oldest_ns]
+        self._too_late += len(self._waiting) - len(lasting)
+        self._waiting = lasting

@@ -37,7 +37,7 @@ THREADS = (
 )
 
 # These run libraries' code that must not come back while the interpreter is taken down.
-FOREIGN = frozenset({"capture", "search", "closing", "pictures", "lookup", "reload"})
+FOREIGN = frozenset({"capture", "search", "zenoh", "closing", "pictures", "lookup", "reload"})
 
 
 def yield_to_the_loop() -> None:

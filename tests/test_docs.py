@@ -54,6 +54,7 @@ def test_every_thread_of_the_daemon_is_in_the_table() -> None:
         for name in re.findall(r'(?:Thread\(.*?\bname|thread_name_prefix)="(\w+)"', path.read_text())
     }
     assert started == {row.name for row in threads.THREADS} - {"main"}
+    assert started >= threads.FOREIGN
 
 
 def test_files_that_the_architecture_names_are_there() -> None:

@@ -118,7 +118,9 @@ def _called(method: Mapping[str, Any]) -> str:
     """A model of one's own is told by its name and how long it learnt, another method by its file."""
     if method.get("name") is None:
         return str(method["file"])
-    return f"{method['name']}, {method['precision']}, after {method['training_samples']:,} windows"
+    samples = method.get("training_samples")
+    learnt = "" if samples is None else f", after {samples:,} windows"
+    return f"{method['name']}, {method['precision']}{learnt}"
 
 
 def _manifest(dataset: Path) -> dict[str, Any]:

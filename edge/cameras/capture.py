@@ -28,7 +28,7 @@ class Capture:
 
     def __init__(self, source: Source, opened: bool) -> None:
         self._source = source
-        self._opened = opened
+        self._opened = self._fitted = opened
         self._stop = threading.Event()
         self._fresh = threading.Condition()
         self._newest: Frame | None = None
@@ -100,8 +100,8 @@ class Capture:
             try:
                 if not self._opened:
                     wait_until(self._link.retry_at_ns, self._stop)
-                    self._open_again()
-                    self._opened = True
+                    self._open()
+                    self._opened = self._fitted = True
                 frame = self._source.read(self._stop)
             except SourceLost as error:
                 self._lose(error)
@@ -116,12 +116,13 @@ class Capture:
                     jumps = self._counts["time_jumps"]
                     self._offer(replace(frame, meta=replace(frame.meta, time_jumps=jumps)))
 
-    def _open_again(self) -> None:
-        """Raises SourceLost. A camera that fitted once may come back in another mode, and the next time in its own."""
+    def _open(self) -> None:
+        """Raises SourceLost, and InputError for a camera that never fitted; one that did may come back in another mode,
+        and the next time in its own."""
         try:
             self._source.open()
         except InputError as error:
-            if not self._counts["captured"]:
+            if not self._fitted:
                 raise
             raise SourceLost(str(error)) from error
 

@@ -89,7 +89,7 @@ class LiveSource(ABC):
             self._capture = None
 
     def _refitted(self, size_wh: tuple[int, int]) -> Intrinsics:
-        """Raises SourceLost: whether the camera has changed for good shows when it is opened again."""
+        """Raises SourceLost: opened again, the camera may be in its own mode."""
         try:
             return self._intrinsics.scaled_to(size_wh)
         except InputError as error:

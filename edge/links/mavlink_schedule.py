@@ -37,8 +37,9 @@ class Schedule:
         if hz == 0.0:
             return False
         interval_ns = round(1e9 / hz)
-        # A rate that was raised since holds from now on.
-        due_ns = min(self._due_ns.get((message_id, instance), now_ns), now_ns + interval_ns)
+        # A rate that was raised since holds from now on; one that holds is due no later than this.
+        latest_ns = now_ns + round((1.0 + EARLY_SHARE) * interval_ns)
+        due_ns = min(self._due_ns.get((message_id, instance), now_ns), latest_ns)
         self._due_ns[message_id, instance] = due_ns
         if now_ns < due_ns - EARLY_SHARE * interval_ns:
             return False

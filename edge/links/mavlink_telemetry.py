@@ -130,7 +130,7 @@ class Telemetry:
     def _take_gimbal(self, message: Any, now_ns: int) -> str | None:
         # One that an autopilot speaks for has a number from 1 to 6, by which it is told from the others there.
         component = message.get_srcComponent()
-        gimbal_id = message.gimbal_device_id or component
+        gimbal_id = message.gimbal_device_id or component if component == AUTOPILOT_COMPONENT else component
         if not self._heeds(gimbal_id, now_ns):
             return "other_gimbal"
         if message.failure_flags & GIMBAL_FAILURES:

@@ -16,7 +16,6 @@ from edge.types import Array, Estimate, Track
 
 LOOK_NS = 1_000_000_000
 REST_NS = 10_000_000_000
-NOTHING_THERE = "no target found where pointed"
 
 
 class ByHand:
@@ -48,7 +47,7 @@ class ByHand:
         """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
         if self._box_share is not None and now_ns > self._look_until_ns:
             self._box_share = None
-            self._news.append(NOTHING_THERE)
+            self._news.append("no target found where pointed")
         if self._box_share is None:
             return None
         box = self._box_share * np.tile(image_size_wh, 2) - 0.5
@@ -64,8 +63,7 @@ class ByHand:
         return now_ns >= self._rest_until_ns
 
     def found(self, estimate: Estimate) -> None:
-        """A target was there: it is to be the chosen one."""
-        self._box_share = None
+        """A target was there: its track is to be the chosen one."""
         self._found = estimate.box_xyxy_px
 
     def settle(self, tracks: Iterable[Track]) -> None:
@@ -93,13 +91,12 @@ class ByHand:
         return None
 
     def _choose_where(self, tracks: Iterable[Track], found_xyxy_px: Array) -> None:
-        """The track that took the estimate in; another one near it is not what was pointed at."""
+        """The track that took the estimate in. Another one near it is not what was pointed at: the look goes on."""
         seen = [track for track in tracks if track.measured_ns == track.time_ns]
         best = max(seen, key=lambda track: iou(track.box_xyxy_px, found_xyxy_px), default=None)
         if best is not None and iou(best.box_xyxy_px, found_xyxy_px) > SAME_BOX_IOU:
+            self._box_share = None
             self._choose(best)
-        else:
-            self._news.append(NOTHING_THERE)
 
     def _choose(self, track: Track) -> None:
         self._chosen = track.track_id, track.born_ns

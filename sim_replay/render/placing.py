@@ -47,7 +47,7 @@ class Window:
     scene: Scene
     kind: Kind
     size_px: int  # side of the finished window; the scene may be rendered smaller and then enlarged
-    native_scale: float  # rendered pixels per native pixel, at most 1
+    native_scale: float  # rendered pixels per native pixel, at most 1; of a squashed frame the sides' geometric mean
     visible_share: float  # share of the target's outline inside the window; 0 without a target
     distractors: bool
     quality: Quality

@@ -14,7 +14,7 @@ import numpy as np
 
 from edge import clock
 from edge.requests import POINTED_AGE_MAX_NS, RequestQueue, SelectTarget, StopTracking, TrackBox
-from edge.tracking.by_hand import LOOK_NS, NOTHING_THERE, REST_NS, ByHand
+from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount
 from msgs.mavlink import dialect
@@ -167,10 +167,12 @@ def test_a_target_found_where_pointed_that_got_no_track_chooses_no_other() -> No
     by_hand.take(TrackBox((0.0, 0.0, 0.1, 0.1)), 0)
     by_hand.found(seen_at(0.0))
     by_hand.settle([elsewhere])
-    assert (by_hand.chosen_id, by_hand.news()) == (None, [NOTHING_THERE])
+    assert (by_hand.chosen_id, by_hand.news()) == (None, [])
+    assert by_hand.box_xyxy_px(1, SIZE_WH, []) is not None, "the look goes on"
     by_hand.found(seen_at(0.0))
     by_hand.settle([elsewhere, track(0, track_id=1, box_xyxy_px=seen_at(0.0).box_xyxy_px + 2.0)])
     assert by_hand.chosen_id == 1
+    assert by_hand.box_xyxy_px(2, SIZE_WH, []) is None
 
 
 def test_what_was_pointed_at_before_the_frames_stopped_is_not_looked_for_when_they_come_again() -> None:

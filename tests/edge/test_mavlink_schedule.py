@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -70,3 +71,12 @@ def test_a_rate_that_is_raised_holds_from_now_on() -> None:
     schedule.set_rate(MESSAGE, 50.0)
     sent = [ms for ms in range(1, 101) if schedule.due(MESSAGE, 0, ms * 1_000_000)]
     assert 4 <= len(sent) <= 6
+
+
+@pytest.mark.parametrize("hz", [0.1, 1.0, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize("fps", [30, 60, 120, 200])
+def test_over_many_frames_a_rate_is_what_was_asked(hz: float, fps: int) -> None:
+    schedule = Schedule({MESSAGE: hz})
+    frames = round(100 / hz * fps)
+    sent = sum(schedule.due(MESSAGE, 0, frame * 1_000_000_000 // fps) for frame in range(frames))
+    assert 98 <= sent <= 102

@@ -123,5 +123,6 @@ def test_passwords_in_addresses_are_not_told() -> None:
 
     assert no_password("rtsp://pilot:secret@10.0.0.2:554/main") == "rtsp://***@10.0.0.2:554/main"
     assert no_password("rtsp://pilot:p@ss@10.0.0.2/main does not open") == "rtsp://***@10.0.0.2/main does not open"
+    assert no_password("rtsp://u:it's@10.0.0.2/x") == "rtsp://***@10.0.0.2/x"
     assert no_password('{"url":"rtsp://10.0.0.2","mail":"a@b"}') == '{"url":"rtsp://10.0.0.2","mail":"a@b"}'
     assert no_password("rtsp://10.0.0.2/a@b") == "rtsp://10.0.0.2/a@b"

@@ -55,7 +55,10 @@ def no_certificate(folder: Path) -> None:
         ('connect = ["quic/ground:7447"]', "config.toml:4: [zenoh]: connect: 'quic/ground:7447' needs tls: root_ca"),
         ('connect = ["udp/ground:7447"]', "'udp/ground:7447' is not tcp/HOST:PORT, tls/HOST:PORT or quic/HOST:PORT"),
         ('listen = ["tcp/0.0.0.0:77447"]', "'tcp/0.0.0.0:77447' is not"),
-        ("pose_rate_max_hz = 0", "config.toml:5: [zenoh] pose_rate_max_hz: Input should be greater than 0"),
+        (
+            "pose_rate_max_hz = 0",
+            "config.toml:5: [zenoh] pose_rate_max_hz: Input should be greater than or equal to 0.1",
+        ),
         ('tls = { root_ca = "x" }', "[zenoh.tls] certificate: is missing"),
     ],
 )

@@ -72,7 +72,6 @@ def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
 
 
 def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
-
     sha256 = hashlib.sha256(SHIPPED_MODEL.read_bytes()).hexdigest()
     windows = f"{read_history(HISTORY)[-1]['total_samples']:,} "
     readme, card = (path.read_text() for path in (ROOT / "README.md", SHIPPED_MODEL.parent / "README.md"))
