@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -148,18 +147,15 @@ def test_the_ground_commands_a_reload_and_is_told_how_it_went(
     assert flight.process.poll() is None
 
 
-@pytest.mark.parametrize("after_s", [0.1, 0.5, 0.9])
-def test_a_daemon_that_is_stopped_while_it_loads_a_model_ends_well(
-    tmp_path: Path, swaying: Path, port: int, after_s: float
-) -> None:
+def test_a_daemon_that_is_stopped_while_it_loads_a_model_ends_well(tmp_path: Path, swaying: Path, port: int) -> None:
     text = toml(swaying, SHIPPED_MODEL, port)
-    with flying(tmp_path, text) as flight:
-        (tmp_path / "config.toml").write_text(text.replace("[model]", "[model]\nspinning = true"))
-        flight.process.send_signal(signal.SIGHUP)
-        flight.until("reload: reading")
-        time.sleep(after_s)  # loading and warming takes about a second
-        flight.process.terminate()
-        assert flight.process.wait(timeout=60) == 0
+    for _ in range(3):  # the library may come back at any time while the interpreter is taken down
+        with flying(tmp_path, text) as flight:
+            (tmp_path / "config.toml").write_text(text.replace("[model]", "[model]\nspinning = true"))
+            flight.process.send_signal(signal.SIGHUP)
+            flight.until("reload: reading")
+            flight.process.terminate()
+            assert flight.process.wait(timeout=60) == 0
 
 
 def test_one_reload_at_a_time() -> None:
