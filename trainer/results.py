@@ -287,5 +287,5 @@ def run(arguments: argparse.Namespace) -> None:
     extra += "".join(f" --beside {path}" for path in arguments.beside)
     command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"
     (arguments.out / "results.md").write_text(page(scores, command, told(history), beside), encoding="utf-8")
-    (arguments.out / "results.json").write_text(json.dumps([*scores, *beside], indent=1) + "\n", encoding="utf-8")
+    (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
     draw_history(history, arguments.out / "learning.png")
