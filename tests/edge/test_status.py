@@ -126,3 +126,10 @@ def test_passwords_in_addresses_are_not_told() -> None:
     assert no_password("rtsp://u:it's@10.0.0.2/x") == "rtsp://***@10.0.0.2/x"
     assert no_password('{"url":"rtsp://10.0.0.2","mail":"a@b"}') == '{"url":"rtsp://10.0.0.2","mail":"a@b"}'
     assert no_password("rtsp://10.0.0.2/a@b") == "rtsp://10.0.0.2/a@b"
+    assert no_password("http://cam/video.cgi?user=pilot&pwd=se=cr%20et&size=hd lost") == (
+        "http://cam/video.cgi?user=***&pwd=***&size=hd lost"
+    )
+    assert no_password('{"url":"rtsp://cam/1?Access_Token=abc","size":"hd"}') == (
+        '{"url":"rtsp://cam/1?Access_Token=***","size":"hd"}'
+    )
+    assert no_password("rtsp://cam/1?channel=1&subtype=0") == "rtsp://cam/1?channel=1&subtype=0"
