@@ -19,6 +19,7 @@ H and W are free multiples of 32; M = `max_peaks`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -58,6 +59,13 @@ _PEAK_LEAST = 1e-6
 _LOGIT_MOST = 30.0
 
 
+def samples_behind(training: Mapping[str, str | int | float]) -> int | None:
+    """Training samples behind weights, of all runs; None where their file does not tell, as older ones did not."""
+    begun = str(training.get("started_from", ""))
+    before = training.get("samples_before", None if begun.startswith("weights ") else 0)
+    return None if before is None or "samples" not in training else int(training["samples"]) + int(before)
+
+
 class ModelContract(BaseModel):
     """Everything the daemon must know of a model, and everything a person asks of one."""
 
@@ -93,6 +101,8 @@ class ModelContract(BaseModel):
     )
     airframes: list[str] = Field(description="airframe classes in the training data")
     data: str = Field("", description="what it was trained on; empty: the file is older than this key")
-    training: dict[str, str | int | float] = Field(description="seed, samples, resolution, commit")
+    training: dict[str, str | int | float] = Field(
+        description="seed, samples of the last run and of those it began from, resolution, commit"
+    )
     metrics: dict[str, float] = Field(description="measured when the file was made; empty if not measured")
     weights_sha256: str = Field(description="hash of the float weights the graph was made from")

@@ -21,10 +21,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.estimator.lens import Lens, lens_of
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.fields import integer, load_json
 from sim_replay.bop.layout import TARGETS_FILE
-from sim_replay.bop.scene import Image, Mask
+from sim_replay.bop.scene import Image, Mask, read_picture_bgr
 
 Array = NDArray[np.float64]
 Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
@@ -48,11 +49,20 @@ class DatasetFrame:
 
     def image_bgr(self) -> Image:
         """The picture as it is on disk [H, W, 3]. Raises BopError."""
-        return _picture(self.image_path)
+        return read_picture_bgr(self.image_path)
 
     def undistorted_bgr(self) -> Image:
         """The picture [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
         return read_undistorted_bgr(self.image_path, self.K, self.distortion)
+
+    def undistorted_boxes_xyxy_px(self, frame_wh: tuple[int, int]) -> list[Array | None]:
+        """The visible box [4] of each target where undistorted_bgr(), frame_wh large, shows it; None: it shows none.
+
+        A lens may show more than the pinhole's picture has room for, so boxes end at its edges.
+        """
+        boxes = [target.box_visible_xyxy_px for target in self.targets]
+        lens = lens_of(self.K, self.distortion or ())
+        return boxes if lens is None else [None if box is None else _straight(lens, box, frame_wh) for box in boxes]
 
     def mask(self, k: int) -> Mask | None:
         """The visible mask [H, W] of targets[k] in the picture on disk; None if the dataset has none."""
@@ -117,6 +127,21 @@ class Dataset:
             _log.warning("%s: what %d pictures show is not told", self.root, len(frames) - len(labelled))
         return labelled
 
+    def boxed_frames(self) -> list[DatasetFrame]:
+        """Those of labelled_frames(); of each of their targets it is known where it is seen, or that it is not.
+
+        Raises BopError, also for a target of which nothing tells that.
+        """
+        frames = self.labelled_frames()
+        for frame in frames:
+            for target in frame.targets:
+                if _unseen(target):
+                    raise BopError(
+                        f"{frame.scene.folder}: nothing tells where picture {frame.image_id} shows its target of "
+                        f"obj_id {target.object_id}: give scene_gt_info.json, masks, or a model with a mesh or a box"
+                    )
+        return frames
+
     @cached_property
     def _wanted(self) -> Wanted | None:
         return _read_targets(self.root / TARGETS_FILE)
@@ -127,7 +152,7 @@ class Dataset:
         path = scene.image_path(frame)
         targets = [_with_box(scene, frame, index) for index in indices]
         if any(_unseen(target) for target in targets) and "wh" not in sizes:
-            height, width = _picture(path).shape[:2]  # of the scene's first; they are alike
+            height, width = read_picture_bgr(path).shape[:2]  # of the scene's first; they are alike
             sizes["wh"] = (width, height)
         placed = tuple(
             _with_projected_box(t, self.models.get(t.object_id), frame, sizes["wh"]) if _unseen(t) else t
@@ -220,6 +245,11 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
     return replace(target, box_visible_xyxy_px=box_of_mask(mask), visible_px=int(mask.sum()))
 
 
+def _straight(lens: Lens, box_xyxy_px: Array, frame_wh: tuple[int, int]) -> Array | None:
+    straight = np.clip(lens.box_to_pinhole(box_xyxy_px), -0.5, np.tile(frame_wh, 2) - 0.5)
+    return straight if (straight[:2] < straight[2:]).all() else None  # NaN where the lens cannot be inverted
+
+
 def box_of_mask(mask: Mask) -> Array | None:
     """Box (x, y, x, y) around the set pixels of a mask [H, W], edges half a pixel outside their centres; or None."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -229,11 +259,16 @@ def box_of_mask(mask: Mask) -> Array | None:
 
 
 def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
-    """The target with boxes from its model's vertices, or the corners of its box; as it is where neither is known."""
+    """The target with boxes from its model's vertices, or the corners of its box; as it is where neither is known.
+
+    One behind the camera is hidden; of one that reaches behind it nothing is known.
+    """
     points = None if model is None else model.points_m
     if points is None:
         return target
     points_cam = points @ target.R_cam_target.T + target.t_cam_target_m
+    if points_cam[:, 2].max() <= 0:
+        return replace(target, visible_px=0)
     if points_cam[:, 2].min() <= 0:
         return target
     lens = np.zeros(5) if frame.distortion is None else np.array(frame.distortion)
@@ -276,14 +311,7 @@ def _widen(largest: dict[int, float], target: BopTarget, box_xyxy_px: Array | No
 
 def read_undistorted_bgr(path: Path, K: Array, distortion: Distortion | None) -> Image:
     """The picture [H, W, 3] that the pinhole camera K would have taken in place of its lens. Raises BopError."""
-    image_bgr = _picture(path)
+    image_bgr = read_picture_bgr(path)
     if distortion is None:
         return image_bgr
     return np.asarray(cv2.undistort(image_bgr, K, np.array(distortion)), dtype=np.uint8)
-
-
-def _picture(path: Path) -> Image:
-    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image_bgr is None:
-        raise BopError(f"{path} is not a readable picture")
-    return np.asarray(image_bgr, dtype=np.uint8)

@@ -10,6 +10,7 @@ from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model, load_model
 from edge.types import Frame, FrameMeta
+from msgs.contract import samples_behind
 from sim_replay.datasets import DatasetFrame
 from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.score import TargetPose
@@ -72,5 +73,5 @@ def method_of(model: Model) -> dict[str, Any]:
         "precision": contract.precision,
         "acquire_score_min": contract.acquire_score_min,
         "track_score_min": contract.track_score_min,
-        "training_samples": contract.training.get("samples"),
+        "training_samples": samples_behind(contract.training),
     }

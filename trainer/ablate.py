@@ -47,6 +47,9 @@ VARIANTS = (
     Variant(
         "no-dense", "no dense heads while training", {"model": {"dense": False}, "loss": {"mask": 0.0, "noc": 0.0}}
     ),
+    Variant(
+        "no-airframes", "no airframe head while training", {"model": {"airframes": 0}, "loss": {"airframe": 0.0}}
+    ),
     Variant("no-uncertainty", "no uncertainty heads", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
     Variant("no-window", "whole reduced frames only, and measured on such", {"data": {"acquire_share": 1.0}}),
     Variant("paper", "the paper's network and loss, on the same windows", {}, PAPER_CONFIG),
@@ -132,13 +135,14 @@ def ablate(
 
 
 def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: OpenView) -> dict[str, Any]:
-    """Metrics on windows of the view that the variant was trained for, and the weights' hash."""
+    """Metrics on windows of the view that the variant was trained for, the weights' hash and the code's commit."""
     model, _, training, sha256 = load_model(folder)
     only_frames = config.data.acquire_share == 1.0
     data = config.data.model_copy(update={"acquire_share": 1.0 if only_frames else 0.0})
     batches = render_once(open_view(data, config.data.validation_seed, scale.size_px), scale.windows)
     metrics = measure(predict_all(torch_predictor(model), batches), batches)
-    return {"weights_sha256": sha256, "trained_samples": training["samples"], **null_where_unknown(metrics)}
+    origin = {"weights_sha256": sha256, "trained_samples": training["samples"], "commit": training["commit"]}
+    return {**origin, **null_where_unknown(metrics)}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -149,8 +153,9 @@ def table(result: dict[str, Any]) -> str:
         values = ((row[key], scale, digits) for key, (_, scale, digits) in COLUMNS.items())
         cells = ["–" if value is None else f"{scale * value:.{digits}f}" for value, scale, digits in values]
         lines.append("| " + " | ".join([row["says"], *cells, f"`{row['weights_sha256'][:12]}`"]) + " |")
+    commits = ", ".join(f"`{commit}`" for commit in dict.fromkeys(row["commit"] for row in result["rows"].values()))
     scale = (
-        f"{result['samples']} training windows of {result['size_px']} px a variant (seed {result['seed']}), "
-        f"{result['windows']} held-out windows (seed {result['validation_seed']})."
+        f"Trained with the code of {commits}: {result['samples']} training windows of {result['size_px']} px a variant "
+        f"(seed {result['seed']}), {result['windows']} held-out windows (seed {result['validation_seed']})."
     )
     return "\n".join([*lines, "", scale, ""])

@@ -21,12 +21,12 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     contents = [load_file(run) for run in runs]
     _, configs, _, hashes = zip(*map(load_model, runs), strict=True)
     for run, config in zip(runs, configs, strict=True):
-        if config.model != configs[-1].model:
+        if config.model.deployed() != configs[-1].model.deployed():
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
-    last = contents[-1]
+    last, every = contents[-1], [content["weights"] for content in contents]
     weights = {
-        # Files written before the training-only heads were kept have none of them: those heads are the others' mean.
-        name: torch.stack([c["weights"][name].double() for c in contents if name in c["weights"]])
+        # Not all runs have the heads that only training has, nor of one shape: those are the mean of the others.
+        name: torch.stack([w[name].double() for w in every if name in w and w[name].shape == value.shape])
         .mean(0)
         .to(value.dtype)
         if value.is_floating_point()

@@ -18,7 +18,7 @@ from trainer.model import PoseNet
 
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
-TRAINING_ONLY_PREFIX = "head_dense."
+TRAINING_ONLY_PREFIXES = ("head_dense.", "head_airframe.")
 
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
@@ -42,7 +42,7 @@ def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """Without the heads that only training has. A run that goes on needs them too: drawn anew they upset the rest."""
-    return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
+    return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIXES)}
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:
@@ -80,7 +80,7 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
     if not {"weights", "config", "training"} <= content.keys():
         raise ConfigError(f"{path}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
-    model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False}))
+    model = PoseNet(config.model.deployed())
     weights = deployed_weights(content["weights"])
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})

@@ -63,7 +63,16 @@ class ModelConfig(Section):
         1, ge=1, description="rotations proposed for a target, each for headings around its own; the likeliest is said"
     )
     dense: bool = Field(description="train the mask and object-coordinate heads, which export drops")
+    airframes: int = Field(
+        0,
+        ge=0,
+        description="the fleet's first so many are told from each other and from all else by a head of training",
+    )
     max_peaks: int = Field(4, ge=1, description="M: targets decoded for each image")
+
+    def deployed(self) -> ModelConfig:
+        """The network that flies: without the heads that only training has, its weights those that it is given."""
+        return self.model_copy(update={"pretrained": False, "dense": False, "airframes": 0})
 
     @model_validator(mode="after")
     def _pretrained_exists(self) -> ModelConfig:
@@ -89,6 +98,7 @@ class LossConfig(Section):
     mask: float = Field(0.0, ge=0)
     noc: float = Field(0.0, ge=0)
     uncertainty: float = Field(0.0, ge=0)
+    airframe: float = Field(0.0, ge=0, description="cross-entropy of which airframe it is, or none of those known")
 
 
 class DatasetSource(Section):
@@ -98,6 +108,12 @@ class DatasetSource(Section):
     split: str = Field("train", description="folder of the dataset that is trained on")
     validation_split: str | None = Field(None, description="folder to validate on; absent: rendered windows only")
     share: float = Field(gt=0, le=1, description="of every batch")
+
+    @model_validator(mode="after")
+    def _validates_elsewhere(self) -> DatasetSource:
+        if self.split == self.validation_split:
+            raise ValueError(f"validation_split {self.split!r} is what is trained on: give another, or leave it out")
+        return self
 
 
 class DataConfig(Section):
@@ -115,6 +131,12 @@ class DataConfig(Section):
     prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")
     validation_samples: int = Field(256, ge=8)
     datasets: list[DatasetSource] = Field([], description="absent: rendered windows alone")
+
+    @property
+    def rendered_share(self) -> float:
+        """Of every batch: what the datasets leave."""
+        rest = 1.0 - sum(source.share for source in self.datasets)
+        return rest if rest > 1e-6 else 0.0
 
     @model_validator(mode="after")
     def _shares_fit(self) -> DataConfig:
@@ -191,6 +213,12 @@ class TrainerConfig(Section):
     schedule: ScheduleConfig
     run: RunConfig
     contract: ContractConfig
+
+    @model_validator(mode="after")
+    def _airframes_are_taught(self) -> TrainerConfig:
+        if (self.model.airframes > 0) != (self.loss.airframe > 0):
+            raise ValueError("model.airframes and loss.airframe belong together: a head and what teaches it")
+        return self
 
     @model_validator(mode="after")
     def _trained_as_used(self) -> TrainerConfig:

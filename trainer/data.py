@@ -47,6 +47,7 @@ class TrainingBatch(NamedTuple):
     noc: NDArray[np.float32]  # [N, 3, H/4, W/4]; NaN where not known
     others: NDArray[np.bool_]  # [N, H/4, W/4], where aircraft lie that are not the labelled one
     diameter_m: NDArray[np.float32]
+    airframe_id: NDArray[np.int32]  # [N], as in SampleBatch; -1 where not known
 
 
 def training_batch(sample: SampleBatch) -> TrainingBatch:
@@ -68,6 +69,7 @@ def training_batch(sample: SampleBatch) -> TrainingBatch:
         noc=np.ascontiguousarray(noc.transpose(0, 3, 1, 2)),
         others=np.zeros(visible.shape, np.bool_),
         diameter_m=sample.diameter_m,
+        airframe_id=sample.airframe_id,
     )
 
 
@@ -91,6 +93,7 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
         coverage=put(batch.coverage),
         noc=put(batch.noc),
         others=put(batch.others),
+        airframe_id=put(batch.airframe_id),
     )
     return put(batch.image_bgr), labels
 

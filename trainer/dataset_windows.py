@@ -5,7 +5,9 @@ What a picture does not tell is NaN: object coordinates always, the mask where t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -17,17 +19,22 @@ from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.sample import AcquireView, SampleBatch
 from trainer.config import ConfigError
 from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
+from trainer.model import Z_RANGE_M
 
 TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
 TRACK_ZOOM = (0.75, 1.33)
 ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame when the acquire stage sees it
-VISIBLE_MIN = 0.35  # of the box inside the window, below which it counts as empty
+VISIBLE_MIN = 0.35  # of the box inside the window, below which nothing is asked of the target
 Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 
 
 class DatasetSampler:
-    """Window i is a pure function of (seed, i, size) and the dataset. Raises ConfigError where that is unreadable."""
+    """Window i is a pure function of (seed, i, size) and the dataset.
+
+    Raises ConfigError where that is unreadable, does not tell where a target is seen, or has all of them out of range.
+    """
 
     def __init__(
         self,
@@ -41,12 +48,13 @@ class DatasetSampler:
         self.seed, self.size_px, self.acquire_share, self.acquire_view = seed, size_px, acquire_share, acquire_view
         try:
             dataset = open_dataset(root, split)
-            self._frames = dataset.labelled_frames()
+            self._frames = dataset.boxed_frames()
             self._diameter_m = {key: model.diameter_m for key, model in dataset.models.items()}
         except BopError as error:
             raise ConfigError(str(error)) from error
         if not self._frames:
             raise ConfigError(f"{root}: holds no frames to train on")
+        _judge_range(root, self._frames)
 
     def batch(self, first_index: int, count: int) -> TrainingBatch:
         """Windows first_index .. first_index + count - 1."""
@@ -59,17 +67,18 @@ class DatasetSampler:
             picture = frame.undistorted_bgr()
         except BopError as error:
             raise ConfigError(str(error)) from error
-        boxes = [target.box_visible_xyxy_px for target in frame.targets]
+        frame_wh = (picture.shape[1], picture.shape[0])
+        boxes = frame.undistorted_boxes_xyxy_px(frame_wh)
         seen = [k for k, box in enumerate(boxes) if box is not None]
         chosen = int(rng.choice(seen)) if seen else None
         box = None if chosen is None else boxes[chosen]
-        low, sides = self._cut(rng, box, (picture.shape[1], picture.shape[0]))
+        low, sides = self._cut(rng, box, frame_wh)
         scale = self.size_px / sides
         to_window = np.column_stack([np.diag(scale), (0.5 - low) * scale - 0.5])
         image = _resampled(picture, to_window, self.size_px)
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
-        if chosen is not None:
-            self._label(out, frame, chosen, to_window)
+        if chosen is not None and box is not None:
+            self._label(out, frame, chosen, box, to_window)
         for k, other in enumerate(boxes):
             if other is not None and k != chosen:
                 _mark(out.others[0], other, to_window)
@@ -87,12 +96,14 @@ class DatasetSampler:
             low, side = _acquire_square(rng, box_xyxy_px, frame_wh, self.size_px)
         return low, np.full(2, side)
 
-    def _label(self, out: TrainingBatch, frame: DatasetFrame, chosen: int, to_window: Array) -> None:
+    def _label(
+        self, out: TrainingBatch, frame: DatasetFrame, chosen: int, box_xyxy_px: Array, to_window: Array
+    ) -> None:
         target = frame.targets[chosen]
-        assert target.box_visible_xyxy_px is not None
-        corners = target.box_visible_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
+        corners = box_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
         inside = np.clip(corners, -0.5, self.size_px - 0.5)
         if np.prod(inside[1] - inside[0]) < VISIBLE_MIN * np.prod(corners[1] - corners[0]):
+            _mark(out.others[0], box_xyxy_px, to_window)  # too little to learn a pose from, and yet no background
             return
         out.present[0] = True
         out.R_cam_target[0], out.t_cam_target_m[0] = target.R_cam_target, target.t_cam_target_m
@@ -100,6 +111,20 @@ class DatasetSampler:
         out.diameter_m[0] = self._diameter_m.get(target.object_id, 0.0)
         mask = frame.mask(chosen) if frame.distortion is None else None
         out.coverage[0] = np.nan if mask is None else _coverage(mask, to_window, self.size_px)
+
+
+def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:
+    """Warn of targets whose depth the network cannot tell; raises ConfigError if all are such."""
+    seen = [target for frame in frames for target in frame.targets if target.box_visible_xyxy_px is not None]
+    Z_m = np.array([target.t_cam_target_m[2] for target in seen])
+    beyond = (Z_m < Z_RANGE_M[0]) | (Z_m > Z_RANGE_M[1])
+    if not beyond.any():
+        return
+    told = "the network tells {:g} to {:g} m".format(*Z_RANGE_M)
+    if beyond.all():
+        lie = f"its targets lie {Z_m.min():g} to {Z_m.max():g} m before the camera"
+        raise ConfigError(f"{root}: {lie}, but {told}; cam_t_m2c is in millimetres")
+    _log.warning("%s: %d of %d targets lie where no depth can be learnt: %s", root, beyond.sum(), len(seen), told)
 
 
 def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, float]:
@@ -169,6 +194,7 @@ def _blank(image_bgr: NDArray[np.uint8], K: Array) -> TrainingBatch:
         noc=np.full((1, 3, side, side), np.nan, np.float32),
         others=np.zeros((1, side, side), np.bool_),
         diameter_m=np.zeros(1, np.float32),
+        airframe_id=np.full(1, -1, np.int32),
     )
 
 
@@ -178,14 +204,34 @@ def joined(batches: Sequence[TrainingBatch]) -> TrainingBatch:
 
 
 class MixedSampler:
-    """The same share of every batch from each sampler; what the shares leave comes from the last."""
+    """Samples of several samplers, each to its share of the stream; what the shares leave comes from the last."""
 
     def __init__(self, samplers: Sequence[Sampler], shares: Sequence[float]) -> None:
-        self._samplers, self._shares = tuple(samplers), tuple(shares)
+        self._samplers = tuple(samplers)
+        left = Fraction(1)
+        self._shares = []  # of what the samplers before leave
+        for share in shares[:-1]:
+            exact = Fraction(share).limit_denominator(10**6)
+            self._shares.append(min(exact / left, Fraction(1)))
+            left -= left * self._shares[-1]
 
     def batch(self, first_index: int, count: int) -> TrainingBatch:
-        """Samples of the batch that starts at first_index; distinct for distinct batches."""
-        counts = [round(share * count) for share in self._shares[:-1]]
-        counts.append(count - sum(counts))
-        drawn = [sampler.batch(first_index, n) for sampler, n in zip(self._samplers, counts, strict=True) if n > 0]
-        return joined([training_batch(one) if isinstance(one, SampleBatch) else one for one in drawn])
+        """Samples first_index .. first_index + count - 1 of the stream, sampler by sampler.
+
+        Every sampler's own are consecutive, so batches that do not overlap share none; a share that is less than a
+        sample of each batch comes in some of them.
+        """
+        drawn = []
+        for sampler, (first, stop) in zip(self._samplers, self._spans(first_index, first_index + count), strict=True):
+            if stop > first:
+                one = sampler.batch(first, stop - first)
+                drawn.append(training_batch(one) if isinstance(one, SampleBatch) else one)
+        return joined(drawn)
+
+    def _spans(self, first: int, stop: int) -> list[tuple[int, int]]:
+        """What each sampler gives, of its own samples, to the stream's first .. stop - 1."""
+        spans = []
+        for share in self._shares:
+            spans.append((int(share * first), int(share * stop)))
+            first, stop = first - spans[-1][0], stop - spans[-1][1]
+        return [*spans, (first, stop)]

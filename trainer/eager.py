@@ -28,8 +28,7 @@ def engine(
     config = load_config(Path(str(files("trainer") / "configs" / f"{contract.configuration}.toml")))
     if contract.backbone != config.model.backbone:
         return None
-    lean = config.model.model_copy(update={"pretrained": False, "dense": False})
-    model = fuse_branches(PoseNet(lean).eval())
+    model = fuse_branches(PoseNet(config.model.deployed()).eval())
     inputs = torch.from_numpy(image), torch.from_numpy(K)
 
     def infer() -> object:

@@ -17,8 +17,8 @@ def register(commands: argparse._SubParsersAction) -> None:
         "evaluate",
         help="score a model, a checkpoint or another method's results with the paper's metrics",
         description="Score a model on every picture of a BOP dataset through the daemon's own estimator, or another "
-        "method's results file, and write metrics.json, frames.jsonl, a BOP results file and figures. A target that "
-        "was not found counts as a failure in every rate; mean and median errors are over found targets. With "
+        "method's results file, and write metrics.json, frames.jsonl, a model's BOP results file and figures. A target "
+        "that was not found counts as a failure in every rate; mean and median errors are over found targets. With "
         "--windows, measure the network alone on rendered windows that training never saw.",
     )
     source = evaluate.add_mutually_exclusive_group()

@@ -139,7 +139,7 @@ def _contract(
         trained_range_m=contract.trained_range_m,
         trained_focal_px=trained_focal_px,
         trained_box_px=trained_box_px,
-        airframes=airframe_names(config.data.airframe_ids),
+        airframes=airframe_names(config.data.airframe_ids) if config.data.rendered_share > 0.0 else [],
         data=data_told(config.data),
         training=training,
         metrics={},
@@ -149,9 +149,9 @@ def _contract(
 
 def data_told(data: DataConfig) -> str:
     """What a configuration trains on, for a person."""
-    rendered = 1.0 - sum(source.share for source in data.datasets)
+    rendered = data.rendered_share
     parts = [f"{source.path.name}, split {source.split}: {source.share:.0%}" for source in data.datasets]
-    if rendered > 1e-6:
+    if rendered > 0.0:
         told = f"rendered windows: {rendered:.0%}, of them {data.empty_share:.0%} without a target"
         told += f", {data.acquire_share:.0%} of the whole frame"
         parts.append(told + (f", {data.invented_share:.0%} of invented aircraft" if data.invented_share else ""))
@@ -264,7 +264,7 @@ def export_unmeasured(
     """
     if untrained:
         config = load_config(source)
-        model = PoseNet(config.model.model_copy(update={"dense": False, "pretrained": False})).eval()
+        model = PoseNet(config.model.deployed()).eval()
         training: dict[str, str | int | float] = {"samples": 0}
         sha256 = weights_sha256(model.state_dict())
     else:

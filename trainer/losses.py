@@ -35,6 +35,7 @@ class Labels(NamedTuple):
     coverage: Tensor  # [N, H/4, W/4], share of visible target pixels
     noc: Tensor  # [N, 3, H/4, W/4]
     others: Tensor  # [N, H/4, W/4], bool: other aircraft, of which nothing is asked
+    airframe_id: Tensor  # [N], -1 where not known
 
 
 def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
@@ -110,7 +111,8 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
     Paper: size is L_wh, on log sizes; depth and planar make L_trans, geodesic (L_geo) and rotation_6d (L_6D) L_rot.
     Without `ray` the network's allocentric rotation is the one in `cam`.
     """
-    center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma = (value[:, 0] for value in out)
+    one = (value[:, 0] for value in out)
+    center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma, airframe_logits = one
     t, K = labels.t_cam_target_m, labels.K
     Z = torch.clamp(t[:, 2], min=1.0)
     true_plane = t[:, :2] / Z[:, None]
@@ -144,7 +146,19 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
             dim=-1,
         )
         terms["uncertainty"] = _laplace_nll(residual.detach(), log_sigma).sum(-1)
+    if airframe_logits.shape[-1] > 0:
+        terms["airframe"] = _airframe_error(airframe_logits, labels.airframe_id)
     return terms
+
+
+def _airframe_error(logits: Tensor, airframe_id: Tensor) -> Tensor:
+    """Cross-entropy [N] of which airframe [N] it is; the last of the logits [N, A + 1] is for all from A on.
+
+    The scale of what is seen is known only of an airframe that is recognised, so features that tell airframes apart,
+    and strangers from them, serve the range and its sigma.
+    """
+    which = airframe_id.long().clamp(max=logits.shape[-1] - 1)
+    return F.cross_entropy(logits, which, ignore_index=-1, reduction="none")
 
 
 def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
@@ -178,7 +192,7 @@ def joint_loss(
     L_rot = terms["geodesic"] + weights.rotation_6d * terms["rotation_6d"]
     total = weights.heatmap * terms["heatmap"] + weights.size * terms["size"]
     total = total + weights.translation * L_trans + weights.rotation * L_rot
-    for name in ("hypothesis", "center", "origin", "mask", "noc", "uncertainty"):
+    for name in ("hypothesis", "center", "origin", "mask", "noc", "uncertainty", "airframe"):
         if name in terms:
             total = total + getattr(weights, name) * terms[name]
     return total, terms

@@ -37,6 +37,7 @@ class Decoded(NamedTuple):
     R_ego_k: Tensor  # [N, M, K, 3, 3]
     R_ego: Tensor  # [N, M, 3, 3], the likeliest
     log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), log Z, rotation x y z in rad
+    airframe_logits: Tensor  # [N, M, A + 1], the last for any other; [N, M, 0] without that head
 
 
 class Perception(NamedTuple):
@@ -140,6 +141,7 @@ class PoseNet(nn.Module):
         self.head_sigma_r = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
         # Linear but for one small layer, so that object coordinates must be written into F_global itself.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
+        self.head_airframe = nn.Linear(hidden, config.airframes + 1) if config.airframes else None
         self._init_priors()
 
     @torch.no_grad()
@@ -224,6 +226,7 @@ class PoseNet(nn.Module):
             (R_ray[:, None] @ R_allo_k).reshape(-1, M, count, 3, 3),
             (R_ray @ R_allo).reshape(-1, M, 3, 3),
             self._log_sigma(f_trans, f_rot).reshape(-1, M, 6),
+            self._airframe_logits(f_trans, M),
         )
 
     def _anchor_of(self, F_global: Tensor, log_P: Tensor, peaks_xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -246,11 +249,16 @@ class PoseNet(nn.Module):
         return logits, eq.gram_schmidt(torch.gather(r_6d, 1, of_best))
 
     def _log_sigma(self, f_trans: Tensor, f_rot: Tensor) -> Tensor:
-        """From detached features: the uncertainty never pulls at the means."""
+        """Its loss sees errors detached: it teaches the features what is hard, and never pulls at the means."""
         if self.head_sigma_t is None or self.head_sigma_r is None:
             return torch.zeros_like(f_trans[..., :6])
-        raw = torch.cat([self.head_sigma_t(f_trans.detach()), self.head_sigma_r(f_rot.detach())], dim=-1)
+        raw = torch.cat([self.head_sigma_t(f_trans), self.head_sigma_r(f_rot)], dim=-1)
         return torch.clamp(raw - 2.0, -7.0, 1.5)
+
+    def _airframe_logits(self, f_trans: Tensor, M: int) -> Tensor:
+        if self.head_airframe is None:
+            return f_trans.new_zeros(f_trans.shape[0] // M, M, 0)
+        return self.head_airframe(f_trans).reshape(-1, M, self.config.airframes + 1)
 
     def _sigma_g(self, log_P: Tensor) -> Tensor | float:
         cells = self.config.soft_argmax_sigma_cells

@@ -20,8 +20,12 @@ class TooFewCandidates(ValueError):
     """Not enough peaks on or off targets to tell them apart by."""
 
 
+class ScoresTellNothing(ValueError):
+    """A higher peak is no more often on a target than a lower one."""
+
+
 def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
-    """The calibration of highest likelihood. Raises TooFewCandidates, and ValueError where a higher peak says less."""
+    """The calibration of highest likelihood. Raises TooFewCandidates, ScoresTellNothing."""
     seen = list(candidates)
     on = np.array([candidate.is_target for candidate in seen], dtype=bool)
     if min(on.sum(), (~on).sum()) < LEAST_OF_EACH:
@@ -35,13 +39,11 @@ def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
     for cap in SIZE_CAPS_PX:
         weights, deviance = _logistic(np.column_stack([np.ones(len(on)), logit, np.log(np.minimum(shown, cap))]), on)
         fits.append((deviance, cap, weights))
-    _, cap, (offset, slope, size_slope) = min(fits, key=lambda one: one[0])
-    return ScoreCalibration(
-        offset=round(float(offset), 4),
-        slope=round(float(slope), 4),
-        size_slope=round(float(size_slope), 4),
-        size_cap_px=cap,
-    )
+    _, cap, weights = min(fits, key=lambda one: one[0])
+    offset, slope, size_slope = (round(float(weight), 4) for weight in weights)
+    if slope <= 0:
+        raise ScoresTellNothing("its scores do not tell targets from the rest: train it longer")
+    return ScoreCalibration(offset=offset, slope=slope, size_slope=size_slope, size_cap_px=cap)
 
 
 def _logistic(X: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:

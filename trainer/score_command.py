@@ -28,6 +28,7 @@ def register(commands: argparse._SubParsersAction) -> None:
     )
     command.add_argument("--model", type=Path, required=True, metavar="ONNX", help="the file to calibrate, in place")
     command.add_argument("--dataset", type=Path, required=True, nargs="+", metavar="DIR", help="BOP datasets")
+    command.add_argument("--split", metavar="NAME", help="folder of each dataset to take (default: all there are)")
     command.set_defaults(run=run)
 
 
@@ -41,6 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
         contract = calibrate_file(
             arguments.model,
             arguments.dataset,
+            arguments.split,
             on_start=lambda total: progress.update(task, total=total),
             on_frame=lambda: progress.advance(task),
         )
@@ -51,7 +53,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def calibrate_file(
     path: Path,
-    datasets: Sequence[Path],
+    folders: Sequence[Path],
+    split: str | None = None,
     *,
     on_start: Callable[[int], None] = lambda _: None,
     on_frame: Callable[[], None] = lambda: None,
@@ -61,11 +64,13 @@ def calibrate_file(
     from sim_replay.evaluation.candidates import candidates
     from sim_replay.offline import DEFAULT_THREADS, InputError, load_model
     from trainer.graph import read_contract, write_contract
-    from trainer.score_calibration import TooFewCandidates, expected_calibration_error, fit
+    from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
 
     contract = read_contract(path)
     try:
-        pictures = [picture for folder in datasets for picture in open_dataset(folder).labelled_frames()]
+        datasets = [open_dataset(folder, split) for folder in folders]
+        of_each = [dataset.boxed_frames() for dataset in datasets]
+        pictures = [picture for frames in of_each for picture in frames]
         on_start(len(pictures))
         seen = list(candidates(load_model(path, DEFAULT_THREADS), pictures, on_frame))
     except InputError as error:
@@ -83,11 +88,16 @@ def calibrate_file(
             changes[f"{stage}_score"] = fitted = fit(of_stage)
         except TooFewCandidates as error:
             raise ConfigError(f"--dataset: {stage}: {error}") from error
+        except ScoresTellNothing as error:
+            raise ConfigError(f"{path}: {stage}: {error}") from error
         metrics[f"{stage}_calibration_error"] = round(expected_calibration_error(fitted, of_stage), 4)
     changes |= {"acquire_score_min": ACQUIRE_PROBABILITY_MIN, "track_score_min": TRACK_PROBABILITY_MIN}
     training = contract.training | {
         "score_frames": len(pictures),
-        "score_datasets": ", ".join(d.name for d in datasets),
+        "score_datasets": ", ".join(
+            f"{dataset.name}/{dataset.split or 'all'} ({len(frames)})"
+            for dataset, frames in zip(datasets, of_each, strict=True)
+        ),
     }
     contract = contract.model_copy(update=changes | {"metrics": metrics, "training": training})
     write_contract(path, contract)

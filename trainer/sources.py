@@ -22,7 +22,7 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
         if split is not None:
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
             shares.append(source.share)
-    if sum(shares) < 1.0:
+    if not samplers or config.rendered_share > 0.0:
         # What is measured on holds the fleet alone, however many invented aircraft are trained on.
         invented = 0.0 if validating or held_out else config.invented_share
         samplers.append(
@@ -30,6 +30,15 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
         )
         shares.append(1.0 - sum(shares))
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
+
+
+def refuse_unreadable(config: DataConfig) -> None:
+    """Raises ConfigError where a dataset to train or to validate on cannot be used: before hours of training."""
+    size_px = 32  # whatever the windows' size, the labels are the same
+    for source in config.datasets:
+        for split in (source.split, source.validation_split):
+            if split is not None:
+                DatasetSampler(source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view)
 
 
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:

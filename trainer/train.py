@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from msgs.contract import samples_behind
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
@@ -26,7 +27,7 @@ from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.rounding import rounded
 from trainer.runlog import RunLog, provenance
-from trainer.sources import window_sampler
+from trainer.sources import refuse_unreadable, window_sampler
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
 
@@ -104,6 +105,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr, fused=True)
         self.steps = 0
         self.samples = 0
+        self.samples_before: int | None = 0  # of the runs whose weights this one began with; None: not known
         self.started_from = "public ImageNet weights" if config.model.pretrained else "scratch"
 
     def _parameter_groups(self) -> list[dict[str, Any]]:
@@ -177,12 +179,14 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "steps": self.steps,
             "samples": self.samples,
+            "samples_before": self.samples_before,
             "started_from": self.started_from,
         }
 
     def start_from(self, weights: Path) -> None:
         """Begin with another run's weights where name and shape agree. Raises ConfigError if none does."""
-        given = load_file(weights).get("weights", {})
+        content = load_file(weights)
+        given = content.get("weights", {})
         self.started_from = f"weights {weights_sha256(given)[:16]}"
         own = self.model.state_dict()
         fitting = {key: value for key, value in given.items() if key in own and own[key].shape == value.shape}
@@ -190,6 +194,7 @@ class Trainer:
             raise ConfigError(f"{weights}: holds no weights that fit this network")
         for network in (self.model, self.average):
             network.load_state_dict(fitting, strict=False)
+        self.samples_before = samples_behind(content.get("training", {}))
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take the state of an earlier run with the same network."""
@@ -198,6 +203,7 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.steps, self.samples = state["steps"], state["samples"]
         self.started_from = state["started_from"]
+        self.samples_before = state.get("samples_before")
 
 
 @torch.no_grad()
@@ -267,6 +273,7 @@ def run_training(
     A resumed run keeps its planned `samples` unless others are given. Raises ConfigError.
     """
     torch.set_num_threads(config.run.threads)
+    refuse_unreadable(config.data)
     opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
     with joined_group() as group:
         trainer = Trainer(config, group.device, group)
@@ -389,6 +396,8 @@ class _Loop:
             "samples": self.trainer.samples,
             "steps": self.trainer.steps,
         }
+        if self.trainer.samples_before is not None:
+            training["samples_before"] = self.trainer.samples_before
         training["resolution_px"] = self.size_px
         save_weights(self.out / WEIGHTS_NAME, self.trainer.average, self.config_text, training)
         write_atomic(self.out / RESUME_NAME, state)

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later wins where a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
+SIXTEEN_BITS_LEAST = 2**14  # that a picture of 16 bits reaches; cameras of 10 to 14 bits that were not scaled do not
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class BopScene:
 
     def image_bgr(self, frame: BopFrame) -> Image:
         """The frame's picture [H, W, 3]; a gray one has three equal channels. Raises BopError."""
-        return _pixels(self.image_path(frame), cv2.IMREAD_COLOR)
+        return read_picture_bgr(self.image_path(frame))
 
     def mask(self, frame: BopFrame, target_index: int) -> Mask | None:
         """The visible mask [H, W] of a target, or None where the data set has no masks. Raises BopError."""
@@ -173,8 +174,23 @@ def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
         raise BopError(f"{path}: '{target_index}' does not hold 'size' and 'counts' of one mask") from error
 
 
-def _pixels(path: Path, flags: int) -> Image:
+def read_picture_bgr(path: Path) -> Image:
+    """The picture [H, W, 3]; of 16 bits the upper eight. Raises BopError, for 16 bits that are not in use too."""
+    pixels = _pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if pixels.dtype == np.uint16:
+        if pixels.max() < SIXTEEN_BITS_LEAST:
+            raise BopError(
+                f"{path}: of its 16 bits no pixel has more than {int(pixels.max()).bit_length()}: "
+                "it would be read nearly black; scale it to all 16, or to 8"
+            )
+        pixels >>= 8
+    elif pixels.dtype != np.uint8:
+        raise BopError(f"{path} has pixels of {pixels.dtype}, not of 8 or 16 bits")
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _pixels(path: Path, flags: int) -> NDArray[Any]:
     pixels = cv2.imread(str(path), flags)
     if pixels is None:
         raise BopError(f"{path} is not a readable picture")
-    return np.asarray(pixels, dtype=np.uint8)
+    return pixels

@@ -43,8 +43,8 @@ def candidates(
     model.warm_up()
     for picture in pictures:
         frame = Frame(FrameMeta(picture.image_id, 0, 0), picture.undistorted_bgr(), picture.K)
-        boxes = [t.box_visible_xyxy_px for t in picture.targets if t.box_visible_xyxy_px is not None]
-        yield from _in_frame(estimator, frame, boxes)
+        boxes = picture.undistorted_boxes_xyxy_px((frame.image_bgr.shape[1], frame.image_bgr.shape[0]))
+        yield from _in_frame(estimator, frame, [box for box in boxes if box is not None])
         on_frame()
 
 

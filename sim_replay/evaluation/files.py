@@ -1,4 +1,4 @@
-"""What an evaluation leaves on disk: metrics.json, frames.jsonl and a BOP results file."""
+"""What an evaluation leaves on disk: metrics.json, frames.jsonl and, of a model, a BOP results file."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ from sim_replay.score import Match, TargetPose
 def write_files(
     out: Path, method: str, dataset: Dataset, score: dict[str, Any], judged: Sequence[JudgedFrame]
 ) -> list[Path]:
-    """Write the score and every frame's result into `out`; returns the files. `method` names the results file."""
+    """Write the score and every frame's result into `out`; returns the files. `method` names the results file.
+
+    Poses that came from a results file are not written as one: it may lie in `out` under the same name.
+    """
     out.mkdir(parents=True, exist_ok=True)
     metrics_json, frames_jsonl = out / "metrics.json", out / "frames.jsonl"
     metrics_json.write_text(json.dumps(score, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     with frames_jsonl.open("w", encoding="utf-8") as file:
         for frame in judged:
             file.write(json.dumps(frame_record(frame, dataset.root), allow_nan=False) + "\n")
+    if score["method"]["precision"] is None:
+        return [metrics_json, frames_jsonl]
     results_csv = out / results_name(method, dataset)
     write_results(results_csv, judged)
     return [metrics_json, frames_jsonl, results_csv]

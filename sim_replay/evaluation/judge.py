@@ -46,7 +46,10 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
             continue
         model = models.get(target.object_id)
         if model is None:
-            raise InputError(f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models")
+            raise InputError(
+                f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models; "
+                "without models, give its diameter_m in model_frame.toml"
+            )
         truths.append(
             Truth(
                 index,

@@ -16,7 +16,7 @@ import pytest
 
 from edge.errors import InputError
 from sim_replay.bop import DISTORTION_KEY, BopError
-from sim_replay.datasets import Dataset, open_dataset
+from sim_replay.datasets import Dataset, box_of_mask, open_dataset
 from sim_replay.ground_truth import read_scene_truth
 
 SIZE_WH = (160, 120)
@@ -287,6 +287,59 @@ def test_a_lens_is_taken_out_and_projected_boxes_lie_in_the_picture_on_disk(tmp_
     np.testing.assert_array_equal(read_scene_truth(folder).undistorted_bgr(0), frame.undistorted_bgr())
     expected = [*vertices_px.min(axis=0), *vertices_px.max(axis=0)]
     np.testing.assert_allclose(frame.targets[0].box_visible_xyxy_px, expected, atol=1e-6)
+
+
+def test_boxes_behind_a_lens_lie_where_the_undistorted_picture_shows_the_target(tmp_path: Path) -> None:
+    folder, lens = write_scene(tmp_path / "test" / "000001", (0, 1, 2), masks=False), (-0.3, 0.02, 0.004, -0.003, 0.0)
+    wide_K = np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 1]])
+    write_json(
+        folder / "scene_camera.json",
+        {str(i): {"cam_K": wide_K.ravel().tolist()} | ({DISTORTION_KEY: lens} if i < 2 else {}) for i in range(3)},
+    )
+    # The first is seen whole, of the second the picture of a pinhole camera has room for a part, of the third for none.
+    rays = np.array([[-0.5, 0.2, 1.0], [0.1, 0.58, 1.0], [0.0, 0.68, 1.0]])
+    (folder / "mask_visib").mkdir()
+    shown = []
+    for k, ray in enumerate(rays):
+        around = np.linspace(0, 2 * np.pi, 60)
+        ring = ray + 0.05 * np.column_stack([np.cos(around), np.sin(around), np.zeros(60)])
+        outline, _ = cv2.projectPoints(ring, np.zeros(3), np.zeros(3), wide_K, np.array(lens))
+        mask = np.zeros(SIZE_WH[::-1], np.uint8)
+        cv2.fillPoly(mask, [np.round(outline * 16).astype(np.int32)], 255, shift=4)
+        assert mask.any()
+        shown.append(box_of_mask(cv2.undistort(mask, wide_K, np.array(lens)) > 127))
+        for image_id in range(3):
+            cv2.imwrite(str(folder / "mask_visib" / f"{image_id:06d}_{k:06d}.png"), mask)
+    poses = [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": (2e5 * ray).tolist()} for ray in rays]
+    write_json(folder / "scene_gt.json", {"0": poses, "1": [], "2": poses})
+    bent, empty, plain = open_dataset(tmp_path).frames()
+    whole, part, none = bent.undistorted_boxes_xyxy_px(SIZE_WH)
+    assert none is None
+    assert shown[2] is None
+    np.testing.assert_allclose(np.stack([whole, part]), np.stack(shown[:2]), atol=1.1)
+    assert part[3] == SIZE_WH[1] - 0.5
+    assert np.abs(whole - bent.targets[0].box_visible_xyxy_px).max() > 4.0
+    assert empty.undistorted_boxes_xyxy_px(SIZE_WH) == []
+    assert plain.undistorted_boxes_xyxy_px(SIZE_WH)[0] is plain.targets[0].box_visible_xyxy_px
+
+
+def test_pictures_of_16_bits_are_read_by_their_upper_eight_and_refused_where_those_are_empty(root: Path) -> None:
+    path = root / "test" / "000048" / "gray" / "000005.tif"
+    eight = picture(gray=True)
+    for suffix in (".tif", ".png"):
+        path.unlink()
+        path = path.with_suffix(suffix)
+        cv2.imwrite(str(path), eight.astype(np.uint16) * 256 + 255)
+        (frame,) = open_dataset(root / "test" / "000048").frames()
+        np.testing.assert_array_equal(frame.image_bgr(), np.repeat(eight[..., None], 3, axis=2))
+        cv2.imwrite(str(path), eight.astype(np.uint16) * 16)  # of a camera of 12 bits, as it came
+        with pytest.raises(BopError, match=rf"000005\{suffix}: of its 16 bits no pixel has more than 12: .*scale it"):
+            frame.undistorted_bgr()
+    path.unlink()
+    cv2.imwrite(str(path.with_suffix(".tiff")), picture().astype(np.float32) / 255)
+    (frame,) = open_dataset(root / "test" / "000048").frames()
+    with pytest.raises(BopError, match=r"000005\.tiff has pixels of float32, not of 8 or 16 bits"):
+        frame.image_bgr()
 
 
 def _broken(name: str, value: Any) -> Callable[[Path], None]:

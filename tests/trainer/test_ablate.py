@@ -14,6 +14,7 @@ import tiny
 import torch
 
 from trainer.ablate import FULL, VARIANTS, Scale, ablate, chosen, table, varied
+from trainer.checkpoint import load_file, write_atomic
 from trainer.config import ConfigError, DataConfig, load_config, parse_config
 from trainer.model import PoseNet
 
@@ -69,6 +70,12 @@ def test_rows_are_trained_once_and_stand_in_one_table(tmp_path: Path) -> None:
     again = ablate(tiny.config(), variants, SCALE, tmp_path, said.append, open_view)
     assert again == first
     assert json.loads((tmp_path / "full" / "log.jsonl").read_text().splitlines()[-1])["samples"] == 8
+    commit = first["rows"]["full"]["commit"]
+    content = load_file(tmp_path / "full")
+    content["training"]["commit"] = "an-older-one"
+    write_atomic(tmp_path / "full" / "weights.pt", content)
+    ablate(tiny.config(), variants, SCALE, tmp_path, said.append, open_view)
+    assert f"the code of `an-older-one`, `{commit}`" in (tmp_path / "table.md").read_text()
     with pytest.raises(ConfigError, match="another configuration or scale"):
         ablate(tiny.config(), [FULL], Scale(12, 64, 16), tmp_path, said.append, open_view)
 

@@ -11,13 +11,14 @@ import torch
 from trainer.average import average
 from trainer.checkpoint import deployed_weights, load_file, load_model, save_weights, write_atomic
 from trainer.cli import main
-from trainer.config import ConfigError
+from trainer.config import ConfigError, parse_config
 from trainer.model import PoseNet
 
 
 def write_run(folder: Path, seed: int, config: str = tiny.TOML) -> Path:
     torch.manual_seed(seed)
-    save_weights(folder / "weights.pt", PoseNet(tiny.config().model), config, {"samples": seed})
+    network = PoseNet(parse_config(config, "tiny.toml").model)
+    save_weights(folder / "weights.pt", network, config, {"samples": seed})
     return folder
 
 
@@ -39,9 +40,17 @@ def test_training_only_heads_that_one_run_lacks_are_the_other_s(tmp_path: Path) 
     write_atomic(one / "weights.pt", content | {"weights": deployed_weights(content["weights"])})
     average([one, other], tmp_path / "mean")
     mean, kept = (load_file(folder)["weights"] for folder in (tmp_path / "mean", other))
-    dense = [name for name in kept if name.startswith("head_dense.")]
-    assert dense
-    assert all(torch.equal(mean[name], kept[name]) for name in dense)
+    only_training = [name for name in kept if name.startswith(("head_dense.", "head_airframe."))]
+    assert len(only_training) > 2
+    assert all(torch.equal(mean[name], kept[name]) for name in only_training)
+
+
+def test_a_head_of_training_of_another_size_is_the_last_run_s(tmp_path: Path) -> None:
+    one = write_run(tmp_path / "a", 1, tiny.TOML.replace("airframes = 21", "airframes = 17"))
+    other = write_run(tmp_path / "b", 2)
+    average([one, other], tmp_path / "mean")
+    mean, last = (load_file(folder)["weights"]["head_airframe.weight"] for folder in (tmp_path / "mean", other))
+    assert torch.equal(mean, last)
 
 
 def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:

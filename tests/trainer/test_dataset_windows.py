@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,13 +13,15 @@ import pytest
 import synthetic_sampler
 import tiny
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
-from sim_replay.datasets import open_dataset
+from sim_replay.datasets import box_of_mask, open_dataset
 from sim_replay.sample import AcquireView
 from trainer.config import ConfigError, parse_config
-from trainer.data import to_tensors, training_batch
+from trainer.data import TrainingBatch, to_tensors, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 from trainer.export import stage_sampler
 from trainer.losses import dense_terms, heatmap_loss, heatmap_target
@@ -71,6 +76,37 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.parametrize("acquire_share", [0.0, 1.0])
+def test_behind_a_lens_labels_are_where_the_straightened_picture_shows_the_target(
+    tmp_path: Path, acquire_share: float
+) -> None:
+    wide_K, lens = np.array([[300.0, 0, 319.5], [0, 300, 179.5], [0, 0, 1]]), (-0.3, 0.02, 0.004, -0.003, 0.0)
+    around = np.linspace(0.0, 2 * np.pi, 90)
+    with SceneWriter(tmp_path / "train" / "000000", jpeg_quality=98) as writer:
+        for image_id, (x, y) in enumerate([(-0.8, 0.1), (0.7, -0.3), (0.75, 0.2), (0.1, 0.45), (-0.6, -0.4)]):
+            t = 260.0 * np.array([x, y, 1.0])
+            ring = t + 13.0 * np.column_stack([np.cos(around), np.sin(around), np.zeros_like(around)])
+            outline, _ = cv2.projectPoints(ring, np.zeros(3), np.zeros(3), wide_K, np.array(lens))
+            image, mask = np.full((HEIGHT, WIDTH, 3), 128, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+            corners = [np.round(outline * 16).astype(np.int32)]
+            cv2.fillPoly(image, corners, DOT_BGR, cv2.LINE_AA, shift=4)
+            cv2.fillPoly(mask, corners, 255, shift=4)
+            target = BopTarget(1, np.eye(3), t, box_of_mask(mask > 0), None, int((mask > 0).sum()))
+            writer.add(BopFrame(image_id, wide_K, (target,), distortion=lens), image)
+    batch = DatasetSampler(tmp_path, "train", 5, 128, acquire_share).batch(0, 40)
+    judged = 0
+    for k in np.flatnonzero(batch.present):
+        redness = batch.image_bgr[k, ..., 2].astype(float) - batch.image_bgr[k, ..., 1]
+        box = box_of_mask(redness > 64)
+        assert box is not None
+        if box.min() > 0 and box.max() < 126:
+            judged += 1
+            sides = box[2:] - box[:2]
+            np.testing.assert_allclose(batch.center_px[k], (box[:2] + box[2:]) / 2, atol=0.05 * sides.max() + 0.5)
+            np.testing.assert_allclose(batch.size_px[k], sides, rtol=0.2)  # the box that its sides' middles bound
+    assert judged > 10
+
+
 def test_of_a_second_aircraft_in_the_window_nothing_is_asked(pairs: Path) -> None:
     batch = DatasetSampler(pairs, "train", 5, 192, 1.0).batch(0, 40)
     _, labels = to_tensors(batch, torch.device("cpu"))
@@ -96,6 +132,23 @@ def test_of_a_second_aircraft_in_the_window_nothing_is_asked(pairs: Path) -> Non
     assert (dense.grad[:, 0][elsewhere] != 0).all()
     unjudged = (target > 0.99) & (target < 1.0)
     assert logits.grad.abs().numpy()[unjudged].max() < 1e-9 < logits.grad.abs().numpy()[target == 0.0].min()
+
+
+def test_of_a_target_that_a_window_shows_too_little_of_nothing_is_asked_and_it_is_no_background(tmp_path: Path) -> None:
+    """A disc of 240 pixels in windows of at most 128: never 35 % of its box."""
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    cv2.circle(mask, (320, 180), 120, 255, -1)
+    image = np.where(mask[..., None] > 0, np.array(DOT_BGR), 128).astype(np.uint8)
+    target = BopTarget(1, np.eye(3), np.array([0.0, 0.0, 60.0]), box_of_mask(mask > 0), None, int((mask > 0).sum()))
+    with SceneWriter(tmp_path / "train" / "000000", jpeg_quality=98) as writer:
+        writer.add(BopFrame(0, K, (target,)), image, [mask > 0])
+    batch = DatasetSampler(tmp_path, "train", 5, 128, 1.0).batch(0, 16)
+    assert not batch.present.any()
+    red = (batch.image_bgr[..., 2].astype(float) - batch.image_bgr[..., 1] > 64).reshape(16, 32, 4, 32, 4).all((2, 4))
+    assert red.sum() > 1000
+    assert batch.others[red].all()
+    _, labels = to_tensors(batch, torch.device("cpu"))
+    assert heatmap_target(labels, 16, 16)[torch.from_numpy(red[:, ::2, ::2])].min() > 0.99
 
 
 @pytest.mark.parametrize(("acquire_share", "view"), [(0.0, "crop"), (1.0, "crop"), (1.0, "frame")])
@@ -145,11 +198,72 @@ def test_mixing_keeps_the_share_and_unknown_labels_teach_nothing(dataset: Path) 
     assert (dense.grad[:2, 1:] == 0).all()
 
 
+class Numbered:
+    """Samples that carry nothing but their index and whose they are."""
+
+    def __init__(self, name: int) -> None:
+        self.name = name
+
+    def batch(self, first_index: int, count: int) -> TrainingBatch:
+        numbers = np.arange(first_index, first_index + count)
+        return TrainingBatch(*[np.column_stack([np.full(count, self.name), numbers])] * len(TrainingBatch._fields))
+
+
+def drawn_by(shares: list[float], first_index: int, count: int) -> list[tuple[int, int]]:
+    """Whose and which sample each of a batch is."""
+    mixed = MixedSampler([Numbered(name) for name in range(len(shares))], shares)
+    return [(int(name), int(number)) for name, number in mixed.batch(first_index, count).K]
+
+
+def test_a_share_of_less_than_a_sample_comes_in_some_batches() -> None:
+    counts = [sum(name == 0 for name, _ in drawn_by([0.02, 0.98], 24 * b, 24)) for b in range(50)]
+    assert sum(counts) == 24  # 2 % of 1,200
+    assert set(counts) == {0, 1}
+
+
+@given(st.lists(st.integers(1, 60), min_size=2, max_size=4), st.integers(0, 10**7), st.integers(1, 64))
+def test_every_stretch_of_the_stream_keeps_the_shares_and_repeats_nothing_however_it_is_cut(
+    parts: list[int], first: int, count: int
+) -> None:
+    shares = [part / sum(parts) for part in parts]
+    whole = drawn_by(shares, first, 2 * count)
+    assert len(set(whole)) == 2 * count
+    assert sorted(drawn_by(shares, first, count) + drawn_by(shares, first + count, count)) == sorted(whole)
+    for name, share in enumerate(shares):
+        assert abs(sum(one == name for one, _ in whole) - share * 2 * count) < len(shares)
+
+
 def test_a_network_trains_on_a_dataset_named_in_its_configuration(dataset: Path, tmp_path: Path) -> None:
-    source = f'[[data.datasets]]\npath = "{dataset}"\nshare = 1.0\nvalidation_split = "train"\n[schedule]'
+    for split in ("train", "val"):
+        shutil.copytree(dataset / "train", tmp_path / "own" / split)
+    source = f'[[data.datasets]]\npath = "{tmp_path / "own"}"\nshare = 1.0\nvalidation_split = "val"\n[schedule]'
     text = tiny.TOML.replace("[schedule]", source)
     trainer = run_training(parse_config(text, "own.toml"), text, tmp_path / "run", max_steps=1)
     assert trainer.samples == 4
+
+
+@pytest.mark.parametrize(("split", "named"), [("vall", "'vall'"), ("train", "is what is trained on")])
+def test_a_wrong_validation_split_is_told_before_the_first_step(
+    dataset: Path, tmp_path: Path, split: str, named: str
+) -> None:
+    source = f'[[data.datasets]]\npath = "{dataset}"\nshare = 0.5\nvalidation_split = "{split}"\n[schedule]'
+    text = tiny.TOML.replace("[schedule]", source)
+    with pytest.raises(ConfigError, match=named):
+        run_training(parse_config(text, "own.toml"), text, tmp_path / "run", max_steps=1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_examples_of_the_page_on_datasets_are_configurations() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "datasets.md").read_text()
+    examples = re.findall(r"```toml\n(\[\[data\.datasets\]\].*?)```", page, re.DOTALL)
+    shares = [
+        [
+            source.share
+            for source in parse_config(tiny.TOML.replace("[schedule]", text + "[schedule]"), "own").data.datasets
+        ]
+        for text in examples
+    ]
+    assert shares == [[0.3], [0.8, 0.2]]
 
 
 def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
@@ -158,6 +272,51 @@ def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
     shares = '[[data.datasets]]\npath = "a"\nshare = 0.7\n[[data.datasets]]\npath = "b"\nshare = 0.6\n[schedule]'
     with pytest.raises(ConfigError, match=r"own\.toml: data: .*add up to more than 1"):
         parse_config(tiny.TOML.replace("[schedule]", shares), "own.toml")
+
+
+def told_by_poses_alone(root: Path, Z_mm: list[float]) -> Path:
+    """A scene without a word of where in its pictures the targets are seen."""
+    scene = root / "train" / "000004"
+    (scene / "rgb").mkdir(parents=True)
+    for image_id in range(len(Z_mm)):
+        cv2.imwrite(str(scene / "rgb" / f"{image_id:06d}.png"), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    camera = {"cam_K": K.ravel().tolist()}
+    pose = {"obj_id": 7, "cam_R_m2c": np.eye(3).ravel().tolist()}
+    poses = {str(k): [pose | {"cam_t_m2c": [0, 0, z]}] for k, z in enumerate(Z_mm)}
+    (scene / "scene_camera.json").write_text(json.dumps({str(k): camera for k in range(len(Z_mm))}))
+    (scene / "scene_gt.json").write_text(json.dumps(poses))
+    return scene
+
+
+def test_a_target_of_which_nothing_tells_where_it_is_seen_is_not_taken_for_background(tmp_path: Path) -> None:
+    scene = told_by_poses_alone(tmp_path, [-200e3, 200e3])
+    box = {f"{kind}_{axis}": v for kind, v in (("min", -5e3), ("size", 1e4)) for axis in "xyz"}
+    models = tmp_path / "models" / "models_info.json"
+    models.parent.mkdir()
+    models.write_text(json.dumps({"7": {"diameter": 1e4}}))
+    with pytest.raises(ConfigError, match=r"000004: .* picture 0 .* obj_id 7: give scene_gt_info\.json, masks, or"):
+        DatasetSampler(tmp_path, "train", 1, 64, 0.0)
+    models.write_text(json.dumps({"7": {"diameter": 1e4} | box}))
+    batch = DatasetSampler(tmp_path, "train", 1, 64, 0.0).batch(0, 16)
+    assert 0 < batch.present.sum() < 16  # what lies behind the camera is not seen
+    models.unlink()
+    seen = {"0": [{"bbox_visib": [-1, -1, -1, -1]}], "1": [{"bbox_visib": [300, 170, 40, 20]}]}
+    (scene / "scene_gt_info.json").write_text(json.dumps(seen))
+    assert DatasetSampler(tmp_path, "train", 1, 64, 0.0).batch(0, 16).present.any()
+
+
+def test_targets_out_of_the_range_that_is_told_are_refused_or_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, Z_mm in {"metres": [200.0, 150.0], "mixed": [200e3, 650e3], "right": [50e3, 600e3]}.items():
+        scene = told_by_poses_alone(tmp_path / name, Z_mm)
+        (scene / "scene_gt_info.json").write_text(json.dumps({k: [{"bbox_visib": [300, 170, 40, 20]}] for k in "01"}))
+    with pytest.raises(ConfigError, match=r"metres: .* 0\.15 to 0\.2 m .* 50 to 600 m; cam_t_m2c is in millimetres"):
+        DatasetSampler(tmp_path / "metres", "train", 1, 64, 0.0)
+    DatasetSampler(tmp_path / "right", "train", 1, 64, 0.0)
+    assert not caplog.text
+    DatasetSampler(tmp_path / "mixed", "train", 1, 64, 0.0)
+    assert "mixed: 1 of 2 targets lie where no depth can be learnt" in caplog.text
 
 
 def test_a_run_on_a_dataset_that_is_not_there_says_so_and_leaves_nothing_to_resume(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import tiny
 import torch
 from scipy.spatial.transform import Rotation
 
+from sim_replay.evaluation.bop_results import write_results as write_bop_results
 from trainer.checkpoint import save_weights
 from trainer.cli import main
 from trainer.evaluate import SCORE_THRESHOLD
@@ -160,9 +161,21 @@ def test_the_results_file_that_is_written_scores_the_same(
     turn = Rotation.from_euler("y", 8, degrees=True).as_matrix()
     results = write_results(tmp_path / "mine_plane-test.csv", [(1, turn @ R, t_m), (4, R, t_m)])
     first = evaluated(capsys, "--results", results, "--dataset", dataset, "--out", tmp_path / "one")
-    written = tmp_path / "one" / "mine_plane-test.csv"
+    written = tmp_path / "two" / results.name
+    written.parent.mkdir()
+    write_bop_results(written, evaluate_dataset(DatasetRequest(results=results, dataset=dataset)).judged)
     second = evaluated(capsys, "--results", written, "--dataset", dataset, "--out", tmp_path / "two")
     assert second == first
+
+
+def test_a_results_file_that_lies_where_the_figures_go_stays_as_it_is(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = write_results(tmp_path / "mine_plane-test.csv", [(k, *true_pose(k)) for k in (0, 2)])
+    content = results.read_bytes()
+    evaluated(capsys, "--results", results, "--dataset", dataset, "--out", tmp_path)
+    assert (tmp_path / "metrics.json").is_file()
+    assert results.read_bytes() == content
 
 
 def test_by_default_the_shipped_model_flies_over_the_bundled_scene(

@@ -73,7 +73,7 @@ def test_the_weights_file_is_the_averaged_network_in_half_precision(whole: tuple
     out, trainer = whole
     model, config, training, sha256 = load_model(out)
     assert config.contract.name == "tiny"
-    assert training["samples"] == 16
+    assert (training["samples"], training["samples_before"]) == (16, 0)
     assert len(sha256) == 64
     averaged = trainer.average.state_dict()
     for name, value in model.state_dict().items():
@@ -92,6 +92,21 @@ def test_weights_of_another_run_start_a_network_with_another_head(whole: tuple[P
         torch.testing.assert_close(kept[name], given[name], rtol=1e-3, atol=1e-4, check_dtype=False)
     assert torch.equal(started.model.head_rot.weight, untouched)
     assert started.started_from.startswith("weights ")
+    assert started.samples_before == 16
+    again = Trainer(parse_config(text, "two.toml"), torch.device("cpu"))
+    again.restore(started.state())
+    assert (again.samples, again.samples_before) == (0, 16)
+
+    content = torch.load(out / "weights.pt", weights_only=True)
+    del content["training"]["samples_before"]  # as files were written before it was kept
+    content["training"]["started_from"] = "weights 0123456789abcdef"
+    torch.save(content, tmp_path / "older.pt")
+    started.start_from(tmp_path / "older.pt")
+    assert started.samples_before is None
+    content["training"]["started_from"] = "public ImageNet weights"
+    torch.save(content, tmp_path / "first.pt")
+    started.start_from(tmp_path / "first.pt")
+    assert started.samples_before == 16
 
     torch.save({"weights": {"elsewhere": torch.zeros(1)}}, tmp_path / "other.pt")
     with pytest.raises(ConfigError, match="no weights that fit"):

@@ -14,14 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msgs.contract import ScoreCalibration
+from sim_replay.bop import DISTORTION_KEY
 from sim_replay.datasets import open_dataset
-from sim_replay.evaluation.candidates import Candidate
+from sim_replay.evaluation.candidates import Candidate, candidates
 from sim_replay.evaluation.judge import judge_frames
 from sim_replay.offline import estimator_answers, load_model
 from tests.sim_replay.conftest import CX_PX, CY_PX, FOCAL_PX, SPOT_Z_M, dark_spot_model
 from trainer.cli import main
 from trainer.graph import read_contract
-from trainer.score_calibration import TooFewCandidates, expected_calibration_error, fit
+from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
 
 __all__ = ["dark_spot_model"]
 
@@ -66,6 +67,16 @@ def test_too_few_peaks_are_refused_with_their_number() -> None:
         fit([Candidate("track", 0.7, 50.0, True)] * 7 + [Candidate("track", 0.2, 50.0, False)] * 30)
 
 
+def test_a_network_whose_higher_peaks_are_no_surer_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    on = [Candidate("track", float(peak), 30.0, True) for peak in rng.uniform(0.1, 0.5, 40)]
+    off = [Candidate("track", float(peak), 30.0, False) for peak in rng.uniform(0.2, 0.7, 40)]
+    with pytest.raises(ScoresTellNothing, match="do not tell targets from the rest: train it longer"):
+        fit(on + off)
+    with pytest.raises(ScoresTellNothing):
+        fit([Candidate("track", 0.5, 30.0, k % 2 == 0) for k in range(80)])
+
+
 @given(peaks, peaks, sizes)
 def test_a_higher_peak_of_the_same_size_is_never_less_probable(a: float, b: float, shown_px: float) -> None:
     low, high = TRUE.probability(min(a, b), shown_px), TRUE.probability(max(a, b), shown_px)
@@ -82,7 +93,13 @@ def test_a_peak_that_is_not_finite_is_no_target(peak: float) -> None:
     assert TRUE.probability(peak, 50.0) == 0.0
 
 
-def write_scene(scene: Path, spots: int, specks: int) -> None:
+def write_scene(
+    scene: Path,
+    spots: int,
+    specks: int,
+    spot_greys: tuple[int, int] = (20, 90),
+    speck_greys: tuple[int, int] = (110, 160),
+) -> None:
     """Targets that are nearly black; then pictures of none, with a grey speck that the network takes for one."""
     (scene / "rgb").mkdir(parents=True)
     rng = np.random.default_rng(5)
@@ -90,7 +107,7 @@ def write_scene(scene: Path, spots: int, specks: int) -> None:
     for frame in range(spots + specks):
         x_m, y_m = rng.uniform((-50.0, -25.0), (50.0, 25.0))
         center = (round(CX_PX + FOCAL_PX * x_m / SPOT_Z_M), round(CY_PX + FOCAL_PX * y_m / SPOT_Z_M))
-        grey = int(rng.integers(20, 90) if frame < spots else rng.integers(110, 160))
+        grey = int(rng.integers(*(spot_greys if frame < spots else speck_greys)))
         image = np.full((1080, 1920, 3), 240, np.uint8)
         cv2.ellipse(image, center, (70, 65), 0, 0, 360, (grey, grey, grey), -1, cv2.LINE_AA)
         cv2.imwrite(str(scene / "rgb" / f"{frame:06d}.png"), image)
@@ -118,25 +135,71 @@ def _corner(t_mm: list[float]) -> tuple[int, int]:
 def test_a_calibrated_file_tells_targets_from_what_fooled_it(
     tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene = tmp_path / "dataset" / "val" / "000000"
-    write_scene(scene, spots=24, specks=24)
+    write_scene(tmp_path / "dataset" / "val" / "000000", spots=24, specks=24)
+    write_scene(tmp_path / "dataset" / "test" / "000000", spots=0, specks=1)
     model = tmp_path / "model.onnx"
     shutil.copy(dark_spot_model, model)
     before = read_contract(model)
 
-    assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 0
+    dataset_of = ["--dataset", str(tmp_path / "dataset"), "--split"]
+    assert main(["calibrate-score", "--model", str(model), *dataset_of, "training"]) == 2
+    assert "no split 'training'; it has test, val" in capsys.readouterr().err
+    assert main(["calibrate-score", "--model", str(model), *dataset_of, "val"]) == 0
     assert capsys.readouterr().out.startswith("acquire")
     after = read_contract(model)
     assert (after.acquire_score_min, after.track_score_min) == (0.7, 0.3)
     assert after.training["score_frames"] == 48
+    assert after.training["score_datasets"] == "dataset/val (48)"
     same = before.model_dump(exclude={"acquire_score", "track_score", "acquire_score_min", "track_score_min"})
     assert {**after.model_dump(exclude=set(before.model_dump()) - set(same)), "training": {}, "metrics": {}} == same
 
-    dataset = open_dataset(tmp_path / "dataset")
+    dataset = open_dataset(tmp_path / "dataset", "val")
     judged = judge_frames(list(dataset.frames()), dataset.models, estimator_answers(load_model(model, threads=1)))
     found = [match.estimate for frame in judged for match in frame.matches if match.estimate is not None]
     assert len(found) >= 22
     assert sum(len(frame.false_poses) for frame in judged) <= 2
+
+
+def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_spot_model: Path) -> None:
+    K, lens = np.array([[FOCAL_PX, 0, CX_PX], [0, FOCAL_PX, CY_PX], [0, 0, 1]]), (-1.0, 0.0, 0.0, 0.0, 0.0)
+    scene = tmp_path / "dataset" / "val" / "000000"
+    (scene / "rgb").mkdir(parents=True)
+    around = np.linspace(0.0, 2 * np.pi, 90)
+    center_m = SPOT_Z_M * np.array([0.35, 0.02, 1.0])
+    ring = center_m + 6.0 * np.column_stack([np.cos(around), np.sin(around), np.zeros_like(around)])
+    outline, _ = cv2.projectPoints(ring, np.zeros(3), np.zeros(3), K, np.array(lens))
+    image = np.full((1080, 1920, 3), 240, np.uint8)
+    cv2.fillPoly(image, [np.round(outline).astype(np.int32)], (40, 40, 40), cv2.LINE_AA)
+    middle, _ = cv2.projectPoints(center_m[None], np.zeros(3), np.zeros(3), K, np.array(lens))
+    cv2.circle(image, [round(float(v)) for v in middle.ravel()], 9, (5, 5, 5), -1, cv2.LINE_AA)
+    cv2.imwrite(str(scene / "rgb" / "000000.png"), image)
+    x, y, width, height = cv2.boundingRect(np.round(outline).astype(np.int32))
+    pose = {"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": (1e3 * center_m).tolist()}
+    (scene / "scene_camera.json").write_text(json.dumps({"0": {"cam_K": K.ravel().tolist(), DISTORTION_KEY: lens}}))
+    (scene / "scene_gt.json").write_text(json.dumps({"0": [pose]}))
+    (scene / "scene_gt_info.json").write_text(json.dumps({"0": [{"bbox_visib": [x, y, width, height]}]}))
+    pictures = open_dataset(tmp_path / "dataset").labelled_frames()
+    seen = list(candidates(load_model(dark_spot_model, threads=1), pictures))
+    assert [(one.stage, one.is_target) for one in seen] == [("acquire", True), ("track", True)]
+
+
+def test_what_tells_no_targets_or_not_where_they_are_is_named_and_the_file_left(
+    tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The greys are the wrong way round for a network that finds what is dark; then there are no boxes."""
+    scene = tmp_path / "dataset" / "val" / "000000"
+    write_scene(scene, spots=24, specks=24, spot_greys=(110, 160), speck_greys=(20, 90))
+    model = tmp_path / "model.onnx"
+    shutil.copy(dark_spot_model, model)
+    content = model.read_bytes()
+    command = ["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]
+    assert main(command) == 2
+    assert f"{model}: acquire: its scores do not tell targets from the rest" in capsys.readouterr().err
+    (scene / "scene_gt_info.json").unlink()
+    (scene.parents[1] / "models" / "models_info.json").unlink()
+    assert main(command) == 2
+    assert "nothing tells where picture 0 shows its target of obj_id 1" in capsys.readouterr().err
+    assert model.read_bytes() == content
 
 
 def test_a_dataset_without_false_peaks_is_refused_and_the_file_left(
