@@ -1,15 +1,19 @@
-"""Validate a configuration as far as can be without flying: keys, model, camera."""
+"""Validate a configuration as far as can be without flying: keys, certificates, model, camera."""
 
 from __future__ import annotations
 
 from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
+from edge.config_ground import ZenohSettings
+from edge.errors import InputError
 from edge.reload import load_configured
 
 
 def check(file: ConfigFile) -> list[str]:
     """Lines for a person on what the configuration holds. Raises InputError on the first thing that does not do."""
     config = file.config
+    with file.blame("zenoh", "tls"):
+        _check_certificates(config.zenoh)
     model = load_configured(file)
     with file.blame(*camera_key(config.camera)):
         source, camera, opened = open_source(config.camera)
@@ -30,3 +34,11 @@ def check(file: ConfigFile) -> list[str]:
         f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",
         f"mavlink  {', '.join(config.mavlink.endpoints) if config.mavlink.enabled else 'off'}",
     ]
+
+
+def _check_certificates(settings: ZenohSettings) -> None:
+    try:
+        if settings.tls is not None:
+            settings.tls.files().check()
+    except ValueError as error:
+        raise InputError(str(error)) from error

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from edge.status_board import StatusBoard
     from msgs.recording import Recorder
 
+log = logging.getLogger(__name__)
+
 # Python's logging levels are those of rcl_interfaces/Log; MAVLink counts the other way (MAV_SEVERITY).
 LEVELS = {HealthState.DEGRADED: logging.WARNING, HealthState.FAULT: logging.ERROR}
 MAV_SEVERITY = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3}
@@ -119,6 +121,11 @@ def start_outlets(
             on=config.recorder.enabled,
         )
         cleanup.callback(recorder.stop)
+        if config.zenoh.enabled and config.zenoh.tls is not None:
+            try:
+                config.zenoh.tls.files().check()
+            except ValueError as error:
+                log.warning("no link over tls and quic until the clock or the certificate is right: %s", error)
         with file.blame("zenoh", "listen"):
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)

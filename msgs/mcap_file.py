@@ -107,6 +107,17 @@ class _Stream:
         os.close(self._fd)
 
 
+def is_written(path: Path) -> bool:
+    """Whether somebody writes to it at present. Raises OSError."""
+    with open(path, "rb") as file:
+        try:
+            # Shared, so that two who only ask do not take each other for a writer.
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
 def finish_unfinished(path: Path) -> bool:
     """Make a file that a crash left unfinished whole: cut the torn record off and write the end; whether it was one.
 

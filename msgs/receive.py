@@ -1,4 +1,5 @@
-"""Judging poses as they arrive: decode, then refuse what is old, repeated or out of order, and count why."""
+"""Judging poses as they arrive: decode, then refuse what is old, repeated, out of order or of a second publisher, and
+count why."""
 
 from __future__ import annotations
 
@@ -12,6 +13,7 @@ from msgs.wire import PayloadError, Refusal
 
 _NS = 1_000_000_000
 _PUBLISHERS_REMEMBERED = 16
+_SILENT_NS = _NS  # of one publisher, until another is taken for its successor
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +42,20 @@ class TargetPose:
         return (self.arrival_ns - self.pose.stamp_ns) / _NS
 
 
+@dataclass(frozen=True)
+class _Last:
+    """The newest pose taken of a target."""
+
+    stamp_ns: int
+    arrival_ns: int
+    gid: bytes  # of its publisher
+
+
 class PoseReceiver:
     """Takes the poses of one UAV's targets and counts what it refuses, by reason.
 
+    A target has one publisher at a time: of two daemons under one name the first that was heard is believed, until
+    nothing of it was taken for a second, as when it was restarted.
     Ages compare the sender's clock with ours: `max_age_s` and `max_future_s` must allow for their difference.
     """
 
@@ -54,7 +67,7 @@ class PoseReceiver:
         self._max_age_ns = round(max_age_s * _NS)
         self._max_future_ns = round(max_future_s * _NS)
         self._sequences: dict[tuple[str, bytes], int] = {}
-        self._stamps_ns: dict[str, int] = {}
+        self._last: dict[str, _Last] = {}
 
     def receive(self, key: str, payload: bytes, attachment: bytes, now_ns: int) -> TargetPose | None:
         """The pose in a sample, or None if it is refused. `now_ns` is UTC."""
@@ -76,17 +89,20 @@ class PoseReceiver:
             raise PayloadError(Refusal.ATTACHMENT)
         sequence, _, gid = parsed
         pose = PoseWithCovarianceStamped.decode(payload)
+        last = self._last.get(target)
+        # Set back, our clock tells nothing of how long the other has been silent.
+        if last is not None and gid != last.gid and 0 <= now_ns - last.arrival_ns <= _SILENT_NS:
+            raise PayloadError(Refusal.PUBLISHER)
         if sequence <= self._sequences.get((target, gid), 0):
             raise PayloadError(Refusal.SEQUENCE)
         if pose.stamp_ns - now_ns > self._max_future_ns:
             raise PayloadError(Refusal.FUTURE)
-        last_ns = self._stamps_ns.get(target)
         # One that lies ahead is of a clock that was set back since: it must not keep poses out until that time comes.
-        overtakes = last_ns is None or pose.stamp_ns > last_ns or last_ns - now_ns > self._max_future_ns
+        overtakes = last is None or pose.stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > self._max_future_ns
         if now_ns - pose.stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
         self._remember(target, gid, sequence)
-        self._stamps_ns[target] = pose.stamp_ns
+        self._last[target] = _Last(pose.stamp_ns, now_ns, gid)
         return TargetPose(self._uav, target, pose, sequence, now_ns)
 
     def _remember(self, target: str, gid: bytes, sequence: int) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Literal
 
 from msgs import topics
-from msgs.mcap_file import McapFile, finish_unfinished
+from msgs.mcap_file import McapFile, finish_unfinished, is_written
 from msgs.topics import Topic
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class Recorder:
     """
 
     def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell, *, on: bool = True) -> None:
-        self._store = Store(folder, stem, limits)
+        self._store = Store(folder, stem, limits, tell)
         self._limits = limits
         self._tell = tell
         self._changed = threading.Condition()
@@ -175,14 +175,14 @@ class Recorder:
             file, self._file = self._file, None
             file.close()
         elif samples:
-            self._store.make_room(self._file)
+            self._store.make_room()
 
     def _open(self, samples: Collection[Sample]) -> None:
         now_s = time.monotonic()
         if self._file is not None or (self._failure is not None and now_s < self._retry_s):
             return
         self._store.finish_unfinished()
-        self._store.make_room(None)
+        self._store.make_room()
         self._file = self._store.new_file()
         self._opened_s = now_s
         with self._changed:
@@ -221,12 +221,16 @@ class Recorder:
 
 
 class Store:
-    """The folder: numbered files, the oldest first to go. Numbers, since a clock may be wrong or be set back."""
+    """The folder: numbered files, the oldest first to go. Numbers, since a clock may be wrong or be set back.
 
-    def __init__(self, folder: Path, stem: str, limits: RecordingLimits) -> None:
+    Other recorders may write into it at the same time: their files count, and stay until they are closed.
+    """
+
+    def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell) -> None:
         self._folder = folder
         self._stem = stem
         self._limits = limits
+        self._tell = tell
         self._name = re.compile(rf"{re.escape(stem)}_(\d{{6,}})_.*\.mcap")
 
     def files(self) -> list[Path]:
@@ -252,24 +256,49 @@ class Store:
         began = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         return McapFile(self._folder / f"{self._stem}_{number:06d}_{began}.mcap")
 
-    def make_room(self, current: McapFile | None) -> None:
-        """Keep to the limits, by removing the oldest if they may go. Raises OSError when there is no room."""
-        files = [path for path in self.files() if current is None or path != current.path]
-        while self._is_full():
-            if self._limits.when_full == "stop" or not files:
-                raise OSError("no room left for recordings")
-            with suppress(OSError):  # of what cannot be removed the next may be
-                files.pop(0).unlink()
+    def make_room(self) -> None:
+        """Keep to the limits, by removing the oldest if they may go. Raises OSError when there is no room.
 
-    def _is_full(self) -> bool:
-        if shutil.disk_usage(self._folder).free < self._limits.free_bytes_min:
-            return True
-        total_max = self._limits.total_bytes_max
-        return total_max is not None and sum(map(_size_of, self.files())) > total_max
+        Nothing is removed where even all that may go would not do, as on a disk that others have filled.
+        """
+        if (short := self._bytes_short()) <= 0:
+            return
+        files = deque(self._removable()) if self._limits.when_full == "oldest" else deque[Path]()
+        removed = []
+        try:
+            while short > 0:
+                if sum(map(_size_of, files)) < short:
+                    raise OSError("no room left for recordings")
+                path = files.popleft()
+                with suppress(OSError):  # of what cannot be removed the next may be
+                    path.unlink()
+                    removed.append(path.name)
+                short = self._bytes_short()
+        finally:
+            if removed:
+                text = f"old recordings removed to make room: {len(removed)}, up to {removed[-1]}"
+                log.info("%s", text)
+                self._tell(logging.INFO, text)
+
+    def _removable(self) -> list[Path]:
+        """Oldest first."""
+        removable = []
+        for path in self.files():
+            with suppress(OSError):
+                if not is_written(path):
+                    removable.append(path)
+        return removable
+
+    def _bytes_short(self) -> int:
+        """How much must go until all limits are kept."""
+        short = self._limits.free_bytes_min - shutil.disk_usage(self._folder).free
+        if (total_max := self._limits.total_bytes_max) is not None:
+            short = max(short, sum(map(_size_of, self.files())) - total_max)
+        return short
 
 
 def _size_of(path: Path) -> int:
     """Bytes; 0 for what cannot be looked at."""
     with suppress(OSError):
-        return path.stat().st_size
+        return path.lstat().st_size
     return 0

@@ -9,8 +9,11 @@ from __future__ import annotations
 import json
 import re
 import ssl
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +31,7 @@ RETRY_PERIOD_MAX_MS = 500
 TF_RATE_MAX_HZ = 5.0
 DETECTIONS_RATE_MAX_HZ = 2.0
 SECURE = ("tls", "quic")
+_NO_CHECK_TIME = 0x200000  # OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which ssl has no name for
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5}))([?#].*)?")
 
 
@@ -40,7 +44,19 @@ class TlsFiles:
     private_key: Path
 
     def check(self) -> None:
-        """Raises ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
+        """`check_files`, and the certificate is valid today. Raises ValueError, a sentence that names the file."""
+        own = self.check_files()
+        # The authority's own dates are left alone: zenoh takes it for what it is told to trust, whatever they say.
+        begins_s, ends_s = (ssl.cert_time_to_seconds(own[key]) for key in ("notBefore", "notAfter"))
+        now_s = time.time()
+        if now_s < begins_s:
+            raise ValueError(f"{self.certificate} is not valid before {_day(begins_s)}; today is {_day(now_s)}")
+        if now_s > ends_s:
+            raise ValueError(f"{self.certificate} expired on {_day(ends_s)}; today is {_day(now_s)}")
+
+    def check_files(self) -> Mapping[str, Any]:
+        """What holds on any day: read, and of one key and authority; the certificate as ssl tells it. Raises
+        ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
         for path in (self.root_ca, self.certificate, self.private_key):
             try:
                 path.read_bytes()
@@ -57,6 +73,38 @@ class TlsFiles:
             context.load_cert_chain(self.certificate, self.private_key)
         except ssl.SSLError as error:
             raise ValueError(f"{self.private_key} is not the PEM key of {self.certificate}") from error
+        try:
+            return self._vouched_for()
+        except ssl.SSLError as error:
+            why = error.verify_message if isinstance(error, ssl.SSLCertVerificationError) else error.reason
+            raise ValueError(f"{self.certificate} is refused by whoever trusts {self.root_ca}: {why}") from error
+
+    def _vouched_for(self) -> Mapping[str, Any]:
+        """The certificate, as whoever trusts root_ca sees it. Raises ssl.SSLError if that end would not take it.
+
+        ssl verifies in a handshake alone, so that one is held in memory.
+        """
+        server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        server.load_cert_chain(self.certificate, self.private_key)
+        client.load_verify_locations(self.root_ca)
+        client.check_hostname = False
+        # As zenoh does, take an intermediate authority's certificate for root_ca.
+        client.verify_flags |= ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+        to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
+        connecting = client.wrap_bio(to_client, to_server)
+        listening = server.wrap_bio(to_server, to_client, server_side=True)
+        while True:
+            try:
+                connecting.do_handshake()
+            except ssl.SSLWantReadError:
+                with suppress(ssl.SSLWantReadError):
+                    listening.do_handshake()
+            else:
+                return connecting.getpeercert() or {}
+
+
+def _day(utc_s: float) -> str:
+    return datetime.fromtimestamp(utc_s, UTC).strftime("%Y-%m-%d")
 
 
 def check_endpoint(endpoint: str, *, tls: bool) -> str:

@@ -39,6 +39,7 @@ class Refusal(Enum):
     STALE = "stamp is too old, or older than one already taken"
     FUTURE = "stamp lies in the future"
     TOPIC = "key is no topic of the table"
+    PUBLISHER = "another publisher of this target was heard within the last second"
 
 
 class PayloadError(ValueError):

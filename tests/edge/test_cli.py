@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from msgs.ground.keys import init_authority, issue
+from tests.certificates import redate
+
 from .conftest import Cli
 from .toy_model import write_toy_model
 
@@ -49,6 +52,23 @@ def test_a_configuration_that_flies_is_checked_and_flown(cli: Cli, tmp_path: Pat
     assert "toy fp32" in checked.stdout
     flown = cli("run", "--config", "config.toml")
     assert flown.returncode == 0, flown.stderr
+    assert "captured=" in flown.stderr.splitlines()[-1]
+
+
+def test_a_certificate_of_another_day_is_told_by_check_and_keeps_nobody_from_flying(
+    cli: Cli, tmp_path: Path, text: str
+) -> None:
+    """A computer without a clock begins in the past, and the link comes up once it knows the time."""
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    begins, _ = redate(tmp_path, "uav1", begins_days=2, ends_days=9)
+    text += "[mavlink]\nenabled = false\n[zenoh]\nlisten = []\n"
+    text += 'tls = { root_ca = "ca.pem", certificate = "uav1.pem", private_key = "uav1.key" }\n'
+    sentence = f"{tmp_path / 'uav1.pem'} is not valid before {begins:%Y-%m-%d}; today is "
+    assert f"config.toml:11: [zenoh] tls: {sentence}" in refusal(cli, tmp_path, text, "check")
+    flown = cli("run", "--config", "config.toml")
+    assert flown.returncode == 0, flown.stderr
+    assert sentence in flown.stderr
     assert "captured=" in flown.stderr.splitlines()[-1]
 
 

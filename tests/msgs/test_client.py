@@ -6,12 +6,13 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import pairwise
 
 import pytest
 import zenoh
 
 from msgs import cdr, client, session, topics
-from msgs.publish import Node
+from msgs.publish import Node, TopicPublisher
 from msgs.receive import TargetPose
 from msgs.topics import POSE
 from msgs.wire import Refusal
@@ -67,12 +68,36 @@ def test_bad_samples_are_counted_by_reason_and_good_ones_still_come(network: Net
         publisher.put(pose_now().encode()[:-8])
         publisher.put(pose_now(age_s=30.0).encode())
         network.daemon.put(publisher.key, pose_now().encode())
-        network.daemon.put(publisher.key, pose_now().encode(), attachment=topics.attachment(1, 0, bytes(16)))
         expected = {Refusal.ENCAPSULATION: 1, Refusal.TRUNCATED: 1, Refusal.STALE: 1, Refusal.ATTACHMENT: 1}
         until(lambda: dict(poses.refused) == expected, lambda: poses.poll())
         accepted = poses.accepted
         until(lambda: poses.poll() is not None, lambda: publisher.put(pose_now().encode()))
         assert poses.accepted > accepted
+
+
+def test_of_two_daemons_of_one_name_one_is_believed_and_the_other_once_it_has_ended(network: Network) -> None:
+    taken: list[tuple[float, int]] = []
+    with (
+        zenoh.open(session.peer_config([], [network.endpoint])) as other_daemon,
+        client.connect(network.endpoint) as tool,
+        client.subscribe(tool, "uav1", depth=64) as poses,
+        Node(other_daemon, "uav1") as other,
+    ):
+        far = other.publisher(POSE, "t0")
+
+        def step(*putting: tuple[TopicPublisher, float]) -> None:
+            for publisher, range_m in putting:
+                publisher.put(pose_now(range_m).encode())
+            taken.extend((one.pose.t_cam_target_m[2], one.arrival_ns) for one in iter(poses.poll, None))
+
+        with Node(network.daemon, "uav1") as node:
+            near = node.publisher(POSE, "t0")
+            until(lambda: taken, lambda: step((near, 100.0)), what="the first daemon's pose")
+            refused = lambda: poses.refused[Refusal.PUBLISHER] >= 20  # noqa: E731
+            until(refused, lambda: step((near, 100.0), (far, 300.0)), what="the other's poses, refused")
+        until(lambda: taken[-1][0] == 300.0, lambda: step((far, 300.0)), what="the other's pose, taken")
+    # On a busy machine one may fall silent for a second while both are there.
+    assert all(b[1] - a[1] > 1_000_000_000 for a, b in pairwise(taken) if a[0] != b[0])
 
 
 def test_a_slow_reader_gets_the_newest_poses(network: Network) -> None:

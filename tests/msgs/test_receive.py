@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -15,7 +16,7 @@ from msgs.wire import Refusal
 
 from .conftest import pose_now
 
-NOW_NS = 1_700_000_000_000_000_000
+NOW_NS, S = 1_700_000_000_000_000_000, 1_000_000_000
 GID, OTHER_GID = bytes(range(16)), bytes(range(1, 17))
 KEY = topics.publication_key(POSE, "uav1", "t0")
 
@@ -44,13 +45,36 @@ def test_repeated_late_and_future_poses_are_refused(sequence: int, stamp_ns: int
     assert receiver.receive(KEY, *sample(3, NOW_NS - 99_999_999), NOW_NS)
 
 
-def test_a_restarted_publisher_counts_from_one_again() -> None:
+def test_a_restarted_publisher_counts_from_one_again_and_is_taken_once_its_predecessor_is_silent_for_a_second() -> None:
     receiver = PoseReceiver("uav1")
     assert receiver.receive(KEY, *sample(900, NOW_NS - 5), NOW_NS)
-    taken = receiver.receive(KEY, *sample(1, NOW_NS - 4, OTHER_GID), NOW_NS)
+    for after_ns in (1, S):
+        assert receiver.receive(KEY, *sample(1, NOW_NS + after_ns, OTHER_GID), NOW_NS + after_ns) is None
+    assert dict(receiver.refused) == {Refusal.PUBLISHER: 2}
+    taken = receiver.receive(KEY, *sample(1, NOW_NS + S - 3, OTHER_GID), NOW_NS + S + 1)
     assert taken is not None
     assert taken.sequence == 1
     assert taken.age_s == pytest.approx(4e-9)
+
+
+def test_of_two_publishers_the_first_alone_is_believed_while_it_is_heard() -> None:
+    receiver = PoseReceiver("uav1")
+    second = topics.publication_key(POSE, "uav1", "t1")
+    for n in range(1, 40):
+        now_ns = NOW_NS + n * S // 10
+        assert receiver.receive(KEY, *sample(n, now_ns), now_ns)
+        assert receiver.receive(KEY, *sample(n, now_ns + 1, OTHER_GID), now_ns + 1) is None
+        assert receiver.receive(second, *sample(n, now_ns, OTHER_GID), now_ns)
+    assert dict(receiver.refused) == {Refusal.PUBLISHER: 39}
+
+
+def test_a_publisher_of_whom_nothing_can_be_taken_keeps_no_other_out() -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(KEY, *sample(1, NOW_NS), NOW_NS)
+    for n in range(2, 14):
+        now_ns = NOW_NS + n * S // 10
+        assert receiver.receive(KEY, *sample(n, NOW_NS - S), now_ns) is None
+    assert receiver.receive(KEY, *sample(1, now_ns, OTHER_GID), now_ns)
 
 
 def test_targets_are_judged_apart() -> None:
@@ -69,36 +93,45 @@ def test_keys_and_attachments_are_judged_too() -> None:
 
 
 @settings(max_examples=60)
-@given(st.lists(st.tuples(st.integers(-3, 40), st.integers(-2_000, 1_000), st.booleans()), max_size=30))
-def test_stamps_and_sequences_taken_always_rise(samples: list[tuple[int, int, bool]]) -> None:
-    receiver = PoseReceiver("uav1")
+@given(
+    st.lists(
+        st.tuples(st.integers(-3, 40), st.integers(-2_000, 1_000), st.booleans(), st.integers(0, 1_500)), max_size=30
+    )
+)
+def test_stamps_and_sequences_taken_always_rise(samples: list[tuple[int, int, bool, int]]) -> None:
+    receiver, now_ns = PoseReceiver("uav1"), NOW_NS
     taken = []
-    for sequence, offset_ms, other in samples:
-        stamp_ns = NOW_NS + offset_ms * 1_000_000
-        pose = receiver.receive(KEY, *sample(sequence, stamp_ns, OTHER_GID if other else GID), NOW_NS)
+    for sequence, offset_ms, other, pause_ms in samples:
+        now_ns += pause_ms * 1_000_000
+        stamp_ns = now_ns + offset_ms * 1_000_000
+        pose = receiver.receive(KEY, *sample(sequence, stamp_ns, OTHER_GID if other else GID), now_ns)
         if pose is not None:
-            taken.append((pose.stamp_ns, other, pose.sequence))
+            taken.append((pose.stamp_ns, other, pose.sequence, now_ns))
     assert [t[0] for t in taken] == sorted({t[0] for t in taken})
     for publisher in (False, True):
         numbers = [t[2] for t in taken if t[1] is publisher]
         assert numbers == sorted(set(numbers))
     assert receiver.accepted + sum(receiver.refused.values()) == len(samples)
-    assert all(-0.5 <= (NOW_NS - stamp_ns) / 1e9 <= 1.0 for stamp_ns, _, _ in taken)
+    assert all(-0.5 <= (arrival_ns - stamp_ns) / 1e9 <= 1.0 for stamp_ns, _, _, arrival_ns in taken)
+    assert all(b[3] - a[3] > S for a, b in pairwise(taken) if a[1] is not b[1])
 
 
 def test_made_up_publishers_do_not_grow_the_receiver() -> None:
     receiver = PoseReceiver("uav1")
     for n in range(1, 1000):
-        assert receiver.receive(KEY, *sample(1, NOW_NS + n, n.to_bytes(16, "little")), NOW_NS)
+        now_ns = NOW_NS + 2 * n * S
+        assert receiver.receive(KEY, *sample(1, now_ns, n.to_bytes(16, "little")), now_ns)
     assert len(receiver._sequences) <= 16
 
 
 def test_a_clock_that_is_set_back_does_not_keep_poses_out() -> None:
     """An hour back on sender and receiver alike, as where both run on one host: the next pose is taken all the same."""
-    receiver, hour_ns = PoseReceiver("uav1"), 3_600_000_000_000
+    receiver, hour_ns = PoseReceiver("uav1"), 3600 * S
     assert receiver.receive(KEY, *sample(1, NOW_NS), NOW_NS)
     back_ns = NOW_NS - hour_ns
     assert receiver.receive(KEY, *sample(2, back_ns), back_ns)
     assert receiver.receive(KEY, *sample(2, back_ns + 1), back_ns) is None
     assert receiver.receive(KEY, *sample(3, back_ns - 1), back_ns) is None
     assert dict(receiver.refused) == {Refusal.SEQUENCE: 1, Refusal.STALE: 1}
+    further_ns = back_ns - hour_ns
+    assert receiver.receive(KEY, *sample(1, further_ns, OTHER_GID), further_ns)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
 import threading
@@ -203,7 +205,8 @@ def test_files_rotate_by_size_and_the_oldest_go(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     limits = RecordingLimits(file_bytes_max=20_000, total_bytes_max=60_000, free_bytes_min=0)
     (tmp_path / "of_somebody_else.mcap").write_bytes(bytes(50_000))
-    recorder = Recorder(tmp_path, "uav1", limits, print)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", limits, lambda *event: told.append(event))
     recorder.start()
     sent: list[int] = []
 
@@ -219,6 +222,57 @@ def test_files_rotate_by_size_and_the_oldest_go(tmp_path: Path, monkeypatch: pyt
     numbers = [int.from_bytes(data[:4], "little") for path in ours for *_, data, _ in read(path)]
     assert numbers == sent[-len(numbers) :]
     assert (tmp_path / "of_somebody_else.mcap").exists()
+    words = re.compile(r"old recordings removed to make room: (\d+), up to uav1_(\d{6})_\w+\.mcap")
+    removals = [match for level, text in told if level == 20 and (match := words.fullmatch(text))]
+    assert len(removals) == len(told)
+    assert sum(int(one[1]) for one in removals) == int(removals[-1][2]) + 1 == int(ours[0].name[5:11])
+
+
+def test_a_recording_that_another_process_writes_stays_when_the_oldest_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    try:
+        next(line for line in writer.stdout if int(line.split()[1]) > 0)
+        writer.send_signal(signal.SIGSTOP)  # it holds its file, which no longer grows
+        (held,) = tmp_path.iterdir()
+        limits = RecordingLimits(file_bytes_max=20_000, total_bytes_max=100_000, free_bytes_min=0)
+        recorder = Recorder(tmp_path, "uav1", limits, print)
+        recorder.start()
+        until(
+            lambda: list(tmp_path.glob("uav1_000010_*")),
+            lambda: recorder.record(topics.EVENTS, "uav1", None, bytes(2000), time.time_ns()),
+        )
+        recorder.stop()
+    finally:
+        writer.kill()
+        writer.wait()
+    ours = sorted(tmp_path.iterdir())
+    assert ours[0] == held
+    assert ours[1].name[:11] > "uav1_000001"
+    assert sum(path.stat().st_size for path in ours) <= 100_000 + 2 * 20_000
+    finish_unfinished(held)
+    numbers = [int.from_bytes(data, "little") for *_, data, _ in read(held)]
+    assert numbers == list(range(len(numbers)))
+    assert numbers
+
+
+def test_nothing_is_removed_where_that_would_not_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.02)
+    old = [tmp_path / f"uav1_{n:06d}_20260101T000000Z.mcap" for n in range(5)]
+    for path in old:
+        path.write_bytes(MCAP0_MAGIC + bytes(5000) + MCAP0_MAGIC)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", RecordingLimits(free_bytes_min=2**62), lambda *event: told.append(event))
+    recorder.start()
+    record_some(recorder, [b"one"])
+    until(lambda: recorder.counters().get("failures", 0) >= 3)
+    recorder.stop()
+    assert told == [(40, "recording stopped: no room left for recordings")]
+    assert sorted(tmp_path.iterdir()) == old
 
 
 def test_switching_off_ends_the_file_and_on_begins_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from msgs.ground import cli
 from msgs.ground.errors import InputError
 from msgs.ground.keys import init_authority, issue, listing
 from msgs.session import TlsFiles
+from tests.certificates import redate
 
 
 def test_openssl_verifies_what_was_issued_and_nothing_of_another_authority(tmp_path: Path) -> None:
@@ -48,6 +49,29 @@ def test_private_keys_are_their_owner_s_alone_and_match(tmp_path: Path) -> None:
     ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(files.certificate, files.private_key)
     with pytest.raises(ValueError, match=r"ca\.key is not the PEM key of"):
         TlsFiles(files.root_ca, files.certificate, tmp_path / "ca.key").check()
+
+
+def test_a_certificate_of_another_authority_or_another_day_does_not_do(tmp_path: Path) -> None:
+    for name in ("ours", "theirs"):
+        init_authority(tmp_path / name)
+        issue(tmp_path / name, "uav1")
+    ours, theirs = (tmp_path / name for name in ("ours", "theirs"))
+    mixed = TlsFiles(ours / "ca.pem", theirs / "uav1.pem", theirs / "uav1.key")
+    with pytest.raises(
+        ValueError, match=r"theirs/uav1\.pem is refused by whoever trusts .*ours/ca\.pem: unable to get"
+    ):
+        mixed.check_files()
+    files = TlsFiles(ours / "ca.pem", ours / "uav1.pem", ours / "uav1.key")
+    _, ended = redate(ours, "uav1", begins_days=-9, ends_days=-2)
+    with pytest.raises(ValueError, match=rf"ours/uav1\.pem expired on {ended:%Y-%m-%d}; today is "):
+        files.check()
+    begins, _ = redate(ours, "uav1", begins_days=2, ends_days=9)
+    with pytest.raises(ValueError, match=rf"ours/uav1\.pem is not valid before {begins:%Y-%m-%d}; today is "):
+        files.check()
+    files.check_files()
+    redate(ours, "ca", begins_days=-9, ends_days=-2)  # zenoh asks the authority's certificate for no date
+    redate(ours, "uav1", begins_days=-2, ends_days=9)
+    files.check()
 
 
 def test_nothing_is_overwritten_and_bad_names_are_refused(tmp_path: Path) -> None:
