@@ -16,7 +16,8 @@ def main() -> None:
         for one in itertools.islice(poses, options.count):
             x, y, z = one.pose.t_cam_target_m
             range_m = np.linalg.norm(one.pose.t_cam_target_m)
-            sigma_m = np.sqrt(one.pose.covariance[2, 2])
+            along = one.pose.t_cam_target_m / range_m
+            sigma_m = np.sqrt(along @ one.pose.covariance[:3, :3] @ along)
             print(
                 f"{one.target}  {1e3 * one.age_s:5.0f} ms old  right {x:+7.1f}  down {y:+7.1f}  ahead {z:7.1f} m  "
                 f"range {range_m:6.1f} ± {sigma_m:.1f} m",

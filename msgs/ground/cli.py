@@ -45,7 +45,9 @@ def _add_watch(commands: Commands) -> None:
     watch = commands.add_parser("watch", help="a live table of vehicles and their targets")
     _connection(watch)
     watch.add_argument("--json", action="store_true", help="one JSON object a line: pose, health, event, vehicle, link")
-    watch.add_argument("--max-age", type=float, default=2.0, metavar="S", help="older poses are refused (default 2)")
+    watch.add_argument(
+        "--max-age", type=_not_negative, default=2.0, metavar="S", help="older poses are refused (default 2)"
+    )
     watch.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     watch.set_defaults(act=_watch)
 
@@ -68,7 +70,9 @@ def _add_view(commands: Commands) -> None:
         "--target-size", type=_positive, nargs=3, default=(8.0, 12.0, 2.5), metavar=("LENGTH", "WIDTH", "HEIGHT"),
         help="metres, of the boxes drawn (default 8 12 2.5)",
     )  # fmt: skip
-    view.add_argument("--max-age", type=float, default=2.0, metavar="S", help="older poses are refused (default 2)")
+    view.add_argument(
+        "--max-age", type=_not_negative, default=2.0, metavar="S", help="older poses are refused (default 2)"
+    )
     view.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     view.set_defaults(act=_view)
 
@@ -80,7 +84,9 @@ def _add_record(commands: Commands) -> None:
     record.add_argument("--file-mb", type=_positive, default=256.0, help="then the next file begins (default 256)")
     record.add_argument("--file-minutes", type=_positive, default=10.0, help="then the next file begins (default 10)")
     record.add_argument("--total-mb", type=_positive, help="of all files; then the oldest go (default: the disk's end)")
-    record.add_argument("--free-mb", type=float, default=1000.0, help="left on the disk for others (default 1000)")
+    record.add_argument(
+        "--free-mb", type=_not_negative, default=1000.0, help="left on the disk for others (default 1000)"
+    )
     record.add_argument("--when-full", choices=("oldest", "stop"), default="oldest", help="remove the oldest, or stop")
     record.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
     record.set_defaults(act=_record)
@@ -140,10 +146,24 @@ def _add_tools(commands: Commands) -> None:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    value = _number(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def _not_negative(text: str) -> float:
+    value = _number(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 on")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
 
 
 def _connection(command: argparse.ArgumentParser) -> None:

@@ -17,7 +17,7 @@ from msgs.session import TlsFiles, check_endpoint
 from msgs.topics import Topic
 
 RETRY_S = 0.5
-_ALIVE = "uavpose/@v1/*/alive"
+ALIVE = "uavpose/@v1/*/alive"
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,14 @@ def linked(opened: zenoh.Session) -> bool:
     return bool(opened.info.routers_zid() or opened.info.peers_zid())
 
 
+def alive_uav(key: str) -> str | None:
+    """Whose token a key below `ALIVE` is; None if no vehicle can be called so."""
+    try:
+        return topics.check_uav_name(key.split("/")[2])
+    except ValueError:
+        return None
+
+
 @contextmanager
 def listening(
     opened: zenoh.Session,
@@ -91,8 +99,8 @@ def listening(
             on_sample(Incoming(*row, key, one.payload.to_bytes(), attachment))
 
     def alive(one: zenoh.Sample) -> None:
-        uav = str(one.key_expr).split("/")[2]
-        if not uavs or uav in uavs:
+        uav = alive_uav(str(one.key_expr))
+        if uav is not None and (not uavs or uav in uavs):
             on_alive(uav, one.kind == zenoh.SampleKind.PUT)
 
     # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
@@ -107,7 +115,7 @@ def listening(
             history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
             recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
             declared.append(ext.declare_advanced_subscriber(opened, key, handler, history=history, recovery=recovery))
-    tokens = opened.liveliness().declare_subscriber(_ALIVE, handlers.Callback(alive, indirect=False), history=True)
+    tokens = opened.liveliness().declare_subscriber(ALIVE, handlers.Callback(alive, indirect=False), history=True)
     try:
         yield
     finally:

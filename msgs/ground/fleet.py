@@ -1,7 +1,8 @@
 """What is known of each vehicle and its targets, from what came so far. No sockets; safe to use from several threads.
 
 Range and closing speed are from the camera. Bearing (clockwise from north), elevation and attitude are in ned while
-the vehicle tells its own attitude; else bearing and elevation are to the right of and above the optical axis.
+the vehicle tells its own attitude; else bearing and elevation are to the right of and above the optical axis. Its own
+attitude comes after the pose and, on a radio, with fewer of them: a row waits for that of its instant.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from msgs import topics
 from msgs.cdr import DECODERS, Detection3DArray, DiagnosticArray, Log, TFMessage
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.ground.feed import Incoming
+from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.receive import PoseReceiver, TargetPose
 from msgs.wire import Array, PayloadError
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
-ATTITUDE_AGE_NS = 1_000_000_000
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
-_RANGES_KEPT = 256
+SET_BACK_NS = 500_000_000  # so far in the future nothing comes, but by a clock that was set back since
+_KEPT_MAX = 256
 TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # what a fleet looks at
 VEHICLES_MAX = 64  # so that made-up names cannot grow this without bound
 
@@ -38,6 +40,7 @@ class TargetRow:
     uav: str
     target: str
     stamp_ns: int  # UTC of the exposure
+    heard_ns: int  # UTC by our clock
     range_m: float
     bearing_deg: float
     elevation_deg: float
@@ -59,6 +62,7 @@ class VehicleRow:
     alive: bool  # its daemon's token is there
     level: int  # as in diagnostic_msgs: 0 ok, 1 warn, 2 error
     health: str
+    health_heard_ns: int  # UTC by our clock; 0: never
     event: str
     pose_rate_hz: float
     refused: int
@@ -67,9 +71,29 @@ class VehicleRow:
 
 @dataclass
 class _Target:
-    row: TargetRow
-    ranges: deque[tuple[int, float]]
+    newest: TargetRow  # by the own attitude that was known when it came
     seen_ns: int
+    ranges: deque[tuple[int, float]]  # stamp, m
+    # The newest whose own attitude has come, and those after it, which still wait for theirs.
+    settled: TargetRow | None = None
+    waiting: deque[tuple[TargetPose, TargetRow]] = field(default_factory=lambda: deque(maxlen=_KEPT_MAX))
+
+    def row(self) -> TargetRow:
+        """What to show: the newest that is sure, unless the vehicle has ceased to tell its attitude."""
+        if self.settled is not None and self.newest.stamp_ns - self.settled.stamp_ns <= GAP_NS:
+            return self.settled
+        return self.newest
+
+    def settle(self, own: OwnShipHistory) -> None:
+        """Make the row anew of the newest pose whose own attitude has come."""
+        for index in reversed(range(len(self.waiting))):
+            pose, row = self.waiting[index]
+            ship = own.at(pose.stamp_ns)
+            if ship is not None:
+                self.settled = target_row(pose, row.closing_mps, ship.R_ned_cam, row.score)
+                for _ in range(index + 1):
+                    self.waiting.popleft()
+                return
 
 
 @dataclass
@@ -78,10 +102,10 @@ class _Vehicle:
     alive: bool = False
     level: int = 0
     health: str = ""
+    health_heard_ns: int = 0
     event: str = ""
     event_number: tuple[bytes, int] = (b"", 0)  # publisher, and its number of the newest event
-    R_ned_cam: Array | None = None
-    attitude_stamp_ns: int = 0
+    own: OwnShipHistory = field(default_factory=OwnShipHistory)
     scores: dict[str, float] = field(default_factory=dict)
     targets: dict[str, _Target] = field(default_factory=dict)
     arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
@@ -118,7 +142,7 @@ class Fleet:
             except PayloadError as error:
                 vehicle.receiver.refused[error.reason] += 1
                 return None
-            return _note(vehicle, message, topics.parse_attachment(incoming.attachment))
+            return _note(vehicle, message, topics.parse_attachment(incoming.attachment), now_ns)
 
     def rows(self, now_ns: int) -> list[VehicleRow]:
         """Every vehicle that was heard, by name; targets not seen for ten seconds are left out."""
@@ -132,32 +156,41 @@ class Fleet:
 
     def _take_pose(self, vehicle: _Vehicle, pose: TargetPose) -> TargetRow:
         known = vehicle.targets.get(pose.target)
-        ranges = known.ranges if known is not None else deque(maxlen=_RANGES_KEPT)
-        range_m = float(np.linalg.norm(pose.pose.t_cam_target_m))
-        if ranges and pose.stamp_ns <= ranges[-1][0]:
-            ranges.clear()  # the vehicle's clock was set back
-        ranges.append((pose.stamp_ns, range_m))
+        if known is not None and pose.stamp_ns <= known.newest.stamp_ns:
+            known = None  # the vehicle's clock was set back
+        ranges = deque[tuple[int, float]](maxlen=_KEPT_MAX) if known is None else known.ranges
+        ranges.append((pose.stamp_ns, float(np.linalg.norm(pose.pose.t_cam_target_m))))
         while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
             ranges.popleft()
-        fresh = abs(pose.stamp_ns - vehicle.attitude_stamp_ns) <= ATTITUDE_AGE_NS
-        row = target_row(
-            pose, closing_mps(ranges), vehicle.R_ned_cam if fresh else None, vehicle.scores.get(pose.target)
-        )
-        vehicle.targets[pose.target] = _Target(row, ranges, pose.arrival_ns)
+        ship = vehicle.own.near(pose.stamp_ns)
+        R_ned_cam = None if ship is None else ship.R_ned_cam
+        row = target_row(pose, closing_mps(ranges), R_ned_cam, vehicle.scores.get(pose.target))
+        if known is None:
+            known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
+        known.newest, known.seen_ns = row, pose.arrival_ns
+        known.waiting.append((pose, row))
+        while known.waiting[0][1].stamp_ns < pose.stamp_ns - GAP_NS:
+            known.waiting.popleft()
+        known.settle(vehicle.own)
         vehicle.arrivals_ns.append(pose.arrival_ns)
         return row
 
     def _row(self, uav: str, vehicle: _Vehicle, now_ns: int) -> VehicleRow:
         # What was seen in the future was seen before our clock was set back, who knows when.
-        kept = {name: one for name, one in vehicle.targets.items() if 0 <= now_ns - one.seen_ns <= FORGET_TARGET_NS}
+        kept = {
+            name: one
+            for name, one in vehicle.targets.items()
+            if -SET_BACK_NS <= now_ns - one.seen_ns <= FORGET_TARGET_NS
+        }
         vehicle.targets = kept
-        recent = sum(0 <= now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
-        targets = tuple(one.row for _, one in sorted(vehicle.targets.items()))
+        recent = sum(-SET_BACK_NS <= now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
+        targets = tuple(one.row() for _, one in sorted(vehicle.targets.items()))
         return VehicleRow(
             uav,
             vehicle.alive,
             vehicle.level,
             vehicle.health,
+            vehicle.health_heard_ns,
             vehicle.event,
             recent / (RATE_WINDOW_NS / 1e9),
             sum(vehicle.receiver.refused.values()),
@@ -165,16 +198,20 @@ class Fleet:
         )
 
 
-def _note(vehicle: _Vehicle, message: object, sent_as: tuple[int, int, bytes] | None) -> Log | DiagnosticArray | None:
+def _note(
+    vehicle: _Vehicle, message: object, sent_as: tuple[int, int, bytes] | None, now_ns: int
+) -> Log | DiagnosticArray | None:
     """`sent_as`: number, time and publisher of the sample, as its attachment has them."""
     match message:
         case Detection3DArray():
             vehicle.scores = {one.id: one.hypotheses[0].score for one in message.detections if one.hypotheses}
-        case TFMessage() if message.transforms:
-            vehicle.R_ned_cam = camera_attitude(message)
-            vehicle.attitude_stamp_ns = message.transforms[0].stamp_ns
+        case TFMessage():
+            vehicle.own.take(message)
+            for target in vehicle.targets.values():
+                target.settle(vehicle.own)
         case DiagnosticArray() if message.status:
             vehicle.level, vehicle.health = message.status[0].level, message.status[0].message
+            vehicle.health_heard_ns = now_ns
             return message
         case Log() if _is_news(vehicle, sent_as):
             vehicle.event = message.msg
@@ -192,18 +229,6 @@ def _is_news(vehicle: _Vehicle, sent_as: tuple[int, int, bytes] | None) -> bool:
         return False
     vehicle.event_number = (publisher, number)
     return True
-
-
-def camera_attitude(message: TFMessage) -> Array | None:
-    """R_ned_cam [3, 3] up the chain of frames from the camera, or None if it does not end at ned axes."""
-    links = {one.child_frame_id: one for one in message.transforms}
-    R = np.eye(3)
-    frame = topics.FRAME_CAMERA
-    while frame in links:
-        link = links.pop(frame)
-        R = R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1)) @ R
-        frame = link.frame_id
-    return R if frame in (topics.FRAME_NED, topics.FRAME_BODY_NED) else None
 
 
 def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
@@ -235,6 +260,7 @@ def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None,
         uav=pose.uav,
         target=pose.target,
         stamp_ns=pose.stamp_ns,
+        heard_ns=pose.arrival_ns,
         range_m=range_m,
         bearing_deg=bearing_deg if R_ned_cam is None else bearing_deg % 360.0,
         elevation_deg=math.degrees(math.atan2(-down, math.hypot(right, ahead))),

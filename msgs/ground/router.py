@@ -27,6 +27,7 @@ from pydantic import Field, model_validator
 
 from msgs.ground.access import Access, access_control
 from msgs.ground.errors import InputError
+from msgs.ground.feed import ALIVE, alive_uav
 from msgs.session import TlsFiles, check_endpoint, router_config
 from msgs.settings import Section, load_settings
 
@@ -98,11 +99,12 @@ def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
     with open_router(settings, path.resolve().parent) as session:
 
         def seen(sample: zenoh.Sample) -> None:
-            vehicle = str(sample.key_expr).split("/")[2]
-            say(f"{vehicle}: {'gone' if sample.kind == zenoh.SampleKind.DELETE else 'here'}")
+            vehicle = alive_uav(str(sample.key_expr))
+            if vehicle is not None:
+                say(f"{vehicle}: {'gone' if sample.kind == zenoh.SampleKind.DELETE else 'here'}")
 
         handler = zenoh.handlers.Callback(seen, indirect=False)
-        session.liveliness().declare_subscriber("uavpose/@v1/*/alive", handler, history=True)
+        session.liveliness().declare_subscriber(ALIVE, handler, history=True)
         say(f"listening on {', '.join(settings.listen)}" + ("" if settings.access else "; everyone may do everything"))
         stop.wait()
     return 0

@@ -17,11 +17,12 @@ from rich.text import Text
 
 from msgs.cdr import DiagnosticArray, Log
 from msgs.ground.feed import Incoming, linked, listening, session
-from msgs.ground.fleet import TAKEN, Fleet, TargetRow, VehicleRow
+from msgs.ground.fleet import SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
 from msgs.session import TlsFiles
 
 REFRESH_S = 0.25
 STALE_S = 1.0
+HEALTH_STALE_S = 3.0  # it is told each second
 _LEVEL_STYLE = {0: "green", 1: "yellow", 2: "bold red"}
 _NS = 1_000_000_000
 
@@ -105,11 +106,12 @@ def _watch_json(
         tell(type="vehicle", uav=uav, alive=here)
 
     with listening(opened, options.uavs, options.domain, take, alive, TAKEN):
-        up: bool | None = None
+        told: bool | None = None
         while True:
-            if linked(opened) != up:
-                up = not up
+            up = linked(opened)
+            if up != told:
                 tell(type="link", up=up)
+                told = up
             if stop.wait(REFRESH_S):
                 return
 
@@ -127,11 +129,28 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) 
         found.add_column(name, justify="right")
     for one in vehicles:
         here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
-        health = Text(one.health or "–", style=_LEVEL_STYLE.get(one.level, "dim"))
-        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused), one.event or "–")
+        event = Text(_printable(one.event) or "–")
+        fleet.add_row(one.uav, here, _health(one, now_ns), f"{one.pose_rate_hz:.1f}", str(one.refused), event)
         for target in one.targets:
-            found.add_row(*_cells(target, now_ns), style="dim" if _age_s(target, now_ns) > STALE_S else None)
+            stale = (now_ns - target.heard_ns) / _NS > STALE_S
+            found.add_row(*_cells(target, now_ns), style="dim" if stale else None)
     return Group(link, fleet, found)
+
+
+def _health(row: VehicleRow, now_ns: int) -> Text:
+    """Dim, with its age, once it is no longer told; none that was told before our clock was set back."""
+    age_s = (now_ns - row.health_heard_ns) / _NS
+    if not row.health_heard_ns or age_s < -SET_BACK_NS / _NS:
+        return Text("–", style="dim")
+    text = _printable(row.health)
+    if row.alive and age_s <= HEALTH_STALE_S:
+        return Text(text, style=_LEVEL_STYLE.get(row.level, "dim"))
+    return Text(f"{text} ({max(age_s, 0.0):.0f} s ago)", style="dim")
+
+
+def _printable(text: str) -> str:
+    """What a vehicle says must not steer the terminal."""
+    return "".join(one if one.isprintable() else " " for one in text)
 
 
 def _cells(row: TargetRow, now_ns: int) -> tuple[str, ...]:
@@ -146,9 +165,5 @@ def _cells(row: TargetRow, now_ns: int) -> tuple[str, ...]:
         "–" if heading is None else f"{heading:.0f}/{pitch:+.0f}/{roll:+.0f}",
         "?" if row.sigma_rotation_deg is None else f"{row.sigma_rotation_deg:.0f}",
         "–" if row.score is None else f"{row.score:.2f}",
-        f"{_age_s(row, now_ns):.2f}",
+        f"{(now_ns - row.stamp_ns) / _NS:.2f}",
     )
-
-
-def _age_s(row: TargetRow, now_ns: int) -> float:
-    return (now_ns - row.stamp_ns) / _NS

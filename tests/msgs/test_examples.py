@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 import msgs.examples
 from msgs import topics
+from msgs.cdr import PoseWithCovarianceStamped
 from msgs.publish import Node
 from tests.waiting import until
 
@@ -27,14 +30,26 @@ runpy.run_module("msgs.examples." + sys.argv.pop(1), run_name="__main__")
 """
 
 
-def run(network: Network, folder: Path, example: str) -> str:
-    """What it prints on five poses, 250 m ahead, of target t3."""
+def ahead() -> PoseWithCovarianceStamped:
+    return pose_now(250.0)
+
+
+def aside() -> PoseWithCovarianceStamped:
+    """Far to the right, and unsure along the line of sight alone."""
+    t_m, along = np.array([200.0, 0.0, 150.0]), np.array([0.8, 0.0, 0.6])
+    covariance = 0.01 * np.eye(6)
+    covariance[:3, :3] += 20.0**2 * np.outer(along, along)
+    return dataclasses.replace(pose_now(), t_cam_target_m=t_m, covariance=covariance)
+
+
+def run(network: Network, folder: Path, example: str, pose: Callable[[], PoseWithCovarianceStamped] = ahead) -> str:
+    """What it prints on five poses of target t3."""
     command = [sys.executable, "-c", RUN, example, "-e", network.endpoint, "-u", "uav1", "-n", "5"]
     with Node(network.daemon, "uav1") as node:
         publisher = node.publisher(topics.POSE, "t3")
         process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
-            until(lambda: process.poll() is not None, lambda: publisher.put(pose_now(250.0).encode()))
+            until(lambda: process.poll() is not None, lambda: publisher.put(pose().encode()))
             out, err = process.communicate()
         finally:
             process.kill()
@@ -46,6 +61,11 @@ def test_poses_are_printed(network: Network, tmp_path: Path) -> None:
     lines = run(network, tmp_path, "print_poses").splitlines()
     assert len(lines) == 5
     assert all(line.startswith("t3 ") and "ahead   250.0 m" in line and "± 1.0 m" in line for line in lines)
+
+
+def test_how_sure_a_printed_range_is_is_along_the_line_of_sight(network: Network, tmp_path: Path) -> None:
+    lines = run(network, tmp_path, "print_poses", aside).splitlines()
+    assert all(line.endswith("range  250.0 ± 20.0 m") for line in lines)
 
 
 def test_ranges_are_plotted(network: Network, tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
     scene = Scene(rec, fleet, options.size_m, arrange)
     with _opened(rec, options, say):
         if options.recordings:
-            _play(options, scene, say)
+            _play(options, scene, stop, say)
         else:
             _listen(options, scene, stop, say)
         scene.finish()
@@ -71,7 +71,9 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
         if options.recordings and options.web_port is not None:
             stop.wait()
         rec.disconnect()
-    say(f"{scene.drawn} poses drawn" + (f" into {options.save}" if options.save is not None else ""))
+    into = f" into {options.save}" if options.save is not None else ""
+    refused = sum(one.refused for one in fleet.rows(time.time_ns()))
+    say(f"{scene.drawn} poses drawn{into}" + (f", {refused} samples refused" if refused else ""))
     return 0
 
 
@@ -135,10 +137,11 @@ def _answers(port: int) -> bool:
         return probe.connect_ex((_LOOPBACK, port)) == 0
 
 
-def _play(options: ViewOptions, scene: Scene, say: Callable[[str], None]) -> None:
+def _play(options: ViewOptions, scene: Scene, stop: threading.Event, say: Callable[[str], None]) -> None:
     for path in options.recordings:
-        log_ns = 0
         for incoming, log_ns in samples(path):
+            if stop.is_set():
+                return
             if not options.uavs or incoming.uav in options.uavs:
                 scene.take(incoming, log_ns)
             scene.tick(log_ns)

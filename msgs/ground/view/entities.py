@@ -32,6 +32,7 @@ LABEL_BELOW_PX = 25.0
 RING_NAMES_TOWARDS = np.array([-0.707, 0.707])  # north, east; a target's name often stands ahead: not there
 VALUE_CHARS_MAX = 24  # hashes are told by their beginning
 _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
+_ANGLES = ("roll", "pitch", "heading")
 _HEALTH_LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR"}
 _MEDIA_TYPES = {"jpeg": "image/jpeg", "png": "image/png"}
 _LATENCIES = {
@@ -77,9 +78,7 @@ def prepare_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
         "range": (target, color),
         "range/minus_2_sigma": (f"{target} −2σ", DOUBT_RGB),
         "range/plus_2_sigma": (f"{target} +2σ", DOUBT_RGB),
-        "attitude/roll": (f"{target} roll", AXES_RGB[0]),
-        "attitude/pitch": (f"{target} pitch", AXES_RGB[1]),
-        "attitude/heading": (f"{target} heading", AXES_RGB[2]),
+        **{f"attitude/{what}": (f"{target} {what}", AXES_RGB[axis]) for axis, what in enumerate(_ANGLES)},
         "closing": (target, color),
         "score": (target, color),
         "age": (f"{target} age on arrival", color),
@@ -125,42 +124,67 @@ def log_seen(
     rec: rr.RecordingStream, row: TargetRow, pose: TargetPose, camera: CameraInfo | None, size_m: Sequence[float]
 ) -> None:
     """The target on the picture: its box, that box one sigma nearer and farther, and where its centre may be."""
-    t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
-    R = R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
-    edges = box_edges_m(size_m)
-    label = f"{row.target}  {row.range_m:.0f} ± {row.sigma_range_m:.0f} m"
+    R = _R_cam_target(pose)
     _log_zoom(rec, row, R, size_m)
     if camera is None:
         return
-    where = f"{row.uav}/ned/camera/target/{row.target}"
-    box = project(posed(edges, R, t_m), camera.K, camera.distortion)
-    if box is None:
+    t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
+    center = project(t_m, camera.K, camera.distortion)
+    if center is None:
         return
+    where = f"{row.uav}/ned/camera/target/{row.target}"
+    doubt = ellipse(center, pixel_covariance(t_m, covariance[:3, :3], camera.K))
+    lowest_px = doubt[:, 1].max()
+    if R is None:
+        _clear(rec, f"{where}/box", f"{where}/range_sigma")
+    else:
+        box = _log_boxes(rec, row, R, t_m, camera, size_m)
+        if box is None:
+            return
+        lowest_px = max(lowest_px, box[..., 1].max())
+    rec.log(f"{where}/sigma", rr.LineStrips2D([doubt], colors=[rgb(row.target)]))
+    label = f"{row.target}  {row.range_m:.0f} ± {row.sigma_range_m:.0f} m"
+    below = [center[0], lowest_px + LABEL_BELOW_PX]
+    rec.log(f"{where}/label", rr.Points2D([below], colors=[rgb(row.target)], labels=[label], radii=[0.0]))
+
+
+def _log_boxes(
+    rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, t_m: Array, camera: CameraInfo,
+    size_m: Sequence[float],
+) -> Array | None:  # fmt: skip
+    """The pixels of the box; None if it is not all before the camera."""
+    where = f"{row.uav}/ned/camera/target/{row.target}"
+    edges = box_edges_m(size_m)
+    box = project(posed(edges, R_cam_target, t_m), camera.K, camera.distortion)
+    if box is None:
+        return None
     rec.log(f"{where}/box", rr.LineStrips2D(list(box), colors=[rgb(row.target)], radii=[-1.5]))
     share = row.sigma_range_m / max(row.range_m, 1e-9)
-    doubtful = [project(posed(edges, R, t_m * max(1.0 + s * share, 0.1)), camera.K, camera.distortion) for s in (-1, 1)]
+    doubtful = [
+        project(posed(edges, R_cam_target, t_m * max(1.0 + side * share, 0.1)), camera.K, camera.distortion)
+        for side in (-1, 1)
+    ]
     strips = [strip for one in doubtful if one is not None for strip in one]
     if strips:
         rec.log(f"{where}/range_sigma", rr.LineStrips2D(strips, colors=[DOUBT_RGB], radii=[-0.7]))
-    center = project(t_m, camera.K, camera.distortion)
-    if center is not None:
-        doubt = ellipse(center, pixel_covariance(t_m, covariance[:3, :3], camera.K))
-        rec.log(f"{where}/sigma", rr.LineStrips2D([doubt], colors=[rgb(row.target)]))
-        below = [center[0], max(box[..., 1].max(), doubt[:, 1].max()) + LABEL_BELOW_PX]
-        rec.log(f"{where}/label", rr.Points2D([below], colors=[rgb(row.target)], labels=[label], radii=[0.0]))
+    return box
 
 
-def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, size_m: Sequence[float]) -> None:
+def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array | None, size_m: Sequence[float]) -> None:
     """The box as the camera sees it, without perspective, one unit long; targets stand side by side."""
     aside = np.array([2.0 * int(row.target[1:]), 0.0])
-    unit = box_edges_m(np.asarray(size_m) / max(size_m))
-    strips = (unit @ R_cam_target.T)[..., :2] + aside
     where = f"{row.uav}/zoom/target/{row.target}"
-    rec.log(f"{where}/box", rr.LineStrips2D(list(strips), colors=[rgb(row.target)]))
-    axes = (0.8 * R_cam_target.T)[:, :2]
-    rec.log(f"{where}/axes", rr.Arrows2D(origins=[aside] * 3, vectors=axes, colors=AXES_RGB))
+    if R_cam_target is None:
+        _clear(rec, f"{where}/box", f"{where}/axes")
+    else:
+        unit = box_edges_m(np.asarray(size_m) / max(size_m))
+        strips = (unit @ R_cam_target.T)[..., :2] + aside
+        rec.log(f"{where}/box", rr.LineStrips2D(list(strips), colors=[rgb(row.target)]))
+        axes = (0.8 * R_cam_target.T)[:, :2]
+        rec.log(f"{where}/axes", rr.Arrows2D(origins=[aside] * 3, vectors=axes, colors=AXES_RGB))
     below = np.array([0.0, 0.95])
-    text = f"{row.target}  ±{row.sigma_rotation_deg:.0f}°"
+    sigma = "?" if row.sigma_rotation_deg is None else f"{row.sigma_rotation_deg:.0f}"
+    text = f"{row.target}  ±{sigma}°"
     rec.log(f"{where}/label", rr.Points2D([aside + below], colors=[rgb(row.target)], labels=[text], radii=[0.01]))
 
 
@@ -170,14 +194,11 @@ def log_placed(
 ) -> None:  # fmt: skip
     """The target in space and from above."""
     color, uav, name = rgb(row.target), row.uav, row.target
-    R = R_ned_cam @ R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
     t_m = t_ned_own_m + R_ned_cam @ pose.pose.t_cam_target_m
     covariance = R_ned_cam @ pose.pose.covariance[:3, :3] @ R_ned_cam.T
     where = f"{uav}/ned/target/{name}"
-    rec.log(f"{where}/body", rr.Transform3D(translation=t_m, mat3x3=R))
     label = f"{name}  {row.range_m:.0f} m"
-    rec.log(f"{where}/body/box", rr.Boxes3D(sizes=[size_m], colors=[color], labels=[label]))
-    rec.log(f"{where}/body/nose", rr.Arrows3D(vectors=[[size_m[0], 0, 0]], colors=[color], radii=[0.3]))
+    rec.log(f"{where}/place", rr.Points3D([t_m], colors=[color], labels=[label], radii=[0.8]))
     half_m, q_xyzw = ellipsoid(covariance)
     doubt = rr.Ellipsoids3D(
         centers=[t_m], half_sizes=[half_m], quaternions=[rr.Quaternion(xyzw=q_xyzw)], colors=[(*color, 70)],
@@ -186,19 +207,45 @@ def log_placed(
     rec.log(f"{where}/sigma", doubt)
     rec.log(f"{where}/line_of_sight", rr.LineStrips3D([[t_ned_own_m, t_m]], colors=[DOUBT_RGB]))
     rec.log(f"{uav}/ned/trail/targets", rr.Points3D([t_m], colors=[color], radii=[0.8]))
-    place = _on_map(t_m - t_ned_own_m)
+    above_m = _on_map(t_m - t_ned_own_m)
     above = f"{uav}/map/target/{name}"
-    heading = rr.Arrows2D(
-        origins=[place], vectors=[30.0 * _on_map(R[:, 0])], colors=[color], labels=[label], radii=[2.0]
-    )
-    rec.log(f"{above}/heading", heading)
+    rec.log(f"{above}/place", rr.Points2D([above_m], colors=[color], labels=[label], radii=[4.0]))
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    doubt_line = ellipse(place, turned @ covariance[:2, :2] @ turned.T)
+    doubt_line = ellipse(above_m, turned @ covariance[:2, :2] @ turned.T)
     rec.log(f"{above}/sigma", rr.LineStrips2D([doubt_line], colors=[color]))
-    rec.log(f"{uav}/map/trail/targets", rr.Points2D([place], colors=[color], radii=[1.5]))
-    roll, pitch, heading_deg = np.degrees(euler_from_R(R))
-    for what, value in (("roll", roll), ("pitch", pitch), ("heading", heading_deg % 360.0)):
+    rec.log(f"{uav}/map/trail/targets", rr.Points2D([above_m], colors=[color], radii=[1.5]))
+    R_cam_target = _R_cam_target(pose)
+    if R_cam_target is None:
+        plots = [plot_path(uav, name, f"attitude/{what}") for what in _ANGLES]
+        _clear(rec, f"{where}/body", f"{above}/heading", *plots)
+    else:
+        _log_turned(rec, row, R_ned_cam @ R_cam_target, t_m, above_m, size_m)
+
+
+def _log_turned(
+    rec: rr.RecordingStream, row: TargetRow, R_ned_target: Array, t_m: Array, above_m: Array, size_m: Sequence[float]
+) -> None:
+    """How the target is turned: in space, from above and as plots."""
+    color, uav, name = rgb(row.target), row.uav, row.target
+    body = f"{uav}/ned/target/{name}/body"
+    rec.log(body, rr.Transform3D(translation=t_m, mat3x3=R_ned_target))
+    rec.log(f"{body}/box", rr.Boxes3D(sizes=[size_m], colors=[color]))
+    rec.log(f"{body}/nose", rr.Arrows3D(vectors=[[size_m[0], 0, 0]], colors=[color], radii=[0.3]))
+    heading = rr.Arrows2D(origins=[above_m], vectors=[30.0 * _on_map(R_ned_target[:, 0])], colors=[color], radii=[2.0])
+    rec.log(f"{uav}/map/target/{name}/heading", heading)
+    roll, pitch, yaw = np.degrees(euler_from_R(R_ned_target))
+    for what, value in zip(_ANGLES, (roll, pitch, yaw % 360.0), strict=True):
         rec.log(plot_path(uav, name, f"attitude/{what}"), rr.Scalars(float(value)))
+
+
+def _R_cam_target(pose: TargetPose) -> Array | None:
+    """None where the pose's quaternion only stands for one: it must not be drawn."""
+    return R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1)) if pose.rotation_known else None
+
+
+def _clear(rec: rr.RecordingStream, *paths: str) -> None:
+    for path in paths:
+        rec.log(path, rr.Clear(recursive=True))
 
 
 def log_plots(rec: rr.RecordingStream, row: TargetRow, age_s: float) -> None:

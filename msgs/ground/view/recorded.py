@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from mcap.exceptions import McapError
@@ -13,7 +13,8 @@ from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming
 
-_GID = bytes(16)
+# Recordings keep no attachments: all that is read is of one publisher, who counts on from file to file.
+_GID, _numbers = bytes(16), count(1)
 
 
 def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
@@ -21,7 +22,6 @@ def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
 
     Raises InputError if the file cannot be read, or ends in the middle, after what comes before that.
     """
-    sequences: Counter[str] = Counter()
     try:
         with path.open("rb") as stream:
             for _, channel, message in make_reader(stream).iter_messages():
@@ -29,8 +29,7 @@ def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
                 row = topics.parse_any_key(key)
                 if row is None:
                     continue
-                sequences[key] += 1  # recordings keep no attachment
-                attachment = topics.attachment(sequences[key], message.publish_time, _GID)
+                attachment = topics.attachment(next(_numbers), message.publish_time, _GID)
                 yield Incoming(*row, key, message.data, attachment), message.log_time
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error

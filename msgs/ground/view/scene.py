@@ -4,6 +4,7 @@ not told again for a second is taken away."""
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -14,13 +15,15 @@ from msgs import topics
 from msgs.cdr import CameraInfo, CompressedImage, DiagnosticArray, Log, PoseWithCovarianceStamped, TFMessage
 from msgs.geometry import R_from_q_wxyz
 from msgs.ground.feed import Incoming
-from msgs.ground.fleet import ATTITUDE_AGE_NS, VEHICLES_MAX, Fleet, TargetRow, camera_attitude
+from msgs.ground.fleet import SET_BACK_NS, VEHICLES_MAX, Fleet, TargetRow
+from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.ground.view import entities
 from msgs.ground.view.layout import TIMELINE
 from msgs.receive import TargetPose
-from msgs.wire import Array, PayloadError
+from msgs.wire import PayloadError
 
 GONE_NS = 1_000_000_000
+_WAITING_MAX = 256
 _ORIGIN_M = np.zeros(3)
 # Without own attitude the camera is drawn level and looking north.
 _R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -29,11 +32,11 @@ _R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 @dataclass
 class _Vehicle:
     camera: CameraInfo | None = None
-    R_ned_cam: Array | None = None
-    t_ned_own_m: Array = field(default_factory=lambda: _ORIGIN_M)
-    own_stamp_ns: int = 0
-    waiting: dict[str, tuple[TargetRow, TargetPose]] = field(default_factory=dict)  # for the own ship at their stamp
-    seen_ns: dict[str, int] = field(default_factory=dict)  # stamp of each target that is drawn
+    own: OwnShipHistory = field(default_factory=OwnShipHistory)
+    waiting: deque[tuple[TargetRow, TargetPose]] = field(  # for the own ship at their stamps
+        default_factory=lambda: deque(maxlen=_WAITING_MAX)
+    )
+    seen_ns: dict[str, tuple[int, int]] = field(default_factory=dict)  # of each target drawn: stamp, and when it came
     prepared: set[str] = field(default_factory=set)  # targets whose plots have their names
     health: str = ""
     told_no_attitude: bool = False
@@ -83,9 +86,10 @@ class Scene:
         """Take away the targets that were not told again; call it now and then."""
         with self._lock:
             for uav, vehicle in self._vehicles.items():
-                for target, stamp_ns in list(vehicle.seen_ns.items()):
-                    if now_ns - stamp_ns > GONE_NS:
-                        self._place(uav, vehicle, target)
+                for target, (stamp_ns, came_ns) in list(vehicle.seen_ns.items()):
+                    # What came in the future came before our clock was set back, who knows when.
+                    if not -SET_BACK_NS <= now_ns - came_ns <= GONE_NS:
+                        self._place(uav, vehicle, stamp_ns)
                         self._at(stamp_ns + GONE_NS)
                         for path in entities.target_paths(uav, target):
                             self._rec.log(path, rr.Clear(recursive=True))
@@ -95,8 +99,7 @@ class Scene:
         """Draw what still waits: no more will come."""
         with self._lock:
             for uav, vehicle in self._vehicles.items():
-                for target in list(vehicle.waiting):
-                    self._place(uav, vehicle, target)
+                self._place(uav, vehicle, None)
 
     def _vehicle(self, uav: str) -> _Vehicle | None:
         """None for the names, made up no doubt, that are one too many."""
@@ -115,7 +118,8 @@ class Scene:
         vehicle = self._vehicle(incoming.uav)
         if vehicle is None:
             return
-        self._place(row.uav, vehicle, row.target)
+        # The own ship of so long before will not come any more.
+        self._place(row.uav, vehicle, row.stamp_ns - GAP_NS)
         message = PoseWithCovarianceStamped.decode(incoming.payload)
         pose = TargetPose(row.uav, row.target, message, 0, now_ns)
         self._at(row.stamp_ns)
@@ -124,11 +128,11 @@ class Scene:
         if row.target not in vehicle.prepared:
             vehicle.prepared.add(row.target)
             entities.prepare_target(self._rec, row.uav, row.target)
-        vehicle.waiting[row.target] = (row, pose)
-        vehicle.seen_ns[row.target] = row.stamp_ns
+        vehicle.waiting.append((row, pose))
+        vehicle.seen_ns[row.target] = row.stamp_ns, now_ns
         self.drawn += 1
-        if vehicle.own_stamp_ns == row.stamp_ns:
-            self._place(row.uav, vehicle, row.target)
+        if vehicle.own.at(row.stamp_ns) is not None:
+            self._place(row.uav, vehicle, row.stamp_ns)
 
     def _take_other(self, incoming: Incoming, news: object, now_ns: int) -> None:
         uav = incoming.uav
@@ -155,34 +159,26 @@ class Scene:
             entities.log_event(self._rec, uav, news.level, news.msg)
 
     def _take_own(self, uav: str, vehicle: _Vehicle, message: TFMessage) -> None:
-        R_ned_cam = camera_attitude(message)
-        links = {one.child_frame_id: one for one in message.transforms}
-        if R_ned_cam is None or topics.FRAME_BODY not in links:
+        ship = vehicle.own.take(message)
+        body = next((one for one in message.transforms if one.child_frame_id == topics.FRAME_BODY), None)
+        if ship is None or body is None:
             return
-        body = links[topics.FRAME_BODY]
-        place = links.get(topics.FRAME_BODY_NED)
-        vehicle.R_ned_cam = R_ned_cam
-        vehicle.t_ned_own_m = place.t_frame_child_m if place is not None else _ORIGIN_M
-        vehicle.own_stamp_ns = body.stamp_ns
-        self._at(body.stamp_ns)
+        self._at(ship.stamp_ns)
         R_ned_body = R_from_q_wxyz(np.roll(body.q_frame_child_xyzw, 1))
-        entities.log_ship(self._rec, uav, R_ned_body, vehicle.t_ned_own_m, R_ned_cam)
-        for target, (row, _) in list(vehicle.waiting.items()):
-            if row.stamp_ns <= body.stamp_ns:
-                self._place(uav, vehicle, target)
+        entities.log_ship(self._rec, uav, R_ned_body, ship.t_ned_own_m, ship.R_ned_cam)
+        self._place(uav, vehicle, ship.stamp_ns)
 
-    def _place(self, uav: str, vehicle: _Vehicle, target: str) -> None:
-        """Draw a pose that waits in space: the own ship at its stamp has come, or will not."""
-        if target not in vehicle.waiting:
-            return
-        row, pose = vehicle.waiting.pop(target)
-        self._at(row.stamp_ns)
-        R_ned_cam, t_own_m = vehicle.R_ned_cam, vehicle.t_ned_own_m
-        if R_ned_cam is None or abs(row.stamp_ns - vehicle.own_stamp_ns) > ATTITUDE_AGE_NS:
-            R_ned_cam, t_own_m = _R_NED_CAM_UNKNOWN, _ORIGIN_M
-            if not vehicle.told_no_attitude:
-                vehicle.told_no_attitude = True
+    def _place(self, uav: str, vehicle: _Vehicle, until_ns: int | None) -> None:
+        """Draw in space what waits, as far as `until_ns`: the own ship at its stamp has come, or will not."""
+        for _ in range(len(vehicle.waiting)):
+            row, pose = vehicle.waiting.popleft()
+            if until_ns is not None and row.stamp_ns > until_ns:
+                vehicle.waiting.append((row, pose))
+                continue
+            self._at(row.stamp_ns)
+            ship = vehicle.own.near(row.stamp_ns)
+            if ship is None and not vehicle.told_no_attitude:
                 entities.log_event(self._rec, uav, 30, "own attitude unknown: drawn as if level and looking north")
-        else:
-            vehicle.told_no_attitude = False
-        entities.log_placed(self._rec, row, pose, R_ned_cam, t_own_m, self._size_m)
+            vehicle.told_no_attitude = ship is None
+            R_ned_cam, t_own_m = (_R_NED_CAM_UNKNOWN, _ORIGIN_M) if ship is None else (ship.R_ned_cam, ship.t_ned_own_m)
+            entities.log_placed(self._rec, row, pose, R_ned_cam, t_own_m, self._size_m)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from msgs import cdr, topics
 from msgs.ground.feed import Incoming
-from msgs.ground.fleet import Fleet
+from msgs.ground.fleet import Fleet, TargetRow
 from msgs.topics import Topic
 
 from ..conftest import pose_now
+from .flight import R_BODY_CAM
 
 NOW_NS = 1_700_000_000_000_000_000
-S, HOUR_NS = 1_000_000_000, 3_600_000_000_000
+MS, S, HOUR_NS = 1_000_000, 1_000_000_000, 3_600_000_000_000
+FRAME_NS, YAW_DEG_S = 40 * MS, 30.0
 GID, OTHER_GID = bytes(range(16)), bytes(range(1, 17))
 
 
@@ -71,3 +76,64 @@ def test_how_fast_a_target_nears_is_not_taken_across_a_clock_that_was_set_back()
         fleet.take(pose(back_ns + k * S // 10, k + 21, 260.0 - 1.0 * k), back_ns + k * S // 10)
     (row,) = fleet.rows(back_ns + 2 * S)
     assert row.targets[0].closing_mps == pytest.approx(10.0, abs=0.5)
+
+
+def R_ned_body(stamp_ns: int) -> Rotation:
+    """Of a vehicle that yaws steadily."""
+    return Rotation.from_euler("Z", YAW_DEG_S * (stamp_ns - NOW_NS) / S, degrees=True)
+
+
+def turning_frame(stamp_ns: int, number: int, *, own: bool) -> Iterator[Incoming]:
+    """A target straight north, as the camera of the turning vehicle sees it; its own attitude is told after it."""
+    R_ned_cam = R_ned_body(stamp_ns).as_matrix() @ R_BODY_CAM
+    t_m, upright = R_ned_cam.T @ np.array([200.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    seen = cdr.PoseWithCovarianceStamped(stamp_ns, topics.FRAME_CAMERA, t_m, upright, 0.01 * np.eye(6))
+    yield incoming(topics.POSE, seen, number, target="t0")
+    if own:
+        q_body, q_cam = R_ned_body(stamp_ns).as_quat(), Rotation.from_matrix(R_BODY_CAM).as_quat()
+        links = (
+            cdr.TransformStamped(stamp_ns, topics.FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q_body),
+            cdr.TransformStamped(stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, np.zeros(3), q_cam),
+        )
+        yield incoming(topics.TF, cdr.TFMessage(links), number)
+
+
+def off_north_deg(row: TargetRow) -> float:
+    return abs((row.bearing_deg + 180.0) % 360.0 - 180.0)
+
+
+@pytest.mark.parametrize("own_every", [1, 5])
+def test_bearings_of_a_turning_vehicle_are_by_its_attitude_of_that_instant(own_every: int) -> None:
+    """At the rate of the poses and at the 5 Hz of a radio; looked at after each sample."""
+    fleet, told, shown = Fleet(), list[TargetRow](), list[TargetRow]()
+    for k in range(100):
+        stamp_ns = NOW_NS + k * FRAME_NS
+        for one in turning_frame(stamp_ns, k + 1, own=k % own_every == 0):
+            news = fleet.take(one, stamp_ns + 20 * MS)
+            told += [news] if isinstance(news, TargetRow) else []
+            (vehicle,) = fleet.rows(stamp_ns + 20 * MS)
+            shown += vehicle.targets if k > own_every else ()
+            assert stamp_ns - vehicle.targets[0].stamp_ns <= own_every * FRAME_NS
+    assert {row.frame for row in shown} == {"ned"}
+    assert max(map(off_north_deg, shown)) < 0.01
+    at_once = [row for row in told if row.frame == "ned"]
+    assert len(at_once) >= 40
+    assert max(map(off_north_deg, at_once)) < 0.1 * YAW_DEG_S + 0.01
+
+
+def test_without_own_attitude_a_row_is_by_the_camera_and_a_lost_target_keeps_its_bearing() -> None:
+    fleet = Fleet()
+    for k in range(50):
+        for one in turning_frame(NOW_NS + k * FRAME_NS, k + 1, own=k < 30):
+            fleet.take(one, NOW_NS + k * FRAME_NS)
+    (vehicle,) = fleet.rows(NOW_NS + 2 * S)
+    assert (vehicle.targets[0].frame, vehicle.targets[0].stamp_ns) == ("cam", NOW_NS + 49 * FRAME_NS)
+
+    fleet = Fleet()
+    for k in range(200):
+        seen, own = turning_frame(NOW_NS + k * FRAME_NS, k + 1, own=True)
+        for one in (seen, own) if k < 30 else (own,):
+            fleet.take(one, NOW_NS + k * FRAME_NS)
+    (vehicle,) = fleet.rows(NOW_NS + 8 * S)
+    assert (vehicle.targets[0].frame, vehicle.targets[0].stamp_ns) == ("ned", NOW_NS + 29 * FRAME_NS)
+    assert off_north_deg(vehicle.targets[0]) < 0.01

@@ -12,6 +12,8 @@ import pytest
 import zenoh
 
 from msgs import client, topics
+from msgs.ground.keys import init_authority, issue
+from msgs.ground.router import load_router, open_router
 from msgs.publish import Node
 from msgs.session import TlsFiles, peer_config
 from tests.waiting import until
@@ -162,6 +164,37 @@ def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
             assert router.stdout.readline() == "uav1: gone\n"
         router.terminate()
         assert router.wait(60.0) == 0
+    finally:
+        router.kill()
+
+
+def test_every_name_that_a_vehicle_may_have_can_be_issued_and_gets_in(tmp_path: Path) -> None:
+    """ROS lets a name end with an underscore; names of hosts do not."""
+    init_authority(tmp_path)
+    router, uav = issue(tmp_path, "ground", ["127.0.0.1"]), issue(tmp_path, "uav1_")
+    secure, loopback = free_endpoint().replace("tcp/", "tls/"), free_endpoint()
+    path = write_router_config(tmp_path, [secure, loopback], router, 'vehicles = ["uav1_"]\nloopback_reads = true\n')
+    with ExitStack() as stack:
+        stack.enter_context(open_router(load_router(path), tmp_path))
+        session = stack.enter_context(zenoh.open(peer_config([], [secure], tls=uav)))
+        publisher = stack.enter_context(Node(session, "uav1_")).publisher(topics.POSE, "t0")
+        reader = stack.enter_context(client.connect(loopback))
+        seen = watch(reader, "0/*/target/**")
+        until(lambda: seen[publisher.key] >= 3, lambda: publisher.put(pose_now().encode()))
+
+
+def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "router.toml"
+    path.write_text(f'listen = ["{endpoint}"]\n')
+    command = [sys.executable, "-m", "msgs.ground.cli", "router", "--config", str(path)]
+    router = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert router.stdout is not None
+        assert router.stdout.readline() == f"listening on {endpoint}; everyone may do everything\n"
+        with client.connect(endpoint) as session, ExitStack() as stack:
+            for name in ("my-uav", "\x1b[2J", "uav1"):
+                stack.enter_context(session.liveliness().declare_token(f"uavpose/@v1/{name}/alive"))
+            assert router.stdout.readline() == "uav1: here\n"
     finally:
         router.kill()
 

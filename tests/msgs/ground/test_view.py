@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,14 +13,19 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
-from msgs import topics
+from msgs import cdr, topics
 from msgs.ground.cli import main
+from msgs.ground.feed import Incoming
+from msgs.ground.fleet import Fleet
+from msgs.ground.view.command import ViewOptions, view
 from msgs.ground.view.drawing import SIGMAS, box_edges_m, ellipse, ellipsoid, pixel_covariance, posed, project
+from msgs.ground.view.scene import Scene
 from msgs.mcap_file import McapFile
 from msgs.publish import Node
 from tests.waiting import until
@@ -66,14 +73,14 @@ def test_every_part_of_a_recorded_flight_is_there_at_its_time(saved: Path) -> No
         assert [stamp_ns for stamp_ns, _ in rows(saved, entity)] == stamps_ns(FRAMES), entity
     for entity in ("health", "ned/camera/image", "plots/latency/total_p50"):
         assert len(list(rows(saved, entity))) == FRAMES // 10, entity
-    assert {component_text(row) for _, row in rows(saved, "events")} == {"tracking t0", "tracking"}
+    assert {text(row, "TextLog:text") for _, row in rows(saved, "events")} == {"tracking t0", "tracking"}
     assert len(RrdReader(saved).blueprints()) == 1
 
 
-def component_text(row: dict[str, object]) -> str:
-    (text,) = (value for key, value in row.items() if key.endswith("TextLog:text"))
-    assert isinstance(text, list)
-    return str(text[0])
+def text(row: dict[str, object], name: str) -> str:
+    (value,) = (value for key, value in row.items() if key.endswith(name))
+    assert isinstance(value, list)
+    return str(value[0])
 
 
 def test_targets_stand_in_space_where_they_were_at_the_own_ship_s_attitude_of_that_instant(saved: Path) -> None:
@@ -109,6 +116,153 @@ def test_a_target_that_is_not_told_again_is_taken_away_after_a_second(tmp_path: 
     for where in ("ned", "ned/camera", "map", "zoom"):
         cleared = [stamp_ns for stamp_ns, _ in rows(tmp_path / "lost.rrd", f"{where}/target/t0")]
         assert cleared == [stamps_ns(10)[-1] + 1_000_000_000], where
+
+
+def rotation_unknown(payload: bytes) -> bytes:
+    """The same pose, as the daemon tells it where it does not know how the target is turned."""
+    pose = cdr.PoseWithCovarianceStamped.decode(payload)
+    covariance = np.diag([0.0, 0.0, 0.0, 1e6, 1e6, 1e6])
+    covariance[:3, :3] = pose.covariance[:3, :3]
+    upright = np.array([0.0, 0.0, 0.0, 1.0])
+    return dataclasses.replace(pose, q_cam_target_xyzw=upright, covariance=covariance).encode()
+
+
+def test_of_a_target_whose_rotation_is_not_known_the_place_alone_is_drawn(tmp_path: Path) -> None:
+    """Known for ten frames, not for ten, and then again: what was drawn of it does not stay meanwhile."""
+    file = McapFile(tmp_path / "turned.mcap")
+    for topic, target, payload, log_ns in samples(30):
+        unknown = topic is topics.POSE and 10 <= (log_ns - START_NS) // PERIOD_NS < 20
+        told = rotation_unknown(payload) if unknown else payload
+        file.write(topics.topic_name(topic, UAV, target), topic.ros_type, told, log_ns, log_ns)
+    file.close()
+    path = tmp_path / "turned.rrd"
+    assert main(["view", str(tmp_path / "turned.mcap"), "--save", str(path)]) == 0
+    place = [
+        "ned/target/t0/place", "ned/target/t0/sigma", "ned/target/t0/line_of_sight", "ned/trail/targets",
+        "ned/camera/target/t0/sigma", "ned/camera/target/t0/label", "map/target/t0/place", "map/target/t0/sigma",
+        "zoom/target/t0/label", "plots/range/t0",
+    ]  # fmt: skip
+    turned = [
+        "ned/target/t0/body", "ned/camera/target/t0/box", "ned/camera/target/t0/range_sigma", "map/target/t0/heading",
+        "zoom/target/t0/box", "zoom/target/t0/axes", "plots/attitude/t0/roll", "plots/attitude/t0/heading",
+    ]  # fmt: skip
+    stamps = stamps_ns(30)
+    for entity in place:
+        assert [stamp_ns for stamp_ns, row in rows(path, entity) if not clears(row)] == stamps, entity
+    for entity in turned:
+        assert [stamp_ns for stamp_ns, row in rows(path, entity) if not clears(row)] == stamps[:10] + stamps[20:], (
+            entity
+        )
+        assert stamps[10] in [stamp_ns for stamp_ns, row in rows(path, entity) if clears(row)], entity
+    labels = [text(row, "labels") for _, row in rows(path, "zoom/target/t0/label")]
+    assert labels == ["t0  ±8°"] * 10 + ["t0  ±?°"] * 10 + ["t0  ±8°"] * 10
+
+
+def clears(row: dict[str, object]) -> bool:
+    return any("Clear:" in name and value is not None for name, value in row.items())
+
+
+def test_where_the_own_ship_is_told_seldom_targets_stand_where_they_were_all_the_same(tmp_path: Path) -> None:
+    """Each fourth of a frame's transforms comes, then none: half a second on nobody knows any more."""
+    file = McapFile(tmp_path / "thin.mcap")
+    for topic, target, payload, log_ns in samples(40):
+        number = (log_ns - START_NS) // PERIOD_NS
+        if topic is topics.TF and (number % 4 or number > 28):
+            continue
+        file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.close()
+    path = tmp_path / "thin.rrd"
+    assert main(["view", str(tmp_path / "thin.mcap"), "--save", str(path)]) == 0
+    placed = {stamp_ns: component(row, "translation")[0] for stamp_ns, row in rows(path, "ned/target/t0/body")}
+    assert list(placed) == stamps_ns(40)
+    for stamp_ns in stamps_ns(29):
+        np.testing.assert_allclose(placed[stamp_ns], places_m(stamp_ns)[1], atol=0.1)
+    unknown = [
+        stamp_ns for stamp_ns, row in rows(path, "events") if "own attitude unknown" in text(row, "TextLog:text")
+    ]
+    assert unknown == [stamps_ns(31)[-1]]
+    sight = {stamp_ns: component(row, "strips")[0][0] for stamp_ns, row in rows(path, "ned/target/t0/line_of_sight")}
+    assert all(sight[stamp_ns].tolist() == [0.0, 0.0, 0.0] for stamp_ns in stamps_ns(40)[30:])
+
+
+def test_targets_are_taken_away_by_when_they_came_also_after_our_clock_was_set_back(tmp_path: Path) -> None:
+    """The vehicle's clock is 1.5 s behind: a target that is told is not taken away for that."""
+    path = tmp_path / "clock.rrd"
+    rec = rr.RecordingStream("uavpose")
+    rec.set_log_tick_enabled(False)
+    rec.set_log_time_enabled(False)
+    rec.save(path)
+    fleet = Fleet()
+    scene = Scene(rec, fleet, (8.0, 12.0, 2.5), lambda _: None)
+    key, behind_ns = topics.publication_key(topics.POSE, UAV, "t0"), 1_500_000_000
+    for number, stamp_ns in enumerate(stamps_ns(10), start=1):
+        topic, target, payload, _ = next(frame(stamp_ns, stamp_ns))
+        attachment = topics.attachment(number, stamp_ns, bytes(16))
+        scene.take(Incoming(UAV, topic, target, key, payload, attachment), stamp_ns + behind_ns)
+        scene.tick(stamp_ns + behind_ns)
+    assert scene.drawn == 10
+    scene.tick(stamps_ns(10)[-1] + behind_ns - 3_600_000_000_000)
+    scene.finish()
+    rec.disconnect()
+    for where in ("ned", "map", "zoom"):
+        cleared = [stamp_ns for stamp_ns, row in rows(path, f"{where}/target/t0") if clears(row)]
+        assert cleared == [stamps_ns(10)[-1] + 1_000_000_000]
+
+
+@pytest.fixture
+def halves(tmp_path: Path) -> tuple[Path, Path]:
+    """One flight in two recordings, as a recorder cuts it."""
+    paths = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    files = [McapFile(path) for path in paths]
+    for topic, target, payload, log_ns in samples(20):
+        half = files[(log_ns - START_NS) // PERIOD_NS >= 10]
+        half.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    for file in files:
+        file.close()
+    return paths
+
+
+def test_the_second_recording_of_a_flight_is_drawn_as_the_first(
+    halves: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "whole.rrd"
+    assert main(["view", *map(str, halves), "--save", str(out)]) == 0
+    assert [stamp_ns for stamp_ns, _ in rows(out, "ned/target/t0/body")] == stamps_ns(20)
+    assert capsys.readouterr().err.splitlines()[-1] == f"20 poses drawn into {out}"
+
+
+def test_what_is_refused_of_a_recording_is_told(
+    halves: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "twice.rrd"
+    assert main(["view", str(halves[0]), str(halves[0]), "--max-age", "0.001", "--save", str(out)]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == f"0 poses drawn into {out}, 20 samples refused"
+
+
+def test_a_recording_is_left_when_told_to_stop_and_what_was_drawn_is_kept(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    stop, said = threading.Event(), list[str]()
+
+    def say(line: str) -> None:
+        said.append(line)
+        stop.set()
+
+    out = tmp_path / "left.rrd"
+    options = ViewOptions(
+        halves,
+        endpoint="",
+        tls=None,
+        uavs=(),
+        domain=0,
+        max_age_s=2.0,
+        size_m=(8.0, 12.0, 2.5),
+        save=out,
+        web_port=None,
+    )
+    assert view(options, stop, say) == 0
+    assert said == [f"{halves[0]}: read", f"10 poses drawn into {out}"]
+    assert [stamp_ns for stamp_ns, _ in rows(out, "ned/target/t0/body")] == stamps_ns(10)
 
 
 def test_what_is_told_live_is_drawn_until_told_to_stop(network: Network, tmp_path: Path) -> None:

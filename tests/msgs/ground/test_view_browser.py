@@ -66,8 +66,9 @@ def test_the_page_is_served_until_told_to_stop_and_nothing_stays_behind(tmp_path
         assert address.startswith(f"http://127.0.0.1:{port}/")
         with urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
             assert b"rerun" in page.read().lower()
-        server.terminate()
         assert server.stderr is not None
+        assert server.stderr.readline().endswith("flight.mcap: read\n")
+        server.terminate()
         assert "5 poses drawn" in server.stderr.read()
     assert server.returncode == 0
     assert not answers(port)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import subprocess
 import sys
@@ -15,14 +17,19 @@ import numpy as np
 import pytest
 import zenoh
 from mcap.reader import make_reader
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from msgs import cdr, topics
+from msgs import cdr, client, topics
+from msgs.ground.cli import main
+from msgs.ground.feed import Incoming, linked, listening
+from msgs.ground.fleet import Fleet
+from msgs.ground.watch import WatchOptions, _watch_json, table
 from msgs.publish import Node, TopicPublisher
 from msgs.session import peer_config, router_config
 from tests.waiting import until
 
-from ..conftest import Network, free_endpoint
+from ..conftest import Network, free_endpoint, pose_now
 
 R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
 R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -199,3 +206,97 @@ def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_
         assert len(poses) > 3
     assert [cdr.Log.decode(m.data).msg for name, m in came if name == "/uav1/events"] == ["before"]
     assert all(0 <= m.log_time - m.publish_time < 10**10 for _, m in came)
+
+
+NOW_NS, S = 1_700_000_000_000_000_000, 1_000_000_000
+DIM = "\x1b[2m"
+
+
+def tell(fleet: Fleet, topic: topics.Topic, message: cdr.Payload, now_ns: int, target: str | None = None) -> None:
+    """A first sample of this topic."""
+    key, attachment = topics.publication_key(topic, "uav1", target), topics.attachment(1, now_ns, bytes(16))
+    fleet.take(Incoming("uav1", topic, target, key, message.encode(), attachment), now_ns)
+
+
+def told_health(level: int, text: str) -> cdr.DiagnosticArray:
+    return cdr.DiagnosticArray(NOW_NS, "", (cdr.DiagnosticStatus(level, "uavpose_edge", text, "uav1"),))
+
+
+def line(fleet: Fleet, now_ns: int, start: str) -> str:
+    """The line of the table that begins so, as a terminal gets it."""
+    console = Console(file=io.StringIO(), width=160, force_terminal=True, color_system="standard")
+    console.print(table(fleet.rows(now_ns), True, "tcp/127.0.0.1:7447", now_ns))
+    assert isinstance(console.file, io.StringIO)
+    (found,) = (one for one in console.file.getvalue().splitlines() if start in one)
+    return found
+
+
+@pytest.mark.parametrize("text", ["cannot open [/dev/video0]", "[camera] 3 frames dropped", "[bold]loud[/bold]"])
+def test_what_a_vehicle_says_is_shown_as_it_says_it(text: str) -> None:
+    fleet = Fleet()
+    tell(fleet, topics.EVENTS, cdr.Log(NOW_NS, 20, "uavpose_edge", text), NOW_NS)
+    tell(fleet, topics.DIAGNOSTICS, told_health(2, text), NOW_NS)
+    assert line(fleet, NOW_NS, "uav1").count(text) == 2
+
+
+def test_what_a_vehicle_says_does_not_steer_the_terminal() -> None:
+    fleet, text = Fleet(), "all\x1b[2J\x1b]0;owned\x07 is\r\nwell\x9b5m"
+    tell(fleet, topics.EVENTS, cdr.Log(NOW_NS, 20, "uavpose_edge", text), NOW_NS)
+    tell(fleet, topics.DIAGNOSTICS, told_health(2, text), NOW_NS)
+    shown = line(fleet, NOW_NS, "uav1")
+    assert shown.count("all [2J ]0;owned  is  well 5m") == 2
+    assert not any(one in shown for one in ("\x1b[2J", "\x1b]", "\x07", "\r", "\x9b"))
+
+
+def test_health_that_is_no_longer_told_is_dim_and_says_its_age() -> None:
+    fleet = Fleet()
+    fleet.alive("uav1", True)
+    assert f"{DIM}–" in line(fleet, NOW_NS, "uav1")
+    tell(fleet, topics.DIAGNOSTICS, told_health(0, "tracking"), NOW_NS)
+    assert "\x1b[32mtracking" in line(fleet, NOW_NS + 2 * S, "uav1")
+    assert f"{DIM}tracking (4 s ago)" in line(fleet, NOW_NS + 4 * S, "uav1")
+    assert "tracking" not in line(fleet, NOW_NS - 3600 * S, "uav1")
+    fleet.alive("uav1", False)
+    assert f"{DIM}tracking (2 s ago)" in line(fleet, NOW_NS + 2 * S, "uav1")
+
+
+def test_a_target_is_dim_by_when_it_was_heard_whatever_the_vehicle_s_clock_says() -> None:
+    fleet = Fleet()
+    tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS - 3 * S // 2), NOW_NS, "t0")
+    assert DIM not in line(fleet, NOW_NS + S // 2, "uav1/t0")
+    assert DIM in line(fleet, NOW_NS + 2 * S, "uav1/t0")
+
+
+def test_a_link_that_is_down_is_told_so_from_the_first() -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        with zenoh.open(router_config([endpoint])):
+            opened = stack.enter_context(client.connect(endpoint))
+            until(lambda: linked(opened))
+        until(lambda: not linked(opened))
+        stop, console = threading.Event(), Console(file=io.StringIO())
+        stop.set()
+        _watch_json(WatchOptions(endpoint), Fleet(), opened, stop, console)
+        assert isinstance(console.file, io.StringIO)
+        assert console.file.getvalue() == '{"type": "link", "up": false}\n'
+
+
+def test_who_bears_no_vehicle_s_name_is_not_told_of(network: Network) -> None:
+    here: list[str] = []
+    with ExitStack() as stack:
+        opened = stack.enter_context(client.connect(network.endpoint))
+        stack.enter_context(listening(opened, (), 0, lambda _: None, lambda uav, _: here.append(uav)))
+        for name in ("my-uav", "\x1b[2J", "uav1"):
+            stack.enter_context(network.daemon.liveliness().declare_token(f"uavpose/@v1/{name}/alive"))
+        until(lambda: "uav1" in here)
+    assert set(here) == {"uav1"}
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-1", "much"])
+@pytest.mark.parametrize("option", ["watch --max-age", "view --max-age", "record --free-mb"])
+def test_what_is_no_number_from_nought_on_is_a_sentence(
+    option: str, number: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([*option.split(), number, "--seconds", "0.1"])
+    assert f"argument {option.split()[1]}: {number} is not a number from 0 on" in capsys.readouterr().err

@@ -1,0 +1,90 @@
+"""How the own ship's camera was turned, and where it was, at any instant of the last seconds. Pure."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from dataclasses import dataclass
+from operator import attrgetter
+
+import numpy as np
+
+from msgs import topics
+from msgs.cdr import TFMessage
+from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
+from msgs.wire import Array
+
+GAP_NS = 500_000_000  # wider apart, the own ship may have done anything in between; a lost one of five a second is not
+NEAR_NS = 100_000_000
+KEPT_NS = 2_000_000_000
+KEPT_MAX = 512
+_stamp_ns = attrgetter("stamp_ns")
+
+
+@dataclass(frozen=True, eq=False)
+class OwnShip:
+    """The own ship at one instant."""
+
+    stamp_ns: int
+    root: str  # the frame that is told of: ned axes, at a place on Earth or at the own ship
+    R_ned_cam: Array
+    t_ned_own_m: Array
+
+
+class OwnShipHistory:
+    """What a vehicle's transforms told of late."""
+
+    def __init__(self) -> None:
+        self._told: list[OwnShip] = []
+
+    def take(self, message: TFMessage) -> OwnShip | None:
+        """Keep what it tells; None if it does not lead from the camera to ned axes."""
+        own = own_ship(message)
+        if own is None:
+            return None
+        newest = self._told[-1] if self._told else own
+        # Of another place on Earth, or of a clock that was set back: no way leads from there to here.
+        if own.root != newest.root or own.stamp_ns < newest.stamp_ns - KEPT_NS:
+            self._told.clear()
+        insort(self._told, own, key=_stamp_ns)
+        while len(self._told) > KEPT_MAX or self._told[0].stamp_ns < self._told[-1].stamp_ns - KEPT_NS:
+            del self._told[0]
+        return own
+
+    def at(self, stamp_ns: int) -> OwnShip | None:
+        """The own ship at an instant, between what was told right before and after; None while that has not come."""
+        index = bisect_left(self._told, stamp_ns, key=_stamp_ns)
+        if index < len(self._told) and self._told[index].stamp_ns == stamp_ns:
+            return self._told[index]
+        if not 0 < index < len(self._told):
+            return None
+        before, after = self._told[index - 1], self._told[index]
+        if after.stamp_ns - before.stamp_ns > GAP_NS:
+            return None
+        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        turn = so3_log(before.R_ned_cam.T @ after.R_ned_cam)
+        t_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
+        return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), t_m)
+
+    def near(self, stamp_ns: int) -> OwnShip | None:
+        """The same, or where that cannot be said what was told nearest to it, no further off than `NEAR_NS`."""
+        own = self.at(stamp_ns)
+        if own is not None or not self._told:
+            return own
+        nearest = min(self._told, key=lambda one: abs(one.stamp_ns - stamp_ns))
+        return nearest if abs(nearest.stamp_ns - stamp_ns) <= NEAR_NS else None
+
+
+def own_ship(message: TFMessage) -> OwnShip | None:
+    """Up the chain of frames from the camera; None if it does not end at ned axes."""
+    links = {one.child_frame_id: one for one in message.transforms}
+    if topics.FRAME_CAMERA not in links:
+        return None
+    stamp_ns, place = links[topics.FRAME_CAMERA].stamp_ns, links.get(topics.FRAME_BODY_NED)
+    R, frame = np.eye(3), topics.FRAME_CAMERA
+    while frame in links:
+        link = links.pop(frame)
+        R = R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1)) @ R
+        frame = link.frame_id
+    if frame not in (topics.FRAME_NED, topics.FRAME_BODY_NED):
+        return None
+    return OwnShip(stamp_ns, frame, R, np.zeros(3) if place is None else place.t_frame_child_m)
