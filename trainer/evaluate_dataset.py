@@ -93,6 +93,8 @@ def evaluate_dataset(
     name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
     score = {
         "mode": request.mode,
+        "own_ship": request.own_ship if request.mode == "track" else None,
+        "every": request.every,
         **score_of(dataset, method, judged),
         "consistency": consistency(judged),
         "filtering": filtering(judged),

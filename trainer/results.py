@@ -109,9 +109,11 @@ def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], scores: Sequence[
             raise ConfigError(f"{_called(score['method'])}: was measured on other pictures: {_pictures(score)}")
 
 
-def _pictures(score: Mapping[str, Any]) -> tuple[str, str, str | None, int, int]:
+def _pictures(score: Mapping[str, Any]) -> tuple[str | int | None, ...]:
+    """What was judged, and how; scores written before own_ship and every were told have neither."""
     overall = score["overall"]
-    return score["dataset"], score["mode"], score["split"], overall["frames"], overall["targets"]
+    which = score["dataset"], score["split"], score.get("every", 1), overall["frames"], overall["targets"]
+    return *which, score["mode"], score.get("own_ship")
 
 
 def _called(method: Mapping[str, Any]) -> str:
@@ -132,20 +134,25 @@ def page(
     scores: Sequence[Mapping[str, Any]], command: str, trained: str, beside: Sequence[Mapping[str, Any]] = ()
 ) -> str:
     """Markdown: overall beside the paper and what else was measured, then each dataset by distance and by airframe."""
-    models = {score["method"]["file"]: score["method"] for score in scores}
+    models = {score["method"]["sha256"]: score["method"] for score in scores}
+    kinds = [method["precision"] for method in models.values()]
+    named = {
+        sha256: method["precision"] + (f" `{sha256[:8]}`" if kinds.count(method["precision"]) > 1 else "")
+        for sha256, method in models.items()
+    }
     lines = ["# Results", "", f"Made by `{command}`. Missed targets count as failures in every rate; means are over "]
     lines[-1] += (
         "found targets. Single frames, unless a row says *track*: then the daemon's tracker, "
         "which is told own attitude with the errors that an autopilot usually has. *False / 1,000*: false poses in "
         "1,000 frames without a target, or with one of which nothing can be seen."
     )
-    lines += ["", *(f"- `{name}`: {m['precision']}, sha256 `{m['sha256'][:16]}`" for name, m in models.items())]
+    lines += ["", *(f"- `{m['file']}`: {m['precision']}, sha256 `{sha256[:16]}`" for sha256, m in models.items())]
     for score in beside:
         sha256 = score["method"].get("sha256", "")
         lines.append(f"- {_called(score['method'])}" + (f": sha256 `{sha256[:16]}`" if sha256 else ""))
     lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]
     lines += ["", "## Overall", "", *_header("dataset", "model", "frames")]
-    rows = [(score, score["method"]["precision"]) for score in scores]
+    rows = [(score, named[score["method"]["sha256"]]) for score in scores]
     rows += [(score, _called(score["method"])) for score in beside]
     names = [score["dataset"] for score in scores]
     for score, called in sorted(rows, key=lambda row: names.index(row[0]["dataset"])):
@@ -153,7 +160,7 @@ def page(
         lines.append(_row([*first, str(score["overall"]["frames"])], score["overall"]))
     lines.append(_row(["FW-UAV6DPose (the paper's own data)", "the paper, FP32", "4,500"], PAPER))
     for score in scores:
-        name = f"{score['dataset']}, {score['method']['precision']}, {score['mode']}"
+        name = f"{score['dataset']}, {named[score['method']['sha256']]}, {score['mode']}"
         lines += [
             "",
             f"## {name}",
