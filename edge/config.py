@@ -191,7 +191,11 @@ class HealthSettings(Section):
         default=None, gt=0, le=10_000, description="degraded when p95 from exposure to the links is above"
     )
     loop_stuck_s: float = Field(
-        default=5.0, ge=1, le=60, description="the process ends when its loop stands still for so long"
+        default=5.0,
+        ge=1,
+        le=7,
+        description="the process ends when its loop stands still for so long, and says where; longer, and the unit's "
+        "WatchdogSec=15 would end it first, without a word",
     )
     prometheus_port: int | None = Field(
         default=None, ge=1, le=65535, description="serve metrics to Prometheus on this port of 127.0.0.1"

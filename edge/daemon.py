@@ -146,11 +146,11 @@ class Pipeline:
         capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         own_ship = self._own_ship.at(capture_ns)
         self._take_requests(capture_ns)
-        expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh)
+        expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh, frame.distortion)
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
         estimates = self._estimate(frame, expected, pointed_at, clock)
-        tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh)
+        tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion)
         self._by_hand.settle(tracks)
         for text in self._by_hand.news():
             self._outlets.event(logging.INFO, text)
@@ -175,7 +175,7 @@ class Pipeline:
         searches = self._by_hand.searches(capture_ns)
         held = [track.box_xyxy_px for track in expected]
         twice = [looked_at_twice(track.state, unhurried) for track in expected]
-        places = self.search.places(capture_ns, held, self._max_targets - len(held)) if searches else []
+        places = self.search.places(capture_ns, held, self._max_targets - len(held) if searches else 0)
         found = self._look_into(held, twice, places, frame, pointed_at, clock)
         self._since_acquire += 1
         if not searches:

@@ -22,6 +22,9 @@ log = logging.getLogger(__name__)
 
 STOP_TIMEOUT_S = 5.0  # a process that ends during an inference is aborted; on a busy machine one takes long
 PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
+# At few frames a second no place is younger than the frame before; where the machine sets the pace, the search, at a
+# lower priority, lasts longer than from one frame to the next. A place that is too old costs a window in vain.
+PLACE_AGE_MAX_FRAMES = 2.5
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Search:
         self._busy = False
         self._places: list[Estimate] = []
         self._seen_ns = 0  # exposure of the frame that they were seen in
+        self._asked_for_ns = 0  # exposure of the last frame that they were asked for
         self._counts: Counter[str] = Counter(searches=0)
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -71,10 +75,11 @@ class Search:
 
     def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Estimate]:
         """What was found since the last call, best first, and may still be there at `capture_ns` (monotonic), off
-        `known_boxes`."""
+        `known_boxes`; asked of every frame, in their order."""
+        interval_ns, self._asked_for_ns = capture_ns - self._asked_for_ns, capture_ns
         with self._changed:
             found, self._places = self._places, []
-            if capture_ns - self._seen_ns > PLACE_AGE_MAX_NS:
+            if capture_ns - self._seen_ns > max(PLACE_AGE_MAX_NS, PLACE_AGE_MAX_FRAMES * interval_ns):
                 return []
         return [place for place in found if not lies_on(place.box_xyxy_px, known_boxes)][: max(at_most, 0)]
 

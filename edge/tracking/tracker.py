@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from edge.estimator.lens import Lens
 from edge.tracking import motion as ekf
 from edge.tracking import rotation
 from edge.tracking.association import associate
@@ -59,15 +60,23 @@ class Tracker:
     _tracks: tuple[Track, ...] = ()
     _motion_doubted: bool = False
 
-    def predict(self, capture_ns: int, own_ship: OwnShip | None, K: Array, image_size_wh: Size) -> list[Track]:
+    def predict(
+        self,
+        capture_ns: int,
+        own_ship: OwnShip | None,
+        K: Array,
+        image_size_wh: Size,
+        distortion: tuple[float, ...] = (),
+    ) -> list[Track]:
         """Where each target should be in the frame taken at `capture_ns`, without those whose box misses the picture.
 
-        Oldest measurement first. Changes nothing. K [3, 3] px; image_size_wh px.
+        Oldest measurement first. Changes nothing. K [3, 3] px; image_size_wh px; distortion as Frame has it.
         """
+        lens = Lens(K, distortion)
         view = View.of(capture_ns, own_ship, self.mount, self._view)
         expected = []
         for target in sorted(self._within_reach(capture_ns), key=lambda t: t.measured_ns):
-            track = _track(target, *self._advanced(target, view), view, K)
+            track = _track(target, *self._advanced(target, view), view, lens)
             if track.t_cam_target_m[2] > RANGE_MIN_M and inside(track.box_xyxy_px, image_size_wh):
                 expected.append(track)
         return expected
@@ -92,7 +101,13 @@ class Tracker:
         return self._view is not None and capture_ns <= self._view.time_ns
 
     def update(
-        self, capture_ns: int, estimates: list[Estimate], own_ship: OwnShip | None, K: Array, image_size_wh: Size
+        self,
+        capture_ns: int,
+        estimates: list[Estimate],
+        own_ship: OwnShip | None,
+        K: Array,
+        image_size_wh: Size,
+        distortion: tuple[float, ...] = (),
     ) -> tuple[Track, ...]:
         """Take in what was seen in the frame taken at `capture_ns`; returns all tracks, by track_id.
 
@@ -108,24 +123,25 @@ class Tracker:
             target.motion, target.attitude = self._advanced(target, view)
         self._view = view
 
+        lens = Lens(K, distortion)
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
-        pairs = associate([(target.motion, target.attitude) for target in self._targets], finite, K, view)
+        pairs = associate([(target.motion, target.attitude) for target in self._targets], finite, lens.K, view)
         for target_index, estimate_index, seen in pairs:
-            _hit(self._targets[target_index], finite[estimate_index], seen, K, view)
+            _hit(self._targets[target_index], finite[estimate_index], seen, lens, view)
         used = {estimate_index for _, estimate_index, _ in pairs}
         hit = {target_index for target_index, _, _ in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]
         for i, target in enumerate(self._targets):
-            if i not in hit and not _taken_over(target, spare, K, view):
+            if i not in hit and not _taken_over(target, spare, lens, view):
                 _miss(target)
-        self._targets = [t for t in self._targets if _alive(t, K, view, image_size_wh)]
-        self._give_birth(spare, K, view)
+        self._targets = [t for t in self._targets if _alive(t, lens, view, image_size_wh)]
+        self._give_birth(spare, lens, view)
         if self._motion_doubted:
             self._forget_motion()
             self._motion_doubted = False
         self._targets.sort(key=lambda t: t.track_id)
-        self._tracks = tuple(_track(target, target.motion, target.attitude, view, K) for target in self._targets)
+        self._tracks = tuple(_track(target, target.motion, target.attitude, view, lens) for target in self._targets)
         return self._tracks
 
     def _within_reach(self, time_ns: int) -> list[Target]:
@@ -154,20 +170,20 @@ class Tracker:
             rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
         )
 
-    def _give_birth(self, estimates: list[Estimate], K: Array, view: View) -> None:
+    def _give_birth(self, estimates: list[Estimate], lens: Lens, view: View) -> None:
         for estimate in sorted(estimates, key=lambda e: -e.score):
             free = sorted(set(range(self.max_targets)) - {t.track_id for t in self._targets})
-            boxes = [_box(target, view, K) for target in self._targets]
+            boxes = [_box(target, view, lens) for target in self._targets]
             if not free:
                 return
             if any(iou(estimate.box_xyxy_px, box) > SAME_BOX_IOU for box in boxes):
                 continue  # two windows saw one target
-            motion, attitude = ekf.begin(estimate, K, view), rotation.begin(estimate, view)
-            box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, K)
+            motion, attitude = ekf.begin(estimate, lens.K, view), rotation.begin(estimate, view)
+            box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, lens)
             self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
 
 
-def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: View) -> None:
+def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view: View) -> None:
     dt_s = (view.time_ns - target.measured_ns) / NS_PER_S
     target.motion = ekf.correct(target.motion, seen, view)
     attitude = rotation.correct(target.attitude, estimate, view, dt_s)
@@ -175,7 +191,7 @@ def _hit(target: Target, estimate: Estimate, seen: Innovation, K: Array, view: V
     target.attitude = rotation.weighed(
         attitude, _along(target.motion, view), _flight(target.motion, view), dt_s, settled
     )
-    _seen(target, estimate, K, view)
+    _seen(target, estimate, lens, view)
 
 
 def _flight(motion: Motion, view: View) -> Flight | None:
@@ -191,22 +207,22 @@ def _along(motion: Motion, view: View) -> Array:
     return rotation.unit(motion.t_m - view.t_frame_cam_m)
 
 
-def _taken_over(target: Target, spare: list[Estimate], K: Array, view: View) -> bool:
+def _taken_over(target: Target, spare: list[Estimate], lens: Lens, view: View) -> bool:
     """Whether an estimate outside the gate has lain under the target's box long enough to become it."""
-    box = _box(target, view, K)
+    box = _box(target, view, lens)
     rivals = [e for e in spare if iou(e.box_xyxy_px, box) > SAME_BOX_IOU]
     target.position_disagreements = target.position_disagreements + 1 if rivals else 0
     if target.position_disagreements < PERSISTENT:
         return False
     rival = max(rivals, key=lambda e: e.score)
-    target.motion, target.attitude = ekf.begin(rival, K, view), rotation.begin(rival, view)
-    _seen(target, rival, K, view)
+    target.motion, target.attitude = ekf.begin(rival, lens.K, view), rotation.begin(rival, view)
+    _seen(target, rival, lens, view)
     spare[:] = [e for e in spare if e is not rival]
     return True
 
 
-def _seen(target: Target, estimate: Estimate, K: Array, view: View) -> None:
-    target.box = BoxModel.measured(estimate.box_xyxy_px, ekf.t_in_cam(target.motion, view), K)
+def _seen(target: Target, estimate: Estimate, lens: Lens, view: View) -> None:
+    target.box = BoxModel.measured(estimate.box_xyxy_px, ekf.t_in_cam(target.motion, view), lens)
     target.score = estimate.score
     target.measured_ns = view.time_ns
     target.hits += 1
@@ -222,17 +238,17 @@ def _miss(target: Target) -> None:
         target.state = TrackState.COASTING
 
 
-def _alive(target: Target, K: Array, view: View, image_size_wh: Size) -> bool:
+def _alive(target: Target, lens: Lens, view: View, image_size_wh: Size) -> bool:
     if target.state is not TrackState.TENTATIVE:
         return True
-    return target.misses < TENTATIVE_MISSES and inside(_box(target, view, K), image_size_wh)
+    return target.misses < TENTATIVE_MISSES and inside(_box(target, view, lens), image_size_wh)
 
 
-def _box(target: Target, view: View, K: Array) -> Array:
-    return target.box.box_xyxy_px(ekf.t_in_cam(target.motion, view), K)
+def _box(target: Target, view: View, lens: Lens) -> Array:
+    return target.box.box_xyxy_px(ekf.t_in_cam(target.motion, view), lens)
 
 
-def _track(target: Target, motion: Motion, attitude: Attitude, view: View, K: Array) -> Track:
+def _track(target: Target, motion: Motion, attitude: Attitude, view: View, lens: Lens) -> Track:
     t_cam = ekf.t_in_cam(motion, view)
     R = view.R_frame_cam.T
     spread = rotation.covariance(attitude, _along(motion, view))
@@ -247,7 +263,7 @@ def _track(target: Target, motion: Motion, attitude: Attitude, view: View, K: Ar
         measured_ns=target.measured_ns,
         born_ns=target.born_ns,
         score=target.score,
-        box_xyxy_px=target.box.box_xyxy_px(t_cam, K),
+        box_xyxy_px=target.box.box_xyxy_px(t_cam, lens),
         R_cam_target=R @ attitude.R_frame_target,
         t_cam_target_m=t_cam,
         covariance=covariance,

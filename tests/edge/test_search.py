@@ -17,6 +17,7 @@ from edge import threads
 from edge.config import SHIPPED_MODEL, Config, ConfigFile
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
+from edge.estimator.lens import Lens
 from edge.estimator.model import load_model
 from edge.health import Reason
 from edge.outlets import Outlets
@@ -82,6 +83,27 @@ def test_a_place_seen_too_long_ago_is_not_looked_into(search: Search, estimator:
         assert search.begin(estimator, seen, [])
         until(lambda before=before: search.counters()["searches"] > before)  # type: ignore[misc]
         assert len(search.places(seen.meta.capture_ns + late_ns, [], 4)) == places
+
+
+@pytest.mark.parametrize("fps", [0.5, 1.9])
+def test_at_few_frames_a_second_a_place_of_the_last_two_frames_is_looked_into(
+    search: Search, toy_model: Path, fps: float
+) -> None:
+    """The frame after is there no sooner, and a search on a slow machine may last longer than until then."""
+    place = Estimate(0.9, box_around(OTHER), np.eye(3), np.array([0.0, 0.0, 200.0]), np.eye(6), "acquire")
+    for frames_after, places in ((1, 1), (2, 1), (3, 0)):
+        gated = Gated(load_model(toy_model, 1))
+        gated.sees = [place]
+        seen = frame(0, OTHER)
+        at_ns = [seen.meta.capture_ns + round(index * 1e9 / fps) for index in range(4)]
+        before = search.counters()["searches"]
+        assert search.places(at_ns[0], [], 4) == []
+        assert search.begin(gated, seen, [])
+        for under_way_ns in at_ns[1:frames_after]:
+            assert search.places(under_way_ns, [], 4) == []
+        gated.gate.set()
+        until(lambda before=before: search.counters()["searches"] > before)  # type: ignore[misc]
+        assert len(search.places(at_ns[frames_after], [], 4)) == places
 
 
 class Gated(Estimator):
@@ -199,6 +221,20 @@ def test_poses_go_out_while_the_search_is_under_way_and_what_it_finds_becomes_a_
     np.testing.assert_allclose(ear.reports[-1].tracks[1].box_xyxy_px, box_around(OTHER), atol=3.0)
 
 
+def test_a_second_target_is_found_beside_a_first_at_one_frame_a_second(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated
+) -> None:
+    loop, ear, _ = pipeline
+    gated.sees = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+    gated.gate.set()
+    for index in range(6):
+        loop._process(frame(30 * index, HELD, OTHER) if index == 5 else frame(30 * index, HELD))
+    until(lambda: loop.search.counters()["searches"] == 1)
+    assert [len(report.tracks) for report in ear.reports] == [1] * 6
+    loop._process(frame(180, HELD, OTHER))
+    assert len(ear.reports[-1].tracks) == 2
+
+
 def test_a_target_that_has_left_its_window_is_looked_for_in_that_same_frame(
     pipeline: tuple[Pipeline, Ear, RequestQueue],
 ) -> None:
@@ -228,6 +264,35 @@ def test_stamps_that_jump_teach_no_speed(pipeline: tuple[Pipeline, Ear, RequestQ
     away_m = np.abs(coasting.t_cam_target_m - held.t_cam_target_m)
     assert np.all(away_m <= 3.0 * np.sqrt(np.diag(coasting.covariance)[:3]))
     assert away_m.max() < 1.0, "nothing true was learnt of its speed"
+
+
+def test_a_target_that_is_missed_is_looked_for_and_told_where_the_lens_would_show_it(
+    pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It flies outwards, across the sight line, by 16 px a frame of a camera without the lens."""
+    loop, ear, _ = pipeline
+    lens = Lens(K, (-0.5, 0.0, 0.0, 0.0))
+    looked_into: list[Array] = []
+    look = gated.track
+
+    def listening(frame: Frame, boxes: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
+        looked_into[:] = boxes
+        return look(frame, boxes, twice)
+
+    monkeypatch.setattr(gated, "track", listening)
+
+    def center(index: int) -> Array:
+        return lens.to_frame(np.array([1259.5 + 16.0 * index, 539.5]))
+
+    empty = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+    for index in range(32):
+        picture = draw((center(index)[0], center(index)[1])) if index < 20 else empty
+        loop._process(replace(frame(index, HELD), image_bgr=picture, distortion=lens.distortion))
+    (coasting,) = ear.reports[-1].tracks
+    assert coasting.state is TrackState.COASTING
+    np.testing.assert_allclose(looked_into, [coasting.box_xyxy_px], atol=1e-6)
+    told = 0.5 * (coasting.box_xyxy_px[:2] + coasting.box_xyxy_px[2:])
+    np.testing.assert_allclose(told, center(31), atol=12.0)
 
 
 def test_a_place_that_the_window_does_not_make_likely_enough_is_no_target(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -109,3 +110,64 @@ def test_in_cam_no_ned_pose_is_told() -> None:
         (track,) = tracker.update(i + 1, [replace(estimate, score=0.8)], None, K, SIZE_WH)
         told = (track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned)
         assert all(one is None for one in told)
+
+
+WIDE_K = np.array([[1000.0, 0.0, 959.5], [0.0, 1000.0, 539.5], [0.0, 0.0, 1.0]])
+BARREL = (-0.3, 0.1, 0.001, -0.001, -0.015)
+FOLDING = (-0.3, 0.0, 0.0, 0.0)  # shows nothing farther than 46 degrees off the axis
+HALF_SPAN_M = np.array([[-6.0, 0.0, 0.0], [0.0, -2.0, 0.0], [6.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+
+
+def seen_through(distortion: tuple[float, ...], t_m: np.ndarray) -> np.ndarray:
+    """The box [4] on the frame of a target that is spread out across the optical axis, by OpenCV."""
+    points, _ = cv2.projectPoints(t_m + HALF_SPAN_M, np.zeros(3), np.zeros(3), WIDE_K, np.array(distortion))
+    (left, _), (_, top), (right, _), (_, bottom) = points[:, 0]
+    return np.array([left, top, right, bottom])
+
+
+def off_axis(degrees: float, range_m: float = 200.0) -> np.ndarray:
+    angle = np.deg2rad(degrees)
+    return np.array([range_m * np.sin(angle), 20.0, range_m * np.cos(angle)])
+
+
+def expected_after_a_turn(
+    before_deg: float, after_deg: float, distortion: tuple[float, ...], box_xyxy_px: np.ndarray
+) -> list[np.ndarray]:
+    """Where a target is looked for that was seen `before_deg` off the axis, in that box, once the camera has turned."""
+    tracker = Tracker(4, LOOKING_NORTH)
+    covariance = np.diag([0.04, 0.04, 16.0, 0.0064, 0.0064, 0.0064])
+    estimate = Estimate(0.9, box_xyxy_px, np.eye(3), off_axis(before_deg), covariance, "track")
+    own = OwnShip(1, np.eye(3), np.zeros(3), np.zeros(3), None)
+    (track,) = tracker.update(own.time_ns, [estimate], own, WIDE_K, SIZE_WH, distortion)
+    assert np.isfinite(track.box_xyxy_px).all()
+    R_ned_body = Rotation.from_euler("z", before_deg - after_deg, degrees=True).as_matrix()
+    turned = replace(own, time_ns=40_000_000, R_ned_body=R_ned_body)
+    return [track.box_xyxy_px for track in tracker.predict(turned.time_ns, turned, WIDE_K, SIZE_WH, distortion)]
+
+
+@pytest.mark.parametrize(("before_deg", "after_deg"), [(35, 25), (35, 5), (30, -30), (0, 40)])
+def test_a_target_is_looked_for_where_the_lens_shows_it(before_deg: float, after_deg: float) -> None:
+    """It stands still and the camera turns; without the lens the box is off by its own width."""
+    seen = seen_through(BARREL, off_axis(before_deg))
+    (box,) = expected_after_a_turn(before_deg, after_deg, BARREL, seen)
+    np.testing.assert_allclose(box, seen_through(BARREL, off_axis(after_deg)), atol=1.0)
+
+
+def test_a_target_that_the_lens_does_not_show_is_not_looked_for() -> None:
+    """60 degrees off the axis the lens's polynomial has folded back into the picture."""
+    assert np.all(seen_through(FOLDING, off_axis(60)) < [*SIZE_WH, *SIZE_WH])
+    assert expected_after_a_turn(30, 60, FOLDING, seen_through(FOLDING, off_axis(30))) == []
+
+
+@pytest.mark.parametrize("right_px", [1700.0, 1750.0, 1919.5])
+def test_a_box_that_reaches_where_the_lens_cannot_be_inverted_is_remembered_where_its_target_is(
+    right_px: float,
+) -> None:
+    """44 degrees off the axis, where the picture ends at column 1662 and the box is told too large."""
+    told = seen_through(FOLDING, off_axis(44))
+    told[2] = right_px
+    (box,) = expected_after_a_turn(44, 20, FOLDING, told)
+    center = 0.5 * (box[:2] + box[2:])
+    true = seen_through(FOLDING, off_axis(20))
+    assert np.all(np.abs(center - 0.5 * (true[:2] + true[2:])) < 0.5 * (true[2:] - true[:2]))
+    assert np.all(box[2:] - box[:2] < 2.0 * (told[2:] - told[:2]))
