@@ -16,9 +16,15 @@ from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
+# What is skipped is decoded all the same: a video that decodes slower than its rate never catches up.
+SKIPPING_MAX_NS = 250_000_000
+
 
 class FileSource:
-    """Frame k is taken as exposed at start + k / fps; frames a late reader missed are skipped, as with a camera."""
+    """Frame k is taken as exposed at start + k / fps; frames a late reader missed are skipped, as with a camera.
+
+    Where skipping takes too long, the frame is an old one and says so by its stamp.
+    """
 
     live = False
 
@@ -54,8 +60,9 @@ class FileSource:
         assert self._capture is not None
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
-        while self._follows(self._next) and self._exposure_ns(self._next + 1) <= time.monotonic_ns():
-            if not self._capture.grab():
+        skipping_until_ns = time.monotonic_ns() + SKIPPING_MAX_NS
+        while self._follows(self._next) and self._exposure_ns(self._next + 1) <= (now_ns := time.monotonic_ns()):
+            if stop.is_set() or now_ns >= skipping_until_ns or not self._capture.grab():
                 break
             self._next += 1
         capture_ns = self._exposure_ns(self._next)

@@ -70,11 +70,16 @@ def read_calibration(path: Path) -> Intrinsics:
         K = _matrix(storage.getNode("camera_matrix"))
         distortion = _matrix(storage.getNode("distortion_coefficients"))
         model = storage.getNode("distortion_model").string()
+        fisheye = storage.getNode("fisheye_model")
     except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
         raise InputError(f"calibration {path} is not valid YAML", INTRINSICS_KEY) from error
     if model not in DISTORTION_MODELS:
         raise InputError(
             f"calibration {path}: distortion_model {model} is not one of plumb_bob, rational_polynomial", INTRINSICS_KEY
+        )
+    if not fisheye.empty() and not (fisheye.isInt() and fisheye.real() == 0):
+        raise InputError(
+            f"calibration {path}: fisheye_model is not 0: fisheye lenses are not supported", INTRINSICS_KEY
         )
     if min(size_wh) <= 0:
         raise InputError(f"calibration {path} has no image_width and image_height", INTRINSICS_KEY)

@@ -32,6 +32,7 @@ class StreamSource(LiveSource):
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
+        self.counts["catching_up"] = 0
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame; what waited while nobody read, or in the server, is passed over, as nobody knows its age."""

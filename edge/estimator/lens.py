@@ -20,7 +20,7 @@ RADIUS_MAX = 4.0
 # How far, in sides of the frame, the pinhole's picture may reach beyond the frame's own pixels.
 EXTENT_EXCESS = 0.5
 _EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-_BORDER_POINTS = 17
+_GRID_POINTS = 65  # a side; the border alone would not do: a lens may fold inside the frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +97,11 @@ def _radius_max(distortion: tuple[float, ...]) -> float:
 def _extent(K_bytes: bytes, distortion: tuple[float, ...], frame_wh: tuple[int, int]) -> Array:
     lens = Lens(np.frombuffer(K_bytes).reshape(3, 3), distortion)
     right, bottom = frame_wh[0] - 0.5, frame_wh[1] - 0.5
-    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
-    xs, ys = -0.5 + along * (right + 0.5), -0.5 + along * (bottom + 0.5)
-    border = np.concatenate(
-        [np.column_stack([xs, np.full_like(xs, y)]) for y in (-0.5, bottom)]
-        + [np.column_stack([np.full_like(ys, x), ys]) for x in (-0.5, right)]
-    )
-    straight = lens.to_pinhole(border)
+    xs, ys = np.linspace(-0.5, right, _GRID_POINTS), np.linspace(-0.5, bottom, _GRID_POINTS)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    straight = lens.to_pinhole(grid)
     radius = np.linalg.norm(lens.rays(straight)[:, :2], axis=1)
-    returned = np.abs(lens.to_frame(straight) - border).max(axis=1)
+    returned = np.abs(lens.to_frame(straight) - grid).max(axis=1)
     straight = straight[(radius < lens.radius_max) & (returned < 0.5)]  # NaN compares false
     if not len(straight):
         return np.array([-0.5, -0.5, right, bottom])

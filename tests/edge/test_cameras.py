@@ -4,8 +4,10 @@ import threading
 import time
 from collections import Counter
 from contextlib import closing
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -193,6 +195,36 @@ def test_however_late_its_reader_a_video_ends_with_its_last_frame(tmp_path: Path
         assert round(float(last.image_bgr.mean()) / 10) == 7
         with pytest.raises(EndOfStream):
             source.read(threading.Event())
+
+
+def write_slow_video(path: Path, frames: int) -> Path:
+    """1000 frames a second, each of which takes many milliseconds to decode."""
+    _, jpeg = cv2.imencode(".jpg", np.full((2160, 3840, 3), 90, np.uint8))
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mjpeg", rate=1000)
+        stream.width, stream.height, stream.pix_fmt = 3840, 2160, "yuvj420p"
+        for index in range(frames):
+            packet = av.Packet(jpeg.tobytes())
+            packet.stream, packet.time_base, packet.is_keyframe = stream, Fraction(1, 1000), True
+            packet.pts = packet.dts = index
+            out.mux(packet)
+    return path
+
+
+def test_a_video_slower_to_decode_than_its_rate_shows_old_frames_instead_of_none(tmp_path: Path) -> None:
+    path = write_slow_video(tmp_path / "flight.avi", frames=300)
+    with closing(FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS))) as source:
+        source.open()
+        first = source.read(threading.Event()).meta
+        late = source.read(threading.Event()).meta
+        assert 0 < late.sequence < 299
+        assert late.capture_ns == first.capture_ns + late.sequence * 1_000_000  # so its age is told
+        stop = threading.Event()
+        stop.set()
+        for _ in range(40):
+            with pytest.raises(EndOfStream):
+                source.read(stop)
+        assert source.read(threading.Event()).meta.sequence < 299  # nothing was skipped for who does not want it
 
 
 @given(st.lists(st.sampled_from(["lost", "delivered"]), max_size=30))

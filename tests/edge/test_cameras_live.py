@@ -271,3 +271,21 @@ def test_a_calibration_of_another_lens_model_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="distortion_model equidistant"):
         read_calibration(path)
+
+
+@pytest.mark.parametrize(("fisheye", "taken"), [("0", True), ("1", False), ("true", False)])
+def test_a_fisheye_calibration_of_opencv_is_refused(tmp_path: Path, fisheye: str, taken: bool) -> None:
+    """As its sample calibrator writes it: with no distortion_model, but four numbers that plumb bob has too."""
+    path = tmp_path / "fisheye.yaml"
+    path.write_text(
+        f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\nfisheye_model: {fisheye}\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [ 300., 0., 320., 0., 300., 240., 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
+        "   data: [ -0.02, 0.008, -0.01, 0.004 ]\n"
+    )
+    if taken:
+        assert read_calibration(path).distortion == (-0.02, 0.008, -0.01, 0.004)
+        return
+    with pytest.raises(InputError, match="fisheye"):
+        read_calibration(path)

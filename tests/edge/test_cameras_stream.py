@@ -151,6 +151,15 @@ def test_a_stream_that_is_absent_is_opened_when_it_comes_and_again_when_it_ends(
     assert capture.counters()["reconnects"] >= 2
 
 
+def test_all_that_a_stream_counts_is_told_from_the_start() -> None:
+    source = StreamSource(StreamCamera(type="stream", url="udp://127.0.0.1:9", intrinsics=INTRINSICS))
+    assert {name for name in Capture(source, False).counters() if name.startswith("camera_")} == {
+        "camera_unstamped",
+        "camera_undecodable",
+        "camera_catching_up",
+    }
+
+
 def test_a_stream_is_named_without_its_password() -> None:
     port = free_port()
     settings = StreamCamera(type="stream", url=f"http://pilot:se@cret@127.0.0.1:{port}/x", intrinsics=INTRINSICS)

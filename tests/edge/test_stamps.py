@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge.cameras.device import DeviceSource
@@ -115,6 +115,72 @@ def test_a_stream_that_stays_behind_says_so_and_one_that_jitters_or_drifts_does_
         behind_s.append(clock.behind_ns(arrival_ns) / S)
     assert max(behind_s[:2000]) < 0.05
     assert behind_s[-1] == pytest.approx(0.4, abs=0.05)
+
+
+@pytest.mark.parametrize("ppm", [-1_900, -1_000, -600, 0])
+def test_a_stream_clock_that_runs_slow_is_followed_and_what_was_held_back_keeps_its_age(ppm: int) -> None:
+    rng, clock, now_ns = np.random.default_rng(1), StreamClock(), 0
+    errors_ns, behind_ns = [], []
+    for k in range(90 * 30):
+        exposed_ns = 10 * S + k * PERIOD_NS
+        released_ns = 72 * S if exposed_ns >= 70 * S else 0
+        now_ns = max(exposed_ns + int(rng.uniform(0, 30e6)), released_ns, now_ns + PERIOD_NS // 2)
+        stamp_ns = clock.monotonic_ns(round(k * PERIOD_NS * (1 + ppm * 1e-6)), now_ns)
+        assert stamp_ns is not None
+        assert stamp_ns <= now_ns
+        errors_ns.append(abs(stamp_ns - exposed_ns))
+        behind_ns.append(clock.behind_ns(now_ns))
+    assert max(errors_ns[30 * 30 :]) < 15_000_000
+    assert max(behind_ns) < BEHIND_MAX_NS  # it is not opened again
+
+
+def test_a_stream_clock_that_runs_fast_is_followed() -> None:
+    rng, clock = np.random.default_rng(1), StreamClock()
+    for k in range(90 * 30):
+        exposed_ns = 10 * S + k * PERIOD_NS
+        arrival_ns = exposed_ns + int(rng.uniform(0, 30e6))
+        stamp_ns = clock.monotonic_ns(round(k * PERIOD_NS * 1.01), arrival_ns)
+        assert stamp_ns is not None
+        assert k < 30 * 30 or abs(stamp_ns - exposed_ns) < 15_000_000
+
+
+def test_a_stream_that_falls_behind_evenly_is_not_taken_for_one_with_a_slow_clock() -> None:
+    rng, clock, behind_s = np.random.default_rng(3), StreamClock(), []
+    for k in range(60 * 30):
+        arrival_ns = 10 * S + round(k * PERIOD_NS * 1.01) + int(rng.uniform(0, 5e6))
+        clock.monotonic_ns(k * PERIOD_NS, arrival_ns)
+        behind_s.append(clock.behind_ns(arrival_ns) / S)
+    assert behind_s[-1] > 0.4
+
+
+@pytest.mark.parametrize("ppm", [0, -1_000])
+def test_a_backlog_is_told_whether_or_not_the_streams_clock_runs_slow(ppm: int) -> None:
+    rng, clock, behind_s = np.random.default_rng(2), StreamClock(), []
+    for k in range(60 * 30):
+        arrival_ns = 10 * S + k * PERIOD_NS + (400_000_000 if k >= 40 * 30 else 0) + int(rng.uniform(0, 30e6))
+        clock.monotonic_ns(round(k * PERIOD_NS * (1 + ppm * 1e-6)), arrival_ns)
+        behind_s.append(clock.behind_ns(arrival_ns) / S)
+    assert max(behind_s[20 * 30 : 40 * 30]) < 0.05
+    assert behind_s[46 * 30] == pytest.approx(0.4, abs=0.05)
+    assert behind_s[-1] == pytest.approx(0.4, abs=0.05)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(3.0, 40.0), st.floats(0.02, 0.2)), min_size=1, max_size=3),
+    st.integers(0, 2**32 - 1),
+)
+def test_a_backlog_that_grows_step_by_step_is_not_taken_for_a_slow_clock(
+    steps_s: list[tuple[float, float]], seed: int
+) -> None:
+    rng, clock = np.random.default_rng(seed), StreamClock()
+    for k in range(45 * 30):
+        backlog_s = sum(size_s for at_s, size_s in steps_s if k >= at_s * 30)
+        exposed_ns = 10 * S + k * PERIOD_NS
+        jitter_ns = int(rng.uniform(0, 5e6)) if k else 0
+        stamp_ns = clock.monotonic_ns(k * PERIOD_NS, exposed_ns + round(backlog_s * S) + jitter_ns)
+        assert stamp_ns is not None
+        assert abs(stamp_ns - exposed_ns) < 32_000_000  # 45 s of drift, and the jitter
 
 
 @given(st.integers(0, 10**15), st.integers(0, AGE_MAX_NS), st.integers(AGE_MAX_NS + 1, 10**12))

@@ -135,6 +135,30 @@ def test_the_whole_frame_is_seen_to_its_corners_through_barrel_and_pincushion(
     np.testing.assert_allclose(centroid(image), expected, atol=0.25)
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "size_wh", "distortion"),
+    [
+        (900.0, (1920, 1080), (-0.3, 0.1, 0.0, 0.0, -0.015)),
+        (900.0, (1920, 1080), (-0.3, 0.1, 0.001, -0.001, -0.015)),
+        (300.0, (640, 480), (-0.3, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_all_that_a_lens_lets_through_is_seen_though_it_folds_inside_the_frame(
+    focal_px: float, size_wh: tuple[int, int], distortion: tuple[float, ...]
+) -> None:
+    width, height = size_wh
+    K_frame = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
+    lens = Lens(K_frame, distortion)
+    radius, angle = np.meshgrid(np.linspace(0.0, 0.9 * lens.radius_max, 100), np.linspace(0.0, 2 * np.pi, 361))
+    rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones_like(radius)], axis=-1).reshape(-1, 3)
+    on_frame, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K_frame, np.array(distortion))
+    shown = np.all((on_frame[:, 0] >= 0) & (on_frame[:, 0] <= (width - 1, height - 1)), axis=-1)
+    on_pinhole = (rays @ K_frame.T)[shown, :2]
+    seen = whole_frame(size_wh, lens)
+    assert np.all(on_pinhole >= (seen.left, seen.top))
+    assert np.all(on_pinhole <= (seen.left + seen.width - 1, seen.top + seen.height - 1))
+
+
 def test_a_window_has_the_pixels_of_the_straightened_frame() -> None:
     rng = np.random.default_rng(3)
     texture = cv2.GaussianBlur(rng.integers(0, 255, (1080, 1920, 3), dtype=np.uint8), (0, 0), 4.0)
