@@ -27,12 +27,14 @@ from sim_replay.golden import run as golden
 from sim_replay.ground_truth import read_sequence
 from sim_replay.lockstep import command as lockstep
 from sim_replay.matrix import command as matrix
+from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
 from sim_replay.play import PlayError, PlaySettings
 from sim_replay.radio import run as radio
 from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
+from sim_replay.result import judge
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -51,7 +53,8 @@ def _parser() -> argparse.ArgumentParser:
         help="the same with a sequence of your own, or in lock-step",
         description="Like demo, with a BOP scene folder that also holds sequence.toml and telemetry.csv, with an MCAP "
         "recording that the daemon made ([recorder] image_max_hz), or with a video and its telemetry. Of these two "
-        "no truth is known: nothing is scored.",
+        "no truth is known: nothing is scored. Exit code 1 if a target is seen and a peer received no pose, or if the "
+        "sky is known to be empty and a peer received one.",
     )
     taken = f"{WHAT} (default: the bundled sequence)"
     play.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="PATH", help=taken)
@@ -110,10 +113,11 @@ def _run(args: argparse.Namespace) -> int:
     if args.command == "play":
         chosen = {"record": args.record, "firmware": args.autopilot, "link": bad_link.link_faults(args)}
         settings = replace(settings, **chosen)
-    if show(settings, args.model, console):
-        return 0
-    print("a peer received no pose", file=sys.stderr)
-    return 1
+    recording = show(settings, args.model, console)
+    wrong = wrong_poses(settings.sequence, judge(settings.sequence, recording))
+    for told in wrong:
+        print(told, file=sys.stderr)
+    return 1 if wrong else 0
 
 
 def _score_flight(args: argparse.Namespace, console: Console) -> int:
@@ -151,6 +155,8 @@ def main(argv: list[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     # As with Ctrl-C: the processes of a replay are stopped on the way out.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         return _run(args)
     except InputError as error:

@@ -19,7 +19,7 @@ from edge.estimator.model import load_model
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.offline import method_of
 from sim_replay.play import PlaySettings, Record, Recording, play
-from sim_replay.report.flight_files import RecordedFlight, write_flight
+from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 from sim_replay.report.write import write_report
 from sim_replay.result import frame_of_record, latency_ms, pose_of
 from sim_replay.score import match_poses
@@ -121,19 +121,16 @@ class LiveView:
         return table
 
 
-def show(settings: PlaySettings, model: Path, console: Console) -> bool:
+def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
     """Play a sequence, keep what the peers received in its folder, and write the report of it there.
 
-    Returns:
-        Whether both peers received poses.
-
-    Raises:
-        InputError, PlayError, OSError.
+    Raises InputError, PlayError, OSError; of an earlier flight nothing is left then.
     """
     sequence, out, loaded = settings.sequence, settings.out, load_model(model, threads=1)
     say = partial(console.print, highlight=False, soft_wrap=True)
     say(f"playing {len(sequence.scene.images)} frames of {sequence.scene.folder}")
     figures = LiveFigures(sequence)
+    remove_flight(out)
     with LiveView(console, figures) as view:
         recording = play(settings, view.on_record)
     flight = RecordedFlight(sequence.scene.folder, method_of(loaded), recording)
@@ -143,7 +140,7 @@ def show(settings: PlaySettings, model: Path, console: Console) -> bool:
     else:
         told = f"{len(recording.poses)} poses over zenoh, {len(recording.targets)} by MAVLink"
         say(f"{told}, written to {out}; not scored: no truth is known")
-    return bool(recording.poses) and bool(recording.targets)
+    return recording
 
 
 def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, console: Console) -> dict[str, Any]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from edge.config import MountSettings
@@ -19,7 +21,10 @@ from sim_replay.datasets import Dataset, read_undistorted_bgr
 from sim_replay.gimbal import R_GIMBAL_CAM, GimbalTrack, track_of
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
-from sim_replay.telemetry import TelemetryError, read_telemetry
+from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
+
+# How far the first and the last exposure may lie outside the telemetry: one row of the slowest that is taken.
+UNCOVERED_NS_MAX = 100_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +38,21 @@ class SceneTruth:
     extents: dict[int, Extents]  # by object id
     distortions: list[Distortion | None]  # of each picture on disk; None: a pinhole camera
     cameras_world: list[tuple[Array, Array] | None]  # R_world_cam [3, 3], t_world_cam_m [3]; None: not known
+    truth_known: bool  # False: no file tells what a picture shows, so no truths does not mean that all are empty
 
     @property
     def name(self) -> str:
         return self.folder.name
+
+    @property
+    def shows_target(self) -> bool:
+        """Whether a target is known to be seen in any frame."""
+        return any(truth.visible for truth in self.truths)
+
+    @property
+    def target_free(self) -> bool:
+        """Whether all frames are known to show none."""
+        return self.truth_known and not self.shows_target
 
     def undistorted_bgr(self, index: int) -> Image:
         """The frame's picture [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
@@ -84,6 +100,7 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         {object_id: extents_of(model) for object_id, model in models.items()},
         [frame.distortion for frame in frames],
         [_camera_world(frame) for frame in frames],
+        all(frame.truth_known for frame in frames),
     )
 
 
@@ -103,22 +120,51 @@ def extents_of(model: Model) -> Extents:
 
 
 def read_sequence(folder: Path) -> PlayedSequence:
-    """Read a scene with its sequence.toml and telemetry.csv. Raises InputError, naming file and key."""
+    """Read a scene with its sequence.toml and telemetry.csv. Raises InputError, naming file and key.
+
+    Its picture numbers must be evenly spaced, and the telemetry must span all exposures.
+    """
     scene = read_scene_truth(folder)
+    _check_spacing(scene)
     with _blame(folder / "sequence.toml") as path:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
         mount = MountSettings(R_body_cam=settings["R_body_cam"], t_body_cam_m=settings["t_body_cam_m"]).mount()
         fps = float(settings["fps"])
         frame0_ns = int(settings["t0_ns"])
         gimballed = settings.get("mount", "fixed") == "gimbal"
+    if not (math.isfinite(fps) and fps > 0.0):
+        raise InputError(f"{folder / 'sequence.toml'}: fps is {fps:g}; it must be a number above 0")
+    telemetry_csv, gimbal = folder / "telemetry.csv", None
     try:
-        read_telemetry(folder / "telemetry.csv")
+        telemetry = read_telemetry(telemetry_csv)
     except TelemetryError as error:
         raise InputError(str(error)) from error
-    telemetry_csv, gimbal = folder / "telemetry.csv", None
+    check_spans(telemetry, telemetry_csv, frame0_ns, len(scene.images), fps)
     if gimballed:
         gimbal, mount = _gimbal(folder, frame0_ns, fps), Mount(R_GIMBAL_CAM, mount.t_body_cam_m)
     return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal)
+
+
+def check_spans(telemetry: Telemetry, path: Path, frame0_ns: int, frames: int, fps: float) -> None:
+    """Raise InputError, naming `path`, unless the telemetry spans all exposures: outside it there is no attitude."""
+    last_ns = frame0_ns + round((frames - 1) * 1e9 / fps)
+    from_ns, to_ns = int(telemetry.t_ns[0]), int(telemetry.t_ns[-1])
+    if frame0_ns < from_ns - UNCOVERED_NS_MAX or last_ns > to_ns + UNCOVERED_NS_MAX:
+        raise InputError(
+            f"{path}: tells of {from_ns * 1e-9:.3f} s to {to_ns * 1e-9:.3f} s, but the pictures were exposed from "
+            f"{frame0_ns * 1e-9:.3f} s to {last_ns * 1e-9:.3f} s on its clock (t0_ns, fps)"
+        )
+
+
+def _check_spacing(scene: SceneTruth) -> None:
+    """Raise InputError if picture numbers are not evenly spaced: exposures are counted by order."""
+    numbers = [int(path.stem) for path in scene.images]
+    for before, after in pairwise(numbers):
+        if after - before != numbers[1] - numbers[0]:
+            raise InputError(
+                f"{scene.folder}: picture {after} follows picture {before}, but {numbers[1]} follows {numbers[0]}: "
+                "a sequence with telemetry needs evenly spaced numbers, or its pictures would be exposed at wrong times"
+            )
 
 
 def _gimbal(folder: Path, frame0_ns: int, fps: float) -> GimbalTrack:

@@ -25,6 +25,7 @@ _PANEL_BGR: Color = (28, 24, 20)
 # Corners are numbered by bits x, y, z; an edge joins two that differ in one bit.
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 _SUBPIXEL_BITS = 4
+_PLACE_PX = 12  # of a cross, for each pixel of its lines
 _INSET_SCALE = 2.2  # window side over the target's longer projected side
 _VIDEO_WIDTH_PX = 1280
 _CODECS = ("vp09", "mp4v")  # browsers play the first; not every build of OpenCV has it
@@ -70,11 +71,18 @@ def window_camera(K: Array, left_top_px: ArrayLike, scale: float) -> Array:
 
 
 def draw_pose(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color: Color, thickness: int) -> None:
-    """The target's box and an arrow along its nose, in place; nothing if it reaches behind the camera."""
+    """The target's box and an arrow along its nose, in place; nothing if it reaches behind the camera.
+
+    Of a pose whose rotation is not known a cross marks the place.
+    """
     nose_m = extents.min_m[0] + extents.size_m[0]
     points_body = np.vstack([extents.corners_m(), np.zeros(3), [nose_m + 0.6 * extents.size_m[0], 0.0, 0.0]])
     points_px = project(points_body @ pose.R_cam_target.T + pose.t_cam_target_m, K)
     if points_px is None or np.abs(points_px).max() > 1e5:
+        return
+    if not pose.rotation_known:
+        u, v = (int(c) for c in np.round(points_px[8]))
+        cv2.drawMarker(canvas, (u, v), color, cv2.MARKER_CROSS, _PLACE_PX * thickness, thickness, cv2.LINE_AA)
         return
     fixed = [tuple(int(c) for c in p) for p in np.round(points_px * 2**_SUBPIXEL_BITS)]
     for a, b in _EDGES:

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,7 +90,8 @@ class PlaySettings:
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
     """Run the sequence once in real time; `on_record` sees each line of a peer as it comes.
 
-    Raises InputError if the daemon refuses what it is given, PlayError if it is late, fails or does not end.
+    Raises InputError if the daemon refuses what it is given, PlayError if it is late, fails or does not end, or if a
+    peer ends before it or gives no summary.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     for lead_s in LEADS_S:
@@ -121,21 +122,26 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
     records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()
     with ExitStack() as stack:
         daemon = stack.enter_context(_daemon(config, settings.out / "daemon.log"))
-        for name, arguments in _peers(settings, recording).items():
-            stack.enter_context(_peer(name, arguments, records))
-        if not _wait_until_ready(daemon, recording, records, on_record):
+        peers = {
+            name: stack.enter_context(_peer(name, arguments, records))
+            for name, arguments in _peers(settings, recording, lead_s).items()
+        }
+        if not _wait_until_ready(daemon, peers, recording, records, on_record):
             return None
         frames_s = len(settings.sequence.scene.images) / settings.sequence.fps
         deadline_ns = start_at_ns + round((frames_s + _OVERTIME_S) * 1e9)
         while daemon.poll() is None and time.monotonic_ns() < deadline_ns:
             _pass_on(records, recording, on_record, timeout_s=0.05)
+            _check_peers_run(peers)
         recording.daemon_exit = daemon.poll()
         settled_ns = time.monotonic_ns() + round(_SETTLE_S * 1e9)
         while time.monotonic_ns() < settled_ns:
             _pass_on(records, recording, on_record, timeout_s=0.05)
+        _check_exit(recording.daemon_exit, settings.out / "daemon.log")
+        _check_peers_run(peers)
     while not records.empty():
         _pass_on(records, recording, on_record, timeout_s=0.0)
-    _check_exit(recording.daemon_exit, settings.out / "daemon.log")
+    _check_summaries(recording)
     recording.daemon_counters = last_counters((settings.out / "daemon.log").read_text(encoding="utf-8"))
     return recording
 
@@ -161,6 +167,18 @@ def _check_exit(code: int | None, log: Path) -> None:
     raise PlayError(f"the daemon ended with exit code {code}: {last}")
 
 
+def _check_peers_run(peers: Mapping[str, subprocess.Popen[str]]) -> None:
+    for name, peer in peers.items():
+        if peer.poll() is not None:
+            raise PlayError(f"the {name} ended before the daemon, with exit code {peer.returncode}")
+
+
+def _check_summaries(recording: Recording) -> None:
+    for name, summary in (("autopilot", recording.mavlink), ("subscriber", recording.zenoh)):
+        if not summary:
+            raise PlayError(f"the {name} gave no summary of what it received when it was told to stop")
+
+
 def _pass_on(
     records: queue.SimpleQueue[tuple[str, Record]],
     recording: Recording,
@@ -177,6 +195,7 @@ def _pass_on(
 
 def _wait_until_ready(
     daemon: subprocess.Popen[bytes],
+    peers: Mapping[str, subprocess.Popen[str]],
     recording: Recording,
     records: queue.SimpleQueue[tuple[str, Record]],
     on_record: Callable[[Recording, Record], None],
@@ -186,10 +205,12 @@ def _wait_until_ready(
         _pass_on(records, recording, on_record, timeout_s=0.05)
         if recording.diagnostics or daemon.poll() is not None:
             return True
+        _check_peers_run(peers)
     return False
 
 
-def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]:
+def _peers(settings: PlaySettings, recording: Recording, lead_s: float) -> dict[str, list[str]]:
+    """Arguments of each; the subscriber gives the daemon all of `lead_s` to appear."""
     telemetry = str(settings.sequence.telemetry_csv)
     address = f"127.0.0.1:{recording.mavlink_port}"
     start = str(recording.start_at_ns - settings.sequence.frame0_ns)
@@ -202,7 +223,7 @@ def _peers(settings: PlaySettings, recording: Recording) -> dict[str, list[str]]
         autopilot += ["--gimbal", str(gimbal_csv)]
     return {
         "autopilot": autopilot,
-        "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav],
+        "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav, "--wait-s", str(lead_s)],
     }
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from msgs.geometry import R_from_q_wxyz
-from sim_replay.ground_truth import PlayedSequence
+from msgs.geometry import Array, R_from_q_wxyz
+from sim_replay.evaluation.instances import instances
+from sim_replay.ground_truth import PlayedSequence, SceneTruth
 from sim_replay.overlay import FrameView
 from sim_replay.play import Record, Recording
 from sim_replay.report.peer import peer_figures
-from sim_replay.score import Match, TargetPose, frame_of, latency_statistics, match_poses, statistics
+from sim_replay.score import Match, TargetPose, Truth, frame_of, latency_statistics, match_poses, statistics
 
 PEERS = ("subscriber", "autopilot")
 
@@ -50,7 +51,10 @@ def pose_of(record: Record, frame: int) -> TargetPose:
     R_cam_target = R_from_q_wxyz(record["q_cam_target_wxyz"])
     covariance = np.array(record["covariance"], dtype=np.float64) if "covariance" in record else None
     t_m = np.array(record["t_cam_target_m"], dtype=np.float64)
-    return TargetPose(frame, R_cam_target, t_m, covariance=covariance, track=str(record["target"]))
+    known = bool(record["rotation_known"])
+    return TargetPose(
+        frame, R_cam_target, t_m, covariance=covariance, track=str(record["target"]), rotation_known=known
+    )
 
 
 def frame_of_record(record: Record, recording: Recording, sequence: PlayedSequence) -> int | None:
@@ -67,10 +71,36 @@ def judge(sequence: PlayedSequence, recording: Recording) -> Result:
     """Set what zenoh brought, and what MAVLink brought, against the truth and the exposure."""
     subscriber = ((record, float(record["age_ms"])) for record in recording.poses)
     autopilot = ((record, latency_ms(record, recording)) for record in recording.targets)
-    return Result(_judge_peer(sequence, recording, subscriber), _judge_peer(sequence, recording, autopilot), recording)
+    truths = _told_apart(sequence.scene)
+    return Result(
+        _judge_peer(sequence, truths, recording, subscriber),
+        _judge_peer(sequence, truths, recording, autopilot),
+        recording,
+    )
 
 
-def _judge_peer(sequence: PlayedSequence, recording: Recording, received: Iterable[tuple[Record, float]]) -> PeerResult:
+def _told_apart(scene: SceneTruth) -> list[Truth]:
+    """The scene's truths, each with a number that is its target's own over all frames."""
+    in_world = all(camera is not None for camera in scene.cameras_world)
+    places_m = [_place(truth, scene.cameras_world[truth.frame] if in_world else None) for truth in scene.truths]
+    numbers = instances(scene.truths, places_m)
+    return [replace(truth, instance=number) for truth, number in zip(scene.truths, numbers, strict=True)]
+
+
+def _place(truth: Truth, camera_world: tuple[Array, Array] | None) -> Array:
+    """[3], metres, in the world's axes; in `cam` where the camera's place in it is not known."""
+    if camera_world is None:
+        return truth.t_cam_target_m
+    R_world_cam, t_world_cam_m = camera_world
+    return R_world_cam @ truth.t_cam_target_m + t_world_cam_m
+
+
+def _judge_peer(
+    sequence: PlayedSequence,
+    truths: Sequence[Truth],
+    recording: Recording,
+    received: Iterable[tuple[Record, float]],
+) -> PeerResult:
     estimates, ages, strays = [], [], 0
     for record, age_ms in received:
         frame = frame_of_record(record, recording, sequence)
@@ -79,7 +109,7 @@ def _judge_peer(sequence: PlayedSequence, recording: Recording, received: Iterab
         else:
             estimates.append(pose_of(record, frame))
             ages.append((frame, age_ms))
-    matches, false_poses = match_poses(sequence.scene.truths, estimates)
+    matches, false_poses = match_poses(truths, estimates)
     visible = tuple(match for match in matches if match.truth.visible)
     return PeerResult(visible, tuple(false_poses), strays, tuple(ages))
 

@@ -1,6 +1,7 @@
 """From poses and ground truth to the figures of a score: association, statistics, distance bands. Pure functions.
 
-A target that no pose was found for counts as a failure in every rate; means and medians are over found targets.
+A target that no pose was found for counts as a failure in every rate; means and medians are over found targets. So
+does, in the rates that ask for a rotation, a pose that tells none; it is in no figure of rotation errors.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class TargetPose:
     score: float | None = field(default=None, kw_only=True)
     covariance: Array | None = field(default=None, kw_only=True)  # [6, 6], as edge.types.Estimate has it
     track: str = field(default="", kw_only=True)  # the name that its sender knows the target by; empty: none
+    rotation_known: bool = field(default=True, kw_only=True)  # False: R_cam_target holds a place and says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Truth(TargetPose):
     diameter_m: float  # largest distance between two points of the target
     airframe: str = ""  # its name; empty: the dataset gives none
     points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
-    instance: int = field(default=0, kw_only=True)  # which of the frame's targets of that object
+    instance: int = field(default=0, kw_only=True)  # which of the targets of that object
     visible: bool = field(default=True, kw_only=True)  # False: the sequence says that nothing of it is to be seen
 
     @property
@@ -58,7 +60,7 @@ class Match:
 
     @property
     def rotation_error_deg(self) -> float | None:
-        if self.estimate is None:
+        if self.estimate is None or not self.estimate.rotation_known:
             return None
         return float(metrics.rotation_error_deg(self.estimate.R_cam_target, self.truth.R_cam_target))
 
@@ -76,8 +78,8 @@ class Match:
 
     @cached_property
     def add_m(self) -> float | None:
-        """ADD; None where nothing was found or the target's model is not known."""
-        if self.estimate is None or self.truth.points_body_m is None:
+        """ADD; None where nothing was found, or the rotation or the target's model is not known."""
+        if self.estimate is None or not self.estimate.rotation_known or self.truth.points_body_m is None:
             return None
         est, gt = self.estimate, self.truth
         points = self.truth.points_body_m
@@ -93,6 +95,8 @@ def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | N
 
 def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], list[TargetPose]]:
     """Give each truth at most one pose of its frame: pairs by growing bearing error, at most one diameter apart.
+
+    Visible truths choose first: of one that is hidden nobody could send a pose but by chance or from memory.
 
     Association looks along the ray alone, so that a wrong depth or rotation is an error and not a miss. A pose less
     than a diameter away would hold the camera: it lies in no direction and is nobody's.
@@ -110,10 +114,10 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
             bearing_deg = float(metrics.bearing_error_deg(estimate.t_cam_target_m, truth.t_cam_target_m))
             has_direction = np.linalg.norm(estimate.t_cam_target_m) >= truth.diameter_m
             if has_direction and bearing_deg <= gate_deg:
-                pairs.append((bearing_deg, i, estimate))
+                pairs.append((not truth.visible, bearing_deg, i, estimate))
     found: dict[int, TargetPose] = {}
     taken: set[int] = set()
-    for _, i, estimate in sorted(pairs, key=lambda pair: pair[:2]):
+    for _, _, i, estimate in sorted(pairs, key=lambda pair: pair[:3]):
         if i not in found and id(estimate) not in taken:
             found[i] = estimate
             taken.add(id(estimate))
@@ -149,29 +153,32 @@ def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
     R_gt, t_gt = stacked([truth for truth, _ in found])
     R_est, t_est = stacked([estimate for _, estimate in found])
+    turned = np.array([estimate.rotation_known for _, estimate in found], dtype=np.bool_)
     rate = lambda good: _share(int(np.sum(good)), len(matches))  # noqa: E731
     return {
         "frames": frames,
         "targets": len(matches),
         "recall": _told(metrics.recall(len(found), len(matches))),
+        "rotations_not_known": len(found) - int(np.sum(turned)),
         "false_positives_per_1000": false_positives_per_1000,
-        "rotation_error_deg": _mean_median(metrics.rotation_error_deg(R_est, R_gt)),
+        "rotation_error_deg": _mean_median(metrics.rotation_error_deg(R_est, R_gt)[turned]),
         "translation_error_m": _mean_median(metrics.translation_error_m(t_est, t_gt)),
         "depth_error_m": _mean_median(metrics.depth_error_m(t_est, t_gt)),
         "depth_error_rel": _mean_median(metrics.depth_error_rel(t_est, t_gt)),
         "bearing_error_deg": _mean_median(metrics.bearing_error_deg(t_est, t_gt)),
-        "rot_10deg": rate(metrics.rot_10deg(R_est, R_gt)),
+        "rot_10deg": rate(turned & metrics.rot_10deg(R_est, R_gt)),
         "depth_5pct": rate(metrics.depth_5pct(t_est, t_gt)),
-        "pose_10deg_5pct": rate(metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt)),
+        "pose_10deg_5pct": rate(turned & metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt)),
         **_add_rates(matches),
         "calibration": calibration(matches),
     }
 
 
-def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
+def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float | None]] | None:
     """Share of the truth inside one and two predicted standard deviations, axis by axis; None without covariances.
 
     Of an honest Gaussian 0.683 and 0.954. Depth is one axis, bearing two, rotation three; each axis counts by itself.
+    Rotation is over the poses that tell one; None where there are none.
     """
     sure = [(m.truth, m.estimate) for m in matches if m.estimate is not None and m.estimate.covariance is not None]
     if not sure:
@@ -179,14 +186,14 @@ def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
     R_gt, t_gt = stacked([truth for truth, _ in sure])
     R_est, t_est = stacked([estimate for _, estimate in sure])
     covariance = np.array([estimate.covariance for _, estimate in sure])
+    turned = np.array([estimate.rotation_known for _, estimate in sure], dtype=np.bool_)
     inside: dict[str, Callable[[float], metrics.Booleans]] = {
         "depth": lambda sigmas: metrics.depth_inside(t_est, t_gt, covariance, sigmas),
         "bearing": lambda sigmas: metrics.bearing_inside(t_est, t_gt, covariance, sigmas),
-        "rotation": lambda sigmas: metrics.rotation_inside(R_est, R_gt, covariance, sigmas),
+        "rotation": lambda sigmas: metrics.rotation_inside(R_est, R_gt, covariance, sigmas)[turned],
     }
     return {
-        name: {f"inside_{sigmas}sigma": _rounded(np.mean(within(sigmas))) for sigmas in (1, 2)}
-        for name, within in inside.items()
+        name: {f"inside_{sigmas}sigma": _mean(within(sigmas)) for sigmas in (1, 2)} for name, within in inside.items()
     }
 
 
@@ -229,7 +236,7 @@ def _frames_of(matches: Sequence[Match]) -> int:
 def _add_rates(matches: Sequence[Match]) -> dict[str, float | None]:
     """ADD rates over the targets whose model is known, found or not."""
     modelled = [m for m in matches if m.truth.points_body_m is not None]
-    add = np.array([np.inf if m.estimate is None else m.add_m for m in modelled])
+    add = np.array([np.inf if m.add_m is None else m.add_m for m in modelled])
     diameter_m = np.array([m.truth.diameter_m for m in modelled])
     return {
         name: _share(int(np.sum(metrics.add_within(add, diameter_m, fraction))), len(modelled))
@@ -244,6 +251,10 @@ def _share(part: int, whole: int) -> float | None:
 def _told(value: float | None) -> float | None:
     """As all figures are told; None stays what it is."""
     return None if value is None else _rounded(value)
+
+
+def _mean(values: Array | metrics.Booleans) -> float | None:
+    return _rounded(values.mean()) if values.size else None
 
 
 def _mean_median(values: Array) -> dict[str, float | None]:

@@ -19,7 +19,7 @@ from edge.errors import InputError
 from sim_replay.airframes import AIRFRAMES, airframe_id
 from sim_replay.benchmark.crew import CrewError, available_cores, crew
 from sim_replay.benchmark.lenses import lenses_of
-from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, write_manifest
+from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, digests, write_manifest
 from sim_replay.benchmark.plan import SequencePlan, plan_dataset
 from sim_replay.benchmark.preset import Preset, parse_preset, preset_text
 from sim_replay.benchmark.progress import Report, flights_bar
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     plans = _plans(preset, args)
     chosen = _chosen(plans, args.split, args.sequences)
     backdrops = _backdrops(args.backdrops)
-    recipe = Recipe(preset.name, args.seed, args.every, args.labels_only, args.undistorted, len(backdrops))
+    recipe = Recipe(preset.name, args.seed, args.every, args.labels_only, args.undistorted, digests(backdrops))
     workers = available_cores() if args.workers is None else args.workers
     if workers < 1:
         raise InputError("--workers: must be at least 1")

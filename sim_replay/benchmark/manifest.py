@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,24 +23,23 @@ PACKAGES = ("mf-uavpose6d-edge", "numpy", "opencv-python-headless", "moderngl", 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What decides every byte of a dataset, on one machine."""
+    """What decides every byte of a dataset, on one machine, beside PACKAGES."""
 
     preset: str  # its own name for itself
     seed: int
     every: int
     labels_only: bool
     undistorted: bool
-    backdrops: int  # photographs offered
+    backdrops: dict[str, str]  # photographs offered: SHA-256 by file name
 
     def lines(self) -> list[str]:
-        """Its keys, as TOML."""
+        """Its keys, as TOML; not the backdrops, which are a table."""
         return [
             f'preset = "{self.preset}"  # its text is in {PRESET_FILE}',
             f"seed = {self.seed}",
             f"every = {self.every}",
             f"labels_only = {str(self.labels_only).lower()}",
             f"undistorted = {str(self.undistorted).lower()}",
-            f"backdrops = {self.backdrops}",
         ]
 
 
@@ -55,11 +55,22 @@ def claim(out: Path, recipe: Recipe, preset_text: str, resume: bool) -> None:
         raise InputError(f"{out}: already holds a dataset; --resume goes on with it, or choose another --out")
     found = read_toml(out / FILE, InputError)
     text = read_text(out / PRESET_FILE, InputError)
-    for key, value in vars(recipe).items():
-        if found.get(key) != value:
-            raise InputError(f"{out / FILE}: {key} is {found.get(key)!r} there and {value!r} now; it must stay")
+    for key, value in (vars(recipe) | {"packages": packages()}).items():
+        there = found.get(key)
+        if isinstance(value, dict):
+            _check_same(out / FILE, key, there if isinstance(there, dict) else {}, value)
+        elif there != value:
+            raise InputError(f"{out / FILE}: {key} is {there!r} there and {value!r} now; it must stay")
     if text != preset_text:
         raise InputError(f"{out / PRESET_FILE}: differs from the preset given; it must stay")
+
+
+def _check_same(path: Path, table: str, there: Mapping[str, object], now: Mapping[str, object]) -> None:
+    """Raise InputError that names the first entry in which they differ."""
+    for name in sorted({*there, *now}):
+        if there.get(name) != now.get(name):
+            before, after = (str(of.get(name, "absent")) for of in (there, now))
+            raise InputError(f"{path}: [{table}] {name} is {before} there and {after} now; it must stay")
 
 
 def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> None:
@@ -77,8 +88,28 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
         if chosen:
             frames = sum(len(job.frames(plan)) for plan in chosen)
             lines += ["", f"[splits.{name}]", f"sequences = {len(chosen)}", f"frames = {frames}"]
-    lines += ["", "[packages]", *(f'{name} = "{package_version(name)}"' for name in PACKAGES), ""]
+    if recipe.backdrops:
+        offered = (f"{toml_value(name)} = {toml_value(digest)}" for name, digest in recipe.backdrops.items())
+        lines += ["", "[backdrops]  # SHA-256 of the photographs offered", *offered]
+    lines += ["", "[packages]", *(f"{name} = {toml_value(installed)}" for name, installed in packages().items()), ""]
     replace_text(job.out / FILE, "\n".join(lines))
+
+
+def packages() -> dict[str, str]:
+    """Versions of PACKAGES."""
+    return {name: package_version(name) for name in PACKAGES}
+
+
+def digests(paths: Sequence[Path]) -> dict[str, str]:
+    """SHA-256 of files of one folder, by name. Raises InputError."""
+    found = {}
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                found[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    return found
 
 
 def package_version(package: str) -> str:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from sim_replay import metrics
+from sim_replay.evaluation.instances import instances
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.score import Match, stacked
 
@@ -17,28 +17,38 @@ SHARE_INSIDE = 0.95
 
 
 def consistency(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
-    """{"flights", "position", "rotation"}; None where no pose has a covariance.
+    """{"flights", "position", "rotation"}; None where no pose has a covariance, rotation None where none is known.
 
     e' P^-1 e (Bar-Shalom's NEES) is averaged over the frames of each flight, one target through one scene. Frames of a
     flight share most of their error, so a flight counts as one draw of chi-square with 3 degrees of freedom: the mean
     over n honest flights is 3 and lies inside `bounds_95` 95 times in 100, and 95 % of them lie inside their own.
-    A mean below says that covariances are too wide, one above that they are too narrow.
+    A mean below says that covariances are too wide, one above that they are too narrow. Rotation's is over the poses
+    that tell one, and over the flights that have such a pose.
     """
     flights = [_mean_nees(matches) for matches in _flights(judged).values()]
     if not flights:
         return None
     position, rotation = np.array(flights).T
-    return {"flights": len(flights), "position": _judged(position), "rotation": _judged(rotation)}
+    turned = rotation[np.isfinite(rotation)]
+    return {
+        "flights": len(flights),
+        "position": _judged(position),
+        "rotation": _judged(turned) if turned.size else None,
+    }
 
 
 def _mean_nees(matches: Sequence[Match]) -> tuple[float, float]:
-    """Mean of position's and of rotation's normalised error squared; each match has an estimate with covariance."""
+    """Mean of position's and of rotation's normalised error squared, the latter NaN where no pose tells a rotation.
+
+    Each match has an estimate with covariance.
+    """
     estimates = [match.estimate for match in matches if match.estimate is not None]
     R_gt, t_gt = stacked([match.truth for match in matches])
     R_est, t_est = stacked(estimates)
     covariance = np.array([estimate.covariance for estimate in estimates])
     _, position, rotation = metrics.nees(R_est, t_est, R_gt, t_gt, covariance)
-    return float(position.mean()), float(rotation.mean())
+    turned = rotation[[estimate.rotation_known for estimate in estimates]]
+    return float(position.mean()), float(turned.mean()) if turned.size else np.nan
 
 
 def bounds_95(flights: int) -> tuple[float, float]:
@@ -51,15 +61,16 @@ def bounds_95(flights: int) -> tuple[float, float]:
 
 
 def _flights(judged: Sequence[JudgedFrame]) -> dict[tuple[str, int, int], list[Match]]:
-    flights: dict[tuple[str, int, int], list[Match]] = {}
+    by_scene: dict[str, list[Match]] = {}
     for frame in judged:
-        alike: Counter[int] = Counter()
-        for match in frame.matches:
-            object_id = match.truth.object_id
-            key = (str(frame.picture.scene.folder), object_id, alike[object_id])
-            alike[object_id] += 1
+        by_scene.setdefault(str(frame.picture.scene.folder), []).extend(frame.matches)
+    flights: dict[tuple[str, int, int], list[Match]] = {}
+    for scene, matches in by_scene.items():
+        truths = [match.truth for match in matches]
+        numbers = instances(truths, [truth.t_cam_target_m for truth in truths])
+        for match, number in zip(matches, numbers, strict=True):
             if match.estimate is not None and match.estimate.covariance is not None:
-                flights.setdefault(key, []).append(match)
+                flights.setdefault((scene, match.truth.object_id, number), []).append(match)
     return flights
 
 

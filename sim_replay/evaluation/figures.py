@@ -15,7 +15,7 @@ from sim_replay import metrics
 from sim_replay.bop import Model
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.evaluation.worst import write_worst
-from sim_replay.report.peer import coordinate_errors, coordinates
+from sim_replay.report.peer import coordinate_errors, coordinates, root_mean_square
 from sim_replay.score import Match, stacked
 
 Array = NDArray[np.float64]
@@ -92,14 +92,15 @@ def _bars(axes: Axes, bands: dict[str, Any], curves: dict[str, tuple[str, str]])
 
 
 def cumulative_error(matches: Sequence[Match]) -> Figure:
-    """Share of all targets with an error below x; one that was not found is never below."""
+    """Share of all targets with an error below x; one that was not found, or whose rotation is not known, never is."""
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
-    R_gt, t_gt = stacked([truth for truth, _ in found])
-    R_est, t_est = stacked([estimate for _, estimate in found])
+    _, t_gt = stacked([truth for truth, _ in found])
+    _, t_est = stacked([estimate for _, estimate in found])
+    turn_deg = np.array([m.rotation_error_deg for m in matches if m.rotation_error_deg is not None])
     add = np.array([m.add_m / m.truth.diameter_m for m in matches if m.add_m is not None])
     modelled = sum(m.truth.points_body_m is not None for m in matches)
     curves = (
-        ("rotation error E_r, °", metrics.rotation_error_deg(R_est, R_gt), len(matches), 180.0, (10.0,)),
+        ("rotation error E_r, °", turn_deg, len(matches), 180.0, (10.0,)),
         ("translation error / range, %", 100 * metrics.translation_error_rel(t_est, t_gt), len(matches), 30.0, (5.0,)),
         ("depth error / depth, %", 100 * metrics.depth_error_rel(t_est, t_gt), len(matches), 30.0, (5.0,)),
         ("ADD / diameter", add, modelled, 2.0, (0.1, 0.5)),
@@ -125,7 +126,7 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
     figure = Figure(figsize=(14, 7), layout="constrained")
     panels = figure.subplots(2, 3).ravel()
     targets = max((len(frame.matches) for frame in frames), default=0)
-    squares: list[list[Array]] = [[] for _ in panels]
+    errors: list[list[Array]] = [[] for _ in panels]
     for k in range(targets):
         seen = [(f.picture.image_id, f.matches[k]) for f in frames if len(f.matches) > k]
         found = [(image_id, m.truth, m.estimate) for image_id, m in seen if m.estimate is not None]
@@ -137,11 +138,11 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
             axes.plot([i for i, _ in seen], true[:, column], ".", ms=4, color=TRUTH_COLOR, **label)
             label = {"label": "estimate"} if k == 0 else {}
             axes.plot([i for i, _, _ in found], estimated[:, column], ".", ms=3, color=ESTIMATE_COLOR, **label)
-            squares[column].append(error[:, column] ** 2)
+            errors[column].append(error[:, column])
     names = ("X", "Y", "Z", "roll", "pitch", "yaw")
-    for axes, name, unit, parts in zip(panels, names, [" m"] * 3 + ["°"] * 3, squares, strict=True):
-        square = np.concatenate([*parts, np.zeros(0)])
-        told = f"RMSE {np.sqrt(square.mean()):.2f}{unit}" if square.size else "nothing found"
+    for axes, name, unit, parts in zip(panels, names, [" m"] * 3 + ["°"] * 3, errors, strict=True):
+        rms = root_mean_square(np.concatenate([*parts, np.zeros(0)]))
+        told = "nothing found" if rms is None else f"RMSE {rms:.2f}{unit}"
         axes.set(title=f"{name}: {told}", ylabel=f"{name}, {unit.strip()}")
         axes.grid(alpha=0.3)
     for axes in panels[3:]:

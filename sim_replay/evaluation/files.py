@@ -64,25 +64,28 @@ def target_record(match: Match) -> dict[str, Any]:
         R_est, t_est = estimate.R_cam_target, estimate.t_cam_target_m
         R_gt, t_gt = truth.R_cam_target, truth.t_cam_target_m
         record["estimate"] = pose_record(estimate)
-        record["rotation_error_deg"] = round(float(metrics.rotation_error_deg(R_est, R_gt)), 4)
+        turn_deg = match.rotation_error_deg
+        record["rotation_error_deg"] = None if turn_deg is None else round(turn_deg, 4)
         record["translation_error_m"] = round(float(metrics.translation_error_m(t_est, t_gt)), 4)
         record["depth_error_m"] = round(float(metrics.depth_error_m(t_est, t_gt)), 4)
         record["bearing_error_deg"] = round(float(metrics.bearing_error_deg(t_est, t_gt)), 5)
         record["add_m"] = None if match.add_m is None else round(match.add_m, 4)
-        record["pose_10deg_5pct"] = bool(metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt))
+        right = bool(metrics.pose_10deg_5pct(R_est, t_est, R_gt, t_gt))
+        record["pose_10deg_5pct"] = right and estimate.rotation_known
     return record
 
 
 def pose_record(pose: TargetPose) -> dict[str, Any]:
-    """A pose in `cam`, rounded, with score and sigma where they are known."""
+    """A pose in `cam`, rounded, with score and sigma where they are known; null for a rotation that is not."""
     record: dict[str, Any] = {
-        "R_cam_target": _rounded(pose.R_cam_target, 6),
+        "R_cam_target": _rounded(pose.R_cam_target, 6) if pose.rotation_known else None,
         "t_cam_target_m": _rounded(pose.t_cam_target_m, 4),
     }
     if pose.score is not None:
         record["score"] = round(pose.score, 4)
     if pose.covariance is not None:
-        record["sigma"] = _rounded(np.sqrt(np.diagonal(pose.covariance)), 6)  # x, y, z m, rotation x, y, z rad
+        sigma = _rounded(np.sqrt(np.diagonal(pose.covariance)), 6)  # x, y, z m, rotation x, y, z rad
+        record["sigma"] = sigma if pose.rotation_known else [*sigma[:3], None, None, None]
     return record
 
 

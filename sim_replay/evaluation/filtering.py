@@ -14,7 +14,7 @@ def filtering(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
     """{"targets", "translation_error_m", "rotation_error_deg"}, the errors each {"measured", "track"}.
 
     They are means over the targets of which the tracker was given an estimate and told a pose in the same frame; None
-    where there are none, and so without a tracker.
+    where there are none, and so without a tracker. Of rotation, over those of them whose rotation it told.
     """
     pairs = [
         (measured, told)
@@ -27,11 +27,15 @@ def filtering(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
         return None
     return {
         "targets": len(pairs),
-        **{
-            name: {
-                whose: round(float(np.mean([getattr(pair[k], name) for pair in pairs])), 4)
-                for k, whose in enumerate(("measured", "track"))
-            }
-            for name in ("translation_error_m", "rotation_error_deg")
-        },
+        "translation_error_m": _means([(m.translation_error_m, t.translation_error_m) for m, t in pairs]),
+        "rotation_error_deg": _means([(m.rotation_error_deg, t.rotation_error_deg) for m, t in pairs]),
     }
+
+
+def _means(errors: Sequence[tuple[float | None, float | None]]) -> dict[str, float | None]:
+    """Of what was measured and of the track, where both are known."""
+    known = np.array([pair for pair in errors if None not in pair], dtype=np.float64)
+    if not known.size:
+        return {"measured": None, "track": None}
+    measured, track = known.mean(axis=0)
+    return {"measured": round(float(measured), 4), "track": round(float(track), 4)}

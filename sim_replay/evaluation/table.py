@@ -39,6 +39,8 @@ def score_table(score: dict[str, Any]) -> Group:
     title = f"{score['method']['file']} on {score['dataset']}, {overall['frames']} frames"
     false_rate = _text(overall["false_positives_per_1000"], "{:.1f}")
     caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
+    if overall["rotations_not_known"]:
+        caption += f"\nposes whose rotation is not known, in no E_r and no hit: {overall['rotations_not_known']}"
     if score.get("consistency") is not None:
         caption += f"\n{_consistency(score['consistency'])}"
     if score.get("filtering") is not None:
@@ -62,13 +64,13 @@ def score_table(score: dict[str, Any]) -> Group:
 def _calibration(group: dict[str, Any]) -> str:
     if group["calibration"] is None:
         return "no covariances to check"
-    shares = (f"{name} {value['inside_1sigma']:.0%}" for name, value in group["calibration"].items())
+    shares = (f"{name} {_text(value['inside_1sigma'], '{:.0%}')}" for name, value in group["calibration"].items())
     return "truth inside one sigma (an honest one: 68 %): " + ", ".join(shares)
 
 
 def _consistency(found: dict[str, Any]) -> str:
     low, high = found["position"]["bounds_95"]
-    means = ", ".join(f"{name} {found[name]['nees_mean']:.2f}" for name in ("position", "rotation"))
+    means = ", ".join(f"{name} {found[name]['nees_mean']:.2f}" for name in ("position", "rotation") if found[name])
     return (
         f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
     )
@@ -79,7 +81,7 @@ def _filtering(found: dict[str, Any]) -> str:
     return (
         f"the tracker beside what it was given, {found['targets']} targets: "
         f"E_t {translation_m['measured']:.2f} to {translation_m['track']:.2f} m, "
-        f"E_r {rotation_deg['measured']:.2f} to {rotation_deg['track']:.2f}°"
+        f"E_r {_text(rotation_deg['measured'], '{:.2f}')} to {_text(rotation_deg['track'], '{:.2f}°')}"
     )
 
 

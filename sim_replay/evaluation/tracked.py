@@ -20,7 +20,7 @@ from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.estimator.pace import Pace, looked_at_twice
-from edge.links.outgoing import sendable
+from edge.links.outgoing import rotation_known, sendable
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
 from msgs.geometry import so3_log
@@ -125,15 +125,24 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
         time_ms = (time.monotonic_ns() - started_ns) * 1e-6
         report = Report(frame.meta, picture.K, size_wh, tracks, told_own_ship, model.sha256)
         told = sendable(report, capture_ns, _MAX_AGE_MS)
-        return Answer(_poses(index, told), time_ms, _poses(index, estimates))
+        known = [rotation_known(track) for track in told]
+        return Answer(_poses(index, told, known), time_ms, _poses(index, estimates, [True] * len(estimates)))
 
     return answer
 
 
-def _poses(index: int, told: Sequence[Track | Estimate]) -> tuple[TargetPose, ...]:
+def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) -> tuple[TargetPose, ...]:
+    """`known` says of each whether its rotation is."""
     return tuple(
-        TargetPose(index, one.R_cam_target, one.t_cam_target_m, score=one.score, covariance=one.covariance)
-        for one in told
+        TargetPose(
+            index,
+            one.R_cam_target,
+            one.t_cam_target_m,
+            score=one.score,
+            covariance=one.covariance,
+            rotation_known=turned,
+        )
+        for one, turned in zip(told, known, strict=True)
     )
 
 

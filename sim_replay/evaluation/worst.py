@@ -29,13 +29,16 @@ _VIEW_MIN_PX = 96
 
 
 def badness(match: Match) -> float:
-    """How many times over the limits of Pose@10°/5 % an estimate is; infinite for a target that was not found."""
+    """How many times over the limits of Pose@10°/5 % an estimate is; infinite for a target that was not found.
+
+    One whose rotation is not known is judged by its place.
+    """
     if match.estimate is None:
         return float("inf")
-    truth, estimate = match.truth, match.estimate
-    rotation_deg = metrics.rotation_error_deg(estimate.R_cam_target, truth.R_cam_target)
-    translation_rel = metrics.translation_error_rel(estimate.t_cam_target_m, truth.t_cam_target_m)
-    return float(max(rotation_deg / metrics.ROTATION_LIMIT_DEG, translation_rel / metrics.TRANSLATION_LIMIT_REL))
+    translation_rel = metrics.translation_error_rel(match.estimate.t_cam_target_m, match.truth.t_cam_target_m)
+    in_place = float(translation_rel) / metrics.TRANSLATION_LIMIT_REL
+    turn_deg = match.rotation_error_deg
+    return in_place if turn_deg is None else max(turn_deg / metrics.ROTATION_LIMIT_DEG, in_place)
 
 
 def worst_matches(judged: Sequence[JudgedFrame], shown: int = SHOWN) -> list[tuple[JudgedFrame, Match]]:
@@ -69,8 +72,10 @@ def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Imag
     tile[_CAPTION_PX:] = close_up(image_bgr, K, match, extents_of(models[truth.object_id]), _TILE_PX)
     range_m = float(np.linalg.norm(truth.t_cam_target_m))
     told = "not found"
-    if match.rotation_error_deg is not None and match.translation_error_m is not None:
-        told = f"E_r {match.rotation_error_deg:.0f} deg, E_t {match.translation_error_m:.1f} m"
+    if match.translation_error_m is not None:
+        turn_deg = match.rotation_error_deg
+        turn = "not known" if turn_deg is None else f"{turn_deg:.0f} deg"
+        told = f"E_r {turn}, E_t {match.translation_error_m:.1f} m"
     where = f"scene {frame.picture.scene_id} image {frame.picture.image_id}, {range_m:.0f} m"
     for line, text in enumerate((where, told)):
         cv2.putText(tile, text, (8, 22 + 23 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (20, 20, 20), 1, cv2.LINE_AA)

@@ -14,10 +14,11 @@ from edge.errors import InputError
 from edge.estimator.model import load_model
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.peers import Record
-from sim_replay.lockstep.player import LockstepSettings, play_lockstep
+from sim_replay.lockstep.player import POSES_JSONL, LockstepSettings, play_lockstep
 from sim_replay.offline import method_of
+from sim_replay.play import MESSAGES_JSONL
 from sim_replay.recorded.opened import open_sequence
-from sim_replay.report.flight_files import RecordedFlight, write_flight
+from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 
 SLOWEST = 0.25
 GO_ON = "g"
@@ -52,6 +53,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
         raise InputError(f"--pause {args.pause}: is none of the frames {settings.frames[0]} to {settings.frames[-1]}")
     gate = Gate(sequence.fps, args.speed, args.pause, args.step, console.input)
     told = args.step or args.pause is not None
+    remove_flight(args.out)
+    for name in (POSES_JSONL, MESSAGES_JSONL):
+        (args.out / name).unlink(missing_ok=True)
 
     with Progress(console=console, disable=told or not console.is_terminal) as progress:
         task = progress.add_task("playing", total=len(settings.frames))
@@ -63,7 +67,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
         outputs = play_lockstep(settings, gate.before, after_frame)
     outputs.write(args.out)
-    files = "poses.jsonl, mavlink.jsonl"
+    files = f"{POSES_JSONL}, {MESSAGES_JSONL}"
     if settings.frames == list(range(len(sequence.scene.images))):  # of a part, the rest would count as missed
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))

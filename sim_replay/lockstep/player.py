@@ -26,13 +26,14 @@ from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
 from sim_replay.pipeline.flight import looped
-from sim_replay.play import PlayError, Recording
+from sim_replay.play import MESSAGES_JSONL, PlayError, Recording
 from sim_replay.telemetry import read_telemetry
 
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot
 LEAD_NS = 1_000_000_000  # of telemetry before the first frame
 UAV = "uav1"
 ENDING_S = 3.0  # from hanging up to its end
+POSES_JSONL = "poses.jsonl"
 
 BeforeFrame = Callable[[int], None]
 AfterFrame = Callable[[int, list[Record]], None]
@@ -69,9 +70,9 @@ class Outputs:
     def write(self, folder: Path) -> None:
         """poses.jsonl and mavlink.jsonl."""
         folder.mkdir(parents=True, exist_ok=True)
-        for name, records in (("poses", self.poses), ("mavlink", self.mavlink)):
+        for name, records in ((POSES_JSONL, self.poses), (MESSAGES_JSONL, self.mavlink)):
             lines = "".join(json.dumps(record) + "\n" for record in records)
-            (folder / f"{name}.jsonl").write_text(lines, encoding="utf-8")
+            (folder / name).write_text(lines, encoding="utf-8")
 
 
 def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_frame: AfterFrame) -> Outputs:

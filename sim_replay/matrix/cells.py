@@ -13,6 +13,7 @@ from sim_replay.faults.run import play_timeline
 from sim_replay.faults.timeline import Timeline
 from sim_replay.faults.witness import AUTOPILOT
 from sim_replay.ground_truth import PlayedSequence
+from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.offline import method_of
 from sim_replay.pace import at_speed
 from sim_replay.play import PlayError, PlaySettings, play
@@ -52,14 +53,14 @@ def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) ->
         return Cell(name, speed, NO_FAULT, (str(error),))
     facts = method_of(model)
     write_flight(out, RecordedFlight(sequence.scene.folder, facts, recording, speed))
-    score = score_json(flown, judge(flown, recording), facts)
+    result = judge(flown, recording)
+    score = score_json(flown, result, facts)
     peer = score["peers"]["autopilot"]
-    silent = tuple(f"the {name} received no pose" for name, figures in score["peers"].items() if not figures["poses"])
     return Cell(
         name,
         speed,
         NO_FAULT,
-        silent,
+        wrong_poses(flown, result),
         peer["poses"],
         peer["overall"]["recall"],
         peer["overall"]["rotation_error_deg"]["median"],
@@ -71,7 +72,10 @@ def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) ->
 
 
 def break_cell(sequence: PlayedSequence, speed: float, fault: str, timeline: Timeline, model: Path, out: Path) -> Cell:
-    """Play a timeline on a rig that shows the sequence's pictures; what is not as expected is what is wrong."""
+    """Play a timeline on a rig that shows the sequence's pictures; what is not as expected is what is wrong.
+
+    Timelines expect poses: the sequence must show a target. Raises InputError.
+    """
     name = sequence.scene.name
     out.mkdir(parents=True, exist_ok=True)
     if timeline.volume and not can_mount(out):

@@ -72,10 +72,15 @@ def run(args: argparse.Namespace) -> int:
     named = [(folder, folder.name) for folder in given]
     named += [(f, f"{dataset.name}/{f.name}") for dataset in args.dataset for f in flyable(dataset, args.take)]
     sequences = [(read_sequence(folder), name) for folder, name in named]
+    if NO_FAULT not in faults and all(sequence.scene.target_free for sequence, _ in sequences):
+        raise InputError(f"--fault: no sequence shows a target, which faults are judged by; say --fault {NO_FAULT}")
     args.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=args.json)
     if not console.is_terminal:
         console.width = WIDTH
+    for sequence, name in sequences:
+        if timelines and sequence.scene.target_free:
+            console.print(f"{name}: shows no target, which faults are judged by: flown without them", highlight=False)
     cells = []
     for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
         cells.append(cell)
@@ -98,10 +103,12 @@ def _cells(
     model: Model,
     out: Path,
 ) -> Iterator[Cell]:
-    """Each combination of the sequences with their names, in a folder of its own."""
+    """Each combination of the sequences with their names, in a folder of its own; no fault without a target."""
     for number, (sequence, name) in enumerate(sequences):
         for speed in speeds:
             for fault in faults:
+                if fault != NO_FAULT and sequence.scene.target_free:
+                    continue
                 folder = out / f"{number}-{sequence.scene.name}-x{speed:g}-{Path(fault).stem}"
                 if fault == NO_FAULT:
                     cell = fly_cell(sequence, speed, model, folder)

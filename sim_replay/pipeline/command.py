@@ -17,12 +17,12 @@ from edge.errors import InputError
 from edge.estimator.model import load_model
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
-from sim_replay.pipeline.flight import Flight, FlightSettings, fly
+from sim_replay.pipeline.flight import SAMPLE_S, Flight, FlightSettings, fly
 from sim_replay.pipeline.report import report, table
+from sim_replay.pipeline.soak import SAMPLES_MIN, silences, trends
 from sim_replay.pipeline.soak import table as trend_table
-from sim_replay.pipeline.soak import trends
 
-EXIT_GROWS = 1
+EXIT_DRIFTS = 1
 FPS_MAX = 240.0
 
 
@@ -38,9 +38,10 @@ def register(commands: Any) -> None:
     bench.set_defaults(run=run)
     soak = commands.add_parser(
         "soak",
-        help="fly a sequence round and round for long, and fail if anything grows",
+        help="fly a sequence round and round for long, and fail if anything grows or the poses stop",
         description="Like bench-pipeline, but set early against late: memory, open descriptors, threads, log, dropped "
-        "frames, age of what the autopilot gets. Writes soak.json. Exit code 0 if all is flat, 1 if something grows.",
+        "frames, age of what the autopilot gets, poses. Writes soak.json. Exit code 0 if all is flat, 1 if something "
+        "grows or poses do not come.",
     )
     _add_arguments(soak, 60.0, "soak")
     soak.set_defaults(run=run_soak)
@@ -64,13 +65,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_soak(args: argparse.Namespace) -> int:
-    """0 if nothing grows, else EXIT_GROWS. Raises InputError, PlayError."""
+    """0 if nothing grows and poses came to the end, else EXIT_DRIFTS. Raises InputError, PlayError."""
+    minutes_min = SAMPLES_MIN * SAMPLE_S / 60.0
+    if args.minutes < minutes_min:
+        raise InputError(f"--minutes {args.minutes:g}: must be at least {minutes_min:g} to show a trend")
     result, flight = _measure(args)
     found = trends(flight, result["fps"])
-    result = {**result, "trends": [asdict(trend) for trend in found]}
+    silent = silences(flight)
+    result = {**result, "trends": [asdict(trend) for trend in found], "silences": silent}
     _write(args.out / "soak.json", result)
-    print(json.dumps(result) if args.json else trend_table(found, args.minutes))
-    return EXIT_GROWS if any(trend.grows for trend in found) else 0
+    print(json.dumps(result) if args.json else "\n".join([trend_table(found, args.minutes), *silent]))
+    return EXIT_DRIFTS if silent or any(trend.grows for trend in found) else 0
 
 
 def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:

@@ -59,7 +59,7 @@ class Flight:
     complaints: list[str] = field(default_factory=list)  # of its peers
     targets: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
     diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
-    poses: int = 0  # received over zenoh
+    poses_ns: list[int] = field(default_factory=list)  # when each was received over zenoh
     usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
     logged: list[tuple[int, int]] = field(default_factory=list)  # when a line of its log came, and its bytes
     ended: threading.Event = field(default_factory=threading.Event)  # a process has
@@ -76,7 +76,7 @@ class Flight:
             self.ready_ns = heard_ns
             self.ready_or_ended.set()
 
-    def hear_peer(self, line: str, _: int) -> None:
+    def hear_peer(self, line: str, heard_ns: int) -> None:
         try:
             record = json.loads(line)
         except ValueError:  # no record: its last words
@@ -87,7 +87,7 @@ class Flight:
         elif record["event"] == "diagnostics":
             self.diagnostics.append(record)
         elif record["event"] == "pose":
-            self.poses += 1
+            self.poses_ns.append(heard_ns)
 
 
 def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:

@@ -42,7 +42,7 @@ def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[
         "captured": counters.get("captured"),
         "dropped": counters.get("dropped"),
         "poses_mavlink": len(flight.targets),
-        "poses_zenoh": flight.poses,
+        "poses_zenoh": len(flight.poses_ns),
         "capture_to_mavlink_ms": latency,
         "stages_ms": stages,
         **cpu(flight, counters.get("captured")),

@@ -1,4 +1,4 @@
-"""Whether a long flight drifts: memory, descriptors, threads, log, drops and age, early against late. Pure functions.
+"""Whether a long flight drifts: memory, descriptors, threads, log, drops, age and poses, early against late. Pure.
 
 The first quarter is left out: caches fill, allocators grow, links come up. The rest is parted into thirds, and the last
 is set against the first. Medians are compared, so that one odd sample is no trend; of memory the floor is, for what
@@ -16,7 +16,7 @@ from msgs.geometry import Array
 from sim_replay.pipeline.flight import Flight
 
 WARM_UP_SHARE = 0.25
-SAMPLES_MIN = 12  # fewer seconds show no trend
+SAMPLES_MIN = 12  # fewer show no trend
 # Three pictures of 1080p and a half: a busy machine has more of them in hand at once than an idle one, and the
 # allocator keeps the places of as many as there ever were.
 MEMORY_MB = 22.0
@@ -40,10 +40,11 @@ class Trend:
 
 
 def trends(flight: Flight, fps: float) -> list[Trend]:
-    """All of them. Age and drops are not judged where the daemon waited longer for other work than it ran itself."""
+    """All of them, of SAMPLES_MIN samples or more.
+
+    Age and drops are not judged where the daemon waited longer for other work than it ran itself.
+    """
     samples = flight.usage
-    if len(samples) < SAMPLES_MIN:
-        return [Trend(name, "", None, None, None, None) for name in ("memory", "descriptors", "threads")]
     times_ns = np.array([sample.time_ns for sample in samples])
     early, late = _thirds(times_ns)
     third_min = (early[1] - early[0]) / 60e9
@@ -71,6 +72,20 @@ def trends(flight: Flight, fps: float) -> list[Trend]:
         _trend("frames dropped", "", drops, lambda value: 2.0 * value + DROPPED_SHARE * frames, judged=not busy),
         _trend("age at the autopilot, p50", "ms", age, lambda a: (1 + AGE_GROWTH) * a + AGE_MS, judged=not busy),
     ]
+
+
+def silences(flight: Flight) -> list[str]:
+    """A sentence for each peer that got no pose at all, or some early and none late."""
+    early, late = _thirds(np.array([sample.time_ns for sample in flight.usage]))
+    received = {"autopilot": [record["received_ns"] for record in flight.targets], "subscriber": flight.poses_ns}
+    told = []
+    for name, times_ns in received.items():
+        first, last = (sum(part[0] <= at_ns <= part[1] for at_ns in times_ns) for part in (early, late))
+        if not times_ns:
+            told.append(f"the {name} received no pose")
+        elif first and not last:
+            told.append(f"the {name} received {first} poses in the first third and none in the last")
+    return told
 
 
 def table(found: Sequence[Trend], minutes: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -11,7 +12,8 @@ from rich.progress import Progress
 from edge.errors import InputError
 from sim_replay.ground_truth import PlayedSequence, read_sequence
 
-SCENE = "sequence"  # folder in `out` that pictures are unpacked into
+SCENE = "sequence"  # folder in `out` that holds what was unpacked
+UNFINISHED = "sequence.part"  # the same while pictures are unpacked into it
 WHAT = "a scene folder, an .mcap recording or a folder of them, or a .toml that names a video and its telemetry"
 
 
@@ -26,10 +28,22 @@ def open_sequence(path: Path, out: Path, console: Console) -> PlayedSequence:
             raise InputError(f"{path}: is not {WHAT}")
         return read_sequence(path)
     scene = out / SCENE
-    if scene.exists():
-        if not (scene / "sequence.toml").is_file():
-            raise InputError(f"{scene}: is in the way: pictures would be unpacked there")
-        shutil.rmtree(scene)
+    if scene.exists() and not (scene / "sequence.toml").is_file():
+        raise InputError(f"{scene}: is in the way: pictures would be unpacked there")
+    unfinished = out / UNFINISHED
+    shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was killed
+    try:
+        _unpack(path, recordings, unfinished, console)
+        if scene.exists():
+            shutil.rmtree(scene)
+        unfinished.rename(scene)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    console.print(f"pictures unpacked into {scene}", highlight=False, soft_wrap=True)
+    return read_sequence(scene)
+
+
+def _unpack(path: Path, recordings: Sequence[Path], scene: Path, console: Console) -> None:
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task("unpacking pictures", total=None)
         if recordings:
@@ -40,5 +54,3 @@ def open_sequence(path: Path, out: Path, console: Console) -> PlayedSequence:
             from sim_replay.recorded.video import unpack_video
 
             unpack_video(path, scene, lambda: progress.advance(task))
-    console.print(f"pictures unpacked into {scene}", highlight=False, soft_wrap=True)
-    return read_sequence(scene)

@@ -1,7 +1,8 @@
 """A recording of the daemon (`[recorder] image_max_hz`) as a scene: its pictures, and the own ship from its transforms.
 
 Pictures are played at a constant rate, each in the slot nearest its exposure, and the telemetry is bent so that the
-attitude at every picture's exposure is the one that was recorded. A slot whose picture was not recorded shows the one
+attitude at every picture's exposure is the one that was recorded. Pictures from before the first and after the last
+attitude are left out. A slot whose picture was not recorded shows the one
 before again, which the daemon takes for a frozen camera and drops.
 """
 
@@ -26,6 +27,7 @@ from msgs.ground.view.recorded import samples
 from msgs.wire import PayloadError
 from sim_replay.bop.records import BopFrame
 from sim_replay.bop.write import SceneWriter
+from sim_replay.ground_truth import UNCOVERED_NS_MAX
 from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, scene_distortion, write_sequence_toml
 from sim_replay.telemetry import Telemetry, write_telemetry
 
@@ -51,9 +53,14 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
     _check(paths, recorded)
     picture_ns = np.array(recorded.picture_ns)
     fps = _rate_hz(picture_ns)
-    slots = np.round((picture_ns - picture_ns[0]) * 1e-9 * fps).astype(np.int64)
-    slots, kept = np.unique(slots, return_index=True)
     own_ns, mounts = _own_ship(recorded)
+    within_ns = UNCOVERED_NS_MAX // 2  # bending moves times by half a picture or so
+    covered = np.flatnonzero((picture_ns >= own_ns[0] - within_ns) & (picture_ns <= own_ns[-1] + within_ns))
+    if len(covered) < 2:
+        raise InputError(f"{paths[0]}: holds no pictures of the time in which the own ship's attitude was recorded")
+    slots = np.round((picture_ns[covered] - picture_ns[covered[0]]) * 1e-9 * fps).astype(np.int64)
+    slots, first = np.unique(slots, return_index=True)
+    kept = covered[first]
     gimballed = any(np.linalg.norm(so3_log(mounts[0].R_body_cam.T @ m.R_body_cam)) > _FIXED_RAD for m in mounts)
     with SceneWriter(folder, JPEG_QUALITY) as writer:
         of_picture = dict(zip(kept.tolist(), slots.tolist(), strict=True))

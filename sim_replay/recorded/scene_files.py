@@ -42,7 +42,7 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
 
 
 def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
-    """sequence.toml; `source` is where the pictures are from."""
+    """sequence.toml of a finished scene whose labels nobody knows; `source` is where the pictures are from."""
     entries = {
         "source": str(source),
         "fps": fps,
@@ -53,3 +53,5 @@ def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, 
     }
     lines = [f"{key} = {toml_value(value)}\n" for key, value in entries.items()]
     (folder / "sequence.toml").write_text("".join(lines), encoding="utf-8")
+    for name in ("scene_gt.json", "scene_gt_info.json"):  # empty lists would say that there is no target
+        (folder / name).unlink(missing_ok=True)

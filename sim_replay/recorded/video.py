@@ -18,10 +18,12 @@ from edge.config_path import ConfigPath
 from edge.errors import InputError
 from msgs.settings import Section, dotted, faults_of, read_toml
 from sim_replay.bop.write import SceneWriter
+from sim_replay.ground_truth import check_spans
 from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_sequence_toml
 from sim_replay.telemetry import TelemetryError, read_telemetry
 
 FPS_MAX = 240.0  # of the daemon's camera
+ROWS_HZ_MIN = 10.0  # of telemetry: between its rows the own ship is taken to turn evenly
 
 
 class FilmedFlight(Section):
@@ -48,9 +50,12 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
     """Make a scene of the flight that the TOML file at `path` tells of. Raises InputError, OSError."""
     flight = read_filmed_flight(path)
     try:
-        read_telemetry(flight.telemetry)
+        telemetry = read_telemetry(flight.telemetry)
     except TelemetryError as error:
         raise InputError(str(error)) from error
+    rows_hz = 1e9 / float(np.median(np.diff(telemetry.t_ns)))
+    if rows_hz < ROWS_HZ_MIN:
+        raise InputError(f"{flight.telemetry}: has {rows_hz:.1f} rows a second; {ROWS_HZ_MIN:g} are needed")
     if not flight.video.is_file():
         raise InputError(f"{path}: video: {flight.video} does not exist")
     capture = cv2.VideoCapture(str(flight.video), cv2.CAP_FFMPEG)
@@ -60,6 +65,8 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         fps = flight.fps or capture.get(cv2.CAP_PROP_FPS)
         if not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
+        frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: it does not say
+        check_spans(telemetry, flight.telemetry, flight.t0_ns, frames, fps)
         _unpack(capture, path, flight, folder, on_picture)
     finally:
         capture.release()

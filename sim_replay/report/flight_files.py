@@ -29,6 +29,12 @@ def is_flight(folder: Path) -> bool:
     return (folder / FLIGHT_JSON).is_file()
 
 
+def remove_flight(folder: Path) -> None:
+    """Remove what an earlier replay left there, so that it is not taken for the one that begins now."""
+    for name in (FLIGHT_JSON, RECEIVED_JSONL):
+        (folder / name).unlink(missing_ok=True)
+
+
 def write_flight(out: Path, flight: RecordedFlight) -> None:
     """Write both files into `out`, which exists."""
     recording = flight.recording

@@ -31,8 +31,8 @@ class Moment:
     frame: int
     t_s: float
     range_m: float
-    rotation_error_deg: float | None  # None: nothing was received of the target
-    range_error_m: float | None
+    rotation_error_deg: float | None  # None: not known
+    range_error_m: float | None  # None: nothing was received of the target
     picture: str  # a data: URL
 
 

@@ -50,11 +50,13 @@ def peer_figures(
 def coordinates(poses: Sequence[TargetPose]) -> Array:
     """[N, 6] of poses: x, y, z in `cam`, metres; roll, pitch, yaw against the camera's axes, degrees.
 
-    Roll, pitch and yaw are zero for a target that flies straight away from the camera, wings along the rows.
+    Roll, pitch and yaw are zero for a target that flies straight away from the camera, wings along the rows; NaN where
+    the rotation is not known.
     """
     R, t_m = stacked(poses)
-    angles = euler_from_R(R_FORWARD_CAM @ R)
-    return np.column_stack([t_m, *(np.rad2deg(angle) for angle in angles)])
+    angles = np.rad2deg(np.column_stack(euler_from_R(R_FORWARD_CAM @ R)))
+    angles[[not pose.rotation_known for pose in poses]] = np.nan
+    return np.column_stack([t_m, angles])
 
 
 def coordinate_errors(found: Sequence[tuple[TargetPose, TargetPose]]) -> Array:
@@ -70,12 +72,16 @@ def pairs(matches: Sequence[Match]) -> list[tuple[TargetPose, TargetPose]]:
 
 
 def rmse(matches: Sequence[Match]) -> dict[str, float | None]:
-    """Root of the mean square error of each of COORDINATES (paper, its figures of a sequence)."""
-    found = pairs(matches)
-    if not found:
-        return dict.fromkeys(COORDINATES)
-    values = np.sqrt((coordinate_errors(found) ** 2).mean(axis=0))
-    return {name: round(float(value), 4) for name, value in zip(COORDINATES, values, strict=True)}
+    """Root of the mean square error of each of COORDINATES (paper, its figures of a sequence); None without any."""
+    values = [root_mean_square(column) for column in coordinate_errors(pairs(matches)).T]
+    told = [None if value is None else round(value, 4) for value in values]
+    return dict(zip(COORDINATES, told, strict=True))
+
+
+def root_mean_square(errors: Array) -> float | None:
+    """Over those that are not NaN; None if there are none."""
+    known = errors[np.isfinite(errors)]
+    return float(np.sqrt((known**2).mean())) if known.size else None
 
 
 def range_error_m(matches: Sequence[Match]) -> dict[str, float | None]:
@@ -91,11 +97,12 @@ def range_error_m(matches: Sequence[Match]) -> dict[str, float | None]:
     return {name: round(float(value), 4) for name, value in values.items()}
 
 
-def nees(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
+def nees(matches: Sequence[Match]) -> dict[str, dict[str, float] | None] | None:
     """Normalised estimation error squared, e' P^-1 e (Bar-Shalom), of the pose and of its two halves.
 
     For an honest covariance the mean is the degrees of freedom and 95 % lie below their chi-square quantile. Errors of
-    neighbouring frames are alike, so the mean of one flight scatters more than its count says. None: no covariances.
+    neighbouring frames are alike, so the mean of one flight scatters more than its count says. Position is over all
+    poses, pose and rotation over those that tell a rotation. None: no covariances, or no such pose.
     """
     sure = [(truth, estimate) for truth, estimate in pairs(matches) if estimate.covariance is not None]
     if not sure:
@@ -103,15 +110,23 @@ def nees(matches: Sequence[Match]) -> dict[str, dict[str, float]] | None:
     R_gt, t_gt = stacked([truth for truth, _ in sure])
     R_est, t_est = stacked([estimate for _, estimate in sure])
     covariance = np.array([estimate.covariance for _, estimate in sure])
-    parts = metrics.nees(R_est, t_est, R_gt, t_gt, covariance)
+    turned = np.array([estimate.rotation_known for _, estimate in sure], dtype=np.bool_)
+    pose, position, rotation = metrics.nees(R_est, t_est, R_gt, t_gt, covariance)
     return {
-        name: {
-            "mean": round(float(values.mean()), 4),
-            "median": round(float(np.median(values)), 4),
-            "degrees_of_freedom": dof,
-            "within_95pct": round(float((values <= CHI2_95[dof]).mean()), 4),
-        }
-        for (name, dof), values in zip((("pose", 6), ("position", 3), ("rotation", 3)), parts, strict=True)
+        "pose": _honesty(pose[turned], 6),
+        "position": _honesty(position, 3),
+        "rotation": _honesty(rotation[turned], 3),
+    }
+
+
+def _honesty(nees: Array, dof: int) -> dict[str, float] | None:
+    if nees.size == 0:
+        return None
+    return {
+        "mean": round(float(nees.mean()), 4),
+        "median": round(float(np.median(nees)), 4),
+        "degrees_of_freedom": dof,
+        "within_95pct": round(float((nees <= CHI2_95[dof]).mean()), 4),
     }
 
 
@@ -152,8 +167,9 @@ def _track(followed: Sequence[Match], false_poses: int) -> dict[str, Any]:
     frames = [match.truth.frame for match in followed]
     R_gt, t_gt = stacked([truth for truth, _ in pairs(followed)])
     R_est, t_est = stacked([estimate for _, estimate in pairs(followed)])
+    turned = np.array([estimate.rotation_known for _, estimate in pairs(followed)], dtype=np.bool_)
     errors = {
-        "rotation_error_deg": metrics.rotation_error_deg(R_est, R_gt),
+        "rotation_error_deg": metrics.rotation_error_deg(R_est, R_gt)[turned],
         "translation_error_m": metrics.translation_error_m(t_est, t_gt),
         "bearing_error_deg": metrics.bearing_error_deg(t_est, t_gt),
     }

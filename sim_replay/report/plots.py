@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from msgs.geometry import Array
 from sim_replay.ground_truth import SceneTruth
-from sim_replay.report.peer import coordinate_errors, coordinates, pairs
+from sim_replay.report.peer import coordinate_errors, coordinates, pairs, root_mean_square
 from sim_replay.score import Match
 
 TRUTH_COLOR, ESTIMATE_COLOR, AUTOPILOT_COLOR, OWN_COLOR = "#0091a1", "#d1009b", "#e08a00", "#64748b"
@@ -74,16 +74,12 @@ def pose_over_time(matches: Sequence[Match], frames: int, fps: float) -> str:
         panels = figure.subplots(2, 3, sharex=True).ravel()
         for target in _by_target(matches):
             _pose_of_target(panels, target, frames, fps)
-        found = pairs(matches)
-        square = coordinate_errors(found) ** 2 if found else np.zeros((0, 6))
+        errors = coordinate_errors(pairs(matches))
         names = ("X, right", "Y, down", "Z, forward", "roll", "pitch", "yaw")
         for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
             unit = " m" if k < 3 else "°"
-            told = (
-                f"RMSE {np.sqrt(square[:, k].mean()):.2f}{' m' if k < 3 else '°'}"
-                if len(square)
-                else "nothing received"
-            )
+            rms = root_mean_square(errors[:, k])
+            told = "nothing received" if rms is None else f"RMSE {rms:.2f}{unit}"
             axes.set_title(f"{name}  ·  {told}")
             axes.set_ylabel(unit)
             axes.set_xlim(0.0, frames / fps)
@@ -245,7 +241,7 @@ def errors_over_range(matches: Sequence[Match]) -> str:
         received_m = np.array([np.linalg.norm(estimate.t_cam_target_m) for _, estimate in found])
         share = 100.0 * (received_m - range_m) / range_m if found else range_m
         panels = (
-            (rotation, "rotation error, °", [match.rotation_error_deg for match in seen]),
+            (rotation, "rotation error, °", np.array([m.rotation_error_deg for m in seen], dtype=np.float64)),
             (distance, "range error, % of range", share),
             (bearing, "bearing error, °", [match.bearing_error_deg for match in seen]),
         )

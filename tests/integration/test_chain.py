@@ -183,13 +183,14 @@ def test_pictures_are_written(demo: DemoRun) -> None:
     assert frames == demo.score["overall"]["frames"]
 
 
-def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(number: signal.Signals, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [BIN / "uavpose-replay", "demo", "--out", out]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True)
     config, session = meet(out, process)
     with session:
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(number)
         assert process.wait(timeout=END_S) == 130
     with pytest.raises(ConnectionError):
         connect(config["zenoh"]["listen"][0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,12 +14,16 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
+from rich.console import Console
 
 from msgs.cdr import CompressedImage
 from msgs.geometry import R_from_euler, R_from_q_wxyz, q_wxyz_from_R, so3_log
 from sim_replay.cli import main
 from sim_replay.ground_truth import read_sequence
+from sim_replay.recorded.opened import open_sequence
 from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+from tests.waiting import until
 
 BIN = Path(sys.executable).parent
 FPS, FRAMES = 10.0, 40
@@ -121,6 +126,89 @@ def test_the_daemons_own_recording_flies_again(
         was = as_it_was[frame + first]["t_cam_target_m"]
         np.testing.assert_allclose(poses[frame]["t_cam_target_m"], was, rtol=0.05, atol=0.5)
     _attitude_as_flown(read_telemetry(tmp_path / "again/sequence/telemetry.csv"))
+
+
+def without_attitude_before(log_ns: int, path: Path, cut: Path) -> None:
+    """Copy a recording, but for what it tells of the own ship before then."""
+    with path.open("rb") as source, cut.open("wb") as target:
+        writer = Writer(target)
+        writer.start()
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages():
+            if channel.id not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                )
+            if message.log_time >= log_ns or not channel.topic.endswith("/tf"):
+                writer.add_message(
+                    channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+                )
+        writer.finish()
+
+
+def test_pictures_from_before_the_first_attitude_are_left_out(flown: Path, toy_model: Path, tmp_path: Path) -> None:
+    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
+    assert recorded.returncode == 0, recorded.stderr
+    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
+    with path.open("rb") as file:
+        kept = [message for _, _, message in make_reader(file).iter_messages("/uav1/image/compressed")]
+    cut = tmp_path / "cut.mcap"
+    without_attitude_before(kept[10].log_time, path, cut)
+    sequence = open_sequence(cut, tmp_path / "again", Console(quiet=True))
+    first = [CompressedImage.decode(message.data).data for message in kept].index(sequence.scene.images[0].read_bytes())
+    assert 8 <= first <= 12
+    first_ns = read_telemetry(sequence.telemetry_csv).t_ns[0]
+    assert abs(first_ns) < 60_000_000  # its attitude is its own
+
+
+def write_film(folder: Path, picture: Path, frames: int, row_s: float = 0.02) -> Path:
+    """A video of one picture, with telemetry of all of it and `flight.toml`."""
+    film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (640, 384))
+    for _ in range(frames):
+        film.write(cv2.imread(str(picture)))
+    film.release()
+    t_s = np.arange(0.0, frames / FPS, row_s)
+    values = np.tile(own_flight().values[0], (len(t_s), 1))
+    write_telemetry(folder / "own.csv", Telemetry(np.round(t_s * 1e9).astype(np.int64), values))
+    path = folder / "flight.toml"
+    path.write_text(f'video = "film.mp4"\ntelemetry = "own.csv"\nintrinsics = {LENS}\n')
+    return path
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_video_whose_unpacking_was_stopped_is_unpacked_anew(
+    number: signal.Signals, flown: Path, tmp_path: Path
+) -> None:
+    frames, out = 1000, tmp_path / "out"
+    path = write_film(tmp_path, flown / "rgb/000000.png", frames)
+    command = [BIN / "uavpose-replay", "play", "--sequence", path, "--out", out]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until(lambda: list(out.glob("*/rgb/*.jpg")) or process.poll() is not None, what="the first picture")
+        process.send_signal(number)
+        process.wait(timeout=30)
+    finally:
+        process.kill()
+        process.wait()
+    assert not (out / "sequence").exists(), "it was stopped too late"
+    assert len(open_sequence(path, out, Console(quiet=True)).scene.images) == frames
+    assert [one.name for one in out.iterdir()] == ["sequence"]
+
+
+def test_a_video_whose_telemetry_is_of_another_time_or_too_sparse_is_refused_before_it_is_unpacked(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_film(tmp_path, flown / "rgb/000000.png", 20)
+    text = path.read_text()
+    path.write_text(f"t0_ns = 7000000000\n{text}")
+    assert main(["play", "--sequence", str(path), "--out", str(tmp_path / "out")]) == 2
+    told = "own.csv: tells of 0.000 s to 1.980 s, but the pictures were exposed from 7.000 s to 8.900 s"
+    assert told in capsys.readouterr().err
+    path = write_film(tmp_path, flown / "rgb/000000.png", 20, row_s=0.5)
+    assert main(["play", "--sequence", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "own.csv: has 2.0 rows a second; 10 are needed" in capsys.readouterr().err
+    assert not list(tmp_path.glob("out/*"))
 
 
 def frame_of(jpeg: bytes) -> int:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from sim_replay.benchmark.plan import plan_dataset
@@ -52,3 +55,49 @@ def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
     told = capsys.readouterr().err
     assert "torn.jpg is not a readable picture" in told
     assert "--resume" not in told
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> list[str]:
+    """The words that made a dataset of two photographs offered, ready to be said again."""
+    (tmp_path / "mine.toml").write_text(PRESET)
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for name in ("lake", "meadow"):
+        cv2.imwrite(str(photographs / f"{name}.png"), np.full((32, 64, 3), 90, np.uint8))
+    words = ["generate", "--preset", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "data"), "--labels-only"]
+    words += ["--workers", "1", "--backdrops", str(photographs)]
+    assert main(words) == 0
+    return [*words, "--resume"]
+
+
+def test_the_same_recipe_goes_on(made: list[str]) -> None:
+    assert main(made) == 0
+
+
+@pytest.mark.parametrize(
+    ("instead_of_lake", "told"),
+    [
+        ("lake", r"\[backdrops\] lake\.png is \w{64} there and \w{64} now"),
+        ("city", r"\[backdrops\] city\.png is absent there and \w{64} now"),
+    ],
+)
+def test_as_many_other_photographs_are_not_mixed_in(
+    instead_of_lake: str, told: str, made: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (tmp_path / "data" / "dataset.toml").read_bytes()
+    (tmp_path / "photographs" / "lake.png").unlink()
+    cv2.imwrite(str(tmp_path / "photographs" / f"{instead_of_lake}.png"), np.full((32, 64, 3), 91, np.uint8))
+    assert main(made) == 2
+    assert re.search(told, capsys.readouterr().err)
+    assert (tmp_path / "data" / "dataset.toml").read_bytes() == before
+
+
+def test_other_packages_are_not_mixed_in(made: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "data" / "dataset.toml"
+    installed = tomllib.loads(path.read_text(encoding="utf-8"))["packages"]["numpy"]
+    path.write_text(path.read_text(encoding="utf-8").replace(f'numpy = "{installed}"', 'numpy = "0.9"'))
+    before = path.read_bytes()
+    assert main(made) == 2
+    assert f"[packages] numpy is 0.9 there and {installed} now; it must stay" in capsys.readouterr().err
+    assert path.read_bytes() == before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,9 +18,10 @@ from edge.errors import InputError
 from sim_replay.bop import BopScene, Model, ModelFrame, ModelFrames
 from sim_replay.datasets import Dataset, DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, read_results, results_name, write_results
-from sim_replay.evaluation.figures import sequence
+from sim_replay.evaluation.figures import cumulative_error, sequence
+from sim_replay.evaluation.files import frame_record
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames
-from sim_replay.evaluation.worst import worst_matches, write_worst
+from sim_replay.evaluation.worst import badness, worst_matches, write_worst
 from sim_replay.report.peer import R_FORWARD_CAM, coordinates
 from sim_replay.score import Match, TargetPose, Truth
 
@@ -182,6 +184,30 @@ def test_a_sequence_tells_its_rmse_and_takes_angles_the_short_way() -> None:
     titles = [axes.get_title() for axes in sequence("title", frames).axes]
     assert titles[0] == "X: RMSE 3.54 m"
     assert titles[5] == "yaw: RMSE 2.00°"
+
+
+def test_a_rotation_that_is_not_known_leaves_a_gap_in_figures_and_files() -> None:
+    """One of two poses tells its heading, 2 degrees off; the other's is right by chance. Both are 3 m aside."""
+    scene = BopScene(Path("scene"), 0)
+    t_m = np.array([0.0, 0.0, 200.0])
+    level = R_FORWARD_CAM.T
+    turned = level @ Rotation.from_euler("z", 2.0, degrees=True).as_matrix()
+    known = TargetPose(0, turned, t_m + np.array([3.0, 0.0, 0.0]), covariance=np.eye(6))
+    unknown = replace(known, frame=1, R_cam_target=level, rotation_known=False)
+    frames = [judged(scene, k, truth(level, t_m, k), pose) for k, pose in enumerate((known, unknown))]
+    titles = [axes.get_title() for axes in sequence("title", frames).axes]
+    assert (titles[0], titles[5]) == ("X: RMSE 3.00 m", "yaw: RMSE 2.00°")
+    (rotation, place, *_) = cumulative_error([frame.matches[0] for frame in frames]).axes
+    assert rotation.lines[0].get_ydata()[-1] == 50.0
+    assert place.lines[0].get_ydata()[-1] == 100.0
+    told = [frame_record(frame, Path())["targets"][0] for frame in frames]
+    assert told[0]["rotation_error_deg"] == pytest.approx(2.0, abs=1e-3)
+    assert (told[0]["pose_10deg_5pct"], told[1]["pose_10deg_5pct"]) == (True, False)
+    assert (told[1]["rotation_error_deg"], told[1]["estimate"]["R_cam_target"]) == (None, None)
+    assert told[1]["estimate"]["sigma"] == [1.0, 1.0, 1.0, None, None, None]
+    assert told[1]["translation_error_m"] == 3.0
+    # The limit is 5 % of 200 m.
+    assert badness(frames[1].matches[0]) == pytest.approx(0.3)
 
 
 def test_the_worst_come_first_and_misses_do_not_crowd_them_out() -> None:

@@ -63,6 +63,22 @@ def test_two_targets_of_one_object_are_two_flights() -> None:
     assert found["flights"] == 2 * FLIGHTS
 
 
+def test_a_flight_stays_its_own_when_another_of_its_object_leaves() -> None:
+    """Two errors squared: nil of the left target, that leaves after two of five frames, and 3 of the right one."""
+    (first, *_) = flights(1.0)
+    frames = []
+    for k in range(5):
+        matches = []
+        for x_m, error_m in ((-40.0, 0.0), (40.0, 3.0**0.5))[0 if k < 2 else 1 :]:
+            truth = Truth(k, np.eye(3), np.array([x_m, 0.0, 300.0]), 4, 10.0)
+            told_m = truth.t_cam_target_m + np.array([0.0, error_m, 0.0])
+            matches.append(Match(truth, TargetPose(k, np.eye(3), told_m, covariance=np.eye(6))))
+        frames.append(replace(first, matches=tuple(matches)))
+    found = consistency(frames)
+    assert found is not None
+    assert (found["flights"], found["position"]["nees_mean"]) == (2, 1.5)
+
+
 @pytest.mark.parametrize("told_wider", [0.25, 4.0])
 def test_what_is_told_too_wide_or_too_narrow_is_out_by_that_factor(told_wider: float) -> None:
     found, honest = consistency(flights(told_wider)), consistency(flights(1.0))
@@ -82,6 +98,43 @@ def test_nothing_is_said_where_no_pose_tells_how_sure_it_is() -> None:
         consistency([JudgedFrame(first.picture, (Match(match.truth, bare), Match(match.truth, None)), (), None)])
         is None
     )
+
+
+def without_rotation(frame: JudgedFrame) -> JudgedFrame:
+    """The same, with a rotation half a turn off in every pose, said not to be known."""
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    told = [replace(m.estimate, R_cam_target=half_turn, rotation_known=False) for m in frame.matches if m.estimate]
+    return replace(frame, matches=tuple(Match(m.truth, pose) for m, pose in zip(frame.matches, told, strict=True)))
+
+
+def test_rotations_that_are_not_known_are_held_against_nothing() -> None:
+    honest = flights(1.0)
+    whole = consistency(honest)
+    assert whole is not None
+    # The frames of one flight share their error: four of its five tell as much as all of them.
+    some = consistency([without_rotation(frame) if k % FRAMES == 2 else frame for k, frame in enumerate(honest)])
+    assert some == whole
+    none = consistency([without_rotation(frame) for frame in honest])
+    assert none == {**whole, "rotation": None}
+
+
+def test_a_tracker_that_tells_no_rotation_is_held_against_what_it_was_given_by_place_alone() -> None:
+    (frame, *_) = flights(1.0)
+    (match,) = frame.matches
+    t_m = match.truth.t_cam_target_m
+    given = TargetPose(0, np.eye(3), t_m + np.array([0.0, 4.0, 0.0]))
+    told = TargetPose(0, np.diag([-1.0, -1.0, 1.0]), t_m + np.array([0.0, 1.0, 0.0]), rotation_known=False)
+    unturned = replace(frame, matches=(Match(match.truth, told),), measured=(Match(match.truth, given),))
+    assert filtering([unturned]) == {
+        "targets": 1,
+        "translation_error_m": {"measured": 4.0, "track": 1.0},
+        "rotation_error_deg": {"measured": None, "track": None},
+    }
+    R = Rotation.from_euler("z", 20.0, degrees=True).as_matrix()
+    turned = replace(unturned, matches=(Match(match.truth, replace(told, R_cam_target=R, rotation_known=True)),))
+    found = filtering([unturned, turned])
+    assert found is not None
+    assert found["rotation_error_deg"] == {"measured": 0.0, "track": pytest.approx(20.0)}
 
 
 def test_what_a_tracker_was_given_is_held_against_what_it_told_of_the_same_targets() -> None:

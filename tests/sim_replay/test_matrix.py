@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from msgs.geometry import R_from_q_wxyz, rotation_angle
+from msgs.geometry import R_from_q_wxyz, rotation_angle, so3_exp
 from sim_replay.cli import main
 from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.gimbal import track_of
 from sim_replay.ground_truth import read_sequence
 from sim_replay.pace import at_speed
 from sim_replay.telemetry import read_telemetry
+from tests.edge.toy_model import write_toy_model
+from tests.sim_replay.toy_flight import write_toy_flight
 
 IMPOSSIBLE = """
 title = "A state that there is not"
@@ -36,6 +40,20 @@ def test_at_another_speed_each_frame_is_taken_from_the_same_place(speed: float, 
         np.testing.assert_allclose(after.t_ned_body_m, before.t_ned_body_m, atol=2e-3)
         assert rotation_angle(R_from_q_wxyz(after.q_ned_body_wxyz), R_from_q_wxyz(before.q_ned_body_wxyz)) < 1e-5
         np.testing.assert_allclose(after.v_ned_body_mps, speed * before.v_ned_body_mps, atol=2e-2)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 3.0])
+def test_at_another_speed_the_gimbal_looks_the_same_way_at_each_frame(speed: float, tmp_path: Path) -> None:
+    sequence = replace(read_sequence(BUNDLED_SEQUENCE), frame0_ns=7_000_000_000)
+    R_cam_ned = [so3_exp(np.array([0.0, 0.0, 0.02 * frame])) for frame in range(len(sequence.scene.images))]
+    sequence = replace(sequence, gimbal=track_of(R_cam_ned, sequence.frame0_ns, sequence.fps))
+    faster = at_speed(sequence, speed, tmp_path)
+    assert sequence.gimbal is not None
+    assert faster.gimbal is not None
+    for frame in range(0, 150, 20):
+        before = sequence.gimbal.at(sequence.frame0_ns + round(frame * 1e9 / sequence.fps))
+        after = faster.gimbal.at(faster.frame0_ns + round(frame * 1e9 / faster.fps))
+        assert rotation_angle(R_from_q_wxyz(after), R_from_q_wxyz(before)) < 1e-5
 
 
 def test_velocity_at_another_speed_is_how_the_place_changes(tmp_path: Path) -> None:
@@ -79,3 +97,30 @@ def test_what_cannot_be_flown_is_named(
 ) -> None:
     assert main(["matrix", *arguments, "--out", str(tmp_path)]) == 2
     assert named in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("false_alarm", [False, True])
+def test_an_empty_sky_is_judged_by_its_false_poses(
+    false_alarm: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sky = write_toy_flight(tmp_path / "sky", target=false_alarm, labelled=True)
+    model = write_toy_model(tmp_path / "toy.onnx")
+    flown = ["--sequence", str(sky), "--model", str(model)]
+    faults = ["--fault", "none", "--fault", "mavlink-cut"]
+    code = main(["matrix", *flown, *faults, "--out", str(tmp_path / "matrix"), "--json"])
+    told = capsys.readouterr()
+    (cell,) = json.loads(told.out)
+    assert "sky: shows no target" in told.err
+    assert (cell["poses"] > 0, code) == (false_alarm, int(false_alarm))
+    played = main(["play", *flown, "--out", str(tmp_path / "play")])
+    said = capsys.readouterr().err
+    assert played == code
+    for peer in ("subscriber", "autopilot"):
+        assert (f"the {peer} received" in said) is false_alarm
+        assert any(f"the {peer} received" in one for one in cell["wrong"]) is false_alarm
+
+
+def test_faults_alone_of_an_empty_sky_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sky = write_toy_flight(tmp_path / "sky", target=False, labelled=True)
+    assert main(["matrix", "--sequence", str(sky), "--fault", "mavlink-cut", "--out", str(tmp_path / "out")]) == 2
+    assert "no sequence shows a target" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -56,6 +57,17 @@ def test_the_box_lies_where_opencv_projects_its_corners() -> None:
     near = cv2.dilate(drawn(canvas, TRUTH_BGR).astype(np.uint8), np.ones((3, 3), np.uint8))
     for u, v in corners.reshape(-1, 2):
         assert near[round(v), round(u)]
+
+
+def test_of_a_rotation_that_is_not_known_nothing_is_drawn_but_the_place() -> None:
+    canvas = np.zeros((360, 640, 3), np.uint8)
+    pose = replace(truth(t_cam_target_m=(8.0, 2.0, 60.0)), rotation_known=False)
+    draw_pose(canvas, K, pose, EXTENTS, ESTIMATE_BGR, 2)
+    rows, columns = np.nonzero(canvas.any(axis=-1))
+    u, v = (K @ pose.t_cam_target_m)[:2] / 60.0
+    assert (rows.mean(), columns.mean()) == pytest.approx((v, u), abs=1.0)
+    assert rows.max() - rows.min() < 30
+    assert columns.max() - columns.min() < 30
 
 
 def test_a_target_that_reaches_behind_the_camera_is_not_drawn() -> None:

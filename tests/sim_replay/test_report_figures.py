@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from msgs.geometry import so3_exp
+from sim_replay.evaluation.instances import instances
 from sim_replay.report.continuity import continuity
-from sim_replay.report.peer import CHI2_95, longest_silence_s, nees, peer_figures, range_error_m, rmse, tracks
+from sim_replay.report.peer import (
+    CHI2_95,
+    R_FORWARD_CAM,
+    longest_silence_s,
+    nees,
+    peer_figures,
+    range_error_m,
+    rmse,
+    tracks,
+)
 from sim_replay.score import Match, TargetPose, Truth
 
 FPS = 10.0
@@ -54,6 +65,21 @@ def test_out_of_view_is_no_loss_and_coming_back_is_a_reacquisition() -> None:
 def test_two_targets_that_swap_names_are_two_switches() -> None:
     swapped = matches("000111", object_id=1) + matches("111000", object_id=2)
     assert continuity(swapped, FPS)["identity_switches"] == 2
+
+
+def test_two_of_one_airframe_are_told_apart_when_one_leaves_and_comes_back() -> None:
+    """A flies on the left, B on the right, C comes late, all by 2 m a frame; the files hold those in view, A first."""
+    truths, expected = [], []
+    for frame, present in enumerate(["AB", "AB", "B", "B", "AB", "A", "", "B", "", "AB", "ABC", "BAC"]):
+        for name in present:
+            place_m = np.array([{"A": -30.0, "B": 30.0, "C": 90.0}[name], 2.0 * frame, 200.0])
+            truths.append(Truth(frame, np.eye(3), place_m, 1, 12.0))
+            # In one frame order is all there is: who stands where A stood is A.
+            expected.append(present.index(name) if frame == 11 else "ABC".index(name))
+    numbers = instances(truths, [truth.t_cam_target_m for truth in truths])
+    assert numbers == expected
+    other = [replace(truth, object_id=2) for truth in truths]
+    assert instances([*truths, *other], [t.t_cam_target_m for t in [*truths, *other]]) == [*expected, *expected]
 
 
 def test_one_that_is_never_found_is_counted_and_has_no_time() -> None:
@@ -103,6 +129,33 @@ def test_rmse_and_bias_of_a_pose_that_is_short_and_turned_about_the_optical_axis
     assert max(value for value in angles if value is not None) == pytest.approx(np.rad2deg(0.1), rel=1e-3)
     bias = range_error_m(turned)["mean"]
     assert bias == pytest.approx(np.hypot(3, 180) - 200, abs=1e-3)
+
+
+def test_rotations_that_are_not_known_are_in_no_figure_of_rotations() -> None:
+    """Turned by 0.2 rad with a standard deviation of 0.1 on each axis: e' P^-1 e is 4, with 1 m of 1 m sideways 5."""
+    P = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
+    told_m = np.array([1.0, 0.0, 200.0])
+    seen = [
+        TargetPose(0, so3_exp([0.0, 0.0, 0.2]), told_m, covariance=P, track="t0"),
+        TargetPose(1, so3_exp([2.0, 0.0, 0.0]), told_m, covariance=1e6 * P, track="t0", rotation_known=False),
+    ]
+    level = R_FORWARD_CAM.T
+    followed = [
+        Match(Truth(pose.frame, level, np.array([0.0, 0.0, 200.0]), 1, 12.0), replace(pose, R_cam_target=R @ level))
+        for pose in seen
+        for R in [pose.R_cam_target]
+    ]
+    told = peer_figures(2, FPS, followed, [], [])
+    assert told["rmse"]["x_m"] == 1.0
+    assert told["rmse"]["roll_deg"] == pytest.approx(np.rad2deg(0.2), abs=1e-4)
+    assert told["rmse"]["pitch_deg"] == pytest.approx(0.0, abs=1e-4)
+    assert told["nees"]["rotation"]["mean"] == pytest.approx(4.0)
+    assert told["nees"]["pose"]["mean"] == pytest.approx(5.0)
+    assert told["nees"]["position"]["mean"] == pytest.approx(0.5, abs=1e-4)
+    assert told["tracks"]["t0"]["rotation_error_deg"] == pytest.approx(np.rad2deg(0.2), abs=1e-4)
+    unturned = peer_figures(2, FPS, followed[1:], [], [])
+    assert (unturned["rmse"]["roll_deg"], unturned["nees"]["rotation"], unturned["nees"]["pose"]) == (None, None, None)
+    assert json.loads(json.dumps(unturned, allow_nan=False)) == unturned
 
 
 def test_silence_counts_only_while_a_target_is_to_be_seen() -> None:

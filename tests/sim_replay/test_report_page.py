@@ -14,7 +14,9 @@ from playwright.sync_api import sync_playwright
 from edge.health import Activity, Condition, HealthState
 from sim_replay.cli import main
 from sim_replay.ground_truth import PlayedSequence, read_sequence
-from sim_replay.play import Recording
+from sim_replay.lockstep import command
+from sim_replay.lockstep.player import Outputs
+from sim_replay.play import PlayError, Recording
 from sim_replay.report import moments
 from sim_replay.report.flight_files import RecordedFlight, read_flight, write_flight
 from sim_replay.report.page import health_of
@@ -40,7 +42,7 @@ def flown(dark_spot_scene: Path) -> PlayedSequence:
     return read_sequence(dark_spot_scene)
 
 
-def recording(sequence: PlayedSequence, frames: set[int]) -> Recording:
+def recording(sequence: PlayedSequence, frames: set[int], rotation_known: bool = True) -> Recording:
     """Poses of these frames at both peers, 10 m short, with a covariance that allows for it."""
     made = Recording(START_NS, UTC_NS, 14550, "tcp/127.0.0.1:7448", 0, {"dropped": 1})
     for truth in sequence.scene.truths:
@@ -49,6 +51,7 @@ def recording(sequence: PlayedSequence, frames: set[int]) -> Recording:
         capture_ns = START_NS + round(truth.frame * 1e9 / FPS)
         t_m = (truth.t_cam_target_m * 0.95).tolist()
         pose: dict[str, Any] = {"t_cam_target_m": t_m, "q_cam_target_wxyz": [1.0, 0.0, 0.0, 0.0]}
+        pose["rotation_known"] = rotation_known
         covariance = np.diag([4.0, 4.0, 100.0, 0.01, 0.01, 0.01]).tolist()
         stamp = {"capture_utc_ns": capture_ns + UTC_NS, "age_ms": 14.0, "covariance": covariance}
         made.take("subscriber", {"event": "pose", "target": "t0", **stamp, **pose})
@@ -131,6 +134,36 @@ def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:
     assert "<b>model</b>.onnx" in text
     assert "waiting for the camera" in text
     assert "75.0 %" in text
+
+
+def test_a_part_that_is_played_where_a_flight_was_does_not_pass_for_it(
+    flown: PlayedSequence, flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = ["play", "--sequence", str(flown.scene.folder), "--start", "0.1", "--out", str(flight)]
+
+    def nothing_came(*_: object) -> Outputs:
+        return Outputs([], [], Recording(0, 0, 0, "", 0))
+
+    def dies(*_: object) -> Outputs:
+        raise PlayError("the daemon ended in the middle of the sequence")
+
+    monkeypatch.setattr(command, "play_lockstep", nothing_came)
+    assert main(part) == 0
+    assert sorted(path.name for path in flight.iterdir()) == ["mavlink.jsonl", "poses.jsonl"]
+    assert main(["score", str(flight)]) == 2
+    assert "flight.json: cannot be read" in capsys.readouterr().err
+    monkeypatch.setattr(command, "play_lockstep", dies)
+    assert main(part) != 0
+    assert list(flight.iterdir()) == []
+
+
+def test_a_report_says_where_no_rotation_was_told(flown: PlayedSequence, tmp_path: Path) -> None:
+    unturned = recording(flown, {0, 1, 2, 3}, rotation_known=False)
+    write_report(flown, RecordedFlight(flown.scene.folder, MODEL, unturned), tmp_path, lambda: None)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "rotation <b>not known</b>, range <b>" in page
+    assert "not known in 4" in page
+    assert "<tr><th>rotation (3)</th>\n<td>–</td>" in page
 
 
 def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_film(

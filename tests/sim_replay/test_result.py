@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edge.types import Mount
+from msgs.geometry import so3_exp
 from sim_replay.demo import LiveFigures
 from sim_replay.ground_truth import PlayedSequence, read_scene_truth
 from sim_replay.play import Recording
 from sim_replay.result import frame_views, judge, score_json
+from sim_replay.score import Truth
 
 START_NS = 50_000_000_000
 UTC_MINUS_MONOTONIC_NS = 1_700_000_000_000_000_123
@@ -23,24 +26,26 @@ def exposure_ns(frame: int) -> int:
     return START_NS + round(frame * 1e9 / FPS)
 
 
-def pose(frame: int, x_m: float, late_ns: int = 0) -> dict[str, object]:
+def pose(frame: int, x_m: float, late_ns: int = 0, rotation_known: bool = True) -> dict[str, object]:
     return {
         "event": "pose",
         "target": "t0",
         "age_ms": 14.0,
         "capture_utc_ns": exposure_ns(frame) + late_ns + UTC_MINUS_MONOTONIC_NS,
         "t_cam_target_m": [x_m, 0.0, 200.0],
+        "rotation_known": rotation_known,
         "q_cam_target_wxyz": [1.0, 0.0, 0.0, 0.0],
     }
 
 
-def target_relative(frame: int, received_after_ms: float) -> dict[str, object]:
+def target_relative(frame: int, received_after_ms: float, rotation_known: bool = True) -> dict[str, object]:
     return {
         "event": "target_relative",
         "target": 0,
         "capture_utc_us": (exposure_ns(frame) + UTC_MINUS_MONOTONIC_NS) // 1000,
         "received_ns": exposure_ns(frame) + round(received_after_ms * 1e6),
         "t_cam_target_m": [-40.0 if frame == 0 else 5.0, 0.0, 200.0],
+        "rotation_known": rotation_known,
         "q_cam_target_wxyz": [1.0, 0.0, 0.0, 0.0],
     }
 
@@ -76,6 +81,42 @@ def test_records_become_the_score(sequence: PlayedSequence, recording: Recording
     assert score["latency_ms"]["p50"] == pytest.approx(15.0, abs=0.002)
     assert score["mavlink_received"] == {"TARGET_RELATIVE": 2}
     assert score["zenoh_received"] == {"uav1/target/t0/pose": 4}
+
+
+def test_a_rotation_that_neither_peer_was_told_is_not_judged(sequence: PlayedSequence) -> None:
+    """Both poses lie where the target is; what stands for the rotation of one is its true one, by chance."""
+    made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
+    for frame, x_m, known in ((0, -40.0, False), (2, 5.0, True)):
+        made.take("subscriber", pose(frame, x_m, rotation_known=known))
+        made.take("autopilot", target_relative(frame, 12.0, rotation_known=known))
+    for peer in score_json(sequence, judge(sequence, made), {})["peers"].values():
+        overall = peer["overall"]
+        assert (overall["rotations_not_known"], overall["recall"]) == (1, 0.5)
+        assert overall["rot_10deg"] == overall["pose_10deg_5pct"] == overall["add_0_1d"] == 0.25
+        assert overall["depth_5pct"] == 0.5
+    figures = LiveFigures(sequence)
+    figures.take(made, pose(0, -40.0, rotation_known=False))
+    assert figures.cells()["rotation error"] == "–"
+    assert figures.cells()["range error"] == "+0.0 m"
+
+
+def test_one_of_two_alike_that_leaves_takes_no_name_with_it(sequence: PlayedSequence) -> None:
+    """Two of one airframe, 30 m left and right at 200 m. The left one leaves, and the camera turns to the other: it
+    then stands in the picture where the left one stood, but not in the world."""
+    turned = so3_exp([0.0, 2.0 * np.arctan(30.0 / 200.0), 0.0])
+    left_m, right_m = np.array([-30.0, 0.0, 200.0]), np.array([30.0, 0.0, 200.0])
+    shown = [[left_m, right_m], [left_m, right_m], [left_m], [left_m], [left_m]]  # in `cam`
+    assert turned @ left_m == pytest.approx(right_m)
+    truths = [Truth(k, np.eye(3), t_m, 1, 12.0) for k, places_m in enumerate(shown) for t_m in places_m]
+    cameras = [(np.eye(3), np.zeros(3)) if k < 2 else (turned, np.zeros(3)) for k in range(5)]
+    alike = replace(sequence, scene=replace(sequence.scene, truths=truths, cameras_world=cameras))
+    made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
+    for truth in truths:
+        name = "t0" if truth.frame < 2 and truth.t_cam_target_m[0] < 0.0 else "t1"
+        made.take("subscriber", {**pose(truth.frame, truth.t_cam_target_m[0]), "target": name})
+    held = score_json(alike, judge(alike, made), {})["peers"]["subscriber"]["continuity"]
+    assert held["identity_switches"] == 0
+    assert [(target["frames"], target["tracks"]) for target in held["targets"]] == [(2, ["t0"]), (5, ["t1"])]
 
 
 def test_the_overlay_gets_each_frames_own_pose_and_latency(sequence: PlayedSequence, recording: Recording) -> None:

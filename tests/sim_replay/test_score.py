@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,34 @@ def test_a_missed_target_lowers_rates_and_leaves_means_alone() -> None:
     assert overall["rotation_error_deg"]["mean"] == pytest.approx(4.0)
     assert overall["depth_error_rel"]["mean"] == pytest.approx(0.05)
     assert overall["depth_error_m"]["mean"] == overall["translation_error_m"]["mean"] == pytest.approx(15.0)
+
+
+def test_a_pose_that_tells_no_rotation_is_found_and_in_no_figure_of_rotations() -> None:
+    """Of four poses one is 6 degrees off and two tell no rotation: what they hold instead is right, or 90 degrees off.
+
+    0.3 % too far at 300 m are 0.9 m of depth, which counts whether the rotation is known or not.
+    """
+    truths = [truth(k) for k in range(5)]
+    covariance = np.diag([1.0, 1.0, 400.0, 1e-4, 1e-4, 1e-4])
+    poses = [
+        replace(estimate(truths[0], 6.0), covariance=covariance),
+        replace(estimate(truths[1]), covariance=covariance),
+        replace(estimate(truths[2], stretched=1.003), covariance=1e6 * np.eye(6), rotation_known=False),
+        replace(estimate(truths[3], 90.0), covariance=1e6 * np.eye(6), rotation_known=False),
+    ]
+    overall = figures(truths, poses)["overall"]
+    assert overall["rotations_not_known"] == 2
+    assert overall["recall"] == 0.8
+    for rate in ("rot_10deg", "pose_10deg_5pct", "add_0_1d", "add_0_5d"):
+        assert overall[rate] == 0.4
+    assert overall["rotation_error_deg"] == {"mean": pytest.approx(3.0), "median": pytest.approx(3.0)}
+    assert overall["depth_error_m"]["mean"] == pytest.approx(0.9 / 4)
+    # 6 degrees about one axis, of which 0.57 are a standard deviation; the other five axes are right.
+    assert overall["calibration"]["rotation"]["inside_2sigma"] == pytest.approx(5 / 6, abs=1e-4)
+    assert overall["calibration"]["depth"]["inside_1sigma"] == 1.0
+    unturned = figures(truths, poses[2:])["overall"]
+    assert unturned["rotation_error_deg"] == {"mean": None, "median": None}
+    assert unturned["calibration"]["rotation"] == {"inside_1sigma": None, "inside_2sigma": None}
 
 
 def test_add_rates_of_known_turns_and_misses() -> None:
@@ -112,6 +141,17 @@ def test_two_targets_each_get_their_own_pose_and_a_duplicate_is_false() -> None:
     matches, false_poses = match_poses([left, right], poses)
     assert [np.sign(m.estimate.t_cam_target_m[0]) for m in matches if m.estimate] == [-1.0, 1.0]
     assert len(false_poses) == 1
+
+
+def test_a_hidden_target_takes_no_pose_from_a_visible_one() -> None:
+    """The pose is 1 m off the hidden target's ray and 4 m off the other's; a second one is left for the hidden."""
+    hidden, seen = replace(truth(0, x_m=0.0), visible=False), truth(0, x_m=5.0)
+    between, aside = (TargetPose(0, np.eye(3), np.array([x_m, 0.0, 300.0])) for x_m in (1.0, -3.0))
+    matches, false_poses = match_poses([hidden, seen], [between])
+    assert [match.estimate for match in matches] == [None, between]
+    assert false_poses == []
+    matches, _ = match_poses([hidden, seen], [between, aside])
+    assert [match.estimate for match in matches] == [aside, between]
 
 
 def test_a_pose_of_another_frame_does_not_help() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 
 from sim_replay.cli import main
 from sim_replay.pipeline.flight import Flight
-from sim_replay.pipeline.soak import Trend, trends
+from sim_replay.pipeline.soak import silences, trends
 from sim_replay.pipeline.usage import Usage
+from tests.edge.toy_model import write_toy_model
+from tests.sim_replay.toy_flight import write_toy_flight
 
 MINUTES, FPS = 4.0, 30.0
 START_NS, UTC_NS = 7_000_000_000, 1_700_000_000_000_000_000
@@ -37,6 +40,7 @@ def steady() -> Flight:
             age_ns = round(1e6 * (12.0 + chance.gamma(2.0, 3.0)))
             stamp_us = (capture_ns + UTC_NS) // 1000
             flight.targets.append({"capture_utc_us": stamp_us, "received_ns": capture_ns + age_ns})
+            flight.poses_ns.append(capture_ns + age_ns)
     return flight
 
 
@@ -94,10 +98,35 @@ def test_age_and_drops_of_a_busy_machine_are_not_judged_and_leaks_still_are() ->
     assert told["memory"] is True
 
 
-def test_a_flight_of_moments_is_not_judged() -> None:
+def test_poses_that_never_came_or_stopped_are_told_of_each_peer() -> None:
     flight = steady()
-    flight.usage = flight.usage[:5]
-    assert all(isinstance(trend, Trend) and trend.grows is None for trend in trends(flight, FPS))
+    assert silences(flight) == []
+    until_ns = START_NS + round(0.7 * MINUTES * 60e9)
+    flight.targets = [record for record in flight.targets if record["received_ns"] < until_ns]
+    (told,) = silences(flight)
+    assert re.fullmatch(r"the autopilot received \d+ poses in the first third and none in the last", told)
+    flight.poses_ns.clear()
+    assert silences(flight) == [told, "the subscriber received no pose"]
+
+
+def test_a_target_that_is_found_late_is_no_silence() -> None:
+    flight = steady()
+    flight.poses_ns = flight.poses_ns[-20:]
+    assert silences(flight) == []
+
+
+def test_a_flight_of_moments_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["soak", "--minutes", "0.15", "--out", str(tmp_path)]) == 2
+    assert "--minutes 0.15: must be at least 0.2" in capsys.readouterr().err
+
+
+def test_a_soak_without_a_pose_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sky = write_toy_flight(tmp_path / "sky", target=False)
+    model = write_toy_model(tmp_path / "toy.onnx")
+    flown = ["soak", "--minutes", "0.2", "--sequence", str(sky), "--model", str(model), "--out", str(tmp_path)]
+    assert main(flown) == 1
+    assert "the autopilot received no pose" in capsys.readouterr().out
+    assert "the subscriber received no pose" in json.loads((tmp_path / "soak.json").read_text())["silences"]
 
 
 @pytest.mark.timeout(420)
@@ -106,5 +135,6 @@ def test_the_daemon_holds_on_to_nothing_in_two_minutes(tmp_path: Path, capsys: p
     told = {trend["name"]: trend for trend in json.loads(capsys.readouterr().out)["trends"]}
     for name in ("memory", "open descriptors", "threads", "log"):
         assert told[name]["grows"] is False, told[name]
-    assert code == int(any(trend["grows"] is True for trend in told.values()))
-    assert json.loads((tmp_path / "soak.json").read_text())["trends"] == list(told.values())
+    written = json.loads((tmp_path / "soak.json").read_text())
+    assert written["trends"] == list(told.values())
+    assert code == int(bool(written["silences"]) or any(trend["grows"] is True for trend in told.values()))

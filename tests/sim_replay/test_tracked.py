@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edge.errors import InputError
+from edge.links import outgoing
 from sim_replay import metrics
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import JudgedFrame, judge_frames
@@ -69,6 +70,19 @@ def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, d
     results = flown(tmp_path / "data", dark_spot_model)
     assert told(results) == [False, False, True, True, True] * 2
     assert all(frame.measured[0].estimate is not None for frame in results)
+
+
+def test_a_rotation_that_no_link_would_tell_is_not_known(
+    tmp_path: Path, dark_spot_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_scene(tmp_path / "data" / "test" / "000000", [0.5] * 4)
+    monkeypatch.setattr(outgoing, "UNSURE_ROTATION_RAD", 0.0)
+    last = flown(tmp_path / "data", dark_spot_model)[-1].matches[0].estimate
+    assert last is not None
+    assert not last.rotation_known
+    monkeypatch.undo()
+    results = flown(tmp_path / "data", dark_spot_model)
+    assert [m.estimate is not None and m.estimate.rotation_known for m in results[-1].matches] == [True]
 
 
 def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(tmp_path: Path, dark_spot_model: Path) -> None:

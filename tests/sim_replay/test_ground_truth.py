@@ -1,0 +1,66 @@
+"""What is flown has a rate, evenly spaced pictures and telemetry of all of them, or a sentence says why not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sim_replay.cli import main
+from sim_replay.ground_truth import read_scene_truth, read_sequence
+from tests.sim_replay.toy_flight import write_toy_flight
+
+FRAMES = 30
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    return write_toy_flight(tmp_path / "flight", FRAMES)
+
+
+def change(folder: Path, before: str, after: str) -> None:
+    path = folder / "sequence.toml"
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+
+
+def refusal(folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What `play` says of a sequence that it does not take."""
+    assert main(["play", "--sequence", str(folder), "--out", str(folder.parent / "out")]) == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("t0_ns", [-1_200_000_000, 1_300_000_000, 900_000_000_000])
+def test_telemetry_that_does_not_span_the_pictures_is_refused(
+    t0_ns: int, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(flight, "t0_ns = 0", f"t0_ns = {t0_ns}")
+    told = refusal(flight, capsys)
+    assert f"{flight / 'telemetry.csv'}: tells of -1.000 s to 3.980 s" in told
+    assert f"from {t0_ns * 1e-9:.3f} s to {t0_ns * 1e-9 + (FRAMES - 1) / 10:.3f} s" in told
+
+
+@pytest.mark.parametrize("from_s", [0.0, 0.08])
+def test_telemetry_may_begin_with_the_pictures_or_a_row_later(from_s: float, tmp_path: Path) -> None:
+    assert read_sequence(write_toy_flight(tmp_path / "flight", FRAMES, from_s=from_s)).frame0_ns == 0
+
+
+def test_a_gap_in_the_numbers_of_a_flown_sequence_is_refused(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (11, 12):
+        (flight / "rgb" / f"{number:06d}.png").unlink()
+    assert "picture 13 follows picture 10, but 1 follows 0" in refusal(flight, capsys)
+    assert len(read_scene_truth(flight).images) == FRAMES - 2  # as stills they are taken
+
+
+def test_every_other_picture_is_a_sequence(flight: Path) -> None:
+    for number in range(1, FRAMES, 2):
+        (flight / "rgb" / f"{number:06d}.png").unlink()
+    change(flight, "fps = 10.0", "fps = 5.0")
+    assert len(read_sequence(flight).scene.images) == FRAMES // 2
+
+
+@pytest.mark.parametrize("fps", ["0", "0.0", "-30.0", "nan", "inf"])
+def test_a_rate_that_is_none_is_refused(fps: str, flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(flight, "fps = 10.0", f"fps = {fps}")
+    assert f"{flight / 'sequence.toml'}: fps is {float(fps):g}; it must be a number above 0" in refusal(flight, capsys)
