@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from edge.config import SHIPPED_MODEL
+from msgs.contract import samples_behind
 from sim_replay.cli import main as replay
 from trainer.config import ConfigError
 from trainer.results import (
@@ -69,6 +70,7 @@ def test_the_shipped_history_ends_with_the_shipped_weights() -> None:
 
     training = load_model(SHIPPED_MODEL, 1).contract.training
     assert read_history(HISTORY)[-1]["samples"] == training["samples"]
+    assert samples_behind(training) in (None, read_history(HISTORY)[-1]["total_samples"])  # None: it does not tell
 
 
 def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
@@ -111,9 +113,12 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
     ]
     assert first[2][1] == "other_crossing-all.csv"
 
+    track = {**scores[1], "method": other["method"]}
+    refuse_other_pictures([track], scores)
     fewer = {**other, "overall": {**other["overall"], "frames": 3}}
-    with pytest.raises(ConfigError, match="other pictures"):
-        refuse_other_pictures([fewer], scores)
+    for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
+        with pytest.raises(ConfigError, match="other pictures"):
+            refuse_other_pictures([unlike], scores)
     for text in ("no json", "{}", "[]"):
         path.write_text(text)
         with pytest.raises(ConfigError, match=str(path)):
@@ -123,8 +128,7 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
 def test_a_model_beside_is_told_by_its_name_and_how_long_it_learnt() -> None:
     from sim_replay.offline import load_model, method_of
 
-    method = method_of(load_model(SHIPPED_MODEL, 1))
-    samples = read_history(HISTORY)[-1]["samples"]
+    method = method_of(load_model(SHIPPED_MODEL, 1)) | {"training_samples": 24_000}
     score = {
         "dataset": "d",
         "mode": "frames",
@@ -134,7 +138,21 @@ def test_a_model_beside_is_told_by_its_name_and_how_long_it_learnt() -> None:
         "recipe": "",
     }
     text = page([{**score, "method": method}], "the command", "", [{**score, "method": method}])
-    assert f"| d | mf-uavpose6d-edge, int8, after {samples:,} windows | 1 |" in text
+    assert "| d | mf-uavpose6d-edge, int8, after 24,000 windows | 1 |" in text
+
+
+def test_two_models_of_one_name_and_precision_are_told_apart() -> None:
+    from sim_replay.offline import load_model, method_of
+
+    method = method_of(load_model(SHIPPED_MODEL, 1))
+    score = {"dataset": "d", "mode": "frames", "overall": {}, "by_range": {}, "by_airframe": {}, "recipe": ""}
+    score["overall"] = {"frames": 1}
+    other = {**method, "sha256": "0" * 64}
+    text = page([{**score, "method": one} for one in (method, other)], "the command", "")
+    for one in (method, other):
+        assert f"sha256 `{one['sha256'][:16]}`" in text
+        assert f"| d | int8 `{one['sha256'][:8]}` | 1 |" in text
+        assert f"## d, int8 `{one['sha256'][:8]}`, frames" in text
 
 
 def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ depth = "rotation_aware"
 uncertainty = true
 hypotheses = 4
 dense = true
-airframes = 21
+airframes = 5
 [loss]
 heatmap = 1.0
 hypothesis = 1.0
