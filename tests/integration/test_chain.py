@@ -187,7 +187,14 @@ def test_pictures_are_written(demo: DemoRun) -> None:
 def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(number: signal.Signals, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [BIN / "uavpose-replay", "demo", "--out", out]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        # Whoever runs the tests under nohup hands down that SIGHUP is ignored.
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
+    )
     config, session = meet(out, process)
     with session:
         process.send_signal(number)
