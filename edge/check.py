@@ -37,8 +37,6 @@ def check(file: ConfigFile) -> list[str]:
 
 
 def _check_certificates(settings: ZenohSettings) -> None:
-    try:
-        if settings.tls is not None:
-            settings.tls.files().check()
-    except ValueError as error:
-        raise InputError(str(error)) from error
+    doubt = None if settings.tls is None else settings.tls.files().doubt()
+    if doubt is not None:
+        raise InputError(doubt)

@@ -36,7 +36,7 @@ class ZenohTlsSettings(Section):
     @model_validator(mode="after")
     def _do(self) -> ZenohTlsSettings:
         # Not its dates: before GPS or the ground tells the time, a computer without a clock must fly all the same.
-        self.files().check_files()
+        self.files().check()
         return self
 
 

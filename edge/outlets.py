@@ -122,10 +122,9 @@ def start_outlets(
         )
         cleanup.callback(recorder.stop)
         if config.zenoh.enabled and config.zenoh.tls is not None:
-            try:
-                config.zenoh.tls.files().check()
-            except ValueError as error:
-                log.warning("no link over tls and quic until the clock or the certificate is right: %s", error)
+            doubt = config.zenoh.tls.files().doubt()
+            if doubt is not None:
+                log.warning("there may be no link over tls and quic: %s", doubt)
         with file.blame("zenoh", "listen"):
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)

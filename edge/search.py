@@ -25,6 +25,7 @@ PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
 # At few frames a second no place is younger than the frame before; where the machine sets the pace, the search, at a
 # lower priority, lasts longer than from one frame to the next. A place that is too old costs a window in vain.
 PLACE_AGE_MAX_FRAMES = 2.5
+INTERVAL_MAX_NS = 2_000_000_000  # a longer one is a gap: there are no tracks at such a rate
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ class Search:
     def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Estimate]:
         """What was found since the last call, best first, and may still be there at `capture_ns` (monotonic), off
         `known_boxes`; asked of every frame, in their order."""
-        interval_ns, self._asked_for_ns = capture_ns - self._asked_for_ns, capture_ns
+        interval_ns = min(capture_ns - self._asked_for_ns, INTERVAL_MAX_NS)
+        self._asked_for_ns = capture_ns
         with self._changed:
             found, self._places = self._places, []
             if capture_ns - self._seen_ns > max(PLACE_AGE_MAX_NS, PLACE_AGE_MAX_FRAMES * interval_ns):

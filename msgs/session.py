@@ -44,19 +44,7 @@ class TlsFiles:
     private_key: Path
 
     def check(self) -> None:
-        """`check_files`, and the certificate is valid today. Raises ValueError, a sentence that names the file."""
-        own = self.check_files()
-        # The authority's own dates are left alone: zenoh takes it for what it is told to trust, whatever they say.
-        begins_s, ends_s = (ssl.cert_time_to_seconds(own[key]) for key in ("notBefore", "notAfter"))
-        now_s = time.time()
-        if now_s < begins_s:
-            raise ValueError(f"{self.certificate} is not valid before {_day(begins_s)}; today is {_day(now_s)}")
-        if now_s > ends_s:
-            raise ValueError(f"{self.certificate} expired on {_day(ends_s)}; today is {_day(now_s)}")
-
-    def check_files(self) -> Mapping[str, Any]:
-        """What holds on any day: read, and of one key and authority; the certificate as ssl tells it. Raises
-        ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
+        """Raises ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
         for path in (self.root_ca, self.certificate, self.private_key):
             try:
                 path.read_bytes()
@@ -73,34 +61,61 @@ class TlsFiles:
             context.load_cert_chain(self.certificate, self.private_key)
         except ssl.SSLError as error:
             raise ValueError(f"{self.private_key} is not the PEM key of {self.certificate}") from error
+
+    def doubt(self) -> str | None:
+        """Why others may well refuse files that pass `check`: another authority, or another day; a sentence.
+
+        Either may be right all the same, where the two ends have authorities of their own, or our clock is wrong.
+        """
         try:
-            return self._vouched_for()
+            own = self._vouched_for()
         except ssl.SSLError as error:
             why = error.verify_message if isinstance(error, ssl.SSLCertVerificationError) else error.reason
-            raise ValueError(f"{self.certificate} is refused by whoever trusts {self.root_ca}: {why}") from error
+            return f"{self.certificate} is refused by whoever trusts {self.root_ca}: {why}"
+        # The authority's own dates are left alone: zenoh takes it for what it is told to trust, whatever they say.
+        begins_s, ends_s = (ssl.cert_time_to_seconds(own[key]) for key in ("notBefore", "notAfter"))
+        now_s = time.time()
+        if now_s < begins_s:
+            return f"{self.certificate} is not valid before {_day(begins_s)}; today is {_day(now_s)}"
+        if now_s > ends_s:
+            return f"{self.certificate} expired on {_day(ends_s)}; today is {_day(now_s)}"
+        return None
 
     def _vouched_for(self) -> Mapping[str, Any]:
-        """The certificate, as whoever trusts root_ca sees it. Raises ssl.SSLError if that end would not take it.
+        """The certificate, as whoever trusts root_ca sees it. Raises ssl.SSLError if that end would not take it, of
+        neither a server nor a client.
 
         ssl verifies in a handshake alone, so that one is held in memory.
         """
+        try:
+            return self._handshake(own_is_server=True)
+        except ssl.SSLError as refused:
+            with suppress(ssl.SSLError):
+                return self._handshake(own_is_server=False)
+            raise refused from None
+
+    def _handshake(self, *, own_is_server: bool) -> Mapping[str, Any]:
+        """The own certificate as the other end sees it."""
         server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        server.load_cert_chain(self.certificate, self.private_key)
-        client.load_verify_locations(self.root_ca)
         client.check_hostname = False
+        client.verify_mode = ssl.CERT_NONE
+        verifier = client if own_is_server else server
+        verifier.verify_mode = ssl.CERT_REQUIRED
+        verifier.load_verify_locations(self.root_ca)
         # As zenoh does, take an intermediate authority's certificate for root_ca.
-        client.verify_flags |= ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+        verifier.verify_flags |= ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
+        for context in (server, client):
+            context.load_cert_chain(self.certificate, self.private_key)
         to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
         connecting = client.wrap_bio(to_client, to_server)
         listening = server.wrap_bio(to_server, to_client, server_side=True)
-        while True:
-            try:
-                connecting.do_handshake()
-            except ssl.SSLWantReadError:
+        waiting = [connecting, listening]
+        while waiting:
+            for end in tuple(waiting):
                 with suppress(ssl.SSLWantReadError):
-                    listening.do_handshake()
-            else:
-                return connecting.getpeercert() or {}
+                    end.do_handshake()
+                    waiting.remove(end)
+        return (connecting if own_is_server else listening).getpeercert() or {}
 
 
 def _day(utc_s: float) -> str:

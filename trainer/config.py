@@ -109,12 +109,6 @@ class DatasetSource(Section):
     validation_split: str | None = Field(None, description="folder to validate on; absent: rendered windows only")
     share: float = Field(gt=0, le=1, description="of every batch")
 
-    @model_validator(mode="after")
-    def _validates_elsewhere(self) -> DatasetSource:
-        if self.split == self.validation_split:
-            raise ValueError(f"validation_split {self.split!r} is what is trained on: give another, or leave it out")
-        return self
-
 
 class DataConfig(Section):
     seed: int = Field(ge=0)

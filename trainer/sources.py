@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from trainer.config import DataConfig
+from trainer.config import ConfigError, DataConfig
 from trainer.data import Sampler
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 
@@ -36,6 +36,8 @@ def refuse_unreadable(config: DataConfig) -> None:
     """Raises ConfigError where a dataset to train or to validate on cannot be used: before hours of training."""
     size_px = 32  # whatever the windows' size, the labels are the same
     for source in config.datasets:
+        if source.split == source.validation_split:
+            raise ConfigError(f"{source.path}: validation_split {source.split!r} is what is trained on: give another")
         for split in (source.split, source.validation_split):
             if split is not None:
                 DatasetSampler(source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view)

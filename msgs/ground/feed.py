@@ -48,6 +48,8 @@ def session(
             tls.check()
     except ValueError as error:
         raise InputError(str(error)) from error
+    if tls is not None and (doubt := tls.doubt()) is not None:
+        say(f"there may be no link: {doubt}")
     waiting = False
     while not stop.is_set():
         try:

@@ -74,13 +74,12 @@ def load_router(path: Path) -> RouterSettings:
 @contextmanager
 def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Session]:
     """The router, running until the context ends. Raises InputError for files and endpoints that do not do."""
-    tls = None
-    if settings.tls is not None:
-        tls = TlsFiles(*(folder / path.expanduser() for path in settings.tls.model_dump().values()))
-        try:
+    tls = _tls_files(settings, folder)
+    try:
+        if tls is not None:
             tls.check()
-        except ValueError as error:
-            raise InputError(f"[tls] {error}") from error
+    except ValueError as error:
+        raise InputError(f"[tls] {error}") from error
     rules = None
     if settings.access is not None:
         rules = access_control(Access(**settings.access.model_dump()), settings.domain)
@@ -93,10 +92,20 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
         yield session
 
 
+def _tls_files(settings: RouterSettings, folder: Path) -> TlsFiles | None:
+    if settings.tls is None:
+        return None
+    return TlsFiles(*(folder / path.expanduser() for path in settings.tls.model_dump().values()))
+
+
 def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
     """Run the router of a TOML file until `stop` is set, saying which vehicles come and go; 0."""
     settings = load_router(path)
-    with open_router(settings, path.resolve().parent) as session:
+    folder = path.resolve().parent
+    with open_router(settings, folder) as session:
+        tls = _tls_files(settings, folder)
+        if tls is not None and (doubt := tls.doubt()) is not None:
+            say(f"vehicles may not link over tls and quic: {doubt}")
 
         def seen(sample: zenoh.Sample) -> None:
             vehicle = alive_uav(str(sample.key_expr))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ Mask = NDArray[np.bool_]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later wins where a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
-SIXTEEN_BITS_LEAST = 2**14  # that a picture of 16 bits reaches; cameras of 10 to 14 bits that were not scaled do not
+SIXTEEN_BITS_LEAST = 2**14  # what cameras of 10 to 14 bits give does not reach it, unless it was scaled
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,18 +177,24 @@ def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
 
 
 def read_picture_bgr(path: Path) -> Image:
-    """The picture [H, W, 3]; of 16 bits the upper eight. Raises BopError, for 16 bits that are not in use too."""
+    """The picture [H, W, 3]; of 16 bits the upper eight. Raises BopError."""
     pixels = _pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype == np.uint16:
         if pixels.max() < SIXTEEN_BITS_LEAST:
-            raise BopError(
-                f"{path}: of its 16 bits no pixel has more than {int(pixels.max()).bit_length()}: "
-                "it would be read nearly black; scale it to all 16, or to 8"
-            )
+            _tell_once_of_dark_pictures(path.parent)
         pixels >>= 8
     elif pixels.dtype != np.uint8:
         raise BopError(f"{path} has pixels of {pixels.dtype}, not of 8 or 16 bits")
     return np.asarray(pixels, dtype=np.uint8)
+
+
+@cache
+def _tell_once_of_dark_pictures(folder: Path) -> None:
+    _log.warning(
+        "%s: holds pictures of 16 bits that do not use the upper two: unless it is dark there, "
+        "scale them, to 16 or to 8",
+        folder,
+    )
 
 
 def _pixels(path: Path, flags: int) -> NDArray[Any]:

@@ -23,7 +23,7 @@ from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_seq
 from sim_replay.telemetry import TelemetryError, read_telemetry
 
 FPS_MAX = 240.0  # of the daemon's camera
-ROWS_HZ_MIN = 10.0  # of telemetry: between its rows the own ship is taken to turn evenly
+ROWS_HZ_MIN = 9.5  # of telemetry said to be of 10: between its rows the own ship is taken to turn evenly
 
 
 class FilmedFlight(Section):
@@ -55,7 +55,7 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         raise InputError(str(error)) from error
     rows_hz = 1e9 / float(np.median(np.diff(telemetry.t_ns)))
     if rows_hz < ROWS_HZ_MIN:
-        raise InputError(f"{flight.telemetry}: has {rows_hz:.1f} rows a second; {ROWS_HZ_MIN:g} are needed")
+        raise InputError(f"{flight.telemetry}: has {rows_hz:.1f} rows a second; 10 are needed")
     if not flight.video.is_file():
         raise InputError(f"{path}: video: {flight.video} does not exist")
     capture = cv2.VideoCapture(str(flight.video), cv2.CAP_FFMPEG)

@@ -106,6 +106,17 @@ def test_at_few_frames_a_second_a_place_of_the_last_two_frames_is_looked_into(
         assert len(search.places(at_ns[frames_after], [], 4)) == places
 
 
+def test_after_a_gap_in_the_frames_a_place_from_before_it_is_not_looked_into(search: Search, toy_model: Path) -> None:
+    gated = Gated(load_model(toy_model, 1))
+    gated.sees = [Estimate(0.9, box_around(OTHER), np.eye(3), np.array([0.0, 0.0, 200.0]), np.eye(6), "acquire")]
+    seen = frame(0, OTHER)
+    assert search.places(seen.meta.capture_ns, [], 4) == []
+    assert search.begin(gated, seen, [])
+    gated.gate.set()
+    until(lambda: search.counters()["searches"] > 0)
+    assert search.places(seen.meta.capture_ns + 8_000_000_000, [], 4) == []
+
+
 class Gated(Estimator):
     """Its search of the whole frame ends when it is let, with what it is told."""
 

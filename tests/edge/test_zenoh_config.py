@@ -68,16 +68,9 @@ def test_a_fault_is_told_with_file_line_and_key(tmp_path: Path, text: str, sente
     assert sentence in str(error.value)
 
 
-def other_authority(folder: Path) -> None:
-    for suffix in ("pem", "key"):
-        (folder / f"ca.{suffix}").unlink()
-    init_authority(folder)
-
-
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [
-        (other_authority, "uav1.pem is refused by whoever trusts"),
         (other_key, "uav1.key is not the PEM key of"),
         (open_key, "uav1.key is open to other users; chmod 600 it"),
         (no_certificate, "uav1.pem cannot be read: No such file"),
