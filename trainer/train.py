@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from msgs.contract import samples_behind
 from trainer import equations as eq
@@ -22,7 +22,8 @@ from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors
 from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.fixed_norms import folded_norms
-from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell, joint_loss
+from trainer.guidance import guided_peaks
+from trainer.losses import Labels, joint_loss
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.rounding import rounded
@@ -49,36 +50,6 @@ def learning_rate(schedule: ScheduleConfig, samples_done: int, progress: float) 
 def size_at(schedule: ScheduleConfig, progress: float) -> int:
     """Side of the training windows at that progress, pixels."""
     return [stage.size_px for stage in schedule.sizes if stage.from_progress <= progress][-1]
-
-
-def guided_peaks(
-    heat_logits: Tensor, labels: Labels, teacher: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Which peak and which box each image is decoded with: cells [N, 1, 2] and sizes [N, 1, 2] px, 0 for predicted.
-
-    With probability `teacher` the true centre's cell, sometimes one off, and the true box, jittered; otherwise the
-    highest cell of the heatmap inside the true box and the predicted box.
-    """
-    count, rows, columns = heat_logits.shape
-    cell = center_cell(labels.center_px, rows, columns)
-    draw = torch.rand((count, 5), generator=generator).to(heat_logits.device)
-    step = torch.where(draw[:, :2] < 0.15, -1.0, torch.where(draw[:, :2] > 0.85, 1.0, 0.0))
-    limit = torch.tensor([columns - 1.0, rows - 1.0], device=heat_logits.device)
-    jittered = torch.minimum(torch.clamp(cell + step, min=0.0), limit)
-
-    reach = torch.clamp(labels.size_px / (4 * eq.STRIDE), min=1.0)
-    x, y = torch.arange(columns, device=cell.device), torch.arange(rows, device=cell.device)
-    near_x = (x - cell[:, :1]).abs() <= reach[:, :1]
-    near_y = (y - cell[:, 1:]).abs() <= reach[:, 1:]
-    near = near_y[:, :, None] & near_x[:, None, :]
-    best = heat_logits.detach().masked_fill(~near, -torch.inf).flatten(1).argmax(1)
-    highest = torch.stack([best % columns, best // columns], dim=-1).to(cell.dtype)
-
-    taught = (draw[:, 4] < teacher)[:, None]
-    noise = torch.exp(0.3 * (draw[:, 2:4] - 0.5))
-    size = torch.clamp(labels.size_px, min=SMALLEST_SIZE_PX) * noise
-    peaks = torch.where(taught, jittered, highest)
-    return peaks[:, None], torch.where(taught, size, torch.zeros_like(size))[:, None]
 
 
 class StepResult(NamedTuple):

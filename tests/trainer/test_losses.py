@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from trainer import equations as eq
 from trainer.evaluate import box_iou
+from trainer.guidance import guided_peaks
 from trainer.losses import (
     Labels,
     gaussian_radius,
@@ -25,7 +26,6 @@ from trainer.losses import (
     rotation_residual,
 )
 from trainer.model import Decoded
-from trainer.train import guided_peaks
 
 
 def labels_at(center_px: tuple[float, float], size_px: tuple[float, float], present: float = 1.0) -> Labels:
