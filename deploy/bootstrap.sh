@@ -53,7 +53,16 @@ fi
 
 stamp=".venv/.$use-$(cat pyproject.toml deploy/constraints.txt | sha256sum | cut -c1-16)"
 if [ ! -e "$stamp" ]; then
-    case $use in demo) extras=replay ;; dev) extras=dev ;; *) say "no such use: $use"; exit 2 ;; esac
+    case $use in
+    demo) extras=replay; needed_mb=1000 ;;
+    dev) extras=dev; needed_mb=4000 ;;
+    *) say "no such use: $use"; exit 2 ;;
+    esac
+    free_mb=$(df -Pm . | awk 'NR == 2 { print $4 }')
+    if [ "$free_mb" -lt "$needed_mb" ]; then
+        say "$free_mb MB are free on the disk of $PWD and the packages for $use need $needed_mb: make room, then run this again"
+        exit 2
+    fi
     say "installing Python packages for $use"
     .venv/bin/python -m pip install -qq --disable-pip-version-check --constraint deploy/constraints.txt --editable ".[$extras]"
     : >"$stamp"
