@@ -27,6 +27,7 @@ CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
+HEALTH_STALE_NS = 3_000_000_000  # it is told each second
 SET_BACK_NS = 500_000_000  # so far in the future nothing comes, but by a clock that was set back since
 _KEPT_MAX = 256
 TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # what a fleet looks at

@@ -17,12 +17,11 @@ from rich.text import Text
 
 from msgs.cdr import DiagnosticArray, Log
 from msgs.ground.feed import Incoming, linked, listening, session
-from msgs.ground.fleet import SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
+from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
 from msgs.session import TlsFiles
 
 REFRESH_S = 0.25
 STALE_S = 1.0
-HEALTH_STALE_S = 3.0  # it is told each second
 _LEVEL_STYLE = {0: "green", 1: "yellow", 2: "bold red"}
 _NS = 1_000_000_000
 
@@ -143,7 +142,7 @@ def _health(row: VehicleRow, now_ns: int) -> Text:
     if not row.health_heard_ns or age_s < -SET_BACK_NS / _NS:
         return Text("–", style="dim")
     text = _printable(row.health)
-    if row.alive and age_s <= HEALTH_STALE_S:
+    if row.alive and age_s <= HEALTH_STALE_NS / _NS:
         return Text(text, style=_LEVEL_STYLE.get(row.level, "dim"))
     return Text(f"{text} ({max(age_s, 0.0):.0f} s ago)", style="dim")
 

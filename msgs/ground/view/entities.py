@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 import rerun as rr
@@ -279,6 +280,14 @@ def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, n
         value = _number(values.get(f"latency_ms/{name.replace('_', '/')}", ""))
         if value is not None:
             rec.log(f"{uav}/plots/latency/{name}", rr.Scalars(value))
+
+
+def log_silence(rec: rr.RecordingStream, uav: str, last: DiagnosticArray) -> None:
+    """In health's place, that none came after `last`."""
+    status = last.status[0]
+    since = datetime.fromtimestamp(last.stamp_ns // 1_000_000_000, UTC).strftime("%H:%M:%S UTC")
+    text = f"## No word since {since}\n\nThe last was: {status.message.replace('|', '¦')}"
+    rec.log(f"{uav}/health", rr.TextDocument(text, media_type="text/markdown"))
 
 
 def health_text(status: DiagnosticStatus) -> str:

@@ -15,7 +15,7 @@ from msgs import topics
 from msgs.cdr import CameraInfo, CompressedImage, DiagnosticArray, Log, PoseWithCovarianceStamped, TFMessage
 from msgs.geometry import R_from_q_wxyz
 from msgs.ground.feed import Incoming
-from msgs.ground.fleet import SET_BACK_NS, VEHICLES_MAX, Fleet, TargetRow
+from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, VEHICLES_MAX, Fleet, TargetRow
 from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.ground.view import entities
 from msgs.ground.view.layout import TIMELINE
@@ -38,7 +38,9 @@ class _Vehicle:
     )
     seen_ns: dict[str, tuple[int, int]] = field(default_factory=dict)  # of each target drawn: stamp, and when it came
     prepared: set[str] = field(default_factory=set)  # targets whose plots have their names
-    health: str = ""
+    health: DiagnosticArray | None = None  # the last that was told, and when it came
+    health_came_ns: int = 0
+    health_silent: bool = False
     told_no_attitude: bool = False
 
 
@@ -83,9 +85,10 @@ class Scene:
                 entities.log_event(self._rec, uav, 20 if here else 30, "here" if here else "gone")
 
     def tick(self, now_ns: int) -> None:
-        """Take away the targets that were not told again; call it now and then."""
+        """Take away the targets that were not told again, say where health was not; call it now and then."""
         with self._lock:
             for uav, vehicle in self._vehicles.items():
+                self._tell_silence(uav, vehicle, now_ns)
                 for target, (stamp_ns, came_ns) in list(vehicle.seen_ns.items()):
                     # What came in the future came before our clock was set back, who knows when.
                     if not -SET_BACK_NS <= now_ns - came_ns <= GONE_NS:
@@ -94,6 +97,14 @@ class Scene:
                         for path in entities.target_paths(uav, target):
                             self._rec.log(path, rr.Clear(recursive=True))
                         del vehicle.seen_ns[target]
+
+    def _tell_silence(self, uav: str, vehicle: _Vehicle, now_ns: int) -> None:
+        heard = -SET_BACK_NS <= now_ns - vehicle.health_came_ns <= HEALTH_STALE_NS
+        if vehicle.health is None or vehicle.health_silent or heard:
+            return
+        vehicle.health_silent = True
+        self._at(vehicle.health.stamp_ns + HEALTH_STALE_NS)
+        entities.log_silence(self._rec, uav, vehicle.health)
 
     def finish(self) -> None:
         """Draw what still waits: no more will come."""
@@ -151,9 +162,9 @@ class Scene:
             self._take_own(uav, vehicle, TFMessage.decode(incoming.payload))
         elif isinstance(news, DiagnosticArray):
             self._at(news.stamp_ns)
-            text = news.status[0].message
-            entities.log_health(self._rec, uav, news, news=text != vehicle.health)
-            vehicle.health = text
+            before = None if vehicle.health is None else vehicle.health.status[0].message
+            entities.log_health(self._rec, uav, news, news=news.status[0].message != before)
+            vehicle.health, vehicle.health_came_ns, vehicle.health_silent = news, now_ns, False
         elif isinstance(news, Log):
             self._at(news.stamp_ns)
             entities.log_event(self._rec, uav, news.level, news.msg)
