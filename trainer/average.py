@@ -25,10 +25,8 @@ def average(runs: Sequence[Path], out: Path) -> Path:
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
     last, every = contents[-1], [content["weights"] for content in contents]
     weights = {
-        # Not all runs have the heads that only training has, nor of one shape: those are the mean of the others.
-        name: torch.stack([w[name].double() for w in every if name in w and w[name].shape == value.shape])
-        .mean(0)
-        .to(value.dtype)
+        # Not all runs have the heads that only training has: those are the mean of the others.
+        name: torch.stack([w[name].double() for w in every if name in w]).mean(0).to(value.dtype)
         if value.is_floating_point()
         else value
         for name, value in last["weights"].items()

@@ -18,7 +18,7 @@ from trainer.model import PoseNet
 
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
-TRAINING_ONLY_PREFIXES = ("head_dense.", "head_airframe.")
+TRAINING_ONLY_PREFIX = "head_dense."
 
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
@@ -42,7 +42,7 @@ def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """Without the heads that only training has. A run that goes on needs them too: drawn anew they upset the rest."""
-    return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIXES)}
+    return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:

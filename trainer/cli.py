@@ -32,6 +32,14 @@ def count(text: str) -> int:
     return number
 
 
+def share(text: str) -> float:
+    """A number from 0 to 1, for argparse."""
+    number = float(text)
+    if not 0.0 <= number <= 1.0:
+        raise ValueError(text)
+    return number
+
+
 def _train(arguments: argparse.Namespace) -> None:
     from trainer.train import run_training
 
@@ -83,6 +91,14 @@ def _average(arguments: argparse.Namespace) -> None:
     print(f"wrote {average(arguments.checkpoints, arguments.out)}")
 
 
+def _refine(arguments: argparse.Namespace) -> None:
+    from trainer.refine import RefinePlan, refine
+
+    plan = RefinePlan(arguments.seed, arguments.windows, arguments.epochs, arguments.strangers)
+    path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
+    print(f"wrote {path}")
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="uavpose-trainer", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -108,11 +124,33 @@ def _parser() -> argparse.ArgumentParser:
     train.set_defaults(run=_train)
     evaluate_command.register(commands)
     results.register(commands)
+    _add_refine(commands)
     _add_ablate(commands)
     _add_export(commands)
     score_command.register(commands)
     _add_average(commands)
     return parser
+
+
+def _add_refine(commands: argparse._SubParsersAction) -> None:
+    refine = commands.add_parser(
+        "refine",
+        help="teach a trained network how sure it is, and what to correct",
+        description="Show a trained network rendered windows, and teach its refinement head alone by its answers: "
+        "corrections of the place, and sigma. All else stays as it is. Writes weights.pt into --out.",
+    )
+    refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
+    refine.add_argument("--out", type=Path, required=True, help="folder for the weights")
+    refine.add_argument("--seed", type=int, required=True, help="of the windows: one that training did not have")
+    refine.add_argument("--windows", type=count, default=100_000, help="how many to look at (default %(default)s)")
+    refine.add_argument("--epochs", type=count, default=8, help="how often to learn from each (default %(default)s)")
+    refine.add_argument(
+        "--strangers",
+        type=share,
+        default=0.35,
+        help="share of targets that are invented, so that what it does not know is learnt too (default %(default)s)",
+    )
+    refine.set_defaults(run=_refine)
 
 
 def _add_average(commands: argparse._SubParsersAction) -> None:

@@ -58,21 +58,16 @@ class ModelConfig(Section):
     depth: Literal["direct", "plain", "rotation_aware"] = Field(
         description="Z itself, or APDD with a scale that is free or made of latent extents seen from R"
     )
-    uncertainty: bool = Field(description="train the sigma heads")
+    uncertainty: bool = Field(description="train the head that tells sigma and corrects the place")
     hypotheses: int = Field(
         1, ge=1, description="rotations proposed for a target, each for headings around its own; the likeliest is said"
     )
     dense: bool = Field(description="train the mask and object-coordinate heads, which export drops")
-    airframes: int = Field(
-        0,
-        ge=0,
-        description="the fleet's first so many are told from each other and from all else by a head of training",
-    )
     max_peaks: int = Field(4, ge=1, description="M: targets decoded for each image")
 
     def deployed(self) -> ModelConfig:
         """The network that flies: without the heads that only training has, its weights those that it is given."""
-        return self.model_copy(update={"pretrained": False, "dense": False, "airframes": 0})
+        return self.model_copy(update={"pretrained": False, "dense": False})
 
     @model_validator(mode="after")
     def _pretrained_exists(self) -> ModelConfig:
@@ -98,7 +93,6 @@ class LossConfig(Section):
     mask: float = Field(0.0, ge=0)
     noc: float = Field(0.0, ge=0)
     uncertainty: float = Field(0.0, ge=0)
-    airframe: float = Field(0.0, ge=0, description="cross-entropy of which airframe it is, or none of those known")
 
 
 class DatasetSource(Section):
@@ -207,12 +201,6 @@ class TrainerConfig(Section):
     schedule: ScheduleConfig
     run: RunConfig
     contract: ContractConfig
-
-    @model_validator(mode="after")
-    def _airframes_are_taught(self) -> TrainerConfig:
-        if (self.model.airframes > 0) != (self.loss.airframe > 0):
-            raise ValueError("model.airframes and loss.airframe belong together: a head and what teaches it")
-        return self
 
     @model_validator(mode="after")
     def _trained_as_used(self) -> TrainerConfig:

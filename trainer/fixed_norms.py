@@ -34,7 +34,7 @@ def folded_norms(model: nn.Module) -> Iterator[None]:
 
     Values are those of evaluation mode, and gradients reach the same parameters.
     """
-    norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm2d)]
+    norms = [module for module in model.modules() if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d)]
     pairs = _pairs(model)
     weights = [conv._parameters["weight"] for conv, _ in pairs]
     for norm in norms:

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from trainer import equations as eq
 from trainer.config import LossConfig
 from trainer.model import Decoded
+from trainer.refinement import CORRECTED, SIGMAS
 
 SMALLEST_SIZE_PX = 2.0
 UNJUDGED = 1.0 - 1e-3  # of the heatmap's target: the focal loss asks next to nothing there
@@ -101,8 +102,28 @@ def _error_6d(R_allo: Tensor, R_allo_true: Tensor) -> Tensor:
     )
 
 
-def _laplace_nll(residual: Tensor, log_scale: Tensor) -> Tensor:
-    return residual.abs() * torch.exp(-log_scale) + log_scale
+def pose_residual(out: Decoded, labels: Labels) -> Tensor:
+    """What the one decoded peak of each image is off by, uncorrected: [N, 6] in the units of Decoded.log_sigma."""
+    side_px = torch.exp(0.5 * out.log_size[:, 0].sum(-1, keepdim=True))
+    log_Z = torch.log(torch.clamp(labels.t_cam_target_m[:, 2:], min=1.0))
+    off_px = out.origin_px[:, 0] - _origin_px(labels)
+    return torch.cat(
+        [off_px / side_px, out.log_Z - log_Z, rotation_residual(out.R_ego[:, 0], labels.R_cam_target)], dim=-1
+    )
+
+
+def refinement_nll(residual: Tensor, correction: Tensor, log_sigma: Tensor) -> Tensor:
+    """Negative log likelihood [..., 6] of residuals [..., 6] once corrected, of Laplace laws, but for a constant."""
+    place, rotation = residual.split([CORRECTED, SIGMAS - CORRECTED], dim=-1)
+    left = torch.cat([place + correction, rotation], dim=-1)
+    return left.abs() * torch.exp(-log_sigma) + log_sigma
+
+
+def _origin_px(labels: Labels) -> Tensor:
+    """Where the body's origin lies in each image: [N, 2]."""
+    K, t = labels.K, labels.t_cam_target_m
+    f_xy, c_xy = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1), K[:, :2, 2]
+    return f_xy * t[:, :2] / torch.clamp(t[:, 2:], min=1.0) + c_xy
 
 
 def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = True) -> dict[str, Tensor]:
@@ -112,12 +133,11 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
     Without `ray` the network's allocentric rotation is the one in `cam`.
     """
     one = (value[:, 0] for value in out)
-    center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, R_ego, log_sigma, airframe_logits = one
+    center, log_size, origin, log_Z, logits, R_allo_k, R_ego_k, _, correction, log_sigma = one
     t, K = labels.t_cam_target_m, labels.K
     Z = torch.clamp(t[:, 2], min=1.0)
     true_plane = t[:, :2] / Z[:, None]
-    f_xy = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1)
-    true_origin = true_plane * f_xy + torch.stack([K[:, 0, 2], K[:, 1, 2]], dim=-1)
+    true_origin = _origin_px(labels)
     true_log_size = torch.log(torch.clamp(labels.size_px, min=SMALLEST_SIZE_PX))
     longer = torch.exp(true_log_size).amax(-1, keepdim=True)
     t_xy = eq.back_project(eq.image_plane_point(origin, K), torch.exp(log_Z))[:, :2]
@@ -136,29 +156,9 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
         "origin": F.smooth_l1_loss(origin / longer, true_origin / longer, reduction="none", beta=0.02).sum(-1),
     }
     if weights.uncertainty > 0:
-        side = torch.exp(0.5 * log_size.sum(-1, keepdim=True))
-        residual = torch.cat(
-            [
-                (origin - true_origin) / side,
-                (log_Z - torch.log(Z))[:, None],
-                rotation_residual(R_ego, labels.R_cam_target),
-            ],
-            dim=-1,
-        )
-        terms["uncertainty"] = _laplace_nll(residual.detach(), log_sigma).sum(-1)
-    if airframe_logits.shape[-1] > 0:
-        terms["airframe"] = _airframe_error(airframe_logits, labels.airframe_id)
+        # The head that it teaches reads detached features, and here what is left of the poses is no pull at them.
+        terms["uncertainty"] = refinement_nll(pose_residual(out, labels).detach(), correction, log_sigma).sum(-1)
     return terms
-
-
-def _airframe_error(logits: Tensor, airframe_id: Tensor) -> Tensor:
-    """Cross-entropy [N] of which airframe [N] it is; the last of the logits [N, A + 1] is for all from A on.
-
-    The scale of what is seen is known only of an airframe that is recognised, so features that tell airframes apart,
-    and strangers from them, serve the range and its sigma.
-    """
-    which = airframe_id.long().clamp(max=logits.shape[-1] - 1)
-    return F.cross_entropy(logits, which, ignore_index=-1, reduction="none")
 
 
 def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
@@ -192,7 +192,7 @@ def joint_loss(
     L_rot = terms["geodesic"] + weights.rotation_6d * terms["rotation_6d"]
     total = weights.heatmap * terms["heatmap"] + weights.size * terms["size"]
     total = total + weights.translation * L_trans + weights.rotation * L_rot
-    for name in ("hypothesis", "center", "origin", "mask", "noc", "uncertainty", "airframe"):
+    for name in ("hypothesis", "center", "origin", "mask", "noc", "uncertainty"):
         if name in terms:
             total = total + getattr(weights, name) * terms[name]
     return total, terms

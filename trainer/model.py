@@ -16,7 +16,9 @@ from torch.nn import functional as F
 from trainer import equations as eq
 from trainer.backbones import build_backbone
 from trainer.config import ModelConfig
-from trainer.neck import AlignFuseNeck, conv_bn_relu
+from trainer.layers import conv_bn_relu, mlp
+from trainer.neck import AlignFuseNeck
+from trainer.refinement import CORRECTED, SIGMAS, Evidence, Refined, RefinementHead, answers_of
 
 Z_RANGE_M = (50.0, 600.0)
 OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -30,14 +32,14 @@ class Decoded(NamedTuple):
 
     center_px: Tensor  # [N, M, 2]
     log_size: Tensor  # [N, M, 2], log (w, h) in log pixels
-    origin_px: Tensor  # [N, M, 2]
-    log_Z: Tensor  # [N, M], not clamped
+    origin_px: Tensor  # [N, M, 2], before its correction
+    log_Z: Tensor  # [N, M], not clamped, before its correction
     hypothesis_logits: Tensor  # [N, M, K]
     R_allo_k: Tensor  # [N, M, K, 3, 3], every hypothesis
     R_ego_k: Tensor  # [N, M, K, 3, 3]
     R_ego: Tensor  # [N, M, 3, 3], the likeliest
-    log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), log Z, rotation x y z in rad
-    airframe_logits: Tensor  # [N, M, A + 1], the last for any other; [N, M, 0] without that head
+    correction: Tensor  # [N, M, 3], to be added: (u, v) in box sides sqrt(w h), log Z
+    log_sigma: Tensor  # [N, M, 6], Laplace scale after it: as `correction`, then rotation x y z in rad
 
 
 class Perception(NamedTuple):
@@ -45,11 +47,6 @@ class Perception(NamedTuple):
 
     F_global: Tensor  # [N, C, H/8, W/8]
     heat_logits: Tensor  # [N, H/8, W/8]
-
-
-def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Two linear layers with a ReLU between."""
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, outputs))
 
 
 class PerspectiveAwareModule(nn.Module):
@@ -81,9 +78,11 @@ class DynamicTopologicalSampling(nn.Module):
         self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, channels, 3, stride=2))
         self.region = nn.Linear(channels * 16, hidden)
 
-    def forward(self, F_global: Tensor, center_px: Tensor, size_px: Tensor, extent_px: Tensor) -> tuple[Tensor, Tensor]:
-        """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px in an image of `extent_px` [2], to f_oct [N M, 8 C]
-        and f_reg [N M, hidden]."""
+    def forward(
+        self, F_global: Tensor, center_px: Tensor, size_px: Tensor, extent_px: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px in an image of `extent_px` [2], to f_oct [N M, 8 C],
+        f_reg [N M, hidden] and the grid [N M, C, 7, 7] that it is made of."""
         # align_corners=False puts -1 and 1 on the outer edges of the border pixels.
         center, size = (2.0 * center_px + 1.0) / extent_px - 1.0, size_px / extent_px
         points = center[:, :, None] + size[:, :, None] * self.get_buffer("offsets")
@@ -91,7 +90,7 @@ class DynamicTopologicalSampling(nn.Module):
         sampled = sampled.permute(0, 2, 3, 1).reshape(-1, len(OCT_OFFSETS) + REGION**2, self.channels)
         f_oct = sampled[:, : len(OCT_OFFSETS)].reshape(-1, len(OCT_OFFSETS) * self.channels)
         grid = sampled[:, len(OCT_OFFSETS) :].reshape(-1, REGION, REGION, self.channels).permute(0, 3, 1, 2)
-        return f_oct, F.relu(self.region(self.convs(grid).flatten(1)))
+        return f_oct, F.relu(self.region(self.convs(grid).flatten(1))), grid
 
 
 class GatedFusion(nn.Module):
@@ -137,11 +136,9 @@ class PoseNet(nn.Module):
         self.head_rot = nn.Linear(hidden, 6 * config.hypotheses)
         self.head_hypothesis = nn.Linear(hidden, config.hypotheses) if config.hypotheses > 1 else None
         self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
-        self.head_sigma_t = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
-        self.head_sigma_r = mlp(hidden, hidden // 4, 3) if config.uncertainty else None
+        self.head_refine = RefinementHead(C, hidden, config.hypotheses) if config.uncertainty else None
         # Linear but for one small layer, so that object coordinates must be written into F_global itself.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
-        self.head_airframe = nn.Linear(hidden, config.airframes + 1) if config.airframes else None
         self._init_priors()
 
     @torch.no_grad()
@@ -195,7 +192,7 @@ class PoseNet(nn.Module):
             guide_size_px = guide_size_px.reshape(-1, 2)
             grid_size = torch.where(guide_size_px > 0, guide_size_px, grid_size)
         boxes = (center_px.detach().reshape(-1, M, 2), grid_size.reshape(-1, M, 2))
-        f_oct, f_reg = self.dts(F_global, *boxes, _extent_px(log_P))
+        f_oct, f_reg, grid = self.dts(F_global, *boxes, _extent_px(log_P))
         # The grid is normalised by the box, so the context says which box it was.
         f_geo = torch.cat([f_c, f_oct, f_pam, torch.log(grid_size / 32.0)], dim=-1)
         f_trans = self.mlp_t(self.fuse_t(f_reg, f_geo))
@@ -216,6 +213,10 @@ class PoseNet(nn.Module):
             log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
         plane_xy = eq.image_plane_point(origin_px, K)
         R_ray = eq.ray_rotation(eq.unit_ray(plane_xy if self.config.ray else torch.zeros_like(plane_xy)))
+        R_ego = R_ray @ R_allo
+        log_f = torch.log(eq.focal_length(K, self.config.focal))
+        answers = answers_of(log_size, log_f, log_Z, plane_xy, logits, R_ego)
+        refined = self._refined(Evidence(grid, f_trans, f_rot, answers))
         return Decoded(
             center_px.reshape(-1, M, 2),
             log_size.reshape(-1, M, 2),
@@ -224,9 +225,9 @@ class PoseNet(nn.Module):
             logits.reshape(-1, M, count),
             R_allo_k.reshape(-1, M, count, 3, 3),
             (R_ray[:, None] @ R_allo_k).reshape(-1, M, count, 3, 3),
-            (R_ray @ R_allo).reshape(-1, M, 3, 3),
-            self._log_sigma(f_trans, f_rot).reshape(-1, M, 6),
-            self._airframe_logits(f_trans, M),
+            R_ego.reshape(-1, M, 3, 3),
+            refined.correction.reshape(-1, M, CORRECTED),
+            refined.log_sigma.reshape(-1, M, SIGMAS),
         )
 
     def _anchor_of(self, F_global: Tensor, log_P: Tensor, peaks_xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -248,17 +249,11 @@ class PoseNet(nn.Module):
         of_best = 6 * logits.argmax(-1, keepdim=True) + torch.arange(6, device=r_6d.device)
         return logits, eq.gram_schmidt(torch.gather(r_6d, 1, of_best))
 
-    def _log_sigma(self, f_trans: Tensor, f_rot: Tensor) -> Tensor:
-        """Its loss sees errors detached: it teaches the features what is hard, and never pulls at the means."""
-        if self.head_sigma_t is None or self.head_sigma_r is None:
-            return torch.zeros_like(f_trans[..., :6])
-        raw = torch.cat([self.head_sigma_t(f_trans), self.head_sigma_r(f_rot)], dim=-1)
-        return torch.clamp(raw - 2.0, -7.0, 1.5)
-
-    def _airframe_logits(self, f_trans: Tensor, M: int) -> Tensor:
-        if self.head_airframe is None:
-            return f_trans.new_zeros(f_trans.shape[0] // M, M, 0)
-        return self.head_airframe(f_trans).reshape(-1, M, self.config.airframes + 1)
+    def _refined(self, evidence: Evidence) -> Refined:
+        if self.head_refine is None:
+            zeros = torch.zeros_like(evidence.f_trans[..., : CORRECTED + SIGMAS])
+            return Refined(zeros[..., :CORRECTED], zeros[..., CORRECTED:])
+        return self.head_refine(evidence)
 
     def _sigma_g(self, log_P: Tensor) -> Tensor | float:
         cells = self.config.soft_argmax_sigma_cells
@@ -276,14 +271,15 @@ class PoseNet(nn.Module):
         seen = Perception(seen.F_global.float(), seen.heat_logits.float())
         score, peaks_xy = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), self.config.max_peaks)
         out = self.decode(seen, K, peaks_xy)
-        Z = torch.clamp(torch.exp(out.log_Z), *Z_RANGE_M)
-        t_cam_target_m = eq.back_project(eq.image_plane_point(out.origin_px, K[:, None]), Z)
         size_px = torch.exp(out.log_size)
+        side_px = torch.sqrt(size_px.prod(-1, keepdim=True))
+        origin_px = out.origin_px + out.correction[..., :2] * side_px
+        Z = torch.clamp(torch.exp(out.log_Z + out.correction[..., 2]), *Z_RANGE_M)
+        t_cam_target_m = eq.back_project(eq.image_plane_point(origin_px, K[:, None]), Z)
         # A Laplace law of scale b has the standard deviation sqrt(2) b.
         sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
-        side_px = torch.sqrt(size_px.prod(-1, keepdim=True))
         sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
-        return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
+        return score, out.center_px, size_px, origin_px, t_cam_target_m, out.R_ego, sigma
 
 
 def _extent_px(log_P: Tensor) -> Tensor:

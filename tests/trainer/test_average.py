@@ -40,17 +40,9 @@ def test_training_only_heads_that_one_run_lacks_are_the_other_s(tmp_path: Path) 
     write_atomic(one / "weights.pt", content | {"weights": deployed_weights(content["weights"])})
     average([one, other], tmp_path / "mean")
     mean, kept = (load_file(folder)["weights"] for folder in (tmp_path / "mean", other))
-    only_training = [name for name in kept if name.startswith(("head_dense.", "head_airframe."))]
+    only_training = [name for name in kept if name.startswith("head_dense.")]
     assert len(only_training) > 2
     assert all(torch.equal(mean[name], kept[name]) for name in only_training)
-
-
-def test_a_head_of_training_of_another_size_is_the_last_run_s(tmp_path: Path) -> None:
-    one = write_run(tmp_path / "a", 1, tiny.TOML.replace("airframes = 5", "airframes = 17"))
-    other = write_run(tmp_path / "b", 2)
-    average([one, other], tmp_path / "mean")
-    mean, last = (load_file(folder)["weights"]["head_airframe.weight"] for folder in (tmp_path / "mean", other))
-    assert torch.equal(mean, last)
 
 
 def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:

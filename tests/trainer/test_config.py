@@ -34,8 +34,6 @@ def test_shipped_configurations_are_valid_and_say_which_they_are() -> None:
         ("[contract]", "[contract", "not valid TOML"),
         ('acquire_fit = "letterbox"', 'acquire_fit = "squash"', 'data.acquire_view = "frame"'),
         ("batch_size = 4", 'batch_size = 4\nacquire_view = "frame"', 'contract.acquire_fit = "squash"'),
-        ("airframes = 5", "airframes = 0", "loss.airframe"),
-        ("airframe = 0.1", "airframe = 0.0", "model.airframes"),
     ],
 )
 def test_a_mistake_is_named_with_its_file_and_key(old: str, new: str, named: str) -> None:

@@ -24,15 +24,17 @@ def ramp(rows: int, columns: int) -> torch.Tensor:
 def test_dts_samples_the_eight_points_of_the_box_where_they_lie() -> None:
     dts = DynamicTopologicalSampling(2, 8)
     center, size = torch.tensor([[[61.3, 50.2], [70.0, 40.0]]]), torch.tensor([[[44.0, 18.5], [30.0, 60.0]]])
-    f_oct, f_reg = dts(ramp(12, 16), center, size, torch.tensor([128.0, 96.0]))
+    f_oct, f_reg, grid = dts(ramp(12, 16), center, size, torch.tensor([128.0, 96.0]))
     for k in range(2):
         expected = center[0, k].numpy() + PRINTED * size[0, k].numpy()
         np.testing.assert_allclose(f_oct[k].detach().reshape(8, 2), expected, atol=1e-3)
     assert f_reg.shape == (2, 8)
+    corner = center[0, 0].numpy() - size[0, 0].numpy() / 2
+    np.testing.assert_allclose(grid[0, :, 0, 0].detach(), corner, atol=1e-3)
 
 
 def test_features_off_the_picture_are_zero() -> None:
-    f_oct, _ = DynamicTopologicalSampling(2, 8)(
+    f_oct, *_ = DynamicTopologicalSampling(2, 8)(
         ramp(8, 8), torch.tensor([[[32.0, 32.0]]]), torch.full((1, 1, 2), 200.0), torch.tensor([64.0, 64.0])
     )
     assert f_oct.abs().max() == 0

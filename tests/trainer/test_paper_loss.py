@@ -100,6 +100,22 @@ def test_sigma_is_a_laplace_scale() -> None:
     assert cost(0.2) < min(cost(0.1), cost(0.4))
 
 
+def test_what_is_corrected_is_no_error_of_sigma_s_law() -> None:
+    """Depth e^0.2 times too far and corrected by it: (b = 0.1) 6 ln b alone; by half of it 0.1 / b more."""
+    log_Z = torch.log(torch.tensor([[200.0]])) + 0.2
+
+    def cost(correction: float) -> float:
+        out = perfect(LABELS, 1)._replace(
+            log_Z=log_Z,
+            correction=torch.tensor([[[0.0, 0.0, correction]]]),
+            log_sigma=torch.full((1, 1, 6), math.log(0.1)),
+        )
+        return pose_terms(out, LABELS, LossConfig(uncertainty=1.0))["uncertainty"].item()
+
+    assert cost(-0.2) == pytest.approx(6 * math.log(0.1), abs=5e-3)
+    assert cost(-0.1) == pytest.approx(6 * math.log(0.1) + 1.0, abs=5e-3)
+
+
 def test_the_batch_counts_targets_and_not_windows() -> None:
     """Of two windows one holds a target: the mean is over that one."""
     both = type(LABELS)(*(torch.cat([a, a]) for a in LABELS))._replace(present=torch.tensor([1.0, 0.0]))

@@ -24,7 +24,6 @@ depth = "rotation_aware"
 uncertainty = true
 hypotheses = 4
 dense = true
-airframes = 5
 [loss]
 heatmap = 1.0
 hypothesis = 1.0
@@ -33,7 +32,6 @@ origin = 1.0
 mask = 1.0
 noc = 1.0
 uncertainty = 0.1
-airframe = 0.1
 [data]
 seed = 3
 validation_seed = 4

@@ -1,0 +1,195 @@
+"""`uavpose-trainer refine`: teach a trained network's refinement head by itself, all else as it is.
+
+What the head reads of each window is kept, so that a window is rendered and seen once and learnt from many times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from trainer import equations as eq
+from trainer.checkpoint import WEIGHTS_NAME, load_file, save_weights, weights_sha256
+from trainer.config import ConfigError, TrainerConfig, made_folder, parse_config
+from trainer.data import Feed, Sampler, TrainingBatch, to_tensors
+from trainer.losses import pose_residual, refinement_nll
+from trainer.model import Perception, PoseNet
+from trainer.refinement import Evidence, RefinementHead
+from trainer.runlog import provenance
+from trainer.sources import window_sampler
+
+PREFIX = "head_refine."
+RENDERED_AT_ONCE = 32
+BATCH = 512
+HELD_OUT_SHARE = 0.04
+LEARNING_RATE, WEIGHT_DECAY, DROPOUT = 2e-3, 0.2, 0.3
+RANGE = 2  # of the residuals
+
+
+class RefinePlan(NamedTuple):
+    """How much to render and how long to learn from it. The seed must be one that training did not have."""
+
+    seed: int
+    windows: int = 100_000
+    epochs: int = 8
+    strangers: float = 0.35  # share of targets that are no member of the fleet
+
+
+class Kept(NamedTuple):
+    """What is learnt from: N targets that the network found, in half precision but for the residual."""
+
+    evidence: Evidence
+    residual: Tensor  # [N, 6]
+    strange: Tensor  # [N], bool: no member of the fleet
+
+    def rows(self, which: Tensor | slice) -> Kept:
+        """Some of them, in single precision."""
+        evidence = Evidence(*(value[which].float() for value in self.evidence))
+        return Kept(evidence, self.residual[which], self.strange[which])
+
+
+def refine(
+    checkpoint: Path,
+    out: Path,
+    plan: RefinePlan,
+    *,
+    open_sampler: Callable[[], Sampler] | None = None,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Write weights.pt with a refinement head learnt anew into `out`; returns its path. Raises ConfigError."""
+    content = load_file(checkpoint)
+    if not {"weights", "config", "training"} <= content.keys():
+        raise ConfigError(f"{checkpoint}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
+    config = parse_config(content["config"], f"{checkpoint} (config)")
+    if plan.seed in (config.data.seed, config.data.validation_seed):
+        raise ConfigError(f"--seed {plan.seed}: is one that the network was trained or validated with; give another")
+    made_folder(out)
+    model = network_without_head(config, content["weights"], checkpoint)
+    torch.manual_seed(plan.seed)
+    head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
+    model.head_refine = head
+    data = config.data.model_copy(update={"invented_share": plan.strangers, "empty_share": 0.0})
+    size_px = config.schedule.sizes[-1].size_px
+    kept = look(model, config, open_sampler or window_sampler(data, plan.seed, size_px), plan.windows, say)
+    known_of = max(int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), 1)
+    fit(head, kept, known_of, plan.epochs, lambda line: say(line))
+    training = content["training"] | {
+        "refined_from": weights_sha256(content["weights"])[:16],
+        "refined_windows": plan.windows,
+        "refined_epochs": plan.epochs,
+        "refined_seed": plan.seed,
+        "refined_strangers": plan.strangers,
+        "refined_commit": provenance(config)["commit"],
+    }
+    save_weights(out / WEIGHTS_NAME, model, content["config"], training)
+    return out / WEIGHTS_NAME
+
+
+def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:
+    """The network as trained, its refinement head as drawn. Raises ConfigError if it has none, or lacks weights."""
+    model = PoseNet(config.model.model_copy(update={"pretrained": False}))
+    if model.head_refine is None:
+        raise ConfigError(f"{named}: [model] uncertainty is false: there is nothing to refine with")
+    own = model.state_dict()
+    for key in own:
+        if not key.startswith(PREFIX) and (key not in weights or weights[key].shape != own[key].shape):
+            raise ConfigError(f"{named}: its weights are not of the network that its [model] describes")
+    given = {key: value for key, value in weights.items() if key in own and own[key].shape == value.shape}
+    model.load_state_dict(given, strict=False)
+    return model.eval().requires_grad_(False)
+
+
+def look(
+    model: PoseNet, config: TrainerConfig, opener: Callable[[], Sampler], windows: int, say: Callable[[str], None]
+) -> Kept:
+    """Show the network windows as it flies, its highest peak decoded, and keep those whose target it found."""
+    seen: list[Evidence] = []
+    assert model.head_refine is not None
+    handle = model.head_refine.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    parts: list[Kept] = []
+    try:
+        with Feed(opener, RENDERED_AT_ONCE, 0, config.data.workers, config.data.prefetch) as feed, torch.no_grad():
+            for done in range(0, windows, RENDERED_AT_ONCE):
+                seen.clear()
+                parts.append(_found(model, config, feed.next(), seen))
+                if done % (100 * RENDERED_AT_ONCE) == 0:
+                    say(f"looked at {done} of {windows} windows")
+    finally:
+        handle.remove()
+    evidence = Evidence(*(torch.cat(values) for values in zip(*(part.evidence for part in parts), strict=True)))
+    kept = Kept(evidence, torch.cat([p.residual for p in parts]), torch.cat([p.strange for p in parts]))
+    if len(kept.residual) == 0:
+        raise ConfigError("the network found no target in any window: train it first")
+    return kept
+
+
+def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: list[Evidence]) -> Kept:
+    image, labels = to_tensors(batch, torch.device("cpu"))
+    with torch.autocast("cpu", torch.bfloat16, enabled=config.run.bf16):
+        perceived = model.perceive(image)
+    perceived = Perception(perceived.F_global.float(), perceived.heat_logits.float())
+    _, peaks_xy = eq.heatmap_peaks(torch.sigmoid(perceived.heat_logits), 1)
+    out = model.decode(perceived, labels.K, peaks_xy)
+    off_px = (out.center_px[:, 0] - labels.center_px).abs()
+    found = (labels.present > 0) & (off_px < 0.5 * labels.size_px).all(-1)
+    evidence = Evidence(*(value[found].half() for value in seen[0]))
+    strange = labels.airframe_id >= fleet_size()
+    return Kept(evidence, pose_residual(out, labels)[found], strange[found])
+
+
+def fleet_size() -> int:
+    """How many airframes have a name; invented ones are numbered from there."""
+    from sim_replay.airframes import AIRFRAMES
+
+    return len(AIRFRAMES)
+
+
+def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callable[[str], None]) -> None:
+    """Learn from the first `learnt` rows and tell of the others, each epoch."""
+    head.requires_grad_(True)
+    head.dropout.p = DROPOUT
+    optimizer = torch.optim.AdamW(head.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    batch = min(BATCH, learnt)
+    steps = learnt // batch
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, LEARNING_RATE, total_steps=epochs * steps + 1, pct_start=0.1
+    )
+    for epoch in range(epochs):
+        head.train()
+        order = torch.randperm(learnt)
+        for step in range(steps):
+            rows = kept.rows(order[step * batch : (step + 1) * batch])
+            refined = head(rows.evidence)
+            loss = refinement_nll(rows.residual, refined.correction, refined.log_sigma).sum(-1).mean()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        say(f"epoch {epoch + 1} of {epochs}: loss {loss.item():.3f}; held out: {told(head, kept, learnt)}")
+    head.dropout.p = 0.0
+    head.eval().requires_grad_(False)
+
+
+@torch.no_grad()
+def told(head: RefinementHead, kept: Kept, first: int) -> str:
+    """In words, what the head makes of the rows from `first` on."""
+    head.eval()
+    refined, residual, strange = [], kept.residual[first:], kept.strange[first:]
+    for start in range(first, len(kept.residual), BATCH):
+        refined.append(head(kept.rows(slice(start, start + BATCH)).evidence))
+    if not refined:
+        return "nothing"
+    correction, log_sigma = (torch.cat(values) for values in zip(*refined, strict=True))
+    nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
+    left = (residual[:, RANGE] + correction[:, RANGE]).abs()
+    words = [f"nll {nll:.3f}"]
+    for name, of in (("known", ~strange), ("strangers", strange)):
+        if of.any():
+            before, after = residual[of, RANGE].abs().mean(), left[of].mean()
+            scale = torch.exp(log_sigma[of, RANGE]).median()
+            words.append(f"log range of {name} off by {before:.3f}, now {after:.3f}, told scale {scale:.3f}")
+    return "; ".join(words)
