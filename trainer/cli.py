@@ -142,7 +142,9 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="folder for the weights")
     refine.add_argument("--seed", type=int, required=True, help="of the windows: one that training did not have")
-    refine.add_argument("--windows", type=count, default=100_000, help="how many to look at (default %(default)s)")
+    refine.add_argument(
+        "--windows", type=count, default=100_000, help="how many to look at, 14 KB of memory each (default %(default)s)"
+    )
     refine.add_argument("--epochs", type=count, default=8, help="how often to learn from each (default %(default)s)")
     refine.add_argument(
         "--strangers",

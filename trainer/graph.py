@@ -28,7 +28,7 @@ from trainer.pixel_quads import take_quads
 OPSET = 17
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
 # Soft-argmax, ray, sampling, depth and rotation stay in float, and so does the last layer of each head.
-QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/")
+QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/", "/head_refine/convs/")
 
 
 def write_graph(model: PoseNet, path: Path) -> None:

@@ -26,6 +26,7 @@ PREFIX = "head_refine."
 RENDERED_AT_ONCE = 32
 BATCH = 512
 HELD_OUT_SHARE = 0.04
+FEWEST = 50  # targets
 LEARNING_RATE, WEIGHT_DECAY, DROPOUT = 2e-3, 0.2, 0.3
 RANGE = 2  # of the residuals
 
@@ -75,8 +76,7 @@ def refine(
     data = config.data.model_copy(update={"invented_share": plan.strangers, "empty_share": 0.0})
     size_px = config.schedule.sizes[-1].size_px
     kept = look(model, config, open_sampler or window_sampler(data, plan.seed, size_px), plan.windows, say)
-    known_of = max(int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), 1)
-    fit(head, kept, known_of, plan.epochs, lambda line: say(line))
+    fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
     training = content["training"] | {
         "refined_from": weights_sha256(content["weights"])[:16],
         "refined_windows": plan.windows,
@@ -122,8 +122,8 @@ def look(
         handle.remove()
     evidence = Evidence(*(torch.cat(values) for values in zip(*(part.evidence for part in parts), strict=True)))
     kept = Kept(evidence, torch.cat([p.residual for p in parts]), torch.cat([p.strange for p in parts]))
-    if len(kept.residual) == 0:
-        raise ConfigError("the network found no target in any window: train it first")
+    if len(kept.residual) < FEWEST:
+        raise ConfigError(f"the network found {len(kept.residual)} targets in {windows} windows: too few to learn from")
     return kept
 
 

@@ -214,13 +214,21 @@ def gathered(earlier: Sequence[dict[str, Any]], runs: Sequence[Path]) -> list[di
     return history
 
 
-def told(history: Sequence[Mapping[str, Any]]) -> str:
-    """How much training is behind the last line."""
+def told(history: Sequence[Mapping[str, Any]], training: Mapping[str, str | int | float]) -> str:
+    """How much training is behind the last line, and behind a model whose contract tells `training`."""
     runs = len({line["run"] for line in history})
-    return (
+    words = (
         f"Trained on {history[-1]['total_samples']:,} rendered windows in {runs} runs, each begun from the weights of "
         "those before it: of the last, or of a mean."
     )
+    if "refined_windows" in training:
+        strangers = 100 * float(training["refined_strangers"])
+        words += (
+            f" Then its refinement head learnt alone, {training['refined_epochs']} times from "
+            f"{training['refined_windows']:,} more (seed {training['refined_seed']}, {strangers:g} % of the targets "
+            "invented)."
+        )
+    return words
 
 
 def draw_history(history: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -281,11 +289,14 @@ def register(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measure and write. Raises ConfigError."""
+    from sim_replay.offline import SHIPPED_MODEL
+    from trainer.graph import read_contract
+
     if arguments.runs:
         history = gathered(read_history(HISTORY), arguments.runs)
         lines = "".join(json.dumps(line) + "\n" for line in history)
         HISTORY.write_text(lines, encoding="utf-8")
-    history = read_history(HISTORY)
+    history, shipped = read_history(HISTORY), read_contract(SHIPPED_MODEL).training
     datasets, beside = datasets_in(arguments.benchmark), read_beside(arguments.beside)
     scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
     refuse_other_pictures(beside, scores)
@@ -293,6 +304,6 @@ def run(arguments: argparse.Namespace) -> None:
     extra = "".join(f" --model {path}" for path in arguments.model)
     extra += "".join(f" --beside {path}" for path in arguments.beside)
     command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"
-    (arguments.out / "results.md").write_text(page(scores, command, told(history), beside), encoding="utf-8")
+    (arguments.out / "results.md").write_text(page(scores, command, told(history, shipped), beside), encoding="utf-8")
     (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
     draw_history(history, arguments.out / "learning.png")

@@ -1,0 +1,117 @@
+"""Refining: the head learns what answers are off by and how sure they are; nothing else of the network moves."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from synthetic_sampler import PlateSampler
+
+from sim_replay.sample import SampleBatch
+from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
+from trainer.config import ConfigError
+from trainer.refine import Kept, RefinePlan, fit, refine
+from trainer.refinement import Evidence, RefinementHead, answer_count
+
+PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
+
+
+class Filling(PlateSampler):
+    """Boxes as large as the picture, so that an untrained network's peak lies in them."""
+
+    def batch(self, first_index: int, count: int) -> SampleBatch:
+        batch = super().batch(first_index, count)
+        box = np.tile(np.array([0, 0, self.size_px, self.size_px], np.float32), (count, 1))
+        return dataclasses.replace(batch, box_xyxy_px=box)
+
+
+def open_plates() -> Filling:
+    return Filling(PLAN.seed, 64)
+
+
+class NoTargets(PlateSampler):
+    def batch(self, first_index: int, count: int) -> SampleBatch:
+        batch = super().batch(first_index, count)
+        return dataclasses.replace(batch, present=batch.present & False)
+
+
+def open_empty() -> NoTargets:
+    return NoTargets(PLAN.seed, 64)
+
+
+def write_run(folder: Path, toml: str = tiny.TOML) -> Path:
+    folder.mkdir()
+    save_weights(folder / "weights.pt", tiny.network(3), toml, {"samples": 5, "steps": 2})
+    return folder
+
+
+def silent(_: str) -> None:
+    pass
+
+
+def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    one, again = (refine(run, tmp_path / n, PLAN, open_sampler=open_plates, say=silent) for n in ("one", "again"))
+    before, after = load_file(run)["weights"], load_file(one)["weights"]
+    assert before.keys() == after.keys()
+    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert moved == {"head_refine"}
+    assert load_model(one)[3] == load_model(again)[3] != load_model(run)[3]
+    told = load_model(one)[2]
+    assert told["samples"] == 5
+    assert told["refined_from"] == load_model(run)[3][:16]
+    assert {name: told[f"refined_{name}"] for name in PLAN._fields} == PLAN._asdict()
+
+
+def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    content = load_file(run)
+    older = {name: value for name, value in content["weights"].items() if not name.startswith("head_refine.")}
+    write_atomic(run / "weights.pt", content | {"weights": older | {"head_sigma_t.0.weight": torch.zeros(8, 32)}})
+    load_model(refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent))
+
+
+def test_what_cannot_be_refined_is_a_sentence(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    with pytest.raises(ConfigError, match="--seed 3: is one that the network was trained"):
+        refine(run, tmp_path / "out", PLAN._replace(seed=3), open_sampler=open_plates, say=silent)
+    with pytest.raises(ConfigError, match="found 0 targets in 96 windows: too few"):
+        refine(run, tmp_path / "out", PLAN, open_sampler=open_empty, say=silent)
+    unsure = write_run(tmp_path / "unsure", tiny.TOML.replace("uncertainty = true", "uncertainty = false"))
+    with pytest.raises(ConfigError, match="uncertainty is false"):
+        refine(unsure, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
+    content = load_file(run)
+    write_atomic(run / "weights.pt", content | {"weights": {**content["weights"], "head_trans.weight": torch.zeros(1)}})
+    with pytest.raises(ConfigError, match="not of the network"):
+        refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
+    assert not (tmp_path / "out" / "weights.pt").exists()
+
+
+def test_strangers_that_show_in_the_features_are_corrected_and_less_is_said_of_them() -> None:
+    """Made up: known ones err by a Laplace law of scale 0.05; strangers, in brighter channels, 0.3 and 0.2 too far."""
+    generator = torch.Generator().manual_seed(4)
+    count = 6000
+    strange = torch.rand(count, generator=generator) < 0.4
+    grid = torch.randn(count, 16, 7, 7, generator=generator)
+    grid[:, 3:5] += 1.5 * strange[:, None, None, None]
+    rest = (torch.randn(count, width, generator=generator) for width in (32, 32, answer_count(4)))
+    scale = torch.where(strange, 0.3, 0.05)
+    draw = torch.rand(count, 6, generator=generator) - 0.5
+    residual = -scale[:, None] * draw.sign() * torch.log1p(-2 * draw.abs())
+    residual[:, 2] += 0.2 * strange
+    kept = Kept(Evidence(*(part.half() for part in (grid, *rest))), residual, strange)
+    torch.manual_seed(0)
+    head = RefinementHead(16, 32, 4)
+    fit(head, kept, 5000, 12, silent)
+    with torch.no_grad():
+        refined = head(kept.rows(slice(5000, None)).evidence)
+    held_out = strange[5000:]
+    scale_of = torch.exp(refined.log_sigma[:, 2])
+    assert scale_of[~held_out].median().item() == pytest.approx(0.05, rel=0.25)
+    assert scale_of[held_out].median().item() == pytest.approx(0.3, rel=0.25)
+    assert refined.correction[held_out, 2].median().item() == pytest.approx(-0.2, abs=0.05)
+    assert refined.correction[~held_out].abs().median().item() < 0.02
