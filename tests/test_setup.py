@@ -12,7 +12,8 @@ ROOT = Path(__file__).parents[1]
 # A checkout on a disk of 20 MB, with a virtual environment that has pip and nothing else made.
 ON_A_SMALL_DISK = """
 mount -t tmpfs -o size=20m none "$1"
-mkdir -p "$1/.venv/bin" && ln -s "$2" "$1/.venv/bin/python"
+mkdir -p "$1/.venv/bin" && printf '#!/bin/sh\nexec "%s" "$@"\n' "$2" >"$1/.venv/bin/python"
+chmod +x "$1/.venv/bin/python"
 cp -r "$3/deploy" "$3/pyproject.toml" "$1"
 sh "$1/deploy/bootstrap.sh" demo
 status=$?

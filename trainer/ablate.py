@@ -47,7 +47,7 @@ VARIANTS = (
     Variant(
         "no-dense", "no dense heads while training", {"model": {"dense": False}, "loss": {"mask": 0.0, "noc": 0.0}}
     ),
-    Variant("no-uncertainty", "no uncertainty heads", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
+    Variant("no-uncertainty", "no refinement head", {"model": {"uncertainty": False}, "loss": {"uncertainty": 0.0}}),
     Variant("no-window", "whole reduced frames only, and measured on such", {"data": {"acquire_share": 1.0}}),
     Variant("paper", "the paper's network and loss, on the same windows", {}, PAPER_CONFIG),
 )

@@ -32,6 +32,14 @@ def count(text: str) -> int:
     return number
 
 
+def whole(text: str) -> int:
+    """A whole number from 0 on that a generator takes as its seed, for argparse."""
+    number = int(text)
+    if not 0 <= number < 2**31:
+        raise ValueError(text)
+    return number
+
+
 def share(text: str) -> float:
     """A number from 0 to 1, for argparse."""
     number = float(text)
@@ -141,7 +149,7 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="folder for the weights")
-    refine.add_argument("--seed", type=int, required=True, help="of the windows: one that training did not have")
+    refine.add_argument("--seed", type=whole, required=True, help="of the windows: one that no run before had")
     refine.add_argument(
         "--windows", type=count, default=100_000, help="how many to look at, 14 KB of memory each (default %(default)s)"
     )
@@ -150,7 +158,7 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "--strangers",
         type=share,
         default=0.35,
-        help="share of targets that are invented, so that what it does not know is learnt too (default %(default)s)",
+        help="share of targets that are invented aircraft, no members of the fleet (default %(default)s)",
     )
     refine.set_defaults(run=_refine)
 

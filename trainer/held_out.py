@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -38,20 +38,25 @@ class _Subject(NamedTuple):
 
     predict: Predictor
     data: DataConfig
-    training_seed: int | None
+    training_seeds: tuple[object, ...]
     track_px: int | None
     acquire_px: int
     thresholds: dict[str, float]
     calibrations: dict[str, ScoreCalibration]
 
 
+def _seeds(training: Mapping[str, object]) -> tuple[object, ...]:
+    """Of the windows that the last run learnt from, and of those that refining did."""
+    return tuple(training[key] for key in ("seed", "refined_seed") if key in training)
+
+
 def _checkpoint(path: Path) -> _Subject:
-    model, config, _, _ = load_model(path)
+    model, config, training, _ = load_model(path)
     track = config.contract.track_size_wh
     track_px = track[0] if track else None
     thresholds = {"track": SCORE_THRESHOLD, "acquire": SCORE_THRESHOLD}
     acquire_px = acquire_window_px(config.contract)
-    return _Subject(torch_predictor(model), config.data, config.data.seed, track_px, acquire_px, thresholds, {})
+    return _Subject(torch_predictor(model), config.data, _seeds(training), track_px, acquire_px, thresholds, {})
 
 
 def _model_file(path: Path, seed: int) -> _Subject:
@@ -61,13 +66,11 @@ def _model_file(path: Path, seed: int) -> _Subject:
     ids = [every.index(name) for name in contract.airframes if name in every] or None
     said = {"seed": seed, "validation_seed": seed + 1, "batch_size": 16, "airframe_ids": ids, "acquire_view": view}
     data = DataConfig.model_validate(said)
-    trained = contract.training.get("seed")
     thresholds = {"track": contract.track_score_min, "acquire": contract.acquire_score_min}
     track = contract.track_size_wh[0] if contract.track_size_wh else None
-    training_seed = trained if isinstance(trained, int) else None
     calibrations = {"track": contract.track_score, "acquire": contract.acquire_score}
     acquire_px = acquire_window_px(contract)
-    return _Subject(onnx_predictor(path), data, training_seed, track, acquire_px, thresholds, calibrations)
+    return _Subject(onnx_predictor(path), data, _seeds(contract.training), track, acquire_px, thresholds, calibrations)
 
 
 def evaluate_file(
@@ -76,7 +79,7 @@ def evaluate_file(
     """Metrics of trainer.evaluate.measure at the file's own threshold. Raises ConfigError when asked the impossible."""
     is_onnx = request.model.suffix == ".onnx"
     subject = _model_file(request.model, request.seed) if is_onnx else _checkpoint(request.model)
-    if request.seed == subject.training_seed:
+    if request.seed in subject.training_seeds:
         raise ConfigError(f"--seed {request.seed}: is the training seed; give another")
     size_px = request.size_px or (subject.track_px if request.stage == "track" else None)
     size_px = size_px or subject.acquire_px

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from trainer import equations as eq
-from trainer.checkpoint import WEIGHTS_NAME, load_file, save_weights, weights_sha256
-from trainer.config import ConfigError, TrainerConfig, made_folder, parse_config
+from trainer.checkpoint import RESUME_NAME, TRAINING_ONLY_PREFIX, WEIGHTS_NAME, load_file, save_weights, weights_sha256
+from trainer.config import ConfigError, DataConfig, TrainerConfig, made_folder, parse_config, refuse_no_folder
 from trainer.data import Feed, Sampler, TrainingBatch, to_tensors
 from trainer.losses import pose_residual, refinement_nll
 from trainer.model import Perception, PoseNet
@@ -58,7 +58,7 @@ def refine(
     out: Path,
     plan: RefinePlan,
     *,
-    open_sampler: Callable[[], Sampler] | None = None,
+    open_sampler: Callable[[DataConfig, int, int], Callable[[], Sampler]] = window_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Write weights.pt with a refinement head learnt anew into `out`; returns its path. Raises ConfigError."""
@@ -68,14 +68,19 @@ def refine(
     config = parse_config(content["config"], f"{checkpoint} (config)")
     if plan.seed in (config.data.seed, config.data.validation_seed):
         raise ConfigError(f"--seed {plan.seed}: is one that the network was trained or validated with; give another")
-    made_folder(out)
+    refuse_no_folder(out)
+    if (out / RESUME_NAME).exists():
+        raise ConfigError(f"{out}: holds a run that training may go on with; give another --out")
+    torch.set_num_threads(config.run.threads)
+    commit = provenance(config)["commit"]
     model = network_without_head(config, content["weights"], checkpoint)
     torch.manual_seed(plan.seed)
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
-    model.head_refine = head
-    data = config.data.model_copy(update={"invented_share": plan.strangers, "empty_share": 0.0})
-    size_px = config.schedule.sizes[-1].size_px
-    kept = look(model, config, open_sampler or window_sampler(data, plan.seed, size_px), plan.windows, say)
+    model.head_refine = head.eval()
+    # Rendered windows alone: a dataset's pictures are few, and its errors on those that it was trained on too small.
+    data = config.data.model_copy(update={"invented_share": plan.strangers, "empty_share": 0.0, "datasets": []})
+    opener = open_sampler(data, plan.seed, config.schedule.sizes[-1].size_px)
+    kept = look(model, config, opener, plan.windows, say)
     fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
     training = content["training"] | {
         "refined_from": weights_sha256(content["weights"])[:16],
@@ -83,22 +88,24 @@ def refine(
         "refined_epochs": plan.epochs,
         "refined_seed": plan.seed,
         "refined_strangers": plan.strangers,
-        "refined_commit": provenance(config)["commit"],
+        "refined_commit": commit,
     }
+    made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
     return out / WEIGHTS_NAME
 
 
 def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:
-    """The network as trained, its refinement head as drawn. Raises ConfigError if it has none, or lacks weights."""
-    model = PoseNet(config.model.model_copy(update={"pretrained": False}))
+    """The network as trained, but for its refinement head. Raises ConfigError if it has none, or lacks weights."""
+    dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # what was made to fly has none
+    model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}))
     if model.head_refine is None:
         raise ConfigError(f"{named}: [model] uncertainty is false: there is nothing to refine with")
     own = model.state_dict()
     for key in own:
         if not key.startswith(PREFIX) and (key not in weights or weights[key].shape != own[key].shape):
             raise ConfigError(f"{named}: its weights are not of the network that its [model] describes")
-    given = {key: value for key, value in weights.items() if key in own and own[key].shape == value.shape}
+    given = {key: value for key, value in weights.items() if key in own and not key.startswith(PREFIX)}
     model.load_state_dict(given, strict=False)
     return model.eval().requires_grad_(False)
 
@@ -106,25 +113,32 @@ def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: 
 def look(
     model: PoseNet, config: TrainerConfig, opener: Callable[[], Sampler], windows: int, say: Callable[[str], None]
 ) -> Kept:
-    """Show the network windows as it flies, its highest peak decoded, and keep those whose target it found."""
+    """Show the network windows, decode the highest peak of each as in flight, and keep those whose target it found."""
     seen: list[Evidence] = []
     assert model.head_refine is not None
     handle = model.head_refine.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    parts: list[Kept] = []
+    found: list[Tensor] = []  # all that is kept, once the first windows tell how large it is
+    count = 0
     try:
         with Feed(opener, RENDERED_AT_ONCE, 0, config.data.workers, config.data.prefetch) as feed, torch.no_grad():
             for done in range(0, windows, RENDERED_AT_ONCE):
                 seen.clear()
-                parts.append(_found(model, config, feed.next(), seen))
+                part = _found(model, config, feed.next(), seen)
+                columns = [*part.evidence, part.residual, part.strange]
+                if not found:
+                    room = windows + RENDERED_AT_ONCE
+                    found = [torch.empty((room, *one.shape[1:]), dtype=one.dtype) for one in columns]
+                for whole, one in zip(found, columns, strict=True):
+                    whole[count : count + len(one)] = one
+                count += len(part.residual)
                 if done % (100 * RENDERED_AT_ONCE) == 0:
                     say(f"looked at {done} of {windows} windows")
     finally:
         handle.remove()
-    evidence = Evidence(*(torch.cat(values) for values in zip(*(part.evidence for part in parts), strict=True)))
-    kept = Kept(evidence, torch.cat([p.residual for p in parts]), torch.cat([p.strange for p in parts]))
-    if len(kept.residual) < FEWEST:
-        raise ConfigError(f"the network found {len(kept.residual)} targets in {windows} windows: too few to learn from")
-    return kept
+    if count < FEWEST:
+        raise ConfigError(f"the network found {count} targets in {windows} windows: too few to learn from")
+    *evidence, residual, strange = (whole[:count] for whole in found)
+    return Kept(Evidence(*evidence), residual, strange)
 
 
 def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: list[Evidence]) -> Kept:
@@ -136,9 +150,10 @@ def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: li
     out = model.decode(perceived, labels.K, peaks_xy)
     off_px = (out.center_px[:, 0] - labels.center_px).abs()
     found = (labels.present > 0) & (off_px < 0.5 * labels.size_px).all(-1)
+    residual = pose_residual(out, labels)
+    found &= residual.isfinite().all(-1)
     evidence = Evidence(*(value[found].half() for value in seen[0]))
-    strange = labels.airframe_id >= fleet_size()
-    return Kept(evidence, pose_residual(out, labels)[found], strange[found])
+    return Kept(evidence, residual[found], (labels.airframe_id >= fleet_size())[found])
 
 
 def fleet_size() -> int:
@@ -155,9 +170,9 @@ def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callabl
     optimizer = torch.optim.AdamW(head.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     batch = min(BATCH, learnt)
     steps = learnt // batch
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, LEARNING_RATE, total_steps=epochs * steps + 1, pct_start=0.1
-    )
+    # Of fewer steps than this it cannot make a cycle.
+    total = max(epochs * steps + 1, 20)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=total, pct_start=0.1)
     for epoch in range(epochs):
         head.train()
         order = torch.randperm(learnt)
@@ -187,7 +202,7 @@ def told(head: RefinementHead, kept: Kept, first: int) -> str:
     nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
     left = (residual[:, RANGE] + correction[:, RANGE]).abs()
     words = [f"nll {nll:.3f}"]
-    for name, of in (("known", ~strange), ("strangers", strange)):
+    for name, of in (("the fleet", ~strange), ("invented ones", strange)):
         if of.any():
             before, after = residual[of, RANGE].abs().mean(), left[of].mean()
             scale = torch.exp(log_sigma[of, RANGE]).median()

@@ -16,6 +16,8 @@ from trainer.layers import conv_bn_relu, mlp
 CORRECTED = 3  # origin u, v in box sides sqrt(w h), log Z
 SIGMAS = 6  # those, and rotation x, y, z in `cam`, rad
 LOG_SIGMA_RANGE = (-7.0, 1.5)
+# What it reads of a picture like none before may be far off all that it learnt from; its correction shall not be.
+CORRECTION_MAX = (0.5, 0.7)  # of the origin, of log Z
 
 
 class Evidence(NamedTuple):
@@ -71,4 +73,6 @@ class RefinementHead(nn.Module):
         grid, *rest = (value.detach() for value in evidence)
         seen = self.dropout(self.norm(torch.cat([self.convs(grid).flatten(1), *rest], dim=-1)))
         decided = self.decide(seen)
-        return Refined(self.place(decided), torch.clamp(self.sigma(decided) - 2.0, *LOG_SIGMA_RANGE))
+        origin, log_Z = self.place(decided).split([2, 1], dim=-1)
+        origin, log_Z = (v.clamp(-most, most) for v, most in zip((origin, log_Z), CORRECTION_MAX, strict=True))
+        return Refined(torch.cat([origin, log_Z], dim=-1), torch.clamp(self.sigma(decided) - 2.0, *LOG_SIGMA_RANGE))

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-# Where trainer.graph quantises, as submodules, but for the refinement head, which learns apart.
+# Where trainer.graph quantises, as submodules but for the refinement head: not every network has one.
 ROUNDED_PARTS = ("backbone", "neck", "head_hm.0", "dts.convs")
 IMAGE_CHANNELS = 3
 _SMALLEST_SCALE = 1e-8

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +15,23 @@ from synthetic_sampler import PlateSampler
 
 from sim_replay.sample import SampleBatch
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
-from trainer.config import ConfigError
-from trainer.refine import Kept, RefinePlan, fit, refine
+from trainer.config import ConfigError, DataConfig
+from trainer.equations import heatmap_peaks
+from trainer.losses import pose_residual
+from trainer.refine import Kept, RefinePlan, fit, fleet_size, look, refine
 from trainer.refinement import Evidence, RefinementHead, answer_count
 
 PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
 
 
 class Filling(PlateSampler):
-    """Boxes as large as the picture, so that an untrained network's peak lies in them."""
+    """Boxes as large as the picture, so that an untrained network's peak lies in them; every third is a stranger."""
 
     def batch(self, first_index: int, count: int) -> SampleBatch:
         batch = super().batch(first_index, count)
         box = np.tile(np.array([0, 0, self.size_px, self.size_px], np.float32), (count, 1))
-        return dataclasses.replace(batch, box_xyxy_px=box)
-
-
-def open_plates() -> Filling:
-    return Filling(PLAN.seed, 64)
+        strange = np.where((first_index + np.arange(count)) % 3 == 0, fleet_size() + 5, batch.airframe_id)
+        return dataclasses.replace(batch, box_xyxy_px=box, airframe_id=strange.astype(np.int32))
 
 
 class NoTargets(PlateSampler):
@@ -39,8 +40,14 @@ class NoTargets(PlateSampler):
         return dataclasses.replace(batch, present=batch.present & False)
 
 
-def open_empty() -> NoTargets:
-    return NoTargets(PLAN.seed, 64)
+def open_plates(data: DataConfig, seed: int, size_px: int) -> Callable[[], Filling]:
+    assert (data.invented_share, data.empty_share, data.datasets) == (PLAN.strangers, 0.0, [])
+    assert (seed, size_px) == (PLAN.seed, tiny.config().schedule.sizes[-1].size_px)
+    return partial(Filling, seed, size_px)
+
+
+def open_empty(data: DataConfig, seed: int, size_px: int) -> Callable[[], NoTargets]:
+    return partial(NoTargets, seed, size_px)
 
 
 def write_run(folder: Path, toml: str = tiny.TOML) -> Path:
@@ -75,6 +82,34 @@ def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_
     load_model(refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent))
 
 
+def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:
+    kept = look(tiny.network(3).eval(), tiny.config(), partial(Filling, 7, 96, 0.0), 96, silent)
+    assert kept.residual.shape == (96, 6)
+    assert kept.strange.tolist() == [index % 3 == 0 for index in range(96)]
+
+
+def test_a_correction_by_what_an_answer_is_off_by_makes_the_truth() -> None:
+    """The truth here lies a tenth of a box right of the answer, a twentieth above it, and e^0.2 times as far."""
+    network = tiny.network(3).eval()
+    image, labels = tiny.batch(8)
+    off = torch.tensor([0.1, -0.05, 0.2])
+    with torch.no_grad():
+        seen = network.perceive(image)
+        out = network.decode(seen, labels.K, heatmap_peaks(torch.sigmoid(seen.heat_logits), 1)[1])
+        side_px = torch.sqrt(torch.exp(out.log_size[:, 0]).prod(-1, keepdim=True))
+        point = torch.cat([out.origin_px[:, 0] + side_px * off[:2], torch.ones(8, 1)], dim=-1)
+        true_m = torch.exp(out.log_Z + off[2]) * torch.linalg.solve(labels.K, point[..., None])[..., 0]
+        truth = labels._replace(t_cam_target_m=true_m, R_cam_target=out.R_ego[:, 0])
+        residual = pose_residual(out, truth)
+        torch.testing.assert_close(residual[:, :3], -off.expand(8, 3), rtol=1e-3, atol=1e-4)
+        assert network.head_refine is not None
+        network.head_refine.place.bias.copy_(-residual[:, :3].mean(0))
+        _, _, _, _, t_m, _, _ = network(image, labels.K)
+    told = (true_m[:, 2] > 50) & (true_m[:, 2] < 600)
+    assert told.any()
+    torch.testing.assert_close(t_m[told, 0], true_m[told], rtol=1e-3, atol=1e-2)
+
+
 def test_what_cannot_be_refined_is_a_sentence(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     with pytest.raises(ConfigError, match="--seed 3: is one that the network was trained"):
@@ -84,6 +119,12 @@ def test_what_cannot_be_refined_is_a_sentence(tmp_path: Path) -> None:
     unsure = write_run(tmp_path / "unsure", tiny.TOML.replace("uncertainty = true", "uncertainty = false"))
     with pytest.raises(ConfigError, match="uncertainty is false"):
         refine(unsure, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
+    write_atomic(tmp_path / "going" / "resume.pt", {})
+    with pytest.raises(ConfigError, match="a run that training may go on with"):
+        refine(run, tmp_path / "going", PLAN, open_sampler=open_plates, say=silent)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="file is a file"):
+        refine(run, tmp_path / "file", PLAN, open_sampler=open_plates, say=silent)
     content = load_file(run)
     write_atomic(run / "weights.pt", content | {"weights": {**content["weights"], "head_trans.weight": torch.zeros(1)}})
     with pytest.raises(ConfigError, match="not of the network"):
