@@ -145,7 +145,7 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "refine",
         help="teach a trained network how sure it is, and what to correct",
         description="Show a trained network rendered windows, and teach its refinement head alone by its answers: "
-        "corrections of the place, and sigma. All else stays as it is. Writes weights.pt into --out.",
+        "a correction of the range, and sigma. All else stays as it is. Writes weights.pt into --out.",
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="folder for the weights")

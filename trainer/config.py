@@ -58,7 +58,7 @@ class ModelConfig(Section):
     depth: Literal["direct", "plain", "rotation_aware"] = Field(
         description="Z itself, or APDD with a scale that is free or made of latent extents seen from R"
     )
-    uncertainty: bool = Field(description="train the head that tells sigma and corrects the place")
+    uncertainty: bool = Field(description="train the head that tells sigma and corrects the range")
     hypotheses: int = Field(
         1, ge=1, description="rotations proposed for a target, each for headings around its own; the likeliest is said"
     )

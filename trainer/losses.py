@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from trainer import equations as eq
 from trainer.config import LossConfig
 from trainer.model import Decoded
-from trainer.refinement import CORRECTED, SIGMAS
+from trainer.refinement import RANGE
 
 SMALLEST_SIZE_PX = 2.0
 UNJUDGED = 1.0 - 1e-3  # of the heatmap's target: the focal loss asks next to nothing there
@@ -113,9 +113,13 @@ def pose_residual(out: Decoded, labels: Labels) -> Tensor:
 
 
 def refinement_nll(residual: Tensor, correction: Tensor, log_sigma: Tensor) -> Tensor:
-    """Negative log likelihood [..., 6] of residuals [..., 6] once corrected, of Laplace laws, but for a constant."""
-    place, rotation = residual.split([CORRECTED, SIGMAS - CORRECTED], dim=-1)
-    left = torch.cat([place + correction, rotation], dim=-1)
+    """Negative log likelihood [N, 6], but for a constant, of residuals [N, 6] of Laplace laws.
+
+    `correction` [N] is of their log Z.
+    """
+    left = torch.cat(
+        [residual[:, :RANGE], (residual[:, RANGE] + correction)[:, None], residual[:, RANGE + 1 :]], dim=-1
+    )
     return left.abs() * torch.exp(-log_sigma) + log_sigma
 
 

@@ -18,7 +18,7 @@ from trainer.backbones import build_backbone
 from trainer.config import ModelConfig
 from trainer.layers import conv_bn_relu, mlp
 from trainer.neck import AlignFuseNeck
-from trainer.refinement import CORRECTED, SIGMAS, Evidence, Refined, RefinementHead, answers_of
+from trainer.refinement import SIGMAS, Evidence, Refined, RefinementHead, answers_of
 
 Z_RANGE_M = (50.0, 600.0)
 OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -32,14 +32,14 @@ class Decoded(NamedTuple):
 
     center_px: Tensor  # [N, M, 2]
     log_size: Tensor  # [N, M, 2], log (w, h) in log pixels
-    origin_px: Tensor  # [N, M, 2], before its correction
+    origin_px: Tensor  # [N, M, 2]
     log_Z: Tensor  # [N, M], not clamped, before its correction
     hypothesis_logits: Tensor  # [N, M, K]
     R_allo_k: Tensor  # [N, M, K, 3, 3], every hypothesis
     R_ego_k: Tensor  # [N, M, K, 3, 3]
     R_ego: Tensor  # [N, M, 3, 3], the likeliest
-    correction: Tensor  # [N, M, 3], to be added: (u, v) in box sides sqrt(w h), log Z
-    log_sigma: Tensor  # [N, M, 6], Laplace scale after it: as `correction`, then rotation x y z in rad
+    correction: Tensor  # [N, M], to be added to log Z
+    log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), corrected log Z, rotation x y z in rad
 
 
 class Perception(NamedTuple):
@@ -226,7 +226,7 @@ class PoseNet(nn.Module):
             R_allo_k.reshape(-1, M, count, 3, 3),
             (R_ray[:, None] @ R_allo_k).reshape(-1, M, count, 3, 3),
             R_ego.reshape(-1, M, 3, 3),
-            refined.correction.reshape(-1, M, CORRECTED),
+            refined.correction.reshape(-1, M),
             refined.log_sigma.reshape(-1, M, SIGMAS),
         )
 
@@ -251,8 +251,8 @@ class PoseNet(nn.Module):
 
     def _refined(self, evidence: Evidence) -> Refined:
         if self.head_refine is None:
-            zeros = torch.zeros_like(evidence.f_trans[..., : CORRECTED + SIGMAS])
-            return Refined(zeros[..., :CORRECTED], zeros[..., CORRECTED:])
+            zeros = torch.zeros_like(evidence.f_trans[..., :SIGMAS])
+            return Refined(zeros[..., 0], zeros)
         return self.head_refine(evidence)
 
     def _sigma_g(self, log_P: Tensor) -> Tensor | float:
@@ -272,14 +272,13 @@ class PoseNet(nn.Module):
         score, peaks_xy = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), self.config.max_peaks)
         out = self.decode(seen, K, peaks_xy)
         size_px = torch.exp(out.log_size)
+        Z = torch.clamp(torch.exp(out.log_Z + out.correction), *Z_RANGE_M)
+        t_cam_target_m = eq.back_project(eq.image_plane_point(out.origin_px, K[:, None]), Z)
         side_px = torch.sqrt(size_px.prod(-1, keepdim=True))
-        origin_px = out.origin_px + out.correction[..., :2] * side_px
-        Z = torch.clamp(torch.exp(out.log_Z + out.correction[..., 2]), *Z_RANGE_M)
-        t_cam_target_m = eq.back_project(eq.image_plane_point(origin_px, K[:, None]), Z)
         # A Laplace law of scale b has the standard deviation sqrt(2) b.
         sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
         sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
-        return score, out.center_px, size_px, origin_px, t_cam_target_m, out.R_ego, sigma
+        return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
 
 
 def _extent_px(log_P: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from trainer.config import ConfigError, DataConfig, TrainerConfig, made_folder, 
 from trainer.data import Feed, Sampler, TrainingBatch, to_tensors
 from trainer.losses import pose_residual, refinement_nll
 from trainer.model import Perception, PoseNet
-from trainer.refinement import Evidence, RefinementHead
+from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
 from trainer.sources import window_sampler
 
@@ -28,7 +28,6 @@ BATCH = 512
 HELD_OUT_SHARE = 0.04
 FEWEST = 50  # targets
 LEARNING_RATE, WEIGHT_DECAY, DROPOUT = 2e-3, 0.2, 0.3
-RANGE = 2  # of the residuals
 
 
 class RefinePlan(NamedTuple):
@@ -200,7 +199,7 @@ def told(head: RefinementHead, kept: Kept, first: int) -> str:
         return "nothing"
     correction, log_sigma = (torch.cat(values) for values in zip(*refined, strict=True))
     nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
-    left = (residual[:, RANGE] + correction[:, RANGE]).abs()
+    left = (residual[:, RANGE] + correction).abs()
     words = [f"nll {nll:.3f}"]
     for name, of in (("the fleet", ~strange), ("invented ones", strange)):
         if of.any():

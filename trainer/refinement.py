@@ -1,4 +1,4 @@
-"""The last look at a pose: what its place is to be corrected by, and how sure it is.
+"""The last look at a pose: what its range is to be corrected by, and how sure all of it is.
 
 It reads all that the decoders had and answered, and teaches none of them: how well they know an aircraft is another
 question than where it is, and a network that is taught both at once answers the second worse.
@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from trainer.layers import conv_bn_relu, mlp
 
-CORRECTED = 3  # origin u, v in box sides sqrt(w h), log Z
-SIGMAS = 6  # those, and rotation x, y, z in `cam`, rad
+SIGMAS = 6  # origin u, v in box sides sqrt(w h), log Z, rotation x, y, z in `cam`, rad
+RANGE = 2  # of these
 LOG_SIGMA_RANGE = (-7.0, 1.5)
 # What it reads of a picture like none before may be far off all that it learnt from; its correction shall not be.
-CORRECTION_MAX = (0.5, 0.7)  # of the origin, of log Z
+CORRECTION_MAX = 0.7
 
 
 class Evidence(NamedTuple):
@@ -30,10 +30,10 @@ class Evidence(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """Residuals and Laplace scales, in CORRECTED's and SIGMAS' units."""
+    """What is to be added to log Z, and the Laplace scales after that."""
 
-    correction: Tensor  # [P, 3], to be added to the answer
-    log_sigma: Tensor  # [P, 6]
+    correction: Tensor  # [P]
+    log_sigma: Tensor  # [P, 6], in SIGMAS' units
 
 
 def answer_count(hypotheses: int) -> int:
@@ -63,16 +63,15 @@ class RefinementHead(nn.Module):
         # Only a fit by itself drops any: see trainer.refine.
         self.dropout = nn.Dropout(0.0)
         self.decide = nn.Sequential(mlp(16 * narrow + told, hidden, hidden), nn.ReLU(inplace=True))
-        self.place = nn.Linear(hidden, CORRECTED)
+        self.range = nn.Linear(hidden, 1)
         self.sigma = nn.Linear(hidden, SIGMAS)
         with torch.no_grad():
-            self.place.weight.zero_()
-            self.place.bias.zero_()
+            self.range.weight.zero_()
+            self.range.bias.zero_()
 
     def forward(self, evidence: Evidence) -> Refined:
         grid, *rest = (value.detach() for value in evidence)
         seen = self.dropout(self.norm(torch.cat([self.convs(grid).flatten(1), *rest], dim=-1)))
         decided = self.decide(seen)
-        origin, log_Z = self.place(decided).split([2, 1], dim=-1)
-        origin, log_Z = (v.clamp(-most, most) for v, most in zip((origin, log_Z), CORRECTION_MAX, strict=True))
-        return Refined(torch.cat([origin, log_Z], dim=-1), torch.clamp(self.sigma(decided) - 2.0, *LOG_SIGMA_RANGE))
+        correction = torch.clamp(self.range(decided)[:, 0], -CORRECTION_MAX, CORRECTION_MAX)
+        return Refined(correction, torch.clamp(self.sigma(decided) - 2.0, *LOG_SIGMA_RANGE))

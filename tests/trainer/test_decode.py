@@ -127,18 +127,28 @@ def test_the_graph_tells_the_point_that_its_own_origin_and_depth_make() -> None:
     np.testing.assert_allclose(torch.linalg.det(R), np.ones(R.shape[:2]), atol=1e-4)
 
 
-def test_corrections_move_the_origin_by_box_sides_and_the_depth_by_a_factor() -> None:
+def test_the_correction_is_a_factor_of_depth_and_leaves_the_rest() -> None:
     network = tiny.network().eval()
     image, labels = tiny.batch()
     with torch.no_grad():
-        _, _, size_px, origin_px, t, _, _ = network(image, labels.K)
+        *before, t, _, sigma = network(image, labels.K)
         assert network.head_refine is not None
-        network.head_refine.place.bias.copy_(torch.tensor([0.5, -0.25, 0.1]))
-        _, _, _, moved_px, moved_t, _, _ = network(image, labels.K)
-    side_px = torch.sqrt(size_px[..., 0] * size_px[..., 1])
-    torch.testing.assert_close(moved_px - origin_px, side_px[..., None] * torch.tensor([0.5, -0.25]))
+        network.head_refine.range.bias.fill_(0.1)
+        *after, moved_t, _, moved_sigma = network(image, labels.K)
+    for one, other in zip([*before, sigma], [*after, moved_sigma], strict=True):
+        torch.testing.assert_close(one, other)
     inside = (t[..., 2] > 51) & (moved_t[..., 2] < 599)
     assert inside.any()
-    torch.testing.assert_close(
-        (moved_t[..., 2] / t[..., 2])[inside], torch.full((int(inside.sum()),), np.exp(0.1)), check_dtype=False
-    )
+    farther = np.exp(0.1) * t[inside]
+    torch.testing.assert_close(moved_t[inside], farther)
+
+
+def test_what_is_read_of_a_picture_like_none_before_cannot_throw_the_range() -> None:
+    network = tiny.network().eval()
+    image, labels = tiny.batch()
+    with torch.no_grad():
+        assert network.head_refine is not None
+        network.head_refine.range.bias.fill_(40.0)
+        seen = network.perceive(image)
+        correction = network.decode(seen, labels.K, torch.ones(len(image), 1, 2)).correction
+    assert correction.tolist() == [[pytest.approx(0.7)]] * len(image)

@@ -95,7 +95,7 @@ def perfect(labels: Labels, hypotheses: int = 4) -> Decoded:
         R_allo[:, None, None].expand(every),
         labels.R_cam_target[:, None, None].expand(every),
         labels.R_cam_target[:, None],
-        torch.zeros(len(t), 1, 3),
+        torch.zeros(len(t), 1),
         torch.zeros(len(t), 1, 6),
     )
 

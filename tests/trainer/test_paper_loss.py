@@ -107,7 +107,7 @@ def test_what_is_corrected_is_no_error_of_sigma_s_law() -> None:
     def cost(correction: float) -> float:
         out = perfect(LABELS, 1)._replace(
             log_Z=log_Z,
-            correction=torch.tensor([[[0.0, 0.0, correction]]]),
+            correction=torch.tensor([[correction]]),
             log_sigma=torch.full((1, 1, 6), math.log(0.1)),
         )
         return pose_terms(out, LABELS, LossConfig(uncertainty=1.0))["uncertainty"].item()
