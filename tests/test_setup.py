@@ -24,7 +24,7 @@ exit $status
 
 def test_a_disk_too_small_for_the_packages_is_told_before_any_is_fetched(tmp_path: Path) -> None:
     if not can_mount(tmp_path):
-        pytest.skip("this user may not mount a disk of its own")
+        pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
     mounting = ["unshare", "--map-root-user", "--mount", "sh", "-c", ON_A_SMALL_DISK, "sh"]
     done = subprocess.run([*mounting, tmp_path, sys.executable, ROOT], capture_output=True, text=True)
     assert done.returncode == 2
