@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES, airframe_of
+from sim_replay.airframes.invented import FLEET_ALONE, Invention
 from sim_replay.render.distractors import add_decoy, add_distractors
 from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
 from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
@@ -96,13 +97,13 @@ class WindowSampler:
         airframe_ids: Sequence[int] | None = None,
         acquire_share: float = 0.3,
         empty_share: float = 0.12,
-        invented_share: float = 0.0,
+        invention: Invention = FLEET_ALONE,
         acquire_view: AcquireView = "crop",
     ) -> None:
         self.seed, self.size_px = seed, size_px
         self.airframe_ids = tuple(range(len(AIRFRAMES)) if airframe_ids is None else airframe_ids)
         self.acquire_share, self.empty_share = acquire_share, empty_share
-        self.invented_share, self.acquire_view = invented_share, acquire_view
+        self.invention, self.acquire_view = invention, acquire_view
         self._renderer: Renderer | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -125,8 +126,9 @@ class WindowSampler:
         return SampleBatch(**out)
 
     def _window(self, index: int) -> Window:
-        shares = self.acquire_share, self.empty_share, self.invented_share
-        return draw_window(self.seed, index, self.size_px, self.airframe_ids, *shares, self.acquire_view)
+        shares = self.acquire_share, self.empty_share
+        drawn = self.seed, index, self.size_px, self.airframe_ids, *shares, self.invention, self.acquire_view
+        return draw_window(*drawn)
 
     def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:
         side, size = window.scene.camera.width_px, self.size_px

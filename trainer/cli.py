@@ -158,7 +158,7 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "--strangers",
         type=share,
         default=0.35,
-        help="share of targets that are invented aircraft, no members of the fleet (default %(default)s)",
+        help="share of targets that are invented aircraft, of some that no training draws (default %(default)s)",
     )
     refine.set_defaults(run=_refine)
 

@@ -20,7 +20,7 @@ from trainer.losses import pose_residual, refinement_nll
 from trainer.model import Perception, PoseNet
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
-from trainer.sources import window_sampler
+from trainer.sources import refinement_sampler
 
 PREFIX = "head_refine."
 RENDERED_AT_ONCE = 32
@@ -36,7 +36,7 @@ class RefinePlan(NamedTuple):
     seed: int
     windows: int = 100_000
     epochs: int = 8
-    strangers: float = 0.35  # share of targets that are no member of the fleet
+    strangers: float = 0.35  # share of targets that are aircraft new to the network
 
 
 class Kept(NamedTuple):
@@ -57,7 +57,7 @@ def refine(
     out: Path,
     plan: RefinePlan,
     *,
-    open_sampler: Callable[[DataConfig, int, int], Callable[[], Sampler]] = window_sampler,
+    open_sampler: Callable[[DataConfig, int, int, float], Callable[[], Sampler]] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Write weights.pt with a refinement head learnt anew into `out`; returns its path. Raises ConfigError."""
@@ -76,9 +76,7 @@ def refine(
     torch.manual_seed(plan.seed)
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
     model.head_refine = head.eval()
-    # Rendered windows alone: a dataset's pictures are few, and its errors on those that it was trained on too small.
-    data = config.data.model_copy(update={"invented_share": plan.strangers, "empty_share": 0.0, "datasets": []})
-    opener = open_sampler(data, plan.seed, config.schedule.sizes[-1].size_px)
+    opener = open_sampler(config.data, plan.seed, config.schedule.sizes[-1].size_px, plan.strangers)
     kept = look(model, config, opener, plan.windows, say)
     fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
     training = content["training"] | {

@@ -11,7 +11,8 @@ from trainer.dataset_windows import DatasetSampler, MixedSampler
 
 
 def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
-    from sim_replay.sampler import WindowSampler  # needs the renderer's packages
+    from sim_replay.airframes.invented import Invention  # needs the renderer's packages
+    from sim_replay.sampler import WindowSampler
 
     validating = seed == config.validation_seed
     view = config.acquire_view
@@ -24,9 +25,9 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
             shares.append(source.share)
     if not samplers or config.rendered_share > 0.0:
         # What is measured on holds the fleet alone, however many invented aircraft are trained on.
-        invented = 0.0 if validating or held_out else config.invented_share
+        invention = Invention(0.0 if validating or held_out else config.invented_share)
         samplers.append(
-            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invented, view)
+            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invention, view)
         )
         shares.append(1.0 - sum(shares))
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
@@ -49,3 +50,19 @@ def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool =
     `held_out` windows come from no picture that is trained on; those of the validation seed are always so.
     """
     return partial(_open_window_sampler, config, seed, size_px, held_out)
+
+
+def _open_refinement_sampler(config: DataConfig, seed: int, size_px: int, strangers: float) -> Sampler:
+    from sim_replay.airframes.invented import KEPT_BACK_VARIANTS, Invention
+    from sim_replay.sampler import WindowSampler
+
+    invention = Invention(strangers, KEPT_BACK_VARIANTS)
+    shares = config.acquire_share, 0.0
+    return WindowSampler(seed, size_px, config.airframe_ids, *shares, invention, config.acquire_view)
+
+
+def refinement_sampler(config: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], Sampler]:
+    """As `window_sampler`, for learning how far a trained network may be trusted: a target in each window, a share of
+    `strangers` among them that no training draws. Of rendered windows alone: a dataset's pictures are few, and the
+    network's errors on those that it was trained on too small."""
+    return partial(_open_refinement_sampler, config, seed, size_px, strangers)

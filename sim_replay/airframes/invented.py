@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 from sim_replay.airframes.fleet import AIRFRAMES, Airframe
 from sim_replay.airframes.mesh import Mesh, Part, merge, moved, scaled
 
-VARIANTS = 4  # of each pair of members of the fleet; a renderer keeps all that it has drawn
+# Variants of each pair of members of the fleet; a renderer keeps all that it has drawn. How sure a network may be of a
+# stranger is learnt from some that it was not trained on: what it knows by heart is none to it.
+TRAINING_VARIANTS, KEPT_BACK_VARIANTS = range(4), range(4, 8)
 SIZE_SIGMA = 0.35  # of the logarithm of span and length together
 STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
 SPAN_M = (1.5, 26.0)
@@ -32,6 +35,16 @@ CANARD_SPAN, CANARD_CHORD = (0.25, 0.5), (0.3, 0.6)  # of the wing's
 _EXCHANGEABLE = (Part.WING, Part.TAIL)
 
 
+class Invention(NamedTuple):
+    """How many targets are invented aircraft, and which."""
+
+    share: float = 0.0  # 0..1
+    variants: range = TRAINING_VARIANTS
+
+
+FLEET_ALONE = Invention()
+
+
 def airframe_of(airframe_id: int) -> Airframe:
     """A member of the fleet, or beyond its end an invented aircraft. Raises IndexError beyond the last of those."""
     if airframe_id < len(AIRFRAMES):
@@ -39,11 +52,11 @@ def airframe_of(airframe_id: int) -> Airframe:
     return _invented(airframe_id)
 
 
-def draw_invented(rng: np.random.Generator, airframe_ids: Sequence[int]) -> int:
+def draw_invented(rng: np.random.Generator, airframe_ids: Sequence[int], variants: range = TRAINING_VARIANTS) -> int:
     """The number of an invented aircraft that is made of parts of these members of the fleet alone."""
     base, donor = (int(rng.choice(np.asarray(airframe_ids))) for _ in range(2))
     fleet = len(AIRFRAMES)
-    return fleet + (int(rng.integers(VARIANTS)) * fleet + donor) * fleet + base
+    return fleet + (int(rng.integers(variants.start, variants.stop)) * fleet + donor) * fleet + base
 
 
 @cache
@@ -51,7 +64,7 @@ def _invented(airframe_id: int) -> Airframe:
     fleet = len(AIRFRAMES)
     rest, base = divmod(airframe_id - fleet, fleet)
     variant, donor = divmod(rest, fleet)
-    if variant >= VARIANTS:
+    if variant >= KEPT_BACK_VARIANTS.stop:
         raise IndexError(f"there is no airframe {airframe_id}")
     rng = np.random.default_rng([variant, donor, base])
     original, other = AIRFRAMES[base], AIRFRAMES[donor]

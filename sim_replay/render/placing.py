@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.geometry import R_from_euler, so3_exp
-from sim_replay.airframes.invented import draw_invented
+from sim_replay.airframes.invented import FLEET_ALONE, Invention, draw_invented
 from sim_replay.render.distractors import Decoy
 from sim_replay.render.environment import direction_ned
 from sim_replay.render.frame import outline_px
@@ -104,12 +104,12 @@ def _lens_for(
 def frame_scene(
     rng: np.random.Generator,
     airframe_ids: Sequence[int],
-    invented_share: float = 0.0,
+    invention: Invention = FLEET_ALONE,
     small_share: float = SMALL_SHARE,
 ) -> Scene:
     """A whole 1920 x 1080 frame with one target wholly inside it where the lens allows."""
-    if invented_share > 0.0 and rng.random() < invented_share:
-        airframe_id = draw_invented(rng, airframe_ids)
+    if invention.share > 0.0 and rng.random() < invention.share:
+        airframe_id = draw_invented(rng, airframe_ids, invention.variants)
     else:
         airframe_id = int(rng.choice(np.asarray(airframe_ids)))
     vertices_m = solid_vertices_m(airframe_id)
@@ -190,7 +190,7 @@ def draw_window(
     airframe_ids: Sequence[int],
     acquire_share: float,
     empty_share: float,
-    invented_share: float = 0.0,
+    invention: Invention = FLEET_ALONE,
     acquire_view: AcquireView = "crop",
 ) -> Window:
     """Window number `index`: a pure function of its arguments."""
@@ -198,7 +198,7 @@ def draw_window(
     kind: Kind = "acquire" if rng.random() < acquire_share else "track"
     empty = bool(rng.random() < empty_share)
     distractors = bool(rng.random() < (DISTRACTORS_EMPTY_SHARE if empty else DISTRACTORS_SHARE))
-    frame = frame_scene(rng, airframe_ids, invented_share, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
+    frame = frame_scene(rng, airframe_ids, invention, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
     if kind == "acquire" and acquire_view == "frame":
         rendered_px = size_px
         x0, y0, scale_x, scale_y = 0.0, 0.0, size_px / FRAME_WIDTH_PX, size_px / FRAME_HEIGHT_PX

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from sim_replay.airframes import AIRFRAMES, Part, airframe_of
-from sim_replay.airframes.invented import SPAN_M, bent, draw_invented
+from sim_replay.airframes.invented import (
+    FLEET_ALONE,
+    KEPT_BACK_VARIANTS,
+    SPAN_M,
+    TRAINING_VARIANTS,
+    Invention,
+    bent,
+    draw_invented,
+)
 from sim_replay.airframes.mesh import Mesh, loft
 from sim_replay.sampler import WindowSampler
 
@@ -91,8 +99,20 @@ def test_only_parts_of_the_given_members_are_used() -> None:
         assert {word for word in words if word in {a.name for a in AIRFRAMES}} <= given
 
 
+def test_those_kept_back_from_training_are_others() -> None:
+    rng = np.random.default_rng(2)
+    drawn, kept_back = (
+        {draw_invented(rng, range(FLEET), variants) for _ in range(400)}
+        for variants in (TRAINING_VARIANTS, KEPT_BACK_VARIANTS)
+    )
+    assert not drawn & kept_back
+    assert len(kept_back) > 300
+    sizes_m = [airframe_of(number).span_m for number in sorted(kept_back)[:20]]
+    assert len({round(size_m, 3) for size_m in sizes_m}) > 15
+
+
 def test_windows_show_them_with_labels_that_fit() -> None:
-    batch = WindowSampler(5, 96, [0, 3, 6], 0.0, 0.0, 1.0).batch(0, 12)
+    batch = WindowSampler(5, 96, [0, 3, 6], 0.0, 0.0, Invention(1.0)).batch(0, 12)
     seen = batch.present
     assert seen.sum() >= 10
     assert (batch.airframe_id[seen] >= FLEET).all()
@@ -108,6 +128,6 @@ def test_windows_show_them_with_labels_that_fit() -> None:
 
 
 def test_without_a_share_the_windows_are_the_fleets_own() -> None:
-    plain, named = WindowSampler(7, 64).batch(0, 4), WindowSampler(7, 64, invented_share=0.0).batch(0, 4)
+    plain, named = WindowSampler(7, 64).batch(0, 4), WindowSampler(7, 64, invention=FLEET_ALONE).batch(0, 4)
     assert (plain.airframe_id < FLEET).all()
     assert np.array_equal(plain.image_bgr, named.image_bgr)

@@ -13,6 +13,7 @@ import tiny
 import torch
 from synthetic_sampler import PlateSampler
 
+from sim_replay.airframes.invented import draw_invented
 from sim_replay.sample import SampleBatch
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.config import ConfigError, DataConfig
@@ -20,6 +21,7 @@ from trainer.equations import heatmap_peaks
 from trainer.losses import pose_residual
 from trainer.refine import Kept, RefinePlan, fit, fleet_size, look, refine
 from trainer.refinement import Evidence, RefinementHead, answer_count
+from trainer.sources import refinement_sampler
 
 PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
 
@@ -40,13 +42,12 @@ class NoTargets(PlateSampler):
         return dataclasses.replace(batch, present=batch.present & False)
 
 
-def open_plates(data: DataConfig, seed: int, size_px: int) -> Callable[[], Filling]:
-    assert (data.invented_share, data.empty_share, data.datasets) == (PLAN.strangers, 0.0, [])
-    assert (seed, size_px) == (PLAN.seed, tiny.config().schedule.sizes[-1].size_px)
+def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], Filling]:
+    assert (seed, size_px, strangers) == (PLAN.seed, tiny.config().schedule.sizes[-1].size_px, PLAN.strangers)
     return partial(Filling, seed, size_px)
 
 
-def open_empty(data: DataConfig, seed: int, size_px: int) -> Callable[[], NoTargets]:
+def open_empty(data: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], NoTargets]:
     return partial(NoTargets, seed, size_px)
 
 
@@ -80,6 +81,19 @@ def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_
     older = {name: value for name, value in content["weights"].items() if not name.startswith("head_refine.")}
     write_atomic(run / "weights.pt", content | {"weights": older | {"head_sigma_t.0.weight": torch.zeros(8, 32)}})
     load_model(refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent))
+
+
+def test_its_strangers_are_none_that_training_draws() -> None:
+    """Two of three are asked to be strangers, whatever share the run was trained with; each window shows a target."""
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.5)
+    batch = refinement_sampler(data, 12, 96, 2 / 3)().batch(0, 24)
+    strange = batch.airframe_id >= fleet_size()
+    assert batch.present.mean() > 0.8
+    assert 0.4 < strange[batch.present].mean() < 0.9
+    names = {int(number) for number in batch.airframe_id[strange]}
+    of_training = {draw_invented(np.random.default_rng(k), data.airframe_ids or []) for k in range(400)}
+    assert names
+    assert not names & of_training
 
 
 def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:
