@@ -218,11 +218,3 @@ AIRFRAMES: tuple[Airframe, ...] = (
         small_uavs.jet_target_drone,
     ),
 )
-
-
-def airframe_id(name: str) -> int:
-    """Index of the airframe of that name. Raises ValueError that lists the names there are."""
-    names = [airframe.name for airframe in AIRFRAMES]
-    if name not in names:
-        raise ValueError(f"no airframe is called {name!r}; there are {', '.join(names)}")
-    return names.index(name)

@@ -1,12 +1,13 @@
-"""Aircraft that nobody built: the fleet's parts exchanged, swept, stretched and resized, for training alone.
+"""Aircraft that nobody built: the fleet's parts exchanged, swept, stretched and resized, to learn of strangers from.
 
 A network that has only seen the fleet takes every stranger for the member that looks most like it, and is as sure of
 its size; and one that has seen small wings at tails alone takes a canard's nose for its tail. Numbers from
-`len(AIRFRAMES)` on mean such aircraft; they never occur in a dataset's labels.
+`len(AIRFRAMES)` on mean such aircraft.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,8 +20,9 @@ from sim_replay.airframes.fleet import AIRFRAMES, Airframe
 from sim_replay.airframes.mesh import Mesh, Part, merge, moved, scaled
 
 # Variants of each pair of members of the fleet; a renderer keeps all that it has drawn. How sure a network may be of a
-# stranger is learnt from some that it was not trained on: what it knows by heart is none to it.
-TRAINING_VARIANTS, KEPT_BACK_VARIANTS = range(4), range(4, 8)
+# stranger is learnt from some that it was not trained on (what it knows by heart is none to it), and judged by others.
+TRAINING_VARIANTS, KEPT_BACK_VARIANTS, DATASET_VARIANTS = range(4), range(4, 8), range(8, 12)
+_NAME = "invented_"
 SIZE_SIGMA = 0.35  # of the logarithm of span and length together
 STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
 SPAN_M = (1.5, 26.0)
@@ -45,27 +47,56 @@ class Invention(NamedTuple):
 FLEET_ALONE = Invention()
 
 
-def airframe_of(airframe_id: int) -> Airframe:
+def airframe_of(number: int) -> Airframe:
     """A member of the fleet, or beyond its end an invented aircraft. Raises IndexError beyond the last of those."""
-    if airframe_id < len(AIRFRAMES):
-        return AIRFRAMES[airframe_id]
-    return _invented(airframe_id)
+    return AIRFRAMES[number] if number < len(AIRFRAMES) else _invented(number)
+
+
+def airframe_id(name: str) -> int:
+    """The number of the airframe of that name, the fleet's or invented. Raises ValueError that lists the fleet's."""
+    names = [airframe.name for airframe in AIRFRAMES]
+    if name in names:
+        return names.index(name)
+    number = name.removeprefix(_NAME)
+    if (
+        name.startswith(_NAME)
+        and number.isdecimal()
+        and len(names) <= int(number) < _number(DATASET_VARIANTS.stop, 0, 0)
+    ):
+        return int(number)
+    raise ValueError(f"no airframe is called {name!r}; there are {', '.join(names)}")
 
 
 def draw_invented(rng: np.random.Generator, airframe_ids: Sequence[int], variants: range = TRAINING_VARIANTS) -> int:
     """The number of an invented aircraft that is made of parts of these members of the fleet alone."""
     base, donor = (int(rng.choice(np.asarray(airframe_ids))) for _ in range(2))
+    return _number(int(rng.integers(variants.start, variants.stop)), donor, base)
+
+
+def dataset_names(count: int, airframe_ids: Sequence[int]) -> tuple[str, ...]:
+    """Names of `count` invented aircraft, of parts of these members of the fleet, that no network learns from.
+
+    Raises ValueError if there are not so many.
+    """
+    pool = [_number(*made_of) for made_of in itertools.product(DATASET_VARIANTS, airframe_ids, airframe_ids)]
+    if count > len(pool):
+        raise ValueError(f"there are no {count} invented aircraft of so few parts, but {len(pool)}")
+    drawn = np.random.default_rng(count).choice(pool, count, replace=False)
+    return tuple(f"{_NAME}{number}" for number in drawn)
+
+
+def _number(variant: int, donor: int, base: int) -> int:
     fleet = len(AIRFRAMES)
-    return fleet + (int(rng.integers(variants.start, variants.stop)) * fleet + donor) * fleet + base
+    return fleet + (variant * fleet + donor) * fleet + base
 
 
 @cache
-def _invented(airframe_id: int) -> Airframe:
+def _invented(number: int) -> Airframe:
     fleet = len(AIRFRAMES)
-    rest, base = divmod(airframe_id - fleet, fleet)
+    rest, base = divmod(number - fleet, fleet)
     variant, donor = divmod(rest, fleet)
-    if variant >= KEPT_BACK_VARIANTS.stop:
-        raise IndexError(f"there is no airframe {airframe_id}")
+    if variant >= DATASET_VARIANTS.stop:
+        raise IndexError(f"there is no airframe {number}")
     rng = np.random.default_rng([variant, donor, base])
     original, other = AIRFRAMES[base], AIRFRAMES[donor]
     exchanged = [part for part in _EXCHANGEABLE if base != donor and rng.random() < EXCHANGED_SHARE]
@@ -86,7 +117,7 @@ def _invented(airframe_id: int) -> Airframe:
 
     extent = np.ptp(build().vertices_m, axis=0)
     return Airframe(
-        f"invented_{airframe_id}",
+        f"{_NAME}{number}",
         f"{original.name} with parts of {other.name}, stretched",
         float(extent[1]),
         float(extent[0]),

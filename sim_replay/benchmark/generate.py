@@ -16,7 +16,7 @@ from pathlib import Path
 from rich.console import Console
 
 from edge.errors import InputError
-from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes import airframe_id, airframe_of
 from sim_replay.benchmark.crew import CrewError, available_cores, crew
 from sim_replay.benchmark.lenses import lenses_of
 from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, digests, write_manifest
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
         write_manifest(job, recipe, plans)
         names = {airframe_id(name) + 1: name for name in preset.airframe_names()}
-        write_models(args.out / "models", {number: AIRFRAMES[number - 1].mesh() for number in names}, names)
+        write_models(args.out / "models", {number: airframe_of(number - 1).mesh() for number in names}, names)
         try:
             _make(job, plans, chosen, workers)
         except CrewError as error:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msgs.geometry import R_from_euler
-from sim_replay.airframes import AIRFRAMES, Part, airframe_id
+from sim_replay.airframes import Part, airframe_id, airframe_of
 from sim_replay.benchmark.preset import SPLITS, Compression, Gust, Preset, Quality, Split, Weather
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def spread_ranges(rng: np.random.Generator, frames: Sequence[int], bounds_m: tup
 @cache
 def mean_box_area_m2(airframe: str) -> float:
     """Area, m², of the box around the airframe's outline seen from afar, averaged over the attitudes of flight."""
-    mesh = AIRFRAMES[airframe_id(airframe)].mesh()
+    mesh = airframe_of(airframe_id(airframe)).mesh()
     vertices = mesh.vertices_m[mesh.part != Part.PROPELLER_DISC].astype(np.float64)
     rng = np.random.default_rng(0x0A5BEC)
     areas = []

@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 
 from edge.errors import InputError
 from msgs.settings import Section, parse_settings, read_text
-from sim_replay.airframes import AIRFRAMES
+from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes.invented import dataset_names
 
 Split = Literal["train", "val", "test"]
 Weather = Literal["clear", "haze", "overcast", "low_sun", "dusk", "fog", "glare", "broken_cloud"]
@@ -45,6 +46,9 @@ class SplitSize(Section):
 class Airframes(Section):
     only: list[str] = Field(default_factory=list, description="names of the airframes to use; empty: all")
     not_those_of: str | None = Field(default=None, description="shipped preset whose `only` is left out here")
+    invented: int = Field(
+        default=0, ge=0, description="so many that nobody built, of parts of those, instead of them; 0: none"
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Airframes:
@@ -185,17 +189,20 @@ class Preset(Section):
                     f"splits.{name}: {size.frames} frames cannot be cut into {size.sequences} sequences of "
                     f"{shortest} to {longest}"
                 )
+        self.airframe_names()  # of few parts there may not be as many as asked for
         return self
 
     def airframe_names(self) -> tuple[str, ...]:
-        """The airframes this dataset shows, in the fleet's order."""
+        """The airframes this dataset shows: in the fleet's order, or invented ones."""
         if self.airframes.only:
             chosen = set(self.airframes.only)
         else:
             left_out = self.airframes.not_those_of
             chosen = {airframe.name for airframe in AIRFRAMES}
             chosen -= set(load_preset(left_out).airframes.only) if left_out else set()
-        return tuple(airframe.name for airframe in AIRFRAMES if airframe.name in chosen)
+        names = tuple(airframe.name for airframe in AIRFRAMES if airframe.name in chosen)
+        invented = self.airframes.invented
+        return dataset_names(invented, [airframe_id(name) for name in names]) if invented else names
 
 
 def held_out_airframes() -> tuple[str, ...]:

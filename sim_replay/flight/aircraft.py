@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes import airframe_id, airframe_of
 
 
 @dataclass(frozen=True)
@@ -95,5 +95,5 @@ _BY_SPAN = (
 
 def flight_class(airframe: str) -> FlightClass:
     """How the airframe of that name flies: by name, else by its span. Raises ValueError."""
-    span_m = AIRFRAMES[airframe_id(airframe)].span_m
+    span_m = airframe_of(airframe_id(airframe)).span_m
     return _CLASSES.get(airframe) or next(c for limit_m, c in _BY_SPAN if span_m <= limit_m)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes import airframe_id, airframe_of
 from sim_replay.flight import bolted
 from sim_replay.flight.aircraft import flight_class
 from sim_replay.flight.encounter import Encounter, EncounterPlan, camera_pose
@@ -149,7 +149,7 @@ def _into_the_world(rng: np.random.Generator, met: _Meeting) -> _Meeting:
 
 
 def _radius_m(airframe: str) -> float:
-    shape = AIRFRAMES[airframe_id(airframe)]
+    shape = airframe_of(airframe_id(airframe))
     return 0.5 * float(np.hypot(shape.span_m, shape.length_m))
 
 
@@ -174,7 +174,7 @@ def _with_others(
     sight = met.target.at(clock.checked_s).t_ned_body_m - t_ned_cam_m
     angles = bearing_rad(np.einsum("nij,ni->nj", R_ned_cam, sight))
     view = View(R_ned_cam, t_ned_cam_m, plan.half_fov_rad, np.all(np.abs(angles) <= plan.half_fov_rad, axis=-1))
-    apart_m = SPANS_APART * max(AIRFRAMES[airframe_id(name)].span_m for name in plan.airframes)
+    apart_m = SPANS_APART * max(airframe_of(airframe_id(name)).span_m for name in plan.airframes)
     for name in plan.airframes[1:]:
         beside = fly_beside(
             rng, clock, name, met.target_sortie, met.own, targets, apart_m, _radius_m(name), LOWEST_M + 5.0, view

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 import trainer
 from edge.errors import InputError
-from sim_replay.airframes import AIRFRAMES
+from sim_replay.airframes import AIRFRAMES, airframe_id, airframe_of
+from sim_replay.airframes.invented import KEPT_BACK_VARIANTS, TRAINING_VARIANTS, draw_invented
 from sim_replay.benchmark.plan import SequencePlan, allotted, cut_frames, plan_dataset, spread_ranges
 from sim_replay.benchmark.preset import RANGE_LIMITS_M, held_out_airframes, load_preset, parse_preset
 from sim_replay.flight import EncounterPlan, fly_encounter
@@ -92,6 +93,22 @@ def test_the_shipped_training_leaves_out_what_is_held_out() -> None:
     assert {AIRFRAMES[k].name for k in trained_on} == {a.name for a in AIRFRAMES} - set(held_out_airframes())
 
 
+def test_the_strangers_to_judge_by_are_of_no_training_and_of_no_part_of_what_is_held_out() -> None:
+    preset = load_preset(str(Path(trainer.__file__).parent / "configs" / "strangers.toml"))
+    shown = {name for plan in plan_dataset(preset, 0) for name in plan.airframes}
+    assert shown == set(preset.airframe_names())
+    assert len(shown) == 24
+    rng = np.random.default_rng(0)
+    drawn = {
+        draw_invented(rng, range(len(AIRFRAMES)), variants)
+        for variants in (TRAINING_VARIANTS, KEPT_BACK_VARIANTS)
+        for _ in range(4000)
+    }
+    assert not drawn & {airframe_id(name) for name in shown}
+    words = " ".join(airframe_of(airframe_id(name)).description for name in shown)
+    assert not [name for name in held_out_airframes() if name in words]
+
+
 def test_stress_has_empty_skies_company_and_every_hardship() -> None:
     plans = plan_dataset(load_preset("stress"), 1)
     empty = sum(plan.frames for plan in plans if plan.shown == 0)
@@ -142,6 +159,11 @@ def test_ranges_of_equal_sequences_are_equally_spaced() -> None:
         ("frames = 30", "frames = 3000", r"mine\.toml: .*splits\.test: 3000 frames cannot be cut into 3"),
         ('name = "mine"', "", r"mine\.toml: name: is missing"),
         ("[picture]", "[airframes]\nonly = ['zeppelin']\n[picture]", r"airframes: only: .*'zeppelin'; there are male"),
+        (
+            "[picture]",
+            "[airframes]\nonly = ['glider']\ninvented = 5\n[picture]",
+            r"mine\.toml: there are no 5 invented aircraft of so few parts, but 4",
+        ),
         ("[picture]", "[picture", r"mine\.toml: not valid TOML"),
         ("clear = 1", "clear = -1", r"picture\.weather\.clear: .*greater than or equal to 0"),
         (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_replay.airframes import AIRFRAMES, Part, airframe_of
+from sim_replay.airframes import AIRFRAMES, Part, airframe_id, airframe_of
 from sim_replay.airframes.invented import (
     FLEET_ALONE,
     KEPT_BACK_VARIANTS,
@@ -25,6 +25,17 @@ def test_numbers_of_the_fleet_mean_the_fleet() -> None:
     assert [airframe_of(number) for number in range(FLEET)] == list(AIRFRAMES)
     with pytest.raises(IndexError):
         airframe_of(10**6)
+
+
+@pytest.mark.parametrize("name", ["glider", "invented_21", "invented_5312"])
+def test_a_name_leads_to_its_aircraft(name: str) -> None:
+    assert airframe_of(airframe_id(name)).name == name
+
+
+@pytest.mark.parametrize("name", ["zeppelin", "invented_20", "invented_5313", "invented_x", "invented_"])
+def test_a_name_of_none_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"no airframe is called '{name}'; there are male"):
+        airframe_id(name)
 
 
 def test_invented_aircraft_are_sound_meshes_of_another_size_and_shape() -> None:
