@@ -20,8 +20,9 @@ from sim_replay.airframes.fleet import AIRFRAMES, Airframe
 from sim_replay.airframes.mesh import Mesh, Part, merge, moved, scaled
 
 # Variants of each pair of members of the fleet; a renderer keeps all that it has drawn. How sure a network may be of a
-# stranger is learnt from some that it was not trained on (what it knows by heart is none to it), and judged by others.
-TRAINING_VARIANTS, KEPT_BACK_VARIANTS, DATASET_VARIANTS = range(4), range(4, 8), range(8, 12)
+# stranger is judged by some that nothing was learnt from, and learnt from others that the network was not trained on,
+# and many: what is known by heart is no stranger.
+TRAINING_VARIANTS, DATASET_VARIANTS, KEPT_BACK_VARIANTS = range(4), range(4, 8), range(8, 24)
 _NAME = "invented_"
 SIZE_SIGMA = 0.35  # of the logarithm of span and length together
 STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
@@ -57,13 +58,9 @@ def airframe_id(name: str) -> int:
     names = [airframe.name for airframe in AIRFRAMES]
     if name in names:
         return names.index(name)
-    number = name.removeprefix(_NAME)
-    if (
-        name.startswith(_NAME)
-        and number.isdecimal()
-        and len(names) <= int(number) < _number(DATASET_VARIANTS.stop, 0, 0)
-    ):
-        return int(number)
+    invented, digits = range(len(names), _number(KEPT_BACK_VARIANTS.stop, 0, 0)), name.removeprefix(_NAME)
+    if name.startswith(_NAME) and digits.isdecimal() and int(digits) in invented:
+        return int(digits)
     raise ValueError(f"no airframe is called {name!r}; there are {', '.join(names)}")
 
 
@@ -95,7 +92,7 @@ def _invented(number: int) -> Airframe:
     fleet = len(AIRFRAMES)
     rest, base = divmod(number - fleet, fleet)
     variant, donor = divmod(rest, fleet)
-    if variant >= DATASET_VARIANTS.stop:
+    if variant >= KEPT_BACK_VARIANTS.stop:
         raise IndexError(f"there is no airframe {number}")
     rng = np.random.default_rng([variant, donor, base])
     original, other = AIRFRAMES[base], AIRFRAMES[donor]
