@@ -77,7 +77,9 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.out,
         float_out=arguments.float_out,
         contract=contract,
-        tolerance=Tolerance(arguments.tolerance, arguments.tolerance_depth, arguments.tolerance_pose),
+        tolerance=Tolerance(
+            arguments.tolerance, arguments.tolerance_depth, arguments.tolerance_pose, arguments.tolerance_sigma
+        ),
         samples=arguments.samples,
         say=lambda text: print(text, flush=True),
     )
@@ -217,6 +219,7 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
         ("--tolerance", "DEG", 2.0, "median rotation differs from FP32's by more degrees"),
         ("--tolerance-depth", "PERCENT", 2.0, "median depth differs from FP32's by more"),
         ("--tolerance-pose", "POINTS", 5.0, "Pose@10°/5 %% is worse than FP32's by more"),
+        ("--tolerance-sigma", "PERCENT", 10.0, "median sigma is smaller than FP32's by more"),
     ):
         export.add_argument(
             option, type=positive, default=default, metavar=unit, help=f"no INT8 file if {what} (default %(default)s)"

@@ -155,13 +155,27 @@ def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> fl
     return float(np.median(steps[gain >= gain.max() - 1e-9]))
 
 
+def sigma_shortfall(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> float:
+    """By what share `a` tells smaller sigmas than `b`, in the median of windows with a target: of the sigma of which it
+    is most; below 0 where it tells larger ones."""
+    ratio = np.median(a.sigma[present] / b.sigma[present], axis=0)
+    return float(1.0 - ratio.min())
+
+
 def difference(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> dict[str, float]:
     """How far two predictors are apart on the same windows: medians and 95th percentiles over those with a target."""
     rotation_deg = metrics.rotation_error_deg(a.R_cam_target, b.R_cam_target)[present]
     depth_rel = np.abs(a.t_cam_target_m[present, 2] / b.t_cam_target_m[present, 2] - 1.0)
     center_px = np.linalg.norm(a.center_px - b.center_px, axis=-1)[present]
+    sigma_rel = np.abs(a.sigma[present] / b.sigma[present] - 1.0)
     score = np.abs(a.score - b.score)
-    values = {"rotation_deg": rotation_deg, "depth_rel": depth_rel, "center_px": center_px, "score": score}
+    values = {
+        "rotation_deg": rotation_deg,
+        "depth_rel": depth_rel,
+        "center_px": center_px,
+        "sigma_rel": sigma_rel,
+        "score": score,
+    }
     return {
         f"{name}_{label}": float(np.percentile(value, percentile))
         for name, value in values.items()

@@ -16,7 +16,16 @@ from msgs.contract import CONTRACT_VERSION, ModelContract
 from trainer.checkpoint import load_model, weights_sha256
 from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
 from trainer.data import Sampler, TrainingBatch, render_once
-from trainer.evaluate import Predictions, Predictor, choose_threshold, difference, measure, predict_all, torch_predictor
+from trainer.evaluate import (
+    Predictions,
+    Predictor,
+    choose_threshold,
+    difference,
+    measure,
+    predict_all,
+    sigma_shortfall,
+    torch_predictor,
+)
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
 from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, Z_RANGE_M, PoseNet
 from trainer.sources import window_sampler
@@ -44,6 +53,7 @@ class Tolerance(NamedTuple):
     rotation_deg: float = 2.0  # median angle between the two
     depth_percent: float = 2.0  # median
     pose_points: float = 5.0  # loss of Pose@10°/5 %; two stages of a few hundred windows tell it to a few points
+    sigma_percent: float = 10.0  # by which sigma is smaller, median
 
 
 class Measured(NamedTuple):
@@ -166,11 +176,12 @@ def airframe_names(ids: list[int] | None) -> list[str]:
 
 
 class Strayed(NamedTuple):
-    """The worse stage's differences: medians, and points of Pose@10°/5 % lost."""
+    """The worse stage's differences: medians, points of Pose@10°/5 % lost, and how much smaller sigma is told."""
 
     rotation_deg: float = 0.0
     depth_percent: float = 0.0
     pose_points: float = 0.0
+    sigma_percent: float = 0.0
 
     def refusal(self, tolerance: Tolerance) -> str | None:
         """Which difference is beyond the tolerance, as a sentence's part; None if none is."""
@@ -178,6 +189,7 @@ class Strayed(NamedTuple):
             ("median rotation differs from FP32's by {:.4g} degrees, more than --tolerance {:g}"),
             ("median depth differs from FP32's by {:.4g} %, more than --tolerance-depth {:g}"),
             ("Pose@10°/5 % is {:.4g} points worse than FP32's, more than --tolerance-pose {:g}"),
+            ("median sigma is smaller than FP32's by {:.4g} %, more than --tolerance-sigma {:g}"),
         )
         pairs = zip(told, self, tolerance, strict=True)
         return next((text.format(value, limit) for text, value, limit in pairs if not value <= limit), None)
@@ -185,17 +197,20 @@ class Strayed(NamedTuple):
 
 def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tuple[str, Strayed]:
     """Differences of `a` from `b` as text, and the larger of the stages'."""
-    lines = [f"{title:24}{'rotation deg':>18}{'depth %':>18}{'centre px':>18}{'score':>18}{'Pose@10°/5 %':>18}"]
+    columns = ("rotation deg", "depth %", "centre px", "sigma %", "score", "Pose@10°/5 %")
+    lines = [f"{title:24}" + "".join(f"{column:>18}" for column in columns)]
     worst = Strayed()
     stages = (("track", a.track, b.track, views.track), ("acquire", a.acquire, b.acquire, views.acquire))
     for stage, one, other, batches in stages:
         if one is None or other is None:
             continue
-        d = difference(one, other, np.concatenate([batch.present for batch in batches]))
+        present = np.concatenate([batch.present for batch in batches])
+        d = difference(one, other, present)
         pose = [100 * measure(predicted, batches)["pose_10deg_5pct"] for predicted in (one, other)]
-        strayed = Strayed(d["rotation_deg_median"], 100 * d["depth_rel_median"], pose[1] - pose[0])
+        smaller = 100 * sigma_shortfall(one, other, present)
+        strayed = Strayed(d["rotation_deg_median"], 100 * d["depth_rel_median"], pose[1] - pose[0], smaller)
         worst = Strayed(*(np.maximum(x, y) for x, y in zip(worst, strayed, strict=True)))  # keeps NaN
-        scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "score": 1}
+        scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "sigma_rel": 100, "score": 1}
         cells = (f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items())
         lines.append(f"  {stage:22}" + "".join(cells) + f"{pose[0]:9.1f} /{pose[1]:7.1f}")
     return "\n".join([*lines, "  (median / 95th percentile over windows with a target; Pose of the two)"]), worst

@@ -16,12 +16,20 @@ from msgs.geometry import R_from_euler
 from trainer.checkpoint import load_model, save_weights
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch, training_batch
-from trainer.evaluate import SCORE_THRESHOLD, choose_threshold, constant_guess, measure, predict_all
+from trainer.evaluate import (
+    SCORE_THRESHOLD,
+    Predictions,
+    choose_threshold,
+    constant_guess,
+    measure,
+    predict_all,
+    sigma_shortfall,
+)
 from trainer.export import Measured, Strayed, Tolerance, Views, export_models, stage_sampler, write_int8
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
 
-ANY = Tolerance(180.0, 100.0, 100.0)
+ANY = Tolerance(180.0, 100.0, 100.0, 100.0)
 
 
 def open_view(seed: int, size_px: int, acquire_share: float) -> partial:
@@ -111,6 +119,7 @@ def windows(seed: int, size_px: int) -> TrainingBatch:
         (ANY._replace(rotation_deg=0.0), r"median rotation differs .* --tolerance 0"),
         (ANY._replace(depth_percent=0.0), r"median depth differs .* --tolerance-depth 0"),
         (ANY._replace(pose_points=-1.0), r"Pose@10°/5 % is 0 points worse .* --tolerance-pose -1"),
+        (ANY._replace(sigma_percent=-200.0), r"median sigma is smaller .* --tolerance-sigma -200"),
     ],
 )
 def test_an_int8_file_that_strays_is_not_written(
@@ -136,7 +145,18 @@ def test_an_int8_file_that_strays_is_not_written(
 
 def test_an_answer_that_is_no_number_is_refused() -> None:
     assert Strayed(float("nan")).refusal(ANY) is not None
-    assert Strayed(1.0, 1.0, -3.0).refusal(Tolerance()) is None
+    assert Strayed(1.0, 1.0, -3.0, -4.0).refusal(Tolerance()) is None
+
+
+def test_sigmas_that_are_told_too_small_are_found_whichever_of_the_six() -> None:
+    rng = np.random.default_rng(6)
+    sure = Predictions(*[np.zeros(1, np.float32)] * 6, rng.uniform(0.1, 1.0, (40, 6)).astype(np.float32))
+    told = sure.sigma * np.array([1.3, 1.0, 0.8, 1.1, 1.0, 1.0], np.float32)
+    told[::4] *= 0.01  # now and then far off: a median does not mind
+    present = np.arange(40) < 36
+    told[~present] = 0.0
+    assert sigma_shortfall(sure._replace(sigma=told), sure, present) == pytest.approx(0.2, abs=1e-5)
+    assert sigma_shortfall(sure, sure, present) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None:
