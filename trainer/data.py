@@ -10,8 +10,10 @@ import multiprocessing as mp
 import os
 import queue
 import signal
+import threading
 import traceback
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -24,7 +26,6 @@ from trainer.config import ConfigError, RenderingError
 from trainer.losses import Labels
 
 DENSE_STRIDE = 4
-POLL_S = 1.0
 
 
 class Sampler(Protocol):
@@ -98,31 +99,39 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor
     return put(batch.image_bgr), labels
 
 
-def _serve(open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, out: mp.Queue) -> None:
-    """Body of a rendering process: batches first, first + stride, ... until the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def _serve(
+    open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, prefetch: int, out: Connection
+) -> None:
+    """Body of a rendering process: batches first, first + stride, ... until the trainer is gone."""
+    # The trainer ends it: a signal to the whole group must not end it before the trainer has saved.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    parent = mp.parent_process()
+    made: queue.Queue[TrainingBatch | ConfigError | str | None] = queue.Queue(prefetch)
+    sender = threading.Thread(target=_send, args=(made, out), daemon=True)
+    sender.start()
     try:
         os.nice(1)
         sampler = open_sampler()
         start = first
         while True:
             drawn = sampler.batch(start, batch_size)
-            batch = training_batch(drawn) if isinstance(drawn, SampleBatch) else drawn
+            made.put(training_batch(drawn) if isinstance(drawn, SampleBatch) else drawn)
             start += stride
-            while True:
-                try:
-                    out.put(batch, timeout=POLL_S)
-                    break
-                except queue.Full:
-                    if parent is None or not parent.is_alive():
-                        return
     except ConfigError as error:
-        out.put(error)
+        made.put(error)
     except Exception:
-        out.put(traceback.format_exc())
+        made.put(traceback.format_exc())
+    made.put(None)
+    sender.join()
+
+
+def _send(made: queue.Queue[TrainingBatch | ConfigError | str | None], out: Connection) -> None:
+    while (batch := made.get()) is not None:
+        try:
+            out.send(batch)
+        except OSError:
+            os._exit(0)  # the trainer is gone, and nobody would ever empty the queue
 
 
 class Feed:
@@ -141,42 +150,41 @@ class Feed:
         """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ...: each trains in one process."""
         context = mp.get_context("spawn")
         self._turn = 0
-        self._queues: list[mp.Queue] = []
+        self._readers: list[Connection] = []
         self._processes = []
         for worker in range(workers):
-            out: mp.Queue = context.Queue(maxsize=prefetch)
+            reader, writer = context.Pipe(duplex=False)
             first = first_index + (worker * ranks + rank) * batch_size
-            arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, out)
+            arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, prefetch, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
             process.start()
-            self._queues.append(out)
+            writer.close()  # or the end of one that is killed in the middle of a batch would not be seen
+            self._readers.append(reader)
             self._processes.append(process)
 
     def next(self) -> TrainingBatch:
         """The next batch in index order. Raises RenderingError when its renderer failed, ConfigError for bad input."""
-        source, process = self._queues[self._turn], self._processes[self._turn]
-        while True:
-            try:
-                batch = source.get(timeout=POLL_S)
-                break
-            except queue.Empty:
-                if not process.is_alive():
-                    raise RenderingError(f"{process.name} ended with exit code {process.exitcode}") from None
+        process = self._processes[self._turn]
+        try:
+            batch = self._readers[self._turn].recv()
+        except (EOFError, OSError):
+            process.join(timeout=5.0)
+            raise RenderingError(f"{process.name} ended with exit code {process.exitcode}") from None
         if isinstance(batch, ConfigError):
             raise batch
         if isinstance(batch, str):
             raise RenderingError(f"{process.name} failed:\n{batch}")
-        self._turn = (self._turn + 1) % len(self._queues)
+        self._turn = (self._turn + 1) % len(self._readers)
+        assert isinstance(batch, TrainingBatch)
         return batch
 
     def close(self) -> None:
         """Stop the renderers; idempotent."""
         for process in self._processes:
-            process.terminate()
-        for process, out in zip(self._processes, self._queues, strict=True):
+            process.kill()
+        for process, reader in zip(self._processes, self._readers, strict=True):
             process.join(timeout=5.0)
-            out.close()
-            out.cancel_join_thread()
+            reader.close()
 
     def __enter__(self) -> Feed:
         return self

@@ -1,0 +1,108 @@
+"""The feed of rendered windows: what is made ahead comes in order; a renderer that fails is told, not waited for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from synthetic_sampler import PlateSampler
+
+from sim_replay.sample import SampleBatch
+from tests.waiting import until
+from trainer.config import RenderingError
+from trainer.data import Feed, training_batch
+
+LARGE_PX = 256  # a batch of such pictures is far more than a pipe holds
+
+
+def rendered_pids() -> set[int]:
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return {pid for pid in map(int, children) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()}
+
+
+def test_batches_come_in_order_whoever_renders_them() -> None:
+    alone = PlateSampler(5, 64)
+    with Feed(partial(PlateSampler, 5, 64), 4, 8, workers=2, prefetch=2) as feed:
+        for first in range(8, 32, 4):
+            assert np.array_equal(feed.next().image_bgr, training_batch(alone.batch(first, 4)).image_bgr)
+    assert not rendered_pids()
+
+
+class Telling(PlateSampler):
+    """Says, by a file, that it was asked for its third batch."""
+
+    def __init__(self, told: Path) -> None:
+        super().__init__(5, LARGE_PX)
+        self.told = told
+
+    def batch(self, first_index: int, count: int) -> SampleBatch:
+        if first_index >= 2 * count:
+            self.told.touch()
+        return super().batch(first_index, count)
+
+
+@pytest.mark.timeout(60)
+def test_a_renderer_that_is_killed_in_the_middle_of_a_batch_is_told(tmp_path: Path) -> None:
+    """The third is rendered once the first is on its way through the pipe, which holds a part, and the second waits."""
+    with Feed(partial(Telling, tmp_path / "told"), 8, 0, prefetch=1) as feed:
+        until((tmp_path / "told").exists)
+        (pid,) = rendered_pids()
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(RenderingError, match="renderer-0 ended with exit code -9"):
+            feed.next()
+
+
+class Broken(PlateSampler):
+    def batch(self, first_index: int, count: int) -> SampleBatch:
+        if first_index:
+            raise ZeroDivisionError("no such aircraft")
+        return super().batch(first_index, count)
+
+
+def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
+    with Feed(partial(Broken, 5, 64), 4, 0) as feed:
+        assert len(feed.next().present) == 4
+        with pytest.raises(RenderingError, match=r"renderer-0 failed:(.|\n)*no such aircraft"):
+            feed.next()
+
+
+SLOW = """
+import sys, time
+from functools import partial
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import tiny
+from synthetic_sampler import PlateSampler
+from trainer.train import run_training
+
+class Slow(PlateSampler):
+    def batch(self, first_index, count):
+        time.sleep(0.5)
+        return super().batch(first_index, count)
+
+if __name__ == "__main__":
+    toml = tiny.TOML.replace("samples = 16\\nwarmup", "samples = 100000\\nwarmup")
+    config = tiny.parse_config(toml, "tiny.toml")
+    run_training(config, toml, Path(sys.argv[1]), open_sampler=lambda seed, size: partial(Slow, seed, size))
+"""
+
+
+def test_a_run_whose_whole_group_is_told_to_stop_ends_as_one_that_was_asked_to(tmp_path: Path) -> None:
+    """As `timeout` and systemd tell it; rendering is slower than training here, so that it waits for a renderer."""
+    (tmp_path / "slow.py").write_text(SLOW.format(tests=str(Path(tiny.__file__).parent)))
+    command = [sys.executable, str(tmp_path / "slow.py"), str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        next(line for line in process.stdout if line.startswith("step"))
+        os.killpg(process.pid, signal.SIGTERM)
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "stopped before the end of the plan" in said
+    assert (tmp_path / "run" / "resume.pt").exists()
