@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from trainer.checkpoint import WEIGHTS_NAME, load_file, load_model, write_atomic
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, load_model, write_atomic
 from trainer.config import ConfigError, made_folder
 
 
@@ -18,6 +18,8 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     """
     if len(runs) < 2:
         raise ConfigError("the mean of fewer than two runs is no other network")
+    if (out / RESUME_NAME).exists():
+        raise ConfigError(f"{out}: holds a run that training may go on with; give another --out")
     contents = [load_file(run) for run in runs]
     _, configs, _, hashes = zip(*map(load_model, runs), strict=True)
     for run, config in zip(runs, configs, strict=True):

@@ -247,13 +247,18 @@ def export_models(
     calibration = render_views(config, CALIBRATION_SEED, samples, trained_on)
     comparison = render_views(config, COMPARISON_SEED, samples, held_out)
 
-    write_graph(model, float_path)
-    floats = _predict(onnx_predictor(float_path), comparison)
-    acquire_min = choose_threshold(floats.acquire, comparison.acquire)
-    track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
-    thresholds = (acquire_min, track_min)
-    promise = make_contract(config, training, sha256, comparison, thresholds)
-    write_contract(float_path, promise.model_copy(update={"metrics": _metrics(floats, comparison, thresholds)}))
+    unmeasured = float_path.with_suffix(".part")
+    try:
+        write_graph(model, unmeasured)
+        floats = _predict(onnx_predictor(unmeasured), comparison)
+        acquire_min = choose_threshold(floats.acquire, comparison.acquire)
+        track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
+        thresholds = (acquire_min, track_min)
+        promise = make_contract(config, training, sha256, comparison, thresholds)
+        write_contract(unmeasured, promise.model_copy(update={"metrics": _metrics(floats, comparison, thresholds)}))
+        unmeasured.replace(float_path)
+    finally:
+        unmeasured.unlink(missing_ok=True)
     by_torch = _predict(torch_predictor(model), comparison)
     say(comparison_table(comparison, "FP32 against PyTorch", floats, by_torch)[0])
 

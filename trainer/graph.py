@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import warnings
 from collections import Counter
@@ -122,10 +123,21 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
 
 
 def write_contract(path: Path, contract: ModelContract) -> None:
-    """Put the contract into the model file's metadata."""
+    """Put the contract into the model file's metadata. Raises ConfigError, the file as it was, where that fails."""
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
-    onnx.save(model, str(path))
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(model.SerializeToString())
+            file.flush()
+            os.fsync(file.fileno())
+        part.chmod(path.stat().st_mode)
+        part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def read_contract(path: Path) -> ModelContract:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from msgs.settings import read_toml
-from trainer.config import ConfigError
+from trainer.config import ConfigError, made_folder
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
 # MF-UAVPose6D, the paper's own network on its own dataset (tables of its section on results).
@@ -292,18 +292,21 @@ def run(arguments: argparse.Namespace) -> None:
     from sim_replay.offline import SHIPPED_MODEL
     from trainer.graph import read_contract
 
-    if arguments.runs:
-        history = gathered(read_history(HISTORY), arguments.runs)
-        lines = "".join(json.dumps(line) + "\n" for line in history)
-        HISTORY.write_text(lines, encoding="utf-8")
+    # What can be wrong is looked at before the hours of measuring.
     history, shipped = read_history(HISTORY), read_contract(SHIPPED_MODEL).training
+    if arguments.runs:
+        history = gathered(history, arguments.runs)
     datasets, beside = datasets_in(arguments.benchmark), read_beside(arguments.beside)
+    for path in arguments.model:
+        read_contract(path)
+    made_folder(arguments.out)
     scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
+    (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
     refuse_other_pictures(beside, scores)
-    arguments.out.mkdir(parents=True, exist_ok=True)
     extra = "".join(f" --model {path}" for path in arguments.model)
     extra += "".join(f" --beside {path}" for path in arguments.beside)
     command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"
     (arguments.out / "results.md").write_text(page(scores, command, told(history, shipped), beside), encoding="utf-8")
-    (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
     draw_history(history, arguments.out / "learning.png")
+    if arguments.runs:
+        HISTORY.write_text("".join(json.dumps(line) + "\n" for line in history), encoding="utf-8")

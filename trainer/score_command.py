@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -67,6 +68,8 @@ def calibrate_file(
     from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
 
     contract = read_contract(path)
+    if not os.access(path.parent, os.W_OK):
+        raise ConfigError(f"{path}: its folder cannot be written to")
     try:
         datasets = [open_dataset(folder, split) for folder in folders]
         of_each = [dataset.boxed_frames() for dataset in datasets]

@@ -250,6 +250,8 @@ def run_training(
         trainer = Trainer(config, group.device, group)
         if not resume and (out / RESUME_NAME).exists():
             raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+        if not resume and (out / WEIGHTS_NAME).exists():
+            raise ConfigError(f"{out}: holds weights already; give another --out")
         if resume and start_from is not None:
             raise ConfigError(f"--start-from {start_from}: a resumed run goes on from its own weights")
         if start_from is not None:

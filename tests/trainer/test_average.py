@@ -45,6 +45,15 @@ def test_training_only_heads_that_one_run_lacks_are_the_other_s(tmp_path: Path) 
     assert all(torch.equal(mean[name], kept[name]) for name in only_training)
 
 
+def test_a_run_that_may_go_on_keeps_its_own_weights(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name, seed) for seed, name in enumerate("ab", start=1)]
+    write_atomic(runs[1] / "resume.pt", {})
+    before = (runs[1] / "weights.pt").read_bytes()
+    with pytest.raises(ConfigError, match="a run that training may go on with"):
+        average(runs, runs[1])
+    assert (runs[1] / "weights.pt").read_bytes() == before
+
+
 def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:
     one = write_run(tmp_path / "a", 1)
     other = write_run(tmp_path / "b", 2, tiny.TOML.replace("origin_range = 0.5", "origin_range = 0.7"))

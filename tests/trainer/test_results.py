@@ -10,6 +10,7 @@ import pytest
 
 from edge.config import SHIPPED_MODEL
 from sim_replay.cli import main as replay
+from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.results import (
     HISTORY,
@@ -164,6 +165,30 @@ def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None
     (score,) = measure([None], [dataset], lambda _: None)
     assert score["overall"]["frames"] == len(list((dataset / "test").glob("*/rgb/*")))
     assert score["recipe"].endswith("--every 50 --split test")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (["--out", "{tmp}/file"], "{tmp}/file: cannot be made a folder"),
+        (["--out", "{tmp}/out", "--model", "{tmp}/typo.onnx"], "{tmp}/typo.onnx: no such model file"),
+        (["--out", "{tmp}/out", "--beside", "{tmp}/none.json"], "{tmp}/none.json: is no metrics.json"),
+    ],
+)
+def test_what_is_wrong_is_told_before_anything_is_measured_or_changed(
+    wrong: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "history.jsonl").write_bytes(HISTORY.read_bytes())
+    monkeypatch.setattr("trainer.results.HISTORY", tmp_path / "history.jsonl")
+    (tmp_path / "benchmark" / "one").mkdir(parents=True)
+    (tmp_path / "benchmark" / "one" / "dataset.toml").touch()
+    given = ["--benchmark", str(tmp_path / "benchmark"), "--runs", str(run_folder(tmp_path / "run", [100]))]
+    arguments = [word.format(tmp=tmp_path) for word in wrong]
+    monkeypatch.setattr("trainer.results.measure", lambda *_: pytest.fail("it measured"))
+    assert main(["results", *given, *arguments]) == 2
+    assert told.format(tmp=tmp_path) in capsys.readouterr().err
+    assert (tmp_path / "history.jsonl").read_bytes() == HISTORY.read_bytes()
 
 
 def test_a_folder_without_datasets_is_named(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.waiting import until
-from trainer.checkpoint import load_file, write_atomic
+from trainer.checkpoint import load_file, save_weights, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
@@ -156,6 +156,14 @@ def test_a_budget_ends_a_run_and_stretches_its_schedule_over_itself(tmp_path: Pa
     assert max(filter(None, progress)) > trainer.samples / 1_000_000
 
 
+def test_weights_that_another_command_left_are_not_overwritten(tmp_path: Path) -> None:
+    save_weights(tmp_path / "weights.pt", tiny.network(), tiny.TOML, {"samples": 0})
+    before = (tmp_path / "weights.pt").read_bytes()
+    with pytest.raises(ConfigError, match="holds weights already"):
+        train(tmp_path, start_from=tmp_path / "weights.pt")
+    assert (tmp_path / "weights.pt").read_bytes() == before
+
+
 def test_a_resumed_run_takes_no_other_weights(run: Path) -> None:
     with pytest.raises(ConfigError, match="--start-from"):
         train(run, resume=True, start_from=run / "weights.pt")
@@ -172,6 +180,7 @@ def test_a_resumed_run_takes_no_other_weights(run: Path) -> None:
         ["export", "--checkpoint", "x", "--samples", "0"],
         ["export", "--checkpoint", "x", "--tolerance", "-1"],
         ["export", "--checkpoint", "x", "--tolerance-pose", "inf"],
+        ["evaluate", "--windows", "8", "--seed", "-1"],
     ],
 )
 def test_a_number_that_means_nothing_is_refused(arguments: list[str], capsys: pytest.CaptureFixture) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import resource
 import shutil
+import signal
 from pathlib import Path
 
 import cv2
@@ -21,7 +23,8 @@ from sim_replay.evaluation.judge import judge_frames
 from sim_replay.offline import estimator_answers, load_model
 from tests.sim_replay.conftest import CX_PX, CY_PX, FOCAL_PX, SPOT_Z_M, dark_spot_model
 from trainer.cli import main
-from trainer.graph import read_contract
+from trainer.config import ConfigError
+from trainer.graph import read_contract, write_contract
 from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
 
 __all__ = ["dark_spot_model"]
@@ -200,6 +203,25 @@ def test_what_tells_no_targets_or_not_where_they_are_is_named_and_the_file_left(
     assert main(command) == 2
     assert "nothing tells where picture 0 shows its target of obj_id 1" in capsys.readouterr().err
     assert model.read_bytes() == content
+
+
+def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path: Path, dark_spot_model: Path) -> None:
+    """A limit on the size of files stands for a disk that is full."""
+    model = tmp_path / "model.onnx"
+    shutil.copy(dark_spot_model, model)
+    content = model.read_bytes()
+    contract = read_contract(model)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
+    try:
+        with pytest.raises(ConfigError, match=r"model\.onnx: cannot be written: File too large"):
+            write_contract(model, contract)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert model.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [model]
 
 
 def test_a_dataset_without_false_peaks_is_refused_and_the_file_left(
