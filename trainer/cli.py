@@ -4,48 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import sys
 from pathlib import Path
 
 from msgs.command_line import EXIT_BAD_INPUT, EXIT_INTERRUPTED, exit_code
 from trainer import evaluate_command, results, score_command
+from trainer.arguments import count, positive, share, whole
 from trainer.config import ConfigError, RenderingError, load_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
-
-
-def positive(text: str) -> float:
-    """A finite number above zero, for argparse."""
-    number = float(text)
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(text)
-    return number
-
-
-def count(text: str) -> int:
-    """A whole number from 1 on, for argparse."""
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
-    return number
-
-
-def whole(text: str) -> int:
-    """A whole number from 0 on that a generator takes as its seed, for argparse."""
-    number = int(text)
-    if not 0 <= number < 2**31:
-        raise ValueError(text)
-    return number
-
-
-def share(text: str) -> float:
-    """A number from 0 to 1, for argparse."""
-    number = float(text)
-    if not 0.0 <= number <= 1.0:
-        raise ValueError(text)
-    return number
 
 
 def _train(arguments: argparse.Namespace) -> None:

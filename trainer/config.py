@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from msgs.settings import Section, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
+Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a picture that the network sees, pixels
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
 
@@ -120,6 +121,15 @@ class DataConfig(Section):
     validation_samples: int = Field(256, ge=8)
     datasets: list[DatasetSource] = Field([], description="absent: rendered windows alone")
 
+    @field_validator("airframe_ids")
+    @classmethod
+    def _of_the_fleet(cls, ids: list[int] | None) -> list[int] | None:
+        from sim_replay.airframes import AIRFRAMES
+
+        if ids is not None and (not ids or len(set(ids)) < len(ids) or not set(ids) <= set(range(len(AIRFRAMES)))):
+            raise ValueError(f"must be some of the fleet's numbers, 0 to {len(AIRFRAMES) - 1}, each once")
+        return ids
+
     @property
     def rendered_share(self) -> float:
         """Of every batch: what the datasets leave."""
@@ -141,7 +151,7 @@ class DataConfig(Section):
 
 class SizeStage(Section):
     from_progress: float = Field(ge=0, lt=1, description="share of the run after which this size is used")
-    size_px: int = Field(ge=32, multiple_of=32)
+    size_px: Side
 
 
 class ScheduleConfig(Section):
@@ -187,11 +197,17 @@ class ContractConfig(Section):
     """What export writes into the model file and measurement cannot find out."""
 
     name: str
-    acquire_size_wh: tuple[int, int]
+    acquire_size_wh: tuple[Side, Side]
     acquire_fit: Literal["letterbox", "squash"]
-    track_size_wh: tuple[int, int] | None = None
+    track_size_wh: tuple[Side, Side] | None = None
     track_window_scale: float = Field(gt=1.0)
     trained_range_m: tuple[float, float] = (100.0, 500.0)
+
+    @model_validator(mode="after")
+    def _windows_are_square(self) -> ContractConfig:
+        if self.track_size_wh is not None and len(set(self.track_size_wh)) > 1:
+            raise ValueError("track_size_wh must be square: training windows are")
+        return self
 
 
 class TrainerConfig(Section):

@@ -7,6 +7,8 @@ import json
 import sys
 from pathlib import Path
 
+from trainer.arguments import whole
+
 DEFAULT_OUT = Path("out") / "evaluate"
 WINDOWS_SEED = 930001
 
@@ -50,9 +52,8 @@ def register(commands: argparse._SubParsersAction) -> None:
     evaluate.add_argument(
         "--own-ship",
         choices=("exact", "usual"),
-        default="usual",
         help="track: tell it the camera's attitude and place as they are, or off by what an autopilot usually is, "
-        "drawn by the scene's name (default %(default)s)",
+        "drawn by the scene's name (default usual)",
     )
     evaluate.add_argument(
         "--score-min",
@@ -66,7 +67,7 @@ def register(commands: argparse._SubParsersAction) -> None:
     )
     windows = evaluate.add_argument_group("rendered windows instead of a dataset")
     windows.add_argument("--windows", type=int, metavar="N", help="measure on N windows; a seed gives the same ones")
-    windows.add_argument("--seed", type=int, default=WINDOWS_SEED, help="seed of the windows (default %(default)s)")
+    windows.add_argument("--seed", type=whole, default=WINDOWS_SEED, help="seed of the windows (default %(default)s)")
     windows.add_argument("--stage", choices=("track", "acquire"), default="track", help="windows as it sees them")
     windows.add_argument("--size", type=int, metavar="PX", help="side of the windows; default: the model's")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
@@ -87,15 +88,18 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
 
     from sim_replay.evaluation.table import score_table
     from trainer.config import ConfigError, refuse_no_folder
-    from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
+    from trainer.evaluate_dataset import DatasetRequest, OwnShipTold, evaluate_dataset
 
     asked = arguments
     for name, unasked in {"seed": WINDOWS_SEED, "stage": "track", "size": None}.items():
         if getattr(asked, name) != unasked:
             raise ConfigError(f"--{name}: is of rendered windows; say how many with --windows")
+    if asked.own_ship is not None and asked.mode != "track":
+        raise ConfigError("--own-ship: is of --mode track; single frames are told none")
     refuse_no_folder(asked.out)
+    own_ship: OwnShipTold = asked.own_ship or "usual"
     request = DatasetRequest(
-        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, asked.own_ship, asked.score_min
+        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, own_ship, asked.score_min
     )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     errors = Console(stderr=True)
@@ -126,9 +130,12 @@ def _on_windows(arguments: argparse.Namespace) -> None:
     from trainer.evaluate import null_where_unknown
     from trainer.held_out import Request, evaluate_file
 
-    for name, unasked in {"results": None, "dataset": None, "split": None, "every": 1, "mode": "frames"}.items():
+    alone = {"results": None, "dataset": None, "split": None, "every": 1, "mode": "frames", "own_ship": None}
+    for name, unasked in alone.items():
         if getattr(arguments, name) != unasked:
-            raise ConfigError(f"--{name}: is of a dataset, --windows of rendered pictures; give one of them")
+            raise ConfigError(
+                f"--{name.replace('_', '-')}: is of a dataset, --windows of rendered pictures; give one of them"
+            )
     if arguments.score_min is not None:
         raise ConfigError("--score-min: --windows measures at what the file says")
     model = arguments.model or SHIPPED_MODEL

@@ -271,3 +271,18 @@ def test_json_that_nobody_reads_ends_without_a_traceback(dataset: Path, tmp_path
     os.close(write_end)
     assert done.returncode == 141
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "--own-ship: is of --mode track"),
+        (["--results", "method_crossing-test.csv"], "--own-ship: is of --mode track"),
+        (["--windows", "8"], "--own-ship: is of a dataset"),
+    ],
+)
+def test_an_own_ship_that_nobody_is_told_of_is_refused(
+    arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "--own-ship", "exact", *arguments]) == 2
+    assert told in capsys.readouterr().err
