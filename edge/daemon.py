@@ -10,12 +10,13 @@ import gc
 import logging
 import threading
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 from edge.cameras import FrameSupply, open_capture
 from edge.cameras.source import EndOfStream
 from edge.clock import monotonic_ns
 from edge.config import ConfigFile, camera_key
+from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.health import HealthSnapshot
@@ -57,8 +58,9 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         gc.freeze()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
-        capture.start(outlets.settle)
-        with file.blame(*camera_key(config.camera)):
+        # In lock-step the start waits for the player's first word, and he may hang up before it.
+        with file.blame(*camera_key(config.camera)), suppress(EndOfStream):
+            capture.start(outlets.settle)
             pipeline.fly(stop)
     # With the links stopped, their counts are whole.
     log.info("stopped: %s", pipeline.snapshot().line())
@@ -210,7 +212,8 @@ class Pipeline:
         seen = self._estimator.track(frame, boxes, twice)
         if pointed_at is not None and (there := seen[-1]) is not None:
             self._by_hand.found(there)
-            self._tracker.make_room()
+            if not lies_on(there.box_xyxy_px, held):  # those held have their room
+                self._tracker.make_room()
         clock.estimated(self._estimator.model.take_runs_ns())
         for i, place in enumerate(places, start=len(held)):
             if (look := seen[i]) is not None and not self._estimator.confirms(place, [look]):

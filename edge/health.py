@@ -195,7 +195,7 @@ class Health:
         self.no_frame_ns = no_frame_ns
         self.faults: tuple[Reason, ...] = ()  # what others noticed, told as reasons while it is there
         self._stages_ns: dict[str, deque[int]] = {}
-        self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number at the source, total ns
+        self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number, total ns
         self._done_ns: int | None = None
         self._tracks: tuple[Track, ...] = ()
         self._has_attitude = False
@@ -209,7 +209,7 @@ class Health:
         has_attitude: bool,
         now_ns: int,
     ) -> None:
-        """Note one frame: its number at the source, the time each stage took, what came out."""
+        """Note one frame: its number, in which a gap is a drop, the time each stage took, what came out."""
         for stage, duration_ns in stages_ns.items():
             self._stages_ns.setdefault(stage, deque(maxlen=WINDOW_FRAMES)).append(duration_ns)
         self._done_ns = now_ns

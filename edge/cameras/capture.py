@@ -40,6 +40,7 @@ class Capture:
         self._watch = FrameWatch()
         self._frozen_since_ns: int | None = None
         self._frozen_told = False
+        self._withheld = 0  # repeats of a live camera: the frames are numbered without them, so a gap is a drop
         self._jumped_ns: deque[int] = deque(maxlen=JUMPS_KEPT)  # when stamps jumped, monotonic
         self._lost: str | None = None  # why there is no camera just now
         self._link = Reconnect()
@@ -113,8 +114,8 @@ class Capture:
             else:
                 self._link = self._link.delivered()
                 if self._lives(frame):
-                    jumps = self._counts["time_jumps"]
-                    self._offer(replace(frame, meta=replace(frame.meta, time_jumps=jumps)))
+                    number, jumps = frame.meta.sequence - self._withheld, self._counts["time_jumps"]
+                    self._offer(replace(frame, meta=replace(frame.meta, sequence=number, time_jumps=jumps)))
 
     def _open(self) -> None:
         """Raises SourceLost, and InputError for a camera that never fitted; one that did may come back in another mode,
@@ -153,8 +154,7 @@ class Capture:
                 self._frozen_since_ns, self._frozen_told = None, False
             elif self._frozen_since_ns is None:
                 self._frozen_since_ns = now_ns
-            if frozen:
-                self._last_sequence = frame.meta.sequence
+            self._withheld += frozen
         if jumps and self._counts["time_jumps"] == 1:
             log.warning("the camera's timestamps jump; the first time at frame %d", frame.meta.sequence)
         if frozen and not self._frozen_told and now_ns - (self._frozen_since_ns or now_ns) >= FROZEN_TOLD_NS:

@@ -14,6 +14,7 @@ from edge.types import Array
 
 INTRINSICS_KEY = ("camera", "intrinsics")
 DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own files name none
+ROUNDING = 1e-6  # what a tool that multiplies matrices leaves where K has its zeros and its one
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,9 @@ def read_calibration(path: Path) -> Intrinsics:
         text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        size_wh = (int(storage.getNode("image_width").real()), int(storage.getNode("image_height").real()))
-        K = _matrix(storage.getNode("camera_matrix"))
-        distortion = _matrix(storage.getNode("distortion_coefficients"))
+        size_wh = (_side_px(storage, path, "image_width"), _side_px(storage, path, "image_height"))
+        K = pinhole(_matrix(storage, path, "camera_matrix"), f"calibration {path}: camera_matrix", INTRINSICS_KEY)
+        distortion = _matrix(storage, path, "distortion_coefficients")
         model = storage.getNode("distortion_model").string()
         fisheye = storage.getNode("fisheye_model")
     except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
@@ -81,22 +82,51 @@ def read_calibration(path: Path) -> Intrinsics:
         raise InputError(
             f"calibration {path}: fisheye_model is not 0: fisheye lenses are not supported", INTRINSICS_KEY
         )
-    if min(size_wh) <= 0:
-        raise InputError(f"calibration {path} has no image_width and image_height", INTRINSICS_KEY)
-    if K.size != 9 or not np.all(np.isfinite(K)) or K[0] <= 0 or K[4] <= 0:
-        raise InputError(
-            f"calibration {path} has no camera_matrix of nine numbers with positive focal lengths", INTRINSICS_KEY
-        )
     if distortion.size not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
         raise InputError(
             f"calibration {path}: distortion_coefficients takes 4, 5 or 8 numbers (plumb bob)", INTRINSICS_KEY
         )
-    return Intrinsics(K.reshape(3, 3), size_wh, tuple(float(d) for d in distortion))
+    return Intrinsics(K, size_wh, tuple(float(d) for d in distortion))
 
 
-def _matrix(node: cv2.FileNode) -> Array:
-    """Flat numbers of a matrix node, as OpenCV tags it or ROS writes it (rows, cols, data); empty if there is none."""
+def pinhole(numbers: Array, named: str, key: tuple[str, ...] = ()) -> Array:
+    """K [3, 3] from its numbers, row by row. Raises InputError, which begins with `named` (their file and key)."""
+    if numbers.size != 9 or not np.isfinite(numbers).all():
+        raise InputError(f"{named} is not 9 finite numbers", key)
+    K = numbers.reshape(3, 3)
+    if min(K[0, 0], K[1, 1]) <= 0:
+        raise InputError(f"{named} has no positive focal lengths", key)
+    if np.abs(K[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > ROUNDING:
+        raise InputError(f"{named} is not, row by row, fx 0 cx, 0 fy cy, 0 0 1", key)
+    return K
+
+
+def _side_px(storage: cv2.FileStorage, path: Path, name: str) -> int:
+    """Raises InputError."""
+    node, named = storage.getNode(name), f"calibration {path}: {name}"
+    side_px = 0.0 if node.empty() else _number(node, named)
+    if side_px <= 0 or not side_px.is_integer():
+        raise InputError(f"{named} is missing or no positive whole number", INTRINSICS_KEY)
+    return int(side_px)
+
+
+def _matrix(storage: cv2.FileStorage, path: Path, name: str) -> Array:
+    """Flat numbers of a matrix, as OpenCV tags it or ROS writes it (rows, cols, data); empty if there is none.
+
+    Raises InputError.
+    """
+    node, named = storage.getNode(name), f"calibration {path}: {name}"
     if node.empty():
         return np.zeros(0)
+    if not node.isMap() or not node.getNode("data").isSeq():
+        raise InputError(f"{named} has no list of data", INTRINSICS_KEY)
     data = node.getNode("data")
-    return np.array([data.at(i).real() for i in range(data.size())], dtype=np.float64)
+    return np.array([_number(data.at(i), named) for i in range(data.size())], dtype=np.float64)
+
+
+def _number(node: cv2.FileNode, named: str) -> float:
+    """Raises InputError. OpenCV itself takes text, such as O.1 with a letter O, for the largest number there is."""
+    if not (node.isInt() or node.isReal()):
+        text = repr(node.string()) if node.isString() else "a list"
+        raise InputError(f"{named} holds {text} in place of a number", INTRINSICS_KEY)
+    return float(node.real())

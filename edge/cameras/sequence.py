@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge import clock
-from edge.cameras.intrinsics import load_intrinsics
+from edge.cameras.intrinsics import load_intrinsics, pinhole
 from edge.cameras.source import EndOfStream, wait_until
 from edge.config_camera import FolderCamera, SequenceCamera
 from edge.errors import InputError
@@ -153,18 +153,19 @@ def _camera(index: Path, key: str, entry: object) -> tuple[Array, tuple[float, .
     """K [3, 3] and distortion of one picture's entry. Raises InputError."""
     if not isinstance(entry, dict) or "cam_K" not in entry:
         raise InputError(f"{index}: {key!r} has no 'cam_K'")
-    values = []
-    for name, size in (("cam_K", 9), (DISTORTION_KEY, 5)):
-        try:
-            numbers = np.array(entry.get(name, ()), dtype=np.float64).reshape(-1)
-        except (ValueError, TypeError, OverflowError):
-            numbers = np.full(1, np.nan)
-        if (name in entry and numbers.size != size) or not np.isfinite(numbers).all():
-            raise InputError(f"{index}: {name!r} of {key!r} is not {size} finite numbers")
-        values.append(numbers)
-    if min(values[0][0], values[0][4]) <= 0:
-        raise InputError(f"{index}: 'cam_K' of {key!r} has no positive focal lengths")
-    return values[0].reshape(3, 3), tuple(float(value) for value in values[1])
+    K = pinhole(_flat(entry["cam_K"]), f"{index}: 'cam_K' of {key!r}")
+    distortion = _flat(entry.get(DISTORTION_KEY, ()))
+    if (DISTORTION_KEY in entry and distortion.size != 5) or not np.isfinite(distortion).all():
+        raise InputError(f"{index}: {DISTORTION_KEY!r} of {key!r} is not 5 finite numbers")
+    return K, tuple(float(value) for value in distortion)
+
+
+def _flat(numbers: object) -> Array:
+    """[n]; one that is not finite in place of what are no numbers."""
+    try:
+        return np.array(numbers, dtype=np.float64).reshape(-1)
+    except (ValueError, TypeError, OverflowError):
+        return np.full(1, np.nan)
 
 
 def _decode(path: Path) -> NDArray[np.uint8]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +25,17 @@ from edge.cameras.watch import FrameWatch
 from edge.cameras.zenoh_topic import ZenohSource
 from edge.config_camera import DeviceCamera, FolderCamera, ZenohCamera
 from edge.errors import InputError
-from edge.types import Frame, FrameMeta
+from edge.estimator.pace import Pace
+from edge.health import Health
+from edge.types import CameraInfo, Frame, FrameMeta
 from msgs import topics
 from msgs.cdr import CompressedImage
 from msgs.publish import Node, TopicPublisher
 from msgs.session import client_config, router_config
 
 from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
+
+PERIOD_NS = 33_333_333
 
 
 def message(index: int, size_wh: tuple[int, int] = SIZE_WH, stamp_ns: int | None = None) -> bytes:
@@ -195,6 +201,76 @@ def test_a_live_picture_that_repeats_is_withheld_and_a_recordings_is_not(tmp_pat
     numbers, counters = all_of(Playing(settings))
     assert numbers == [1, 2, 3, 4, 5, 6, 7, 8]
     assert (counters["frozen"], counters["dropped"]) == (3, 0)
+
+
+class Numbered:
+    """A live camera of thirty frames a second that shows what it is given, under its number."""
+
+    live = True
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._shown: queue.Queue[tuple[int, int]] = queue.Queue()
+
+    def show(self, sequence: int, shade: int) -> None:
+        self._shown.put((sequence, shade))
+
+    def open(self) -> CameraInfo:
+        return CameraInfo("numbered", (16, 16), np.eye(3), 30.0)
+
+    def read(self, stop: threading.Event) -> Frame:
+        while not stop.is_set():
+            with suppress(queue.Empty):
+                sequence, shade = self._shown.get(timeout=0.02)
+                meta = FrameMeta(sequence, sequence * PERIOD_NS, sequence * PERIOD_NS)
+                return Frame(meta, np.full((16, 16, 3), shade, np.uint8), np.eye(3))
+        raise EndOfStream
+
+    def close(self) -> None: ...
+
+
+def handed_on(numbers: Iterable[int], repeated: Container[int]) -> tuple[list[FrameMeta], dict[str, int]]:
+    """What a reader that is always in time gets of a live camera, those `repeated` show what the one before does."""
+    source, taken, shade = Numbered(), list[FrameMeta](), 0
+    capture = Capture(source, True)
+    capture.start()
+    try:
+        for number in numbers:
+            shade += number not in repeated
+            source.show(number, shade)
+            if number not in repeated:
+                frame = capture.newest(60.0)
+                assert frame is not None
+                taken.append(frame.meta)
+        return taken, capture.counters()
+    finally:
+        capture.stop()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "repeated", "said", "frozen", "dropped"),
+    [
+        (range(60), range(4, 60, 6), [], 10, 0),  # a sensor of 25 Hz in a stream of 30
+        (range(60), [k for k in range(60) if k % 19 > 11], [], 21, 0),  # frozen again and again
+        ([k for k in range(60) if k % 6 != 2], [], ["17 % of frames dropped"], 0, 10),
+        ([k for k in range(60) if k % 6 != 2], range(3, 60, 6), ["20 % of frames dropped"], 10, 10),
+    ],
+)
+def test_pictures_that_a_live_camera_repeats_are_no_drops_and_numbers_that_it_skips_are(
+    numbers: Iterable[int], repeated: Container[int], said: list[str], frozen: int, dropped: int
+) -> None:
+    taken, counters = handed_on(numbers, repeated)
+    health = Health(wants_attitude=False)
+    for meta in taken:
+        health.frame_done(meta.sequence, {"total": 1}, (), True, meta.capture_ns)
+    assert [reason.text for reason in health.assess(taken[-1].capture_ns).reasons] == said
+    assert (counters["captured"], counters["frozen"], counters["dropped"]) == (len(taken), frozen, dropped)
+
+
+def test_a_camera_that_shows_each_picture_twice_leaves_the_time_of_both() -> None:
+    pace = Pace()
+    taken, _ = handed_on(range(12), range(1, 12, 2))
+    assert [pace.unhurried(meta) for meta in taken] == [False, *[True] * 5]
 
 
 def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:

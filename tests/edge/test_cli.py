@@ -106,6 +106,18 @@ def test_a_calibration_that_is_not_there_is_named(cli: Cli, tmp_path: Path) -> N
     assert sentence == f"{place} cannot be read: No such file or directory"
 
 
+def test_a_calibration_with_another_minus_sign_is_named(cli: Cli, tmp_path: Path, text: str) -> None:
+    (tmp_path / "nose.yaml").write_text(
+        "image_width: 1920\nimage_height: 1080\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [2000, 0, 959.5, 0, 2000, 539.5, 0, 0, 1]}\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [\N{MINUS SIGN}0.03, 0.001, 0, 0, 0]\n",
+        encoding="utf-8",
+    )
+    sentence = refusal(cli, tmp_path, text + '[camera.intrinsics]\nfile = "nose.yaml"\n' + OFF, "check")
+    place = f"config.toml:7: [camera] intrinsics: calibration {tmp_path / 'nose.yaml'}: distortion_coefficients"
+    assert sentence == f"{place} holds '\N{MINUS SIGN}0.03' in place of a number"
+
+
 def test_an_unreadable_video_is_named(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     (tmp_path / "flight.mp4").write_bytes(b"no video" * 100)
     intrinsics = "[camera.intrinsics]\nfx = 800\nfy = 800\ncx = 320\ncy = 240\nwidth = 640\nheight = 480\n"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -17,6 +19,7 @@ from edge.cameras.lockstep import LockstepCapture
 from edge.cameras.source import EndOfStream
 from edge.config_camera import SequenceCamera
 from edge.errors import InputError
+from tests.waiting import WITHIN_S
 
 
 class Player:
@@ -76,6 +79,31 @@ def test_when_the_player_hangs_up_the_recording_is_over(player: Player) -> None:
     player.hang_up()
     with pytest.raises(EndOfStream):
         player.capture.newest(5.0)
+
+
+@pytest.mark.parametrize("heard", [False, True], ids=["at once", "after ready"])
+def test_a_daemon_whose_player_hangs_up_before_his_first_word_ends_as_after_a_recording(
+    tmp_path: Path, scene: Path, toy_model: Path, heard: bool
+) -> None:
+    config = tmp_path / "config.toml"
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        config.write_text(
+            f'[camera]\ntype = "sequence"\npath = "{scene}"\nlockstep = "127.0.0.1:{listening.getsockname()[1]}"\n'
+            f'[model]\npath = "{toy_model}"\n[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n'
+        )
+        command = [sys.executable, "-m", "edge.cli", "run", "--config", str(config)]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as daemon:
+            try:
+                listening.settimeout(WITHIN_S)
+                ours, _ = listening.accept()
+                with ours, ours.makefile("r") as lines:
+                    assert not heard or lines.readline() == "ready\n"
+                _, said = daemon.communicate(timeout=WITHIN_S)
+            finally:
+                daemon.kill()
+    assert daemon.returncode == 0, said
+    assert "Traceback" not in said
+    assert "stopped: " in said.splitlines()[-1]
 
 
 @pytest.mark.parametrize("line", ["frame 99", "time 5", "time -3", "frame", "jump 3", "time 1e3", "frame \xff"])

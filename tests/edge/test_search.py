@@ -6,6 +6,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,12 @@ from edge.estimator.model import load_model
 from edge.health import Reason
 from edge.outlets import Outlets
 from edge.reload import Reloader
-from edge.requests import RequestQueue, StopTracking
+from edge.requests import RequestQueue, StopTracking, TrackBox
 from edge.search import PLACE_AGE_MAX_NS, Search
 from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, Report, TrackState
+from msgs.contract import ScoreCalibration
 from tests.waiting import until
 
 from .toy_scene import SIZE_WH, TARGET_WH, K, draw
@@ -196,19 +198,27 @@ class Supply:
     def stop(self) -> None: ...
 
 
-@pytest.fixture
-def pipeline(gated: Gated) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
+@contextmanager
+def looping(gated: Gated, max_targets: int = 4) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
     config = Config.model_validate({
         "camera": {"type": "sequence", "path": "/scene"}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
-        "estimator": {"acquire_every_n": 5},
+        "estimator": {"acquire_every_n": 5, "max_targets": max_targets},
     })  # fmt: skip
     board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))
     ear, requests = Ear(), RequestQueue()
     pipeline = Pipeline(board, gated, OwnShipBuffer(), ear, Supply(), requests, Reloader())
     pipeline.search.start()
-    yield pipeline, ear, requests
-    gated.gate.set()
-    pipeline.search.stop()
+    try:
+        yield pipeline, ear, requests
+    finally:
+        gated.gate.set()
+        pipeline.search.stop()
+
+
+@pytest.fixture
+def pipeline(gated: Gated) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
+    with looping(gated) as told:
+        yield told
 
 
 def test_poses_go_out_while_the_search_is_under_way_and_what_it_finds_becomes_a_track(
@@ -353,6 +363,32 @@ def test_a_person_s_stop_holds_against_a_search_under_way(
     for index in range(9, 14):
         loop._process(frame(index, HELD))
     assert [len(report.tracks) for report in ear.reports[8:]] == [0] * 6
+
+
+def test_pointing_beside_a_target_that_is_held_chooses_it_and_throws_none_out(gated: Gated) -> None:
+    """The window that is pointed at is larger, so it shows the target smaller; of that, this model is surer."""
+    score = ScoreCalibration(offset=1.5, slope=0.2, size_slope=-0.5, size_cap_px=1000.0)
+    gated.model.contract = gated.model.contract.model_copy(update={"track_score": score})
+    with looping(gated, max_targets=2) as (loop, ear, requests):
+        gated.sees = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+        gated.gate.set()
+        for index in range(6):
+            loop._process(frame(index, HELD))
+        until(lambda: loop.search.counters()["searches"] == 1)
+        for index in range(6, 12):
+            loop._process(frame(index, HELD, OTHER))
+        before = ear.reports[-1].tracks
+        assert [track.state for track in before] == [TrackState.CONFIRMED] * 2
+
+        beside_px = np.tile(OTHER, 2) + np.array([10.5, -89.5, 190.5, 90.5])
+        left, top, right, bottom = (beside_px / np.tile(SIZE_WH, 2)).tolist()
+        requests.put(TrackBox((left, top, right, bottom)))
+        for index in range(12, 15):
+            loop._process(frame(index, HELD, OTHER))
+    held = [(TrackState.CONFIRMED, track.born_ns) for track in before]
+    for report in ear.reports[-3:]:
+        assert [(track.state, track.born_ns) for track in report.tracks] == held
+        assert report.chosen_id == before[1].track_id
 
 
 def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated) -> None:

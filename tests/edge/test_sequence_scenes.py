@@ -93,6 +93,11 @@ def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) ->
         ({}, r"scene_camera\.json: '7' has no 'cam_K'"),
         ({"cam_K": [1, 0, 0]}, r"'cam_K' of '7' is not 9 finite numbers"),
         ({"cam_K": [float("nan")] * 9}, r"'cam_K' of '7' is not 9 finite numbers"),
+        ({"cam_K": [300, 0, 160, 0, "3OO", 90, 0, 0, 1]}, r"'cam_K' of '7' is not 9 finite numbers"),
+        ({"cam_K": [300, 0, 160, 0, -300, 90, 0, 0, 1]}, r"'cam_K' of '7' has no positive focal lengths"),
+        ({"cam_K": camera(300.0).T.ravel().tolist()}, r"scene_camera\.json: 'cam_K' of '7' is not, row by row"),
+        ({"cam_K": [300, 0, 160, 0, 300, 90, 0, 0, 0]}, r"scene_camera\.json: 'cam_K' of '7' is not, row by row"),
+        ({"cam_K": [300, 0, 160, 5, 300, 90, 0, 0, 1]}, r"scene_camera\.json: 'cam_K' of '7' is not, row by row"),
         ({"cam_K": np.eye(3).ravel().tolist(), DISTORTION_KEY: [0.1, "a"]}, rf"'{DISTORTION_KEY}' of '7' is not 5"),
     ],
 )
