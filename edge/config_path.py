@@ -10,7 +10,10 @@ from pydantic import AfterValidator, ValidationInfo
 
 def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
     folder = (info.context or {}).get("folder", Path())
-    return (folder / path.expanduser()).resolve()
+    try:
+        return (folder / path.expanduser()).resolve()
+    except RuntimeError as error:  # nobody's home, or links in a circle
+        raise ValueError(f"'{path}' leads nowhere: {error}") from error
 
 
 ConfigPath = Annotated[Path, AfterValidator(_from_config_folder)]

@@ -2,7 +2,7 @@
 
 | command | |
 |---|---|
-| 2004 CAMERA_TRACK_POINT, 2005 CAMERA_TRACK_RECTANGLE | look for a target there |
+| 2004 CAMERA_TRACK_POINT, 2005 CAMERA_TRACK_RECTANGLE | look for a target there, and tell its box again if it is off |
 | 2010 CAMERA_STOP_TRACKING | drop all targets |
 | 511 SET_MESSAGE_INTERVAL | of what is sent at a rate |
 | 512 REQUEST_MESSAGE | of what is sent |
@@ -17,7 +17,8 @@ from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any
 
-from edge.links.mavlink_table import CAMERA_INFORMATION, HEARTBEAT, RATE_LIMITS_HZ
+from edge.links.mavlink_schedule import RESUMED_HZ
+from edge.links.mavlink_table import CAMERA_INFORMATION, HEARTBEAT, IMAGE_STATUS, RATE_LIMITS_HZ
 from edge.requests import Request, StopTracking, TrackBox
 from msgs.mavlink import dialect
 
@@ -33,7 +34,7 @@ class Answer:
     result: int
     request: Request | None = None  # to be handed to the loop
     send_once: int | None = None  # message id
-    interval: tuple[int, float | None] | None = None  # message id, Hz: 0 off, None the default
+    interval: tuple[int, float | None] | None = None  # message id, Hz as Schedule.set_rate takes it
 
 
 def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
@@ -100,7 +101,9 @@ def _track_rectangle(corners: tuple[float, float, float, float]) -> Answer:
 
 def _look_into(box: tuple[float, float, float, float]) -> Answer:
     left, top, right, bottom = (min(max(value, 0.0), 1.0) for value in box)
-    return Answer(dialect.MAV_RESULT_ACCEPTED, request=TrackBox((left, top, right, bottom)))
+    # A ground station switches the box off when it stops tracking, and need not switch it on when it starts again.
+    box_told = (IMAGE_STATUS, RESUMED_HZ)
+    return Answer(dialect.MAV_RESULT_ACCEPTED, request=TrackBox((left, top, right, bottom)), interval=box_told)
 
 
 def _is_share(value: float) -> bool:

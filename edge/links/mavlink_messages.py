@@ -160,6 +160,8 @@ def statustexts(severity: int, text: str, text_id: int) -> list[Any]:
     data = text.encode()
     chunks = [data[i : i + STATUSTEXT_BYTES] for i in range(0, len(data), STATUSTEXT_BYTES)] or [b""]
     shared = text_id if len(chunks) > 1 else 0
+    if shared and len(chunks[-1]) == STATUSTEXT_BYTES:
+        chunks.append(b"")  # a null is what tells the last chunk: without one the whole text is waited for in vain
     return [dialect.MAVLink_statustext_message(severity, chunk, shared, i) for i, chunk in enumerate(chunks)]
 
 

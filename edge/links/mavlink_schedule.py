@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
+RESUMED_HZ = math.inf  # to `set_rate`: the rate that holds, or the default of what is off
 EARLY_SHARE = 0.1  # a message may come this share of its interval early: frames jitter
 
 
@@ -21,7 +23,9 @@ class Schedule:
         return set(self._default_hz)
 
     def set_rate(self, message_id: int, hz: float | None) -> None:
-        """0 switches off, None takes the default."""
+        """0 switches off, None takes the default, RESUMED_HZ does where it is off."""
+        if hz == RESUMED_HZ:
+            hz = self._hz[message_id] or None
         self._hz[message_id] = self._default_hz[message_id] if hz is None else hz
 
     def ask_once(self, message_id: int) -> None:

@@ -95,7 +95,14 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
 def _tls_files(settings: RouterSettings, folder: Path) -> TlsFiles | None:
     if settings.tls is None:
         return None
-    return TlsFiles(*(folder / path.expanduser() for path in settings.tls.model_dump().values()))
+    return TlsFiles(*(_from_folder(folder, path) for path in settings.tls.model_dump().values()))
+
+
+def _from_folder(folder: Path, path: Path) -> Path:
+    try:
+        return folder / path.expanduser()
+    except RuntimeError as error:  # nobody's home
+        raise InputError(f"[tls] '{path}' leads nowhere: {error}") from error
 
 
 def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:

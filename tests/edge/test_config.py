@@ -58,6 +58,14 @@ def test_a_fault_is_told_with_file_line_and_key(tmp_path: Path, text: str, sente
     assert sentence in str(error.value)
 
 
+@pytest.mark.parametrize("path", ["~nosuchuser/rec", "circle/rec"])
+def test_a_path_that_leads_nowhere_is_told_with_file_line_and_key(tmp_path: Path, path: str) -> None:
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(InputError) as error:
+        load_config(write(tmp_path, f"{CAMERA}[recorder]\nfolder = '{path}'"))
+    assert f"config.toml:5: [recorder] folder: '{path}' leads nowhere: " in str(error.value)
+
+
 def test_every_fault_is_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         load_config(write(tmp_path, CAMERA + "fps = 0\n[model]\nthreads = 0\n"))
@@ -138,6 +146,46 @@ def test_calibrations_of_ros_and_opencv_are_read(tmp_path: Path, text: str) -> N
     assert intrinsics.image_size_wh == (1280, 720)
     assert intrinsics.K.tolist() == [[1100.5, 0, 640.25], [0, 1101.0, 359.75], [0, 0, 1]]
     assert intrinsics.distortion == (-0.1, 0.02, 0.001, -0.002, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("written", "instead", "said"),
+    [
+        ("-0.1", "\N{MINUS SIGN}0.1", r"distortion_coefficients holds '\N{MINUS SIGN}0\.1' in place of a number"),
+        ("0.001", "O.001", r"distortion_coefficients holds 'O\.001'"),
+        ("0.001", "[0.001]", "distortion_coefficients holds a list"),
+        ("0.001", ".Inf", "distortion_coefficients takes 4, 5 or 8 numbers"),
+        ("cols: 5\n  data", "cols: 5\n  date", "distortion_coefficients has no list of data"),
+        ("640.25", "O.25", r"camera_matrix holds 'O\.25'"),
+        ("1100.5", ".NaN", "camera_matrix is not 9 finite numbers"),
+        (", 1.0]", "]", "camera_matrix is not 9 finite numbers"),
+        ("1101.0", "-1101.0", "camera_matrix has no positive focal lengths"),
+        ("0.0, 640.25, 0.0, 1101.0, 359.75, 0.0, 0.0", "0, 0, 0, 1101, 0, 640.25, 359.75", "camera_matrix is not, row"),
+        ("640.25, 0.0", "640.25, 7.5", "camera_matrix is not, row by row, fx 0 cx, 0 fy cy, 0 0 1"),
+        (", 1.0]", ", 0.0]", "camera_matrix is not, row by row"),
+        (", 1.0]", ", 2.0]", "camera_matrix is not, row by row"),
+        ("width: 1280", "width: .Inf", "image_width is missing or no positive whole number"),
+        ("width: 1280", "width: 1280.7", "image_width is missing"),
+        ("width: 1280", "width: [1280]", "image_width holds a list"),
+        ("height: 720", "height: ~", "image_height holds '~'"),
+        ("image_height: 720\n", "", "image_height is missing"),
+    ],
+)  # fmt: skip
+def test_a_calibration_with_what_is_no_number_or_no_camera_is_told_with_its_key(
+    tmp_path: Path, written: str, instead: str, said: str
+) -> None:
+    assert ROS_CALIBRATION.count(written) == 1
+    path = tmp_path / "nose.yaml"
+    path.write_text(ROS_CALIBRATION.replace(written, instead), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"^calibration {path}: {said}") as refused:
+        read_calibration(path)
+    assert refused.value.key == ("camera", "intrinsics")
+
+
+def test_what_a_product_of_matrices_leaves_of_a_zero_is_rounding(tmp_path: Path) -> None:
+    path = tmp_path / "nose.yaml"
+    path.write_text(ROS_CALIBRATION.replace("0.0, 0.0, 1.0]", "-3e-17, 2.2e-16, 1.0000000000000002]"))
+    assert read_calibration(path).image_size_wh == (1280, 720)
 
 
 @pytest.mark.parametrize("text", ["", "image_width: 10\n", "{[", ROS_CALIBRATION.replace("1100.5", "-3")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -46,6 +47,10 @@ ACCEPTED, DENIED, UNSUPPORTED = (
         (512, (246.0,), DENIED),
         (512, (math.inf,), DENIED),
         (511, (275.0, 100_000.0), ACCEPTED),
+        (511, (275.0, 500_000.0), ACCEPTED),
+        (511, (275.0, 1_000_000.0), ACCEPTED),
+        (511, (276.0, 1_000_000.0), ACCEPTED),
+        (511, (275.0, 1_250_000.0), DENIED),
         (511, (275.0, 1_000.0), DENIED),
         (511, (275.0, -2.0), DENIED),
         (511, (144.0, 100_000.0), DENIED),
@@ -142,6 +147,20 @@ def test_a_camera_that_opens_at_another_size_than_its_calibrations_is_told_as_it
         assert (information.resolution_h, information.resolution_v) == half
 
 
+def told_beside_poses(peer: Peer, publish: Callable[[], None]) -> set[str]:
+    """The names of what comes while 20 poses do."""
+    peer.received.clear()
+    poses = 0
+
+    def count(message: Any) -> bool:
+        nonlocal poses
+        poses += message.get_type() == "TARGET_RELATIVE"
+        return poses == 20
+
+    peer.until(count, "20 poses", publish)
+    return {message.get_type() for message in peer.received}
+
+
 def test_a_message_switched_off_stays_off_until_it_is_asked_for_or_switched_on() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
@@ -152,19 +171,38 @@ def test_a_message_switched_off_stays_off_until_it_is_asked_for_or_switched_on()
         peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
         peer.command(511, 275.0, -1.0)
         peer.named("COMMAND_ACK")
-        peer.received.clear()
-        poses = 0
-
-        def count(message: Any) -> bool:
-            nonlocal poses
-            poses += message.get_type() == "TARGET_RELATIVE"
-            return poses == 20
-
-        peer.until(count, "20 poses", publish)
-        assert "CAMERA_TRACKING_IMAGE_STATUS" not in {m.get_type() for m in peer.received}
+        assert "CAMERA_TRACKING_IMAGE_STATUS" not in told_beside_poses(peer, publish)
         peer.command(512, 275.0)
         peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
         peer.command(511, 275.0, 0.0)
+        for _ in range(2):
+            peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
+
+
+@pytest.mark.parametrize("pointing", [(2004, 0.5, 0.5), (2005, 0.4, 0.4, 0.6, 0.6)])
+def test_a_ground_station_that_stops_tracking_is_told_the_box_again_when_it_starts_anew(
+    pointing: tuple[int, float],
+) -> None:
+    """As QGroundControl does: it asks 2 Hz when it starts, and switches the box off when it stops."""
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+
+        def publish() -> None:
+            link.publish(report(track(time.monotonic_ns())))
+
+        def ask(command: int, *params: float) -> None:
+            peer.command(command, *params)
+            ack = peer.named("COMMAND_ACK")
+            assert (ack.command, ack.result) == (command, ACCEPTED)
+            requests.take()
+
+        ask(*pointing)
+        ask(511, 275.0, 500_000.0)
+        ask(2010)
+        ask(511, 275.0, -1.0)
+        assert "CAMERA_TRACKING_IMAGE_STATUS" not in told_beside_poses(peer, publish)
+        ask(*pointing)
         for _ in range(2):
             peer.named("CAMERA_TRACKING_IMAGE_STATUS", publish)
 

@@ -259,6 +259,20 @@ def test_long_events_arrive_in_chunks_that_belong_together() -> None:
     assert (first.chunk_seq, second.chunk_seq, first.severity) == (0, 1, 4)
 
 
+@pytest.mark.parametrize("length", [51, 99, 100, 101, 150])
+def test_the_last_chunk_of_an_event_and_no_other_shows_by_a_null_that_it_is_the_last(length: int) -> None:
+    text = "".join(chr(ord("a") + at % 26) for at in range(length))
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.event(4, text)
+        chunks = [peer.named("STATUSTEXT")]
+        while len(chunks[-1].text) == 50:  # no null in it
+            chunks.append(peer.named("STATUSTEXT"))
+    assert "".join(chunk.text for chunk in chunks) == text
+    assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
+    assert len({chunk.id for chunk in chunks} - {0}) == 1
+
+
 def test_the_loop_never_waits_for_the_links_thread_to_count() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as flood:
         junk = b"\xfe\0\0\0\0\0\0\0" * 1_000  # what takes a parser longest: 10 ms

@@ -16,6 +16,7 @@ import pytest
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.camera import Camera
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
+from mavsdk.plugins.telemetry import Telemetry
 from scipy.spatial.transform import Rotation
 
 from edge.links.mavlink_link import MavlinkLink
@@ -137,3 +138,13 @@ def test_target_relative_is_the_whole_pose(flight: Flight) -> None:
     R_ned_cam = Rotation.from_quat(np.roll(pose["q_sensor"], -1)).as_matrix()
     np.testing.assert_allclose(R_ned_cam, R_NED_CAM, atol=1e-6)
     assert abs(pose["timestamp"] - time.time_ns() // 1000) < 60_000_000
+
+
+def test_an_event_arrives_whole_also_where_its_last_chunk_is_full(flight: Flight) -> None:
+    told: list[str] = []
+    telemetry = Telemetry(flight.ground.get_systems()[0])
+    telemetry.subscribe_status_text(lambda status, _: told.append(status.text))
+    text = "target 0 lost: held for 12.3 s, last seen at 240 m".ljust(99, ".") + "!"
+    flight.link.event(4, text)
+    flight.until(lambda: bool(told), "event")
+    assert told == [text]

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.links.allowance import Allowance
-from edge.links.mavlink_schedule import Schedule
+from edge.links.mavlink_schedule import RESUMED_HZ, Schedule
 
 MESSAGE = 275
 GAPS_NS = st.lists(st.integers(1_000_000, 400_000_000), min_size=1, max_size=200)
@@ -62,6 +62,21 @@ def test_what_is_allowed_is_so_many_at_once_and_one_a_period(
     assert went <= (now_ns - began_ns) / period_ns + 1
     now_ns += (at_once + 1) * period_ns
     assert [allowance.take(now_ns) for _ in range(at_once + 1)] == [True] * at_once + [False]
+
+
+def sent_in_10_s(schedule: Schedule, from_s: int) -> int:
+    return sum(schedule.due(MESSAGE, 0, from_s * 10**9 + ms * 1_000_000) for ms in range(10_000))
+
+
+def test_what_is_resumed_keeps_its_rate_and_comes_back_at_the_default_where_it_was_off() -> None:
+    schedule = Schedule({MESSAGE: 10.0})
+    schedule.set_rate(MESSAGE, 2.0)
+    schedule.set_rate(MESSAGE, RESUMED_HZ)
+    assert 19 <= sent_in_10_s(schedule, 0) <= 21
+    schedule.set_rate(MESSAGE, 0.0)
+    assert sent_in_10_s(schedule, 10) == 0
+    schedule.set_rate(MESSAGE, RESUMED_HZ)
+    assert 98 <= sent_in_10_s(schedule, 20) <= 102
 
 
 def test_a_rate_that_is_raised_holds_from_now_on() -> None:

@@ -8,7 +8,7 @@ import sys
 import termios
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, Protocol
 
 from edge.links.errors import LinkError
@@ -70,21 +70,26 @@ def resolve(
     """Family and address of an endpoint, all that its host has. Raises LinkError for a host without one."""
     try:
         found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind, flags=flags)
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
+        # Of 192.168..10, or a part of more than 63 characters, Python does not even ask.
+        reason = error.strerror if isinstance(error, OSError) else "no host can have this name"
         raise LinkError(
-            f"MAVLink endpoint {endpoint.text}: host {endpoint.host!r} cannot be resolved: {error.strerror}"
+            f"MAVLink endpoint {endpoint.text}: host {endpoint.host!r} cannot be resolved: {reason}"
         ) from error
     return [(family, address) for family, _, _, _, address in found]
 
 
 @contextmanager
-def opening(endpoint: NetworkEndpoint, unready: socket.socket) -> Iterator[None]:
-    """While a socket is made ready to be called. It is closed, and LinkError raised, if something will not do."""
-    try:
-        yield
-    except OSError as error:
-        unready.close()
-        raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
+def opening(
+    endpoint: NetworkEndpoint, family: socket.AddressFamily, kind: socket.SocketKind
+) -> Iterator[socket.socket]:
+    """A socket, while it is made ready to be called. It is closed, and LinkError raised, if something will not do."""
+    with ExitStack() as unready:
+        try:
+            yield unready.enter_context(socket.socket(family, kind))
+        except OSError as error:
+            raise LinkError(f"MAVLink endpoint {endpoint.text} cannot be opened: {error.strerror}") from error
+        unready.pop_all()
 
 
 def local_port(bound: socket.socket) -> int:

@@ -223,8 +223,7 @@ class TcpServer:
         self._callers: dict[Address, Connection] = {}
         self._heeded: Address | None = None
         family, address = resolve(endpoint, socket.SOCK_STREAM)[0]
-        self._socket = socket.socket(family, socket.SOCK_STREAM)
-        with opening(endpoint, self._socket):
+        with opening(endpoint, family, socket.SOCK_STREAM) as self._socket:
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind(address)

@@ -1,4 +1,4 @@
-"""UDP, IPv4 and IPv6: `udpin` is bound and answers whom it comes to trust, `udpout` talks to one address."""
+"""UDP, IPv4 and IPv6: `udpin` is bound and answers whom it comes to trust, `udpout` talks to one address at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from edge import clock
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
-from edge.links.transports.lookup import Lookup
+from edge.links.transports.lookup import Lookup, Places
 from edge.links.transports.medium import DATAGRAM_MAX, Address, Received, local_port, opening, resolve
 from msgs.mavlink import FrameReader
 
@@ -21,8 +21,7 @@ SILENT_NS = 5_000_000_000  # nothing heard for so long: the host may have anothe
 
 def _bound(endpoint: NetworkEndpoint, family: socket.AddressFamily, address: Address) -> socket.socket:
     """Raises LinkError if that cannot be."""
-    opened = socket.socket(family, socket.SOCK_DGRAM)
-    with opening(endpoint, opened):
+    with opening(endpoint, family, socket.SOCK_DGRAM) as opened:
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         opened.bind(address)
@@ -74,7 +73,10 @@ class Udp:
 
 
 class UdpCaller:
-    """`udpout`: one host, looked up until it has an address, and again while nothing is heard from there."""
+    """`udpout`: one host, looked up until it has an address, and again after each SILENT_NS without a word from there.
+
+    Of several addresses each then has its turn.
+    """
 
     finds_peers = False
 
@@ -86,6 +88,7 @@ class UdpCaller:
         self._reader = FrameReader(datagram=True)
         self._socket: socket.socket | None = None
         self._heard = self._told = False
+        self._called_ns: dict[Address, int] = {}  # each of the host's addresses, when its turn was
         now_ns = clock.monotonic_ns()
         self._look_at_ns = now_ns
         self.tick(now_ns)
@@ -106,8 +109,7 @@ class UdpCaller:
         try:
             if isinstance(places, LinkError):
                 raise places
-            if all(address != self.peer for _, address in places):
-                self._call(*places[0])
+            self._call_next(places, now_ns)
         except LinkError as error:
             if not self._told:
                 log.warning("mavlink: %s; trying again", error)
@@ -136,11 +138,33 @@ class UdpCaller:
         if self._socket is not None:
             self._socket.close()
 
+    def _call_next(self, places: Places, now_ns: int) -> None:
+        """Call whom was called longest ago: name service tells several addresses in any order.
+
+        One that this host cannot call at all, as IPv6 where there is none, leaves its turn to the next. Raises
+        LinkError if that is so of all.
+        """
+        before_ns = self._called_ns
+        self._called_ns = {address: before_ns.get(address, -1) for _, address in places}
+        failed: LinkError | None = None
+        for family, address in sorted(places, key=lambda place: self._called_ns[place[1]]):
+            self._called_ns[address] = now_ns
+            try:
+                self._call(family, address)
+            except LinkError as error:
+                failed = error
+                continue
+            if address not in before_ns:  # else told already: somebody who only listens has them called for ever
+                log.info("mavlink: %s: calling %s", self.endpoint, address)
+                self._told = False
+            return
+        if failed is not None:
+            raise failed
+
     def _call(self, family: socket.AddressFamily, address: Address) -> None:
         """Raises LinkError if this host cannot call there at all."""
         if self._socket is None or self._socket.family != family:
             opened = _bound(self._named, family, ("", 0))
             self.close()
             self._socket = opened
-        self.peer, self._told = address, False
-        log.info("mavlink: %s: calling %s", self.endpoint, address)
+        self.peer = address

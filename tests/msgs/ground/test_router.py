@@ -212,6 +212,10 @@ def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path
             'listen = ["tls/0.0.0.0:7447"]\n[tls]\nroot_ca = "none.pem"\ncertificate = "a"\nprivate_key = "b"',
             "none.pem cannot be read: No such file",
         ),
+        (
+            'listen = ["tls/0.0.0.0:7447"]\n[tls]\nroot_ca = "~nosuchuser/a"\ncertificate = "a"\nprivate_key = "b"',
+            "[tls] '~nosuchuser/a' leads nowhere: ",
+        ),
         ("listen = [", "not valid TOML"),
     ],
 )
