@@ -74,8 +74,10 @@ def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Find
     """Where recordings go; the folder is made when one begins, so its parents count. Not `from_start`: only when the
     ground asks for one."""
     bad, of_what = (wrong, "") if from_start else (poor, "a recording that the ground asks for will fail: ")
-    there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+    # Paths' own `exists` and `is_dir` raise where a folder above may not be searched. A link that leads there is there.
+    there = next((parent for parent in (folder, *folder.parents) if os.path.lexists(parent)), Path("/"))
+    needed = os.W_OK | os.X_OK | (os.R_OK if there == folder else 0)  # the recorder looks for its files of before
+    if not os.path.isdir(there) or not os.access(there, needed):
         advice = f"sudo install -d -o $USER {folder}, or name another in [recorder] folder"
         return bad("disk", f"{of_what}{folder} cannot be written by this user", advice)
     free = shutil.disk_usage(there).free

@@ -39,8 +39,13 @@ def wrong(what: str, says: str, advice: str) -> Finding:
 
 def device_fault(path: Path, group: str) -> tuple[str, str] | None:
     """Why a device file cannot be used by this user, and what to do; None if it can."""
-    if not path.exists():
+    forbidden = f"{path} may not be read and written by this user"
+    try:
+        path.stat()
+    except PermissionError:
+        return forbidden, f"`namei -l {path}` shows the folder that this user may not enter"
+    except (OSError, ValueError):
         return f"{path} is not there", f"plug it in, or name another; `ls {path.parent}` shows what there is"
     if not os.access(path, os.R_OK | os.W_OK):
-        return f"{path} may not be read and written by this user", f"sudo usermod -aG {group} $USER, then log in again"
+        return forbidden, f"sudo usermod -aG {group} $USER, then log in again"
     return None

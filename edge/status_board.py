@@ -17,7 +17,7 @@ import zenoh
 from zenoh import handlers
 
 from edge import clock
-from edge.addresses import no_password
+from edge.addresses import no_passwords
 from edge.config import ConfigFile
 from edge.estimator.model import Model
 from edge.health import HealthSnapshot
@@ -67,8 +67,7 @@ class StatusBoard:
         return told
 
     def config(self) -> dict[str, Any]:
-        tree = json.loads(no_password(self.file.config.model_dump_json()))
-        return {"file": str(self.file.path), "config": tree}
+        return {"file": str(self.file.path), "config": no_passwords(self.file.config.model_dump(mode="json"))}
 
     def model_card(self) -> dict[str, Any]:
         model = self.model

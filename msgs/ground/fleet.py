@@ -25,6 +25,11 @@ from msgs.wire import Array, PayloadError
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
+# A range that differs from the one before by more than flight makes of it is of another aircraft under the same number,
+# or of a track that was moved to where its frames are. Two small aircraft near each other by less than 150 m/s; with a
+# frame's noise a track's range goes up to 5 m from frame to frame, and by tens of metres where it is moved.
+FLIGHT_MPS = 150.0
+RANGE_NOISE_M = 5.0
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
 HEALTH_STALE_NS = 3_000_000_000  # it is told each second
@@ -160,7 +165,10 @@ class Fleet:
         if known is not None and pose.stamp_ns <= known.newest.stamp_ns:
             known = None  # the vehicle's clock was set back
         ranges = deque[tuple[int, float]](maxlen=_KEPT_MAX) if known is None else known.ranges
-        ranges.append((pose.stamp_ns, float(np.linalg.norm(pose.pose.t_cam_target_m))))
+        range_m = float(np.linalg.norm(pose.pose.t_cam_target_m))
+        if ranges and not _flown(*ranges[-1], pose.stamp_ns, range_m):
+            ranges.clear()
+        ranges.append((pose.stamp_ns, range_m))
         while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
             ranges.popleft()
         ship = vehicle.own.near(pose.stamp_ns)
@@ -230,6 +238,11 @@ def _is_news(vehicle: _Vehicle, sent_as: tuple[int, int, bytes] | None) -> bool:
         return False
     vehicle.event_number = (publisher, number)
     return True
+
+
+def _flown(before_ns: int, before_m: float, stamp_ns: int, range_m: float) -> bool:
+    """Whether flight may have brought a target from one range to another."""
+    return abs(range_m - before_m) <= FLIGHT_MPS * (stamp_ns - before_ns) / 1e9 + RANGE_NOISE_M
 
 
 def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:

@@ -163,25 +163,53 @@ def test_a_camera_that_the_running_daemon_has_is_not_taken_for_a_broken_one(
 NO_ROOT_LOOKS = """
 import os
 from pathlib import Path
+from edge.doctor_machine import disk_finding
 from edge.findings import device_fault
 if os.geteuid() == 0:  # who may everything
     os.setgroups([])
     os.setgid(65534)
     os.setuid(65534)
-print(*(device_fault(Path("video0"), "video") or ["may be used"]), sep="\\n")
+print(*(device_fault(Path("{path}"), "video") or ["may be used"]), sep="\\n")
+print(disk_finding(Path("{path}"), 0, from_start=True).line())
 """
+
+
+def looked_at_by_nobody(folder: Path, path: str) -> str:
+    """What is said of `path`, from `folder`, as a device and as a folder for recordings."""
+    folder.chmod(0o755)
+    command = [sys.executable, "-c", NO_ROOT_LOOKS.replace("{path}", path)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout
 
 
 @pytest.mark.parametrize(
     ("mode", "words"), [(0o000, "usermod -aG video"), (0o444, "may not be"), (0o666, "may be used")]
 )
 def test_a_device_without_permission_names_the_group(tmp_path: Path, mode: int, words: str) -> None:
-    tmp_path.chmod(0o755)
     device = tmp_path / "video0"
     device.touch()
     device.chmod(mode)
-    command = [sys.executable, "-c", NO_ROOT_LOOKS]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+    assert words in looked_at_by_nobody(tmp_path, "video0")
+
+
+@pytest.mark.parametrize("path", ["home/rec", "home/rec/deep", "home/none", "link"])
+def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_as_forbidden(tmp_path: Path, path: str) -> None:
+    (tmp_path / "home" / "rec").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "home" / "rec")
+    (tmp_path / "home").chmod(0o000)
+    said = looked_at_by_nobody(tmp_path, path)
+    (tmp_path / "home").chmod(0o755)  # or pytest, where it is not root, cannot remove it
+    assert f"{path} may not be read" in said
+    assert f"namei -l {path}" in said
+    assert f"WRONG  disk         {path} cannot be written by this user" in said
+
+
+@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, "cannot be"), (0o333, "cannot be")])
+def test_a_recorder_s_folder_must_be_one_to_write_and_to_look_into(tmp_path: Path, mode: int, words: str) -> None:
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    folder.chmod(mode)
+    said = looked_at_by_nobody(tmp_path, "rec")
+    folder.chmod(0o755)
     assert words in said
 
 

@@ -7,11 +7,16 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from edge.config import Config, ConfigFile
+from edge.estimator.model import load_model
 from edge.health import Activity, HealthState
 from edge.stages import STAGES
 from edge.status import ask
+from edge.status_board import StatusBoard
+from edge.types import CameraInfo
 from msgs import topics
 from msgs.cdr import DiagnosticArray
 from msgs.client import connect
@@ -124,12 +129,31 @@ def test_passwords_in_addresses_are_not_told() -> None:
     assert no_password("rtsp://pilot:secret@10.0.0.2:554/main") == "rtsp://***@10.0.0.2:554/main"
     assert no_password("rtsp://pilot:p@ss@10.0.0.2/main does not open") == "rtsp://***@10.0.0.2/main does not open"
     assert no_password("rtsp://u:it's@10.0.0.2/x") == "rtsp://***@10.0.0.2/x"
-    assert no_password('{"url":"rtsp://10.0.0.2","mail":"a@b"}') == '{"url":"rtsp://10.0.0.2","mail":"a@b"}'
+    assert no_password("rtsp://u:p q@10.0.0.2/x") == "rtsp://***@10.0.0.2/x"
     assert no_password("rtsp://10.0.0.2/a@b") == "rtsp://10.0.0.2/a@b"
     assert no_password("http://cam/video.cgi?user=pilot&pwd=se=cr%20et&size=hd lost") == (
         "http://cam/video.cgi?user=***&pwd=***&size=hd lost"
     )
-    assert no_password('{"url":"rtsp://cam/1?Access_Token=abc","size":"hd"}') == (
-        '{"url":"rtsp://cam/1?Access_Token=***","size":"hd"}'
-    )
+    assert no_password("rtsp://cam/1?Access_Token=abc#1") == "rtsp://cam/1?Access_Token=***#1"
     assert no_password("rtsp://cam/1?channel=1&subtype=0") == "rtsp://cam/1?channel=1&subtype=0"
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("rtsp://u:p\"q'@cam/1", "rtsp://***@cam/1"),
+        ('http://cam/x?token=a"b\\"c&size=hd', "http://cam/x?token=***&size=hd"),
+        ("rtsp://cam/1", "rtsp://cam/1"),
+    ],
+)
+def test_the_configuration_that_is_told_holds_no_password(tmp_path: Path, toy_model: Path, url: str, told: str) -> None:
+    intrinsics = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 89.5, "width": 320, "height": 180}
+    tree = {"camera": {"type": "stream", "url": url, "intrinsics": intrinsics}, "vehicle": {"name": "kestrel"}}
+    config = Config.model_validate(tree)
+    camera = CameraInfo("camera", (320, 180), np.eye(3), None)
+    board = StatusBoard(ConfigFile(tmp_path / "config.toml", "", config), load_model(toy_model, 1), camera)
+    answer = json.loads(json.dumps(board.config(), allow_nan=False))
+    assert answer["file"] == str(tmp_path / "config.toml")
+    assert answer["config"]["camera"]["url"] == told
+    answer["config"]["camera"]["url"] = url
+    assert Config.model_validate(answer["config"]) == config

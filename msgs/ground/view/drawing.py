@@ -13,6 +13,7 @@ from msgs.wire import Array
 NEAR_M = 0.5  # nearer than this to the camera's plane nothing is projected
 SIGMAS = 2.0  # of every ellipse and ellipsoid drawn
 _ELLIPSE_POINTS = 48
+_OPENCV_LENSES = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that its camera model has
 # Corners are numbered by their signs: bit 0 x, bit 1 y, bit 2 z.
 _EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
 
@@ -30,11 +31,14 @@ def posed(points_m: ArrayLike, R_cam_target: ArrayLike, t_cam_target_m: ArrayLik
 
 
 def project(points_cam_m: ArrayLike, K: ArrayLike, distortion: ArrayLike = ()) -> Array | None:
-    """Pixels [..., 2] of points [..., 3], by OpenCV's camera model; None if any is not before the camera."""
+    """Pixels [..., 2] of points [..., 3], by OpenCV's camera model; None if any is not before the camera.
+
+    None too for a lens of another model: drawn without it a box would stand in a wrong place.
+    """
     points = np.asarray(points_cam_m, dtype=np.float64)
-    if (points[..., 2] < NEAR_M).any():
-        return None
     lens = np.asarray(distortion, dtype=np.float64)
+    if lens.size not in _OPENCV_LENSES or (points[..., 2] < NEAR_M).any():
+        return None
     zero = np.zeros(3)
     px, _ = cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, np.asarray(K, dtype=np.float64), lens)
     return np.asarray(px, dtype=np.float64).reshape(*points.shape[:-1], 2)

@@ -131,9 +131,10 @@ def log_seen(
         return
     t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
     center = project(t_m, camera.K, camera.distortion)
-    if center is None:
-        return
     where = f"{row.uav}/ned/camera/target/{row.target}"
+    if center is None:
+        _clear(rec, where)
+        return
     doubt = ellipse(center, pixel_covariance(t_m, covariance[:3, :3], camera.K))
     lowest_px = doubt[:, 1].max()
     if R is None:
@@ -141,6 +142,7 @@ def log_seen(
     else:
         box = _log_boxes(rec, row, R, t_m, camera, size_m)
         if box is None:
+            _clear(rec, where)
             return
         lowest_px = max(lowest_px, box[..., 1].max())
     rec.log(f"{where}/sigma", rr.LineStrips2D([doubt], colors=[rgb(row.target)]))

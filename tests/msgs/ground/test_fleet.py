@@ -1,9 +1,9 @@
-"""How things stand, when clocks are set and history comes late."""
+"""How things stand, when clocks are set, history comes late and numbers are used again."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -76,6 +76,42 @@ def test_how_fast_a_target_nears_is_not_taken_across_a_clock_that_was_set_back()
         fleet.take(pose(back_ns + k * S // 10, k + 21, 260.0 - 1.0 * k), back_ns + k * S // 10)
     (row,) = fleet.rows(back_ns + 2 * S)
     assert row.targets[0].closing_mps == pytest.approx(10.0, abs=0.5)
+
+
+def closing_mps(ranges: Sequence[tuple[int, float]]) -> list[float | None]:
+    """As it is told with each of the poses at these (ns from the start, m)."""
+    fleet, told = Fleet(), list[float | None]()
+    for number, (after_ns, range_m) in enumerate(ranges, start=1):
+        row = fleet.take(pose(NOW_NS + after_ns, number, range_m), NOW_NS + after_ns)
+        assert isinstance(row, TargetRow)
+        told.append(row.closing_mps)
+    return told
+
+
+def test_another_aircraft_under_the_same_number_nears_from_where_it_is() -> None:
+    """Both rest. How fast is told again as soon as there is enough of the second."""
+    first = [(k * 33 * MS, 400.0) for k in range(60)]
+    second = [(first[-1][0] + 130 * MS + k * 33 * MS, 150.0) for k in range(60)]
+    told = closing_mps(first + second)
+    assert all(one is None or abs(one) < 5.0 for one in told)
+    assert told[59] is not None
+    assert told[60] is None
+    assert None not in told[-40:]
+
+
+def test_a_track_that_is_moved_once_does_not_near_for_it() -> None:
+    told = closing_mps([(k * 33 * MS, 300.0 if k < 45 else 360.0) for k in range(90)])
+    assert all(one is None or abs(one) < 5.0 for one in told)
+    assert told[44] is not None
+    assert None not in told[-30:]
+
+
+@pytest.mark.parametrize("rate_hz", [30, 5])
+def test_how_fast_a_fast_one_nears_is_told_all_along(rate_hz: int) -> None:
+    """Nearly head on, each range off by a metre; also at the few poses a second of a radio."""
+    off_m = np.random.default_rng(0).normal(size=3 * rate_hz)
+    told = closing_mps([(k * S // rate_hz, 500.0 - 120.0 * k / rate_hz + off_m[k]) for k in range(3 * rate_hz)])
+    assert told[rate_hz:] == pytest.approx([120.0] * (2 * rate_hz), abs=10.0)
 
 
 def R_ned_body(stamp_ns: int) -> Rotation:
