@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 class FrameMeta:
     """Who a frame is, all times on the monotonic clock."""
 
-    sequence: int  # counts frames the source produced, so a gap is a drop
+    sequence: int  # counts frames the source produced less repeats that were withheld, so a gap is a drop
     capture_ns: int  # exposure time
     arrival_ns: int  # when the daemon held the pixels
     time_jumps: int = 0  # how often the camera's time had jumped by then
