@@ -80,10 +80,15 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         if kind == "serial" and (fault := device_fault(Path(rest.rpartition(":")[0]), "dialout")) is not None:
             yield wrong("mavlink", *fault)
             return
-        if kind in ("udpout", "tcpout") and isinstance(named := parse_endpoint(endpoint), NetworkEndpoint):
+        if isinstance(named := parse_endpoint(endpoint), NetworkEndpoint):
             try:
                 resolve(named, socket.SOCK_DGRAM)
             except InputError as error:
+                if kind in ("udpin", "tcpin"):
+                    yield wrong(
+                        "mavlink", str(error), "give it an address of this computer, or 0.0.0.0 for all of them"
+                    )
+                    return
                 yield poor("host", str(error), f"`getent hosts {named.host}` shows the same; give it an address")
     own_ship = OwnShipBuffer()
     camera = CameraInfo("doctor", (640, 480), np.eye(3), None)

@@ -82,6 +82,16 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
     assert "host 'autopilot.invalid' cannot be resolved" in found["host"]["says"]
 
 
+def test_a_name_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
+    code, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["udpin:ground..local:14550"]\n')
+    assert code == 1
+    assert "host 'ground..local' cannot be resolved" in found["mavlink"]["says"]
+    assert found["mavlink"]["advice"] == "give it an address of this computer, or 0.0.0.0 for all of them"
+
+
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text("[camera]\ntype = 'film'\n")
     done = cli("doctor", "--config", "config.toml")
