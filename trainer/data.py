@@ -12,8 +12,11 @@ import queue
 import signal
 import threading
 import traceback
+import weakref
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -26,6 +29,7 @@ from trainer.config import ConfigError, RenderingError
 from trainer.losses import Labels
 
 DENSE_STRIDE = 4
+STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Sampler(Protocol):
@@ -104,8 +108,9 @@ def _serve(
 ) -> None:
     """Body of a rendering process: batches first, first + stride, ... until the trainer is gone."""
     # The trainer ends it: a signal to the whole group must not end it before the trainer has saved.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
     os.environ.setdefault("LP_NUM_THREADS", "1")
     made: queue.Queue[TrainingBatch | ConfigError | str | None] = queue.Queue(prefetch)
     sender = threading.Thread(target=_send, args=(made, out), daemon=True)
@@ -130,8 +135,16 @@ def _send(made: queue.Queue[TrainingBatch | ConfigError | str | None], out: Conn
     while (batch := made.get()) is not None:
         try:
             out.send(batch)
-        except OSError:
+        except ConnectionError:
             os._exit(0)  # the trainer is gone, and nobody would ever empty the queue
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)  # or the trainer would wait for ever
+
+
+def _kill(processes: list[BaseProcess]) -> None:
+    for process in processes:
+        process.kill()
 
 
 class Feed:
@@ -151,16 +164,24 @@ class Feed:
         context = mp.get_context("spawn")
         self._turn = 0
         self._readers: list[Connection] = []
-        self._processes = []
+        self._processes: list[BaseProcess] = []
+        # Where nobody closes it: what multiprocessing waits for at the end of Python does not heed its signal.
+        weakref.finalize(self, _kill, self._processes)
+        resource_tracker.ensure_running()  # it unblocks signals
         for worker in range(workers):
             reader, writer = context.Pipe(duplex=False)
             first = first_index + (worker * ranks + rank) * batch_size
             arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, prefetch, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
-            process.start()
+            # Until it ignores them: it first imports for seconds.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+            try:
+                process.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            self._processes.append(process)
             writer.close()  # or the end of one that is killed in the middle of a batch would not be seen
             self._readers.append(reader)
-            self._processes.append(process)
 
     def next(self) -> TrainingBatch:
         """The next batch in index order. Raises RenderingError when its renderer failed, ConfigError for bad input."""
@@ -180,8 +201,7 @@ class Feed:
 
     def close(self) -> None:
         """Stop the renderers; idempotent."""
-        for process in self._processes:
-            process.kill()
+        _kill(self._processes)
         for process, reader in zip(self._processes, self._readers, strict=True):
             process.join(timeout=5.0)
             reader.close()

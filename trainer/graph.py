@@ -124,6 +124,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
 
 def write_contract(path: Path, contract: ModelContract) -> None:
     """Put the contract into the model file's metadata. Raises ConfigError, the file as it was, where that fails."""
+    path = path.resolve()  # of a link, the file that it leads to
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
     part = path.with_name(f"{path.name}.part")

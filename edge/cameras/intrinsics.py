@@ -96,7 +96,7 @@ def pinhole(numbers: Array, named: str, key: tuple[str, ...] = ()) -> Array:
     K = numbers.reshape(3, 3)
     if min(K[0, 0], K[1, 1]) <= 0:
         raise InputError(f"{named} has no positive focal lengths", key)
-    if np.abs(K[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > ROUNDING:
+    if np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > ROUNDING:
         raise InputError(f"{named} is not, row by row, fx 0 cx, 0 fy cy, 0 0 1", key)
     return K
 

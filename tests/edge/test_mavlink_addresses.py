@@ -10,6 +10,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from typing import Any
 
 import pytest
@@ -122,6 +123,22 @@ def test_a_ground_station_is_called_by_ipv4_where_there_is_no_ipv6(
     assert f"MAVLink endpoint udpout:::1:14550 cannot be opened: {NO_IPV6}; trying again" in caplog.text
 
 
+def test_an_address_that_nothing_can_be_sent_to_has_no_turn(
+    name_service: dict[str, Callable[[], list[str]]], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A broadcast, which needs a permission of its own, stands for one to which no way leads."""
+    asked = list[int]()
+    called = set[Any]()
+    name_service["ground.test"] = lambda: asked.append(1) or ["255.255.255.255", "127.0.0.1"]
+    with calling("ground.test", 14550) as caller:
+        now_ns = count(time.monotonic_ns() + SILENT_NS, SILENT_NS)
+        until(lambda: len(asked) > 4, lambda: (caller.tick(next(now_ns)), called.add(caller.peer)), what="four turns")
+        assert called - {None} == {("127.0.0.1", 14550)}
+    with calling("255.255.255.255", 14550) as alone:
+        assert alone.peer is None
+    assert "udpout:255.255.255.255:14550 cannot be opened: Permission denied; trying again" in caplog.text
+
+
 def test_each_address_of_a_silent_ground_station_has_its_turn_until_one_is_heard(
     name_service: dict[str, Callable[[], list[str]]],
 ) -> None:
@@ -132,11 +149,11 @@ def test_each_address_of_a_silent_ground_station_has_its_turn_until_one_is_heard
         return addresses
 
     name_service["ground.test"] = in_another_order
-    now_ns = time.monotonic_ns()
     with contextlib.closing(socket.socket(type=socket.SOCK_DGRAM)) as ground:
         ground.bind(("127.0.0.2", 0))
         ground.settimeout(DEADLINE_S)
         with calling("ground.test", ground.getsockname()[1]) as caller:
+            now_ns = time.monotonic_ns()  # after its first look, which may have been answered at once
 
             def next_called() -> str:
                 """Whom it calls after a silence."""

@@ -22,8 +22,10 @@ from trainer.data import Feed, training_batch
 LARGE_PX = 256  # a batch of such pictures is far more than a pipe holds
 
 
-def rendered_pids() -> set[int]:
-    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+def rendered_pids(parent: int | None = None) -> set[int]:
+    """Of this process, unless told."""
+    pid = parent or os.getpid()
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     return {pid for pid in map(int, children) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()}
 
 
@@ -94,15 +96,23 @@ if __name__ == "__main__":
 """
 
 
-def test_a_run_whose_whole_group_is_told_to_stop_ends_as_one_that_was_asked_to(tmp_path: Path) -> None:
+@pytest.mark.parametrize("renderer", ["starting", "rendering"])
+def test_a_run_whose_whole_group_is_told_to_stop_ends_as_one_that_was_asked_to(tmp_path: Path, renderer: str) -> None:
     """As `timeout` and systemd tell it; rendering is slower than training here, so that it waits for a renderer."""
     (tmp_path / "slow.py").write_text(SLOW.format(tests=str(Path(tiny.__file__).parent)))
     command = [sys.executable, str(tmp_path / "slow.py"), str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
-        assert process.stdout is not None
-        next(line for line in process.stdout if line.startswith("step"))
-        os.killpg(process.pid, signal.SIGTERM)
-        said, _ = process.communicate(timeout=60)
+        try:
+            assert process.stdout is not None
+            if renderer == "starting":
+                until(lambda: rendered_pids(process.pid))
+            else:
+                next(line for line in process.stdout if line.startswith("step"))
+            os.killpg(process.pid, signal.SIGTERM)
+            said, _ = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 0
     assert "stopped before the end of the plan" in said
-    assert (tmp_path / "run" / "resume.pt").exists()
+    if renderer == "rendering":  # else it may have been stopped before it had learnt anything
+        assert (tmp_path / "run" / "resume.pt").exists()

@@ -141,7 +141,7 @@ class UdpCaller:
     def _call_next(self, places: Places, now_ns: int) -> None:
         """Call whom was called longest ago: name service tells several addresses in any order.
 
-        One that this host cannot call at all, as IPv6 where there is none, leaves its turn to the next. Raises
+        One that this host cannot call at all, as where no way leads there, leaves its turn to the next. Raises
         LinkError if that is so of all.
         """
         before_ns = self._called_ns
@@ -154,7 +154,8 @@ class UdpCaller:
             except LinkError as error:
                 failed = error
                 continue
-            if address not in before_ns:  # else told already: somebody who only listens has them called for ever
+            # Else told already: where somebody only listens, addresses are called by turns for ever.
+            if address not in before_ns or self._told:
                 log.info("mavlink: %s: calling %s", self.endpoint, address)
                 self._told = False
             return
@@ -163,6 +164,9 @@ class UdpCaller:
 
     def _call(self, family: socket.AddressFamily, address: Address) -> None:
         """Raises LinkError if this host cannot call there at all."""
+        with opening(self._named, family, socket.SOCK_DGRAM) as probe:
+            probe.connect(address)  # sends nothing, and fails where no way leads there
+        probe.close()
         if self._socket is None or self._socket.family != family:
             opened = _bound(self._named, family, ("", 0))
             self.close()
