@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 
 import pytest
@@ -9,6 +10,8 @@ from hypothesis import settings
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+# A shell that runs the tests in the background has Ctrl-C ignored, and all that is started here would ignore it too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 RECOVERY = "recovery"  # the user property in which a test leaves a line for the closing report
 
