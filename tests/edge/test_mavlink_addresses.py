@@ -153,7 +153,9 @@ def test_each_address_of_a_silent_ground_station_has_its_turn_until_one_is_heard
         ground.bind(("127.0.0.2", 0))
         ground.settimeout(DEADLINE_S)
         with calling("ground.test", ground.getsockname()[1]) as caller:
-            now_ns = time.monotonic_ns()  # after its first look, which may have been answered at once
+            now_ns = time.monotonic_ns()
+            # Its first look may have been answered at once, or is answered a little later.
+            until(lambda: caller.peer, lambda: caller.tick(now_ns), what="the first address")
 
             def next_called() -> str:
                 """Whom it calls after a silence."""
