@@ -61,11 +61,16 @@ class RequestQueue:
         self._too_late = 0
 
     def put(self, request: Request) -> bool:
-        """Leave a request; False, and it is not taken, if too many wait."""
+        """Leave a request; False, and it is not taken, if too many wait.
+
+        A stop always is: it undoes what waits, and where there is no room takes its place.
+        """
         with self._lock:
             self._drop_old()
             if len(self._waiting) >= WAITING_MAX:
-                return False
+                if not isinstance(request, StopTracking):
+                    return False
+                self._waiting.clear()
             self._waiting.append((request, clock.monotonic_ns()))
             return True
 

@@ -294,7 +294,7 @@ class Station:
         asker = (command.get_srcSystem(), command.get_srcComponent())
         ack = dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *asker)
         out = [self._packed(ack, camera=camera)]
-        if reply.interval is not None:
+        if reply.interval is not None and result == reply.result:
             self._schedule.set_rate(*reply.interval)
         if reply.send_once == CAMERA_INFORMATION:
             boot_ms = now_ns // 1_000_000 % 2**32

@@ -109,15 +109,23 @@ def test_a_point_without_a_usable_radius_is_looked_at_four_hundredths_of_the_wid
     assert ((top + bottom) / 2, bottom - top) == pytest.approx((0.5, side_px / SIZE_WH[1])), "a square in the picture"
 
 
-def test_a_loop_that_takes_no_requests_is_told_to_the_sender() -> None:
-    with linked(requests=RequestQueue()) as (link, _), Peer(link.ports[0]) as peer:
+def test_a_loop_that_takes_no_requests_is_told_to_the_sender_who_can_still_stop() -> None:
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
-        for _ in range(9):
-            peer.command(2010)
-        peer.until(
-            lambda m: m.get_type() == "COMMAND_ACK" and m.result == dialect.MAV_RESULT_TEMPORARILY_REJECTED,
-            "rejection",
-        )
+
+        def answer(number: int, *parameters: float) -> int:
+            peer.received.clear()
+            peer.command(number, *parameters)
+            return int(peer.named("COMMAND_ACK").result)
+
+        assert [answer(2004, 0.5, 0.5, 0.1) for _ in range(8)] == [ACCEPTED] * 8
+        assert answer(511, 275.0, -1.0) == ACCEPTED
+        assert answer(2004, 0.5, 0.5, 0.1) == dialect.MAV_RESULT_TEMPORARILY_REJECTED
+        sent = told_beside_poses(peer, lambda: link.publish(report(track(time.monotonic_ns()))))
+        assert "CAMERA_TRACKING_IMAGE_STATUS" not in sent, "what is turned down changes nothing"
+        assert answer(2010) == ACCEPTED
+        assert requests.take() == [StopTracking()]
 
 
 def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> None:

@@ -70,15 +70,17 @@ def answered(one: Commanded, name: str, body: dict[str, Any]) -> dict[str, Any]:
     return said
 
 
-def test_requests_reach_the_loop_in_order(tmp_path: Path) -> None:
+def test_requests_reach_the_loop_in_order_and_a_stop_always(tmp_path: Path) -> None:
     with vehicle(tmp_path) as one:
         box = [0.4, 0.25, 0.5, 1]
         assert answered(one, "track", {"box": box}) == {"ok": True, "command": "track", "done": {"box": box}}
         assert answered(one, "stop", {}) == {"ok": True, "command": "stop", "done": {}}
         assert one.requests.take() == [TrackBox((0.4, 0.25, 0.5, 1.0)), StopTracking()]
         for _ in range(WAITING_MAX):
-            assert answered(one, "stop", {})["ok"]
-        assert answered(one, "stop", {})["error"] == "too many requests wait; try again"
+            assert answered(one, "track", {"box": box})["ok"]
+        assert answered(one, "track", {"box": box})["error"] == "too many requests wait; try again"
+        assert answered(one, "stop", {})["ok"]
+        assert one.requests.take() == [StopTracking()]
 
 
 def test_a_target_is_selected_by_its_name_if_it_is_tracked(tmp_path: Path) -> None:

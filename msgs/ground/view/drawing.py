@@ -14,6 +14,7 @@ NEAR_M = 0.5  # nearer than this to the camera's plane nothing is projected
 SIGMAS = 2.0  # of every ellipse and ellipsoid drawn
 _ELLIPSE_POINTS = 48
 _OPENCV_LENSES = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that its camera model has
+_OPENCV_MODELS = ("", "plumb_bob", "rational_polynomial")  # its names in ROS; some tell none
 # Corners are numbered by their signs: bit 0 x, bit 1 y, bit 2 z.
 _EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
 
@@ -30,14 +31,14 @@ def posed(points_m: ArrayLike, R_cam_target: ArrayLike, t_cam_target_m: ArrayLik
     return np.asarray(points_m) @ np.asarray(R_cam_target).T + np.asarray(t_cam_target_m)
 
 
-def project(points_cam_m: ArrayLike, K: ArrayLike, distortion: ArrayLike = ()) -> Array | None:
+def project(points_cam_m: ArrayLike, K: ArrayLike, distortion: ArrayLike = (), model: str = "") -> Array | None:
     """Pixels [..., 2] of points [..., 3], by OpenCV's camera model; None if any is not before the camera.
 
     None too for a lens of another model: drawn without it a box would stand in a wrong place.
     """
     points = np.asarray(points_cam_m, dtype=np.float64)
     lens = np.asarray(distortion, dtype=np.float64)
-    if lens.size not in _OPENCV_LENSES or (points[..., 2] < NEAR_M).any():
+    if model not in _OPENCV_MODELS or lens.size not in _OPENCV_LENSES or (points[..., 2] < NEAR_M).any():
         return None
     zero = np.zeros(3)
     px, _ = cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, np.asarray(K, dtype=np.float64), lens)

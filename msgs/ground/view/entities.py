@@ -130,7 +130,7 @@ def log_seen(
     if camera is None:
         return
     t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
-    center = project(t_m, camera.K, camera.distortion)
+    center = project(t_m, *_lens(camera))
     where = f"{row.uav}/ned/camera/target/{row.target}"
     if center is None:
         _clear(rec, where)
@@ -151,6 +151,10 @@ def log_seen(
     rec.log(f"{where}/label", rr.Points2D([below], colors=[rgb(row.target)], labels=[label], radii=[0.0]))
 
 
+def _lens(camera: CameraInfo) -> tuple[Array, Array, str]:
+    return camera.K, camera.distortion, camera.distortion_model
+
+
 def _log_boxes(
     rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, t_m: Array, camera: CameraInfo,
     size_m: Sequence[float],
@@ -158,14 +162,13 @@ def _log_boxes(
     """The pixels of the box; None if it is not all before the camera."""
     where = f"{row.uav}/ned/camera/target/{row.target}"
     edges = box_edges_m(size_m)
-    box = project(posed(edges, R_cam_target, t_m), camera.K, camera.distortion)
+    box = project(posed(edges, R_cam_target, t_m), *_lens(camera))
     if box is None:
         return None
     rec.log(f"{where}/box", rr.LineStrips2D(list(box), colors=[rgb(row.target)], radii=[-1.5]))
     share = row.sigma_range_m / max(row.range_m, 1e-9)
     doubtful = [
-        project(posed(edges, R_cam_target, t_m * max(1.0 + side * share, 0.1)), camera.K, camera.distortion)
-        for side in (-1, 1)
+        project(posed(edges, R_cam_target, t_m * max(1.0 + side * share, 0.1)), *_lens(camera)) for side in (-1, 1)
     ]
     strips = [strip for one in doubtful if one is not None for strip in one]
     if strips:

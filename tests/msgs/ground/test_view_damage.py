@@ -19,24 +19,27 @@ from .flight import START_NS, UAV, K, samples, stamps_ns
 from .test_view import rows
 
 
-def write(path: Path, frames: int, coefficients: int) -> None:
-    """A flight without pictures, whose camera tells a distortion of so many."""
+def write(path: Path, frames: int, coefficients: int, model: str = "plumb_bob") -> None:
+    """A flight without pictures, whose camera tells a distortion of so many, of this model."""
     file = McapFile(path)
     for topic, target, payload, log_ns in samples(frames):
         if topic is topics.IMAGE:
             continue
         if topic is topics.CAMERA_INFO:
             info = cdr.CameraInfo.decode(payload)
-            payload = dataclasses.replace(info, distortion=np.full(coefficients, 0.01)).encode()
+            lens = {"distortion_model": model, "distortion": np.full(coefficients, 0.01)}
+            payload = dataclasses.replace(info, **lens).encode()
         file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
     file.close()
 
 
-@pytest.mark.parametrize(("coefficients", "drawn"), [(5, 10), (6, 0)])
+@pytest.mark.parametrize(
+    ("coefficients", "model", "drawn"), [(5, "plumb_bob", 10), (6, "plumb_bob", 0), (4, "equidistant", 0), (4, "", 10)]
+)
 def test_of_a_camera_whose_lens_is_not_known_the_picture_alone_goes_without_targets(
-    tmp_path: Path, coefficients: int, drawn: int
+    tmp_path: Path, coefficients: int, model: str, drawn: int
 ) -> None:
-    write(tmp_path / "lens.mcap", 10, coefficients)
+    write(tmp_path / "lens.mcap", 10, coefficients, model)
     path = tmp_path / "lens.rrd"
     assert main(["view", str(tmp_path / "lens.mcap"), "--save", str(path)]) == 0
     for part in ("box", "range_sigma", "sigma", "label"):
