@@ -11,6 +11,8 @@ from sim_replay.bop.fields import integer, length_m, matrix, rotation
 from sim_replay.bop.model_frame import ModelFrames
 from sim_replay.bop.records import DISTORTION_KEY, Array, BopError, BopFrame, BopTarget, Distortion
 
+ROUNDING = 1e-6  # of what must be 0 or 1 in a camera's matrix
+
 
 class Source(NamedTuple):
     """The files that a picture's entries come from, to name them in errors."""
@@ -29,6 +31,8 @@ def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, 
     K = matrix(source.camera, key, camera, "cam_K", (3, 3))
     if min(K[0, 0], K[1, 1]) <= 0:
         raise BopError(f"{source.camera}: 'cam_K' of {key!r} has no positive focal lengths")
+    if np.abs(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1]).max() > ROUNDING:
+        raise BopError(f"{source.camera}: 'cam_K' of {key!r} is not, row by row, fx 0 cx, 0 fy cy, 0 0 1")
     has_world = "cam_R_w2c" in camera and "cam_t_w2c" in camera
     return BopFrame(
         image_id=image_id,

@@ -107,6 +107,8 @@ def test_a_test_split_without_truth_or_masks_can_be_read(tmp_path: Path) -> None
         ("scene_camera.json", '"cam_K"', '"cam_k"', r"scene_camera\.json: '3' has no 'cam_K'"),
         ("scene_camera.json", "1500.25, ", "", r"scene_camera\.json: 'cam_K' of '3' is not 9 numbers"),
         ("scene_camera.json", "1500.25", "NaN", r"'cam_K' of '3' is not finite"),
+        ("scene_camera.json", "0.0, 0.0, 1.0]", "0.0, 5.0, 1.0]", r"'cam_K' of '3' is not, row by row"),
+        ("scene_camera.json", "0.0, 0.0, 1.0]", "0.0, 0.0, 2.0]", r"'cam_K' of '3' is not, row by row"),
         ("scene_camera.json", '"3"', '"three"', r"'three' is not the number"),
         ("scene_gt.json", '"obj_id": 5', '"obj_id": "a"', r"scene_gt\.json: '3' has no integer 'obj_id'"),
         ("scene_gt.json", "}]", "}", r"scene_gt\.json line 3 is not JSON"),
