@@ -213,7 +213,7 @@ class Pipeline:
         if pointed_at is not None and (there := seen[-1]) is not None:
             self._by_hand.found(there)
             if not lies_on(there.box_xyxy_px, held):  # those held have their room
-                self._tracker.make_room()
+                self._tracker.make_room(there)
         clock.estimated(self._estimator.model.take_runs_ns())
         for i, place in enumerate(places, start=len(held)):
             if (look := seen[i]) is not None and not self._estimator.confirms(place, [look]):

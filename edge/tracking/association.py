@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,14 @@ from edge.types import Array, Estimate
 POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as the soft gate is inside it
 ROTATION_D2_MAX = 9.0  # what a rotation that does not fit may cost: a network errs, an aircraft rolls
 
-Pair = tuple[int, int, Innovation]
+
+class Pair(NamedTuple):
+    """A target and the estimate that it takes, by their places in what was given."""
+
+    target: int
+    estimate: int
+    seen: Innovation
+    left_out: list[int]  # targets that take none, though this one fits them too
 
 
 def associate(
@@ -40,7 +48,9 @@ def associate(
         if contested[i].sum() > 1 or contested[:, j].sum() > 1:
             d2 = rotation.disagreement_d2(targets[i][1], estimates[j], view)
             cost[i, j] += min(d2, ROTATION_D2_MAX)
-    return [(i, j, seen[i, j]) for i, j in best_pairs(cost)]
+    best = best_pairs(cost)
+    idle = set(range(len(targets))) - {i for i, _ in best}
+    return [Pair(i, j, seen[i, j], sorted(k for k in idle if (k, j) in seen)) for i, j in best]
 
 
 def best_pairs(cost: Array) -> list[tuple[int, int]]:

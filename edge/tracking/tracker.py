@@ -2,7 +2,7 @@
 
 A target is tentative until it was seen CONFIRM_HITS times, coasts on prediction when it is missed, and is lost, and
 its number free again, after COAST_MAX_S. A position that stays outside the gate but under the same box wins after
-PERSISTENT frames.
+PERSISTENT frames. Of two targets that have taken turns at one aircraft for COAST_MAX_S the younger goes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from edge.estimator.lens import Lens
 from edge.tracking import motion as ekf
 from edge.tracking import rotation
-from edge.tracking.association import associate
+from edge.tracking.association import Pair, associate
 from edge.tracking.boxes import RANGE_MIN_M, SAME_BOX_IOU, BoxModel, inside, iou
 from edge.tracking.heading import Flight
 from edge.tracking.motion import Innovation, Motion
@@ -41,6 +41,7 @@ class Target:
     score: float
     measured_ns: int
     born_ns: int
+    alone_ns: int  # when last it was seen and no target was missed that could have been what was seen
     state: TrackState = TrackState.TENTATIVE
     hits: int = 1
     misses: int = 0
@@ -59,6 +60,7 @@ class Tracker:
     _view: View | None = None  # the camera at the last frame
     _tracks: tuple[Track, ...] = ()
     _motion_doubted: bool = False
+    _wanted: Estimate | None = None  # of the frame to come, to be a target before all others
 
     def predict(
         self,
@@ -91,10 +93,12 @@ class Tracker:
         self._motion_doubted = True
         self._forget_motion()
 
-    def make_room(self) -> None:
-        """Forget the target that was measured longest ago, if there is no room for another."""
+    def make_room(self, wanted: Estimate) -> None:
+        """Where there is no room for another target, forget one that was missed or is least sure; that place is for
+        `wanted`, if the next update has it."""
         if len(self._targets) >= self.max_targets:
-            self._targets.remove(min(self._targets, key=lambda t: t.measured_ns))
+            self._targets.remove(min(self._targets, key=lambda t: (t.measured_ns, t.hits >= CONFIRM_HITS, t.score)))
+            self._wanted = wanted
 
     def is_late(self, capture_ns: int) -> bool:
         """Whether a frame is not later than the last: nothing of it can be used."""
@@ -127,15 +131,16 @@ class Tracker:
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
         pairs = associate([(target.motion, target.attitude) for target in self._targets], finite, lens.K, view)
-        for target_index, estimate_index, seen in pairs:
-            _hit(self._targets[target_index], finite[estimate_index], seen, lens, view)
-        used = {estimate_index for _, estimate_index, _ in pairs}
-        hit = {target_index for target_index, _, _ in pairs}
+        for pair in pairs:
+            _hit(self._targets[pair.target], finite[pair.estimate], pair.seen, lens, view)
+        used = {pair.estimate for pair in pairs}
+        hit = {pair.target for pair in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]
         for i, target in enumerate(self._targets):
             if i not in hit and not _taken_over(target, spare, lens, view):
                 _miss(target)
-        self._targets = [t for t in self._targets if _alive(t, lens, view, image_size_wh)]
+        doubles = self._doubles(pairs, capture_ns)
+        self._targets = [t for t in self._targets if t.track_id not in doubles and _alive(t, lens, view, image_size_wh)]
         self._give_birth(spare, lens, view)
         if self._motion_doubted:
             self._forget_motion()
@@ -170,8 +175,22 @@ class Tracker:
             rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
         )
 
+    def _doubles(self, pairs: list[Pair], time_ns: int) -> set[int]:
+        """Numbers of targets that are an aircraft that another already is: one is seen now and one then, never both."""
+        for pair in pairs:
+            if not pair.left_out:
+                self._targets[pair.target].alone_ns = time_ns
+        found = set()
+        for pair in pairs:
+            for rival in pair.left_out:
+                two = self._targets[pair.target], self._targets[rival]
+                if all((time_ns - target.alone_ns) / NS_PER_S > COAST_MAX_S for target in two):
+                    found.add(max(two, key=lambda t: (t.born_ns, t.track_id)).track_id)
+        return found
+
     def _give_birth(self, estimates: list[Estimate], lens: Lens, view: View) -> None:
-        for estimate in sorted(estimates, key=lambda e: -e.score):
+        wanted, self._wanted = self._wanted, None
+        for estimate in sorted(estimates, key=lambda e: (e is not wanted, -e.score)):
             free = sorted(set(range(self.max_targets)) - {t.track_id for t in self._targets})
             boxes = [_box(target, view, lens) for target in self._targets]
             if not free:
@@ -180,7 +199,8 @@ class Tracker:
                 continue  # two windows saw one target
             motion, attitude = ekf.begin(estimate, lens.K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, lens)
-            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
+            now = (view.time_ns,) * 3
+            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, *now))
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view: View) -> None:

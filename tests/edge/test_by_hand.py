@@ -6,6 +6,7 @@ import json
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,10 +148,39 @@ def test_a_target_pointed_at_takes_the_place_of_the_one_not_seen_for_longest() -
         see(frame, -40.0, 0.0)
     assert see(5, 0.0) == [-40, 0]
     assert see(6, 0.0, 40.0) == [-40, 0], "no room"
-    tracker.make_room()
+    tracker.make_room(seen_at(40.0))
     assert see(7, 0.0, 40.0) == [0, 40]
     tracker.drop_all()
     assert see(8) == []
+
+
+def test_a_fainter_target_pointed_at_is_taken_though_the_one_that_gives_way_is_seen_too() -> None:
+    tracker, by_hand, held = Tracker(1, Mount(np.eye(3), np.zeros(3))), ByHand(), seen_at(0.0)
+    wanted = replace(seen_at(40.0), score=0.6)
+    for frame in range(1, 5):
+        (before,) = tracker.update(frame * 33_000_000, [held], None, toy_scene.K, SIZE_WH)
+    by_hand.take(TrackBox((0.0, 0.0, 0.1, 0.1)), 150_000_000)
+    by_hand.found(wanted)
+    tracker.make_room(wanted)
+    tracks = tracker.update(165_000_000, [held, wanted], None, toy_scene.K, SIZE_WH)
+    by_hand.settle(tracks)
+    assert [round(float(t.t_cam_target_m[0])) for t in (before, *tracks)] == [0, 40]
+    assert (by_hand.chosen_id, by_hand.news()) == (tracks[0].track_id, [f"target {tracks[0].track_id} chosen"])
+
+
+def test_who_gives_way_to_a_target_pointed_at_is_missed_or_not_yet_sure_or_faint() -> None:
+    def kept(*seen: tuple[float, float, int]) -> list[int]:
+        """Where the targets are that stay, of those seen at x in metres with a score from a frame on."""
+        tracker = Tracker(len(seen), Mount(np.eye(3), np.zeros(3)))
+        for frame in range(1, 6):
+            here = [replace(seen_at(x), score=score) for x, score, first in seen if frame >= first]
+            tracker.update(frame * 33_000_000, here, None, toy_scene.K, SIZE_WH)
+        tracker.make_room(seen_at(80.0))
+        expected = tracker.predict(200_000_000, None, toy_scene.K, (4000, 3000))
+        return sorted(round(float(track.t_cam_target_m[0])) for track in expected)
+
+    assert kept((-40.0, 0.9, 1), (0.0, 0.7, 1), (40.0, 0.8, 1)) == [-40, 40], "the faintest goes"
+    assert kept((-40.0, 0.7, 1), (0.0, 0.9, 5), (40.0, 0.8, 1)) == [-40, 40], "the one just begun goes"
 
 
 def test_the_choice_ends_with_its_target_though_another_has_its_number_at_once() -> None:

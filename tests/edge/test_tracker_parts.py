@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -79,6 +80,40 @@ def test_two_that_cross_keep_their_numbers_though_one_hides_the_other(seed: int)
                 nearest = min(tracks, key=lambda one: float(np.linalg.norm(one.t_cam_target_m - place)))
                 assert number.setdefault(name, nearest.track_id) == nearest.track_id
     assert number["east"] != number["west"]
+
+
+OWN_SHIPS = {
+    "ned": OwnShip(1, np.eye(3), np.zeros(3), np.zeros(3), None),
+    "ned_relative": OwnShip(1, np.eye(3), None, None, None),
+    "cam": None,
+}
+NORTH_EAST = LOOKING_NORTH.R_body_cam.T @ Rotation.from_euler("z", 70, degrees=True).as_matrix()
+
+
+def tracked(kind: str, seen: Callable[[float], list[np.ndarray]], until_s: float) -> list[tuple[float, int]]:
+    """At each frame the time, s, and how many tracks there are of what is seen at these places [3] in `cam`."""
+    rng, tracker, counts = np.random.default_rng(0), Tracker(4, LOOKING_NORTH), []
+    for i in range(round(30 * until_s)):
+        own, time_ns = OWN_SHIPS[kind], 1 + round(i * 1e9 / 30)
+        own = own and replace(own, time_ns=time_ns)
+        tracks = tracker.update(time_ns, [sight(rng, place, NORTH_EAST) for place in seen(i / 30)], own, K, SIZE_WH)
+        counts.append((i / 30, len(tracks)))
+    return counts
+
+
+@pytest.mark.parametrize(("kind", "apart_m"), [("cam", 8.0), ("ned", 8.0), ("ned", 4.0), ("ned_relative", 8.0)])
+def test_of_two_side_by_side_the_one_that_goes_is_soon_lost(kind: str, apart_m: float) -> None:
+    stays, goes = np.array([0.0, 0.0, 200.0]), np.array([apart_m, 0.0, 204.0])
+    counts = tracked(kind, lambda t: [stays, goes] if t < 2.0 else [stays], 7.0)
+    assert {count for t, count in counts if 0.5 < t < 2.0} == {2}
+    assert {count for t, count in counts if t > 5.0} == {1}
+
+
+@pytest.mark.parametrize("knock_px", [80.0, 200.0])
+def test_after_a_knock_of_the_camera_one_aircraft_is_one_target_again(knock_px: float) -> None:
+    knock_m = np.array([knock_px * 200.0 / K[0, 0], 0.0, 0.0])
+    counts = tracked("cam", lambda t: [np.array([0.0, 0.0, 200.0]) + knock_m * (t >= 2.0)], 7.0)
+    assert {count for t, count in counts if t > 5.0} == {1}
 
 
 def test_a_target_that_leaves_the_picture_is_not_looked_for_and_taken_up_again_when_it_is_back() -> None:
