@@ -50,6 +50,7 @@ def _endpoint(text: str) -> str:
 
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+LeverM = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]  # longer are millimetres, no doubt
 
 
 class VehicleSettings(Section):
@@ -67,7 +68,7 @@ class MountSettings(Section):
     R_body_cam: list[list[Finite]] | None = Field(
         default=None, description="3x3 rotation, cam (optical) into body (FRD)"
     )
-    t_body_cam_m: tuple[Finite, Finite, Finite] = Field(default=(0.0, 0.0, 0.0), description="camera in body, metres")
+    t_body_cam_m: tuple[LeverM, LeverM, LeverM] = Field(default=(0.0, 0.0, 0.0), description="camera in body, metres")
 
     @model_validator(mode="after")
     def _rotation(self) -> MountSettings:
@@ -165,8 +166,12 @@ class MavlinkSettings(Section):
         description="whose gimbal attitude is the camera's: a component, or 1 to 6 of a gimbal that the autopilot "
         "speaks for; default: the first heard",
     )
-    attitude_rate_hz: float = Field(default=50.0, ge=1, le=400, description="asked of the autopilot")
-    position_rate_hz: float = Field(default=20.0, ge=0.1, le=100, description="asked of the autopilot")
+    attitude_rate_hz: float = Field(
+        default=50.0, ge=7, le=400, description="asked of the autopilot; of fewer no frame has any use"
+    )
+    position_rate_hz: float = Field(
+        default=20.0, ge=3, le=100, description="asked of the autopilot; of fewer no frame has any use"
+    )
     max_age_ms: float = Field(
         default=200.0, gt=0, allow_inf_nan=False, description="an older measurement is never sent"
     )

@@ -10,10 +10,14 @@ import numpy as np
 
 from edge.config_camera import IntrinsicsSettings
 from edge.errors import InputError
+from edge.estimator.lens import Lens
 from edge.types import Array
 
 INTRINSICS_KEY = ("camera", "intrinsics")
 DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own files name none
+FOCAL_RATIO_MAX = 2.0  # pixels are as wide as high, or in anamorphic pictures nearly so
+OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, a principal point may lie outside the picture, which may be cut out
+CLEAR_SHARE = 0.5  # of its sides, in the picture's middle, that a lens must show without folding
 ROUNDING = 1e-6  # what a tool that multiplies matrices leaves where K has its zeros and its one
 
 
@@ -42,9 +46,29 @@ class Intrinsics:
 
 
 def load_intrinsics(settings: IntrinsicsSettings) -> Intrinsics:
-    """From the numbers in the configuration or the file it names. Raises InputError."""
-    if settings.file is not None:
-        return read_calibration(settings.file)
+    """From the numbers in the configuration or the file it names. Raises InputError, also for what no camera is."""
+    intrinsics = read_calibration(settings.file) if settings.file is not None else _from_numbers(settings)
+    reason = _no_camera(intrinsics)
+    if reason is not None:
+        raise InputError(f"{settings.file or 'these intrinsics'}: {reason}", INTRINSICS_KEY)
+    return intrinsics
+
+
+def _no_camera(intrinsics: Intrinsics) -> str | None:
+    """Why no camera has these numbers; None: one may."""
+    K, sides = intrinsics.K, np.array(intrinsics.image_size_wh)
+    if not 1 / FOCAL_RATIO_MAX <= K[0, 0] / K[1, 1] <= FOCAL_RATIO_MAX:
+        return f"fx {K[0, 0]:g} and fy {K[1, 1]:g} cannot be of one camera"
+    if (np.abs(K[:2, 2] - 0.5 * (sides - 1)) > (0.5 + OUTSIDE_MAX_SHARE) * sides).any():
+        return f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is far outside the picture of {sides[0]}x{sides[1]}"
+    if any(intrinsics.distortion):
+        corners = 0.5 * (sides - 1) + 0.5 * CLEAR_SHARE * sides * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        if not Lens(K, intrinsics.distortion).shows(corners).all():
+            return "the distortion folds the picture over itself in its middle half: is a coefficient wrong?"
+    return None
+
+
+def _from_numbers(settings: IntrinsicsSettings) -> Intrinsics:
     numbers = (settings.fx, settings.fy, settings.cx, settings.cy)
     fx, fy, cx, cy = (float(n) for n in numbers if n is not None)
     assert settings.width is not None

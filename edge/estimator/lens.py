@@ -19,6 +19,7 @@ from edge.types import Array
 RADIUS_MAX = 4.0
 # How far, in sides of the frame, the pinhole's picture may reach beyond the frame's own pixels.
 EXTENT_EXCESS = 0.5
+RETURNED_MAX_PX = 0.5  # a pixel that comes back farther from where it was has no ray of its own
 _EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 _GRID_POINTS = 65  # a side; the border alone would not do: a lens may fold inside the frame
 
@@ -58,6 +59,13 @@ class Lens:
     def box_to_frame(self, box_xyxy_px: ArrayLike) -> Array:
         """Box [..., 4] on the pinhole's picture to the box on the frame that its sides' middles bound."""
         return _through(self.to_frame, box_xyxy_px)
+
+    def shows(self, points_px: ArrayLike) -> Array:
+        """Whether each of [..., 2] frame pixels is where the lens bends one ray and no other."""
+        straight = self.to_pinhole(points_px)
+        radius = np.linalg.norm(self.rays(straight)[..., :2], axis=-1)
+        returned = np.abs(self.to_frame(straight) - np.asarray(points_px)).max(axis=-1)
+        return np.asarray((radius < self.radius_max) & (returned < RETURNED_MAX_PX))  # NaN compares false
 
     def extent_xyxy_px(self, frame_wh: tuple[int, int]) -> Array:
         """The box [4] of pinhole pixels that holds all of the frame that the lens lets through, within bounds."""
@@ -99,10 +107,7 @@ def _extent(K_bytes: bytes, distortion: tuple[float, ...], frame_wh: tuple[int, 
     right, bottom = frame_wh[0] - 0.5, frame_wh[1] - 0.5
     xs, ys = np.linspace(-0.5, right, _GRID_POINTS), np.linspace(-0.5, bottom, _GRID_POINTS)
     grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    straight = lens.to_pinhole(grid)
-    radius = np.linalg.norm(lens.rays(straight)[:, :2], axis=1)
-    returned = np.abs(lens.to_frame(straight) - grid).max(axis=1)
-    straight = straight[(radius < lens.radius_max) & (returned < 0.5)]  # NaN compares false
+    straight = lens.to_pinhole(grid)[lens.shows(grid)]
     if not len(straight):
         return np.array([-0.5, -0.5, right, bottom])
     low, high = straight.min(axis=0), straight.max(axis=0)

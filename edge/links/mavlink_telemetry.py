@@ -144,16 +144,17 @@ class Telemetry:
             self._forget_gimbal_clock()
         self._gimbal = (gimbal_id, now_ns)
         if component == AUTOPILOT_COMPONENT:
-            time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
+            clock, up_ns = self._boot_clock, self._uptime_ns(message, now_ns)
         else:
-            time_ns = self._gimbal_clock.monotonic_ns(message.time_boot_ms * 1_000_000, now_ns)
+            clock, up_ns = self._gimbal_clock, message.time_boot_ms * 1_000_000
+        time_ns = clock.monotonic_ns(up_ns, now_ns)
         if self._jumps.gimbal(time_ns, R_from_q_wxyz(message.q), frame):
             self.gimbal_jumps += 1
             self._own_ship.clear()
             self._gimbals_from_ns = now_ns + JUMP_REST_NS
         if now_ns < self._gimbals_from_ns:
             return None
-        return None if self._own_ship.add_gimbal(time_ns, message.q, frame) else "late"
+        return None if self._own_ship.add_gimbal(time_ns, message.q, frame, clock.std_s) else "late"
 
     def _uptime_ns(self, message: Any, now_ns: int) -> int:
         return uptime_ms(message.time_boot_ms, self._timesync.offset_ns, now_ns) * 1_000_000

@@ -9,6 +9,7 @@ from edge.types import Array
 
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
+ORIGIN_ROUNDS = 2  # leave less than a millimetre at 100 km
 
 
 def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
@@ -28,6 +29,17 @@ def lat_lon_alt_from_ned(origin_deg_m: tuple[float, float, float], t_ned_m: Arra
     per_lat, per_lon = radii_m(lat, alt)
     lon_deg = (lon + float(np.rad2deg(east / per_lon)) + 180.0) % 360.0 - 180.0
     return lat + float(np.rad2deg(north / per_lat)), lon_deg, alt - down
+
+
+def origin_of_ned(point_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -> tuple[float, float, float]:
+    """The origin from which `lat_lon_alt_from_ned` leads by t_ned_m [3] to the point: where both are known, far from it
+    too, what lies near the point is placed well."""
+    lat, lon, alt = origin = lat_lon_alt_from_ned(point_deg_m, -np.asarray(t_ned_m, dtype=np.float64))
+    for _ in range(ORIGIN_ROUNDS):
+        there = lat_lon_alt_from_ned(origin, t_ned_m)
+        lat, lon, alt = (o + p - q for o, p, q in zip(origin, point_deg_m, there, strict=True))
+        origin = lat, (lon + 180.0) % 360.0 - 180.0, alt
+    return origin
 
 
 def ned_from_lat_lon_alt(origin_deg_m: tuple[float, float, float], point_deg_m: tuple[float, float, float]) -> Array:

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edge.tracking.geodesy import lat_lon_alt_from_ned
+from edge.tracking.geodesy import lat_lon_alt_from_ned, origin_of_ned
 from edge.types import Array, OwnShip
 from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so3_log
 
@@ -56,6 +56,7 @@ class _Gimbal:
     time_ns: int
     R_frame_gimbal: Array
     frame: GimbalFrame
+    clock_std_s: float
 
 
 @dataclass(frozen=True)
@@ -90,10 +91,15 @@ class OwnShipBuffer:
         with self._lock:
             return _append(self._attitudes, sample)
 
-    def add_gimbal(self, time_ns: int, q_frame_gimbal_wxyz: ArrayLike, frame: GimbalFrame) -> bool:
-        """Attitude [4] of the gimbal's axes (FRD when it looks ahead). Raises ValueError on a zero quaternion."""
+    def add_gimbal(
+        self, time_ns: int, q_frame_gimbal_wxyz: ArrayLike, frame: GimbalFrame, clock_std_s: float = 0.0
+    ) -> bool:
+        """Attitude [4] of the gimbal's axes (FRD when it looks ahead), at a time known to `clock_std_s`.
+
+        Raises ValueError on a zero quaternion.
+        """
         with self._lock:
-            return _append(self._gimbals, _Gimbal(time_ns, R_from_q_wxyz(q_frame_gimbal_wxyz), frame))
+            return _append(self._gimbals, _Gimbal(time_ns, R_from_q_wxyz(q_frame_gimbal_wxyz), frame, clock_std_s))
 
     def add_position(self, time_ns: int, t_ned_m: ArrayLike, v_ned_mps: ArrayLike) -> bool:
         """Position and velocity [3] of the body origin in the local ned frame."""
@@ -140,7 +146,8 @@ class OwnShipBuffer:
             position = _position_at(self._positions, time_ns)
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
             origin = self._origin(time_ns, t_ned_m is not None)
-            clock_std_s, attitude_std_rad = self._attitudes[-1].clock_std_s, self._attitude_std_rad(time_ns)
+            clock_std_s = self._of_body_and_gimbal(*(s[-1].clock_std_s if s else 0.0 for s in self._sources))
+            attitude_std_rad = self._of_body_and_gimbal(*(_turned_rad(s, time_ns) for s in self._sources))
             return OwnShip(
                 time_ns,
                 R_ned_body,
@@ -154,13 +161,17 @@ class OwnShipBuffer:
                 self._origin_epoch,
             )
 
-    def _attitude_std_rad(self, time_ns: int) -> float:
-        """How far the camera may have turned otherwise than at the last rates, since the samples that its attitude
-        comes from: a gimbal's against the earth is the camera's whole attitude."""
-        body_rad, gimbal_rad = _turned_rad(self._attitudes, time_ns), _turned_rad(self._gimbals, time_ns)
+    @property
+    def _sources(self) -> tuple[deque[_Attitude], deque[_Gimbal]]:
+        return self._attitudes, self._gimbals
+
+    def _of_body_and_gimbal(self, body_std: float, gimbal_std: float) -> float:
+        """A doubt about the camera's attitude, by those about its sources': a gimbal's against the earth is the
+        camera's whole attitude."""
         if not self.gimballed:
-            return body_rad
-        return gimbal_rad if self._gimbals[-1].frame is GimbalFrame.EARTH else float(np.hypot(body_rad, gimbal_rad))
+            return body_std
+        earth = self._gimbals[-1].frame is GimbalFrame.EARTH
+        return gimbal_std if earth else float(np.hypot(body_std, gimbal_std))
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
         """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
@@ -173,7 +184,7 @@ class OwnShipBuffer:
         then = _position_at(self._positions, self._global.time_ns)
         if then is None or abs(age_ns) > GLOBAL_AGE_MAX_NS:
             return None
-        return lat_lon_alt_from_ned(place, -then[0])
+        return origin_of_ned(place, then[0])
 
 
 def _append(samples: deque, sample: _Attitude | _Gimbal | _Position) -> bool:
@@ -211,21 +222,26 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
 
 
 def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> float:
-    ahead_s = max(time_ns - samples[-1].time_ns, 0) / NS_PER_S if samples else 0.0
-    return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * ahead_s**2
+    """How far it may have turned otherwise than between two samples, or by the rates of the last."""
+    after = _first_after(samples, time_ns)
+    if after == 0:
+        return 0.0
+    since_s = (time_ns - samples[after - 1].time_ns) / NS_PER_S
+    until_s = since_s if after == len(samples) else (samples[after].time_ns - time_ns) / NS_PER_S
+    return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * since_s * until_s
 
 
-def _usual_gap_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
+def _usual_gap_ns(samples: deque) -> int | None:
     """Median time between the last few samples; None: there are too few to tell."""
     times = [samples[i].time_ns for i in range(max(len(samples) - USUAL_OF, 0), len(samples))]
     gaps = sorted(b - a for a, b in pairwise(times))
     return gaps[len(gaps) // 2] if gaps else None
 
 
-def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
+def _reach_ns(samples: deque, ahead_ns: tuple[int, int] = ATTITUDE_AHEAD_NS) -> int | None:
     """How long after the last sample it can be gone on from; None: too few come, and they serve no frame."""
     gap_ns = _usual_gap_ns(samples)
-    least_ns, most_ns = ATTITUDE_AHEAD_NS
+    least_ns, most_ns = ahead_ns
     if gap_ns is None:
         return least_ns
     return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else None
@@ -252,16 +268,21 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
 
 
 def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array] | None:
-    after = _first_after(samples, time_ns)
-    if after == 0:
+    after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples, (POSITION_AHEAD_MAX_NS,) * 2)
+    if after == 0 or reach_ns is None:
         return None
     a = samples[after - 1]
     if after == len(samples):
-        if time_ns - a.time_ns > POSITION_AHEAD_MAX_NS:
+        if time_ns - a.time_ns > reach_ns:
             return None
         return a.t_ned_m + a.v_ned_mps * ((time_ns - a.time_ns) / NS_PER_S), a.v_ned_mps
     b = samples[after]
     if b.time_ns - a.time_ns > POSITION_GAP_MAX_NS:
         return None
+    apart_s = (b.time_ns - a.time_ns) / NS_PER_S
     share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
-    return a.t_ned_m + share * (b.t_ned_m - a.t_ned_m), a.v_ned_mps + share * (b.v_ned_mps - a.v_ned_mps)
+    v_mps = a.v_ned_mps + share * (b.v_ned_mps - a.v_ned_mps)
+    way_m = b.t_ned_m - a.t_ned_m
+    # The cubic that leaves `a` and reaches `b` at their velocities: a turn cuts no corner.
+    bent_m = (1.0 - share) * (a.v_ned_mps * apart_s - way_m) - share * (b.v_ned_mps * apart_s - way_m)
+    return a.t_ned_m + share * way_m + share * (1.0 - share) * bent_m, v_mps

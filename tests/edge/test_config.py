@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.cameras.intrinsics import read_calibration
+from edge.cameras.intrinsics import load_intrinsics, read_calibration
 from edge.config import load_config
+from edge.config_camera import IntrinsicsSettings
 from edge.errors import InputError
 
 LIVE = "[camera]\nintrinsics = { fx = 9, fy = 9, cx = 3, cy = 2, width = 6, height = 4 }\n"
@@ -36,6 +37,14 @@ def write(tmp_path: Path, text: str) -> Path:
         (CAMERA + "[mavlink]\nendpoints = ['udpin:1.2.3.4:14550', 'tcp:1']", "config.toml:5: [mavlink] endpoints[1]: "),
         (CAMERA + "[mount]\nR_body_cam = [[1,0,0],[0,1,0],[0,0,-1]]", "[mount]: R_body_cam is not a rotation"),
         (CAMERA + "[mount]\nyaw_deg = 3\nR_body_cam = [[1,0,0],[0,1,0],[0,0,1]]", "[mount]: give either the angles or"),
+        (
+            CAMERA + "[mount]\nt_body_cam_m = [250, 0, -40]",
+            "config.toml:5: [mount] t_body_cam_m[0]: Input should be less",
+        ),
+        (
+            CAMERA + "[mavlink]\nattitude_rate_hz = 4",
+            "config.toml:5: [mavlink] attitude_rate_hz: Input should be greater",
+        ),
         (CAMERA + "[mavlink]\ncomponent_id = 1", "config.toml:5: [mavlink] component_id: Input should be greater"),
         (CAMERA + "[mavlink]\ncomponent_id = 100", "config.toml:4: [mavlink]: component_id and camera_component_id"),
         (CAMERA + "[zenoh]\nmax_age_ms = inf", "config.toml:5: [zenoh] max_age_ms: Input should be a finite number"),
@@ -180,6 +189,32 @@ def test_a_calibration_with_what_is_no_number_or_no_camera_is_told_with_its_key(
     with pytest.raises(InputError, match=rf"^calibration {path}: {said}") as refused:
         read_calibration(path)
     assert refused.value.key == ("camera", "intrinsics")
+
+
+@pytest.mark.parametrize(
+    ("written", "instead", "said"),
+    [
+        ("1100.5", "2.0", "fx 2 and fy 1101 cannot be of one camera"),
+        ("640.25", "64025", r"the principal point \(64025, 359\.75\) is far outside the picture of 1280x720"),
+        ("359.75", "-480", r"the principal point \(640\.25, -480\) is far outside"),
+        ("-0.1, 0.02", "-28.0, 9.0", "the distortion folds the picture over itself in its middle half"),
+    ],
+)
+def test_numbers_of_no_camera_are_told_before_a_flight(tmp_path: Path, written: str, instead: str, said: str) -> None:
+    assert ROS_CALIBRATION.count(written) == 1
+    path = tmp_path / "nose.yaml"
+    path.write_text(ROS_CALIBRATION)
+    sound = load_intrinsics(IntrinsicsSettings(file=path))
+    path.write_text(ROS_CALIBRATION.replace(written, instead))
+    with pytest.raises(InputError, match=rf"nose\.yaml: {said}") as refused:
+        load_intrinsics(IntrinsicsSettings(file=path))
+    assert refused.value.key == ("camera", "intrinsics")
+    assert sound.image_size_wh == (1280, 720)
+
+
+def test_a_lens_that_shows_nothing_in_the_corners_is_a_lens() -> None:
+    numbers = {"fx": 1000.0, "fy": 1000.0, "cx": 959.5, "cy": 539.5, "width": 1920, "height": 1080}
+    assert load_intrinsics(IntrinsicsSettings(distortion=[-0.3, 0.0, 0.0, 0.0], **numbers)).distortion[0] == -0.3
 
 
 def test_what_a_product_of_matrices_leaves_of_a_zero_is_rounding(tmp_path: Path) -> None:

@@ -216,6 +216,7 @@ def test_a_gimbals_attitude_is_read_as_its_flags_say(flags: int, R_ned_gimbal: R
         peer.settle(lambda: bool(seen), "both", lambda: (both(), seen.extend(filter(None, [own_ship.at(now_ns())]))))
     R = seen[0].R_ned_body @ seen[0].R_body_gimbal
     np.testing.assert_allclose(R, R_ned_gimbal.as_matrix(), atol=1e-5)
+    assert 0.02 <= seen[0].clock_std_s < 0.03, "nobody synchronises a gimbal's clock"
     mount = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
     optical_axis_ned = seen[0].R_ned_body @ seen[0].camera(mount).R_body_cam[:, 2]
     np.testing.assert_allclose(optical_axis_ned, R_ned_gimbal.apply([1.0, 0.0, 0.0]), atol=1e-5)
