@@ -6,6 +6,7 @@ The fit is OpenCV's (Z. Zhang, "A flexible new technique for camera calibration"
 from __future__ import annotations
 
 import json
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -273,7 +274,8 @@ def camera_info_yaml(found: Calibration, name: str) -> str:
     return (
         f"# Reprojection {found.rms_px:.3f} px RMS over {found.views} views; focal length to "
         f"{100 * found.focal_sigma:.2f} % (1 sigma)\n"
-        f"image_width: {found.image_size_wh[0]}\nimage_height: {found.image_size_wh[1]}\ncamera_name: {name}\n"
+        f"image_width: {found.image_size_wh[0]}\nimage_height: {found.image_size_wh[1]}\n"
+        f"camera_name: {json.dumps(name, ensure_ascii=False)}\n"
         + matrix("camera_matrix", K)
         + f"distortion_model: {found.model}\n"
         + matrix("distortion_coefficients", np.array([found.distortion]))
@@ -294,6 +296,13 @@ def report(found: Calibration, out: Path) -> list[str]:
         f"boards were seen in {100 * found.covered:.0f} % of the picture",
         f"distortion ({found.model}) " + " ".join(f"{value:.5f}" for value in found.distortion),
     ]
+
+
+def refuse_unwritable(out: Path) -> None:
+    """Raises InputError, before an hour of pictures is looked at for nothing."""
+    folder = out.absolute().parent
+    if out.is_dir() or not os.access(out if out.exists() else folder, os.W_OK):
+        raise InputError(f"{out} cannot be written")
 
 
 def write_calibration(found: Calibration, name: str, out: Path) -> None:

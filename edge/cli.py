@@ -115,7 +115,16 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    from edge.calibrate import BoardSettings, board_squares, calibrate, report, to_json, write_board, write_calibration
+    from edge.calibrate import (
+        BoardSettings,
+        board_squares,
+        calibrate,
+        refuse_unwritable,
+        report,
+        to_json,
+        write_board,
+        write_calibration,
+    )
 
     squares = board_squares(options.squares)
     board = BoardSettings(options.pattern, squares, options.dictionary, options.marker_share)
@@ -124,6 +133,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         return 0
     if options.source is None:
         raise InputError("calibrate needs a video or a folder of pictures, or --draw")
+    refuse_unwritable(options.out)
     found = calibrate(options.source, board, options.coefficients)
     write_calibration(found, options.name, options.out)
     print(to_json(found) if options.json else "\n".join(report(found, options.out)))

@@ -43,6 +43,12 @@ def _signing_key(path: Path) -> Path:
     return path
 
 
+def _no_folder(path: Path) -> Path:
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give a file in it")
+    return path
+
+
 def _endpoint(text: str) -> str:
     parse_endpoint(text)
     return text
@@ -136,7 +142,7 @@ class MavlinkSettings(Section):
     signing_key: Annotated[ConfigPath, AfterValidator(_signing_key)] | None = Field(
         default=None, description="file of 32 bytes by `uavpose-edge keygen`; all is signed, nothing unsigned is heard"
     )
-    signing_state: ConfigPath | None = Field(
+    signing_state: Annotated[ConfigPath, AfterValidator(_no_folder)] | None = Field(
         default=None, description="where the last signing timestamp is kept; default: beside the key, .timestamp"
     )
     target_relative: bool = Field(default=True, description="send TARGET_RELATIVE (511) to autopilots other than PX4")

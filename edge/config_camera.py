@@ -36,6 +36,12 @@ def _own_machine(text: str) -> str:
     return text
 
 
+def _device(text: str) -> str:
+    if not text.startswith("/"):
+        raise ValueError(f"{text!r} is no device such as /dev/video0")
+    return text
+
+
 class IntrinsicsSettings(Section):
     """Either `file`, or the numbers themselves."""
 
@@ -102,7 +108,7 @@ class FileCamera(Camera):
 
 class DeviceCamera(Camera):
     type: Literal["device"]
-    device: str = Field(default="/dev/video0", min_length=1, description="V4L2 device")
+    device: Annotated[str, AfterValidator(_device)] = Field(default="/dev/video0", description="V4L2 device")
     width: int = Field(default=1920, gt=0, description="pixels asked of the device")
     height: int = Field(default=1080, gt=0, description="pixels asked of the device")
     fps: float = Field(default=30.0, ge=0.01, le=1000, description="rate asked of the device")

@@ -44,7 +44,7 @@ class ZenohSettings(Section):
     enabled: bool = Field(default=True, description="publish over zenoh")
     listen: list[str] = Field(default=["tcp/127.0.0.1:7448"], description="endpoints for tools on board")
     connect: list[str] = Field(
-        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447?mixed_rel=1; retried for ever"
+        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447; retried for ever"
     )
     tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
     pose_rate_max_hz: float | None = Field(

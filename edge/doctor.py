@@ -15,7 +15,7 @@ from edge.cameras import open_source
 from edge.cameras.capture import Capture
 from edge.cameras.source import EndOfStream
 from edge.config import ConfigFile
-from edge.doctor_links import link_findings, running_daemon
+from edge.doctor_links import CAMERA_REASONS, link_findings, running_daemon, told_reasons
 from edge.doctor_machine import machine_findings
 from edge.errors import InputError
 from edge.estimator.model import Model
@@ -26,7 +26,11 @@ from edge.reload import load_configured
 FRAME_S = 8.0
 TIMED_RUNS = 10
 LIVE_FRAMES = 20
-CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # kinds of edge.health.Reason
+ADVICE = {  # by the kind of edge.health.Reason
+    "camera_stamps": "docs/cameras.md says what a timestamp means; so do pictures that come in bursts",
+    "camera_frozen": "does it look at anything that moves? else plug it in again",
+}
+ADVICE_CAMERA = "is it on, plugged in, and reachable from here?"
 
 
 def doctor(file: ConfigFile, as_json: bool) -> int:
@@ -49,20 +53,20 @@ def findings(file: ConfigFile) -> Iterator[Finding]:
     yield from machine_findings(file.config)
     running = running_daemon(file.config)
     frame_ms: float | None = None
-    for finding, rate_hz in _camera(file) if running is None else _camera_as_told(running):
+    for finding, rate_hz in _camera(file) if running is None else camera_as_told(running):
         frame_ms = 1e3 / rate_hz if rate_hz else frame_ms
         yield finding
     yield from _model(file, frame_ms)
     yield from link_findings(file.config, running)
 
 
-def _camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float | None]]:
+def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float | None]]:
     """A camera serves one program at a time: where the daemon has it, its word is taken."""
-    reasons = zip(running.get("reason_kinds", ()), running.get("reasons", ()), strict=True)
-    wrongs = [text for kind, text in reasons if kind.startswith(CAMERA_REASONS)]
-    if wrongs:
-        advice = "is it on, plugged in, and reachable from here?"
-        yield wrong("camera", f"the daemon, which has it, says: {'; '.join(wrongs)}", advice), None
+    of_camera = [(kind, text) for kind, text in told_reasons(running) if kind.startswith(CAMERA_REASONS)]
+    if of_camera:
+        advice = next((ADVICE[kind] for kind, _ in of_camera if kind in ADVICE), ADVICE_CAMERA)
+        said = "; ".join(text for _, text in of_camera)
+        yield wrong("camera", f"the daemon, which has it, says: {said}", advice), None
         return
     rate_hz = running.get("frame_rate_hz")
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""

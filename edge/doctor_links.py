@@ -28,6 +28,9 @@ from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
 from msgs.session import client_config, peer_config
 
+CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # how the kinds of edge.health.Reason begin that tell of it
+NO_AUTOPILOT = "no_attitude"
+ADVICE_AUTOPILOT = "is the autopilot on, its port set to MAVLink 2 at this speed, its stream sent to this address?"
 HEARING_S = 4.0
 LOOK_S = 0.1
 
@@ -36,12 +39,24 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
     """`running` is what the daemon says of itself: its endpoints are then its own, and not tried."""
     if running is not None:
         said = f"the daemon runs (process {running['pid']}) and is {running.get('state', 'starting')}"
-        yield good("daemon", f"{said}; its links are not tried from here")
+        others = {kind: text for kind, text in told_reasons(running) if not kind.startswith(CAMERA_REASONS)}
+        if NO_AUTOPILOT in others:
+            yield wrong("daemon", f"{said}: {'; '.join(others.values())}", ADVICE_AUTOPILOT)
+        elif others:
+            advice = "`uavpose-edge status` has its counters, `journalctl -u uavpose-edge` what came before"
+            yield poor("daemon", f"{said}: {'; '.join(others.values())}", advice)
+        else:
+            yield good("daemon", f"{said}; its links are not tried from here")
         return
     if config.zenoh.enabled:
         yield from _zenoh(config.zenoh)
     if config.mavlink.enabled:
         yield from _mavlink(config.mavlink)
+
+
+def told_reasons(running: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Kind and text of what a daemon says is wrong with it."""
+    return list(zip(running.get("reason_kinds", ()), running.get("reasons", ()), strict=True))
 
 
 def running_daemon(config: Config) -> Mapping[str, Any] | None:
@@ -109,21 +124,21 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         yield good("mavlink", f"{where}: a heartbeat is heard")
         return
     refused = ", ".join(f"{name} {count}" for name, count in counters.items() if name.startswith("refused_") and count)
-    advice = "is the autopilot on, its port set to MAVLink 2 at this speed, its stream sent to this address?"
-    yield wrong(
-        "mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{f' ({refused})' if refused else ''}", advice
-    )
+    counted = f" ({refused})" if refused else ""
+    yield wrong("mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{counted}", ADVICE_AUTOPILOT)
 
 
 def signing_finding(state: Path) -> Finding:
     """Whether the daemon can keep the last timestamp that it signed with, and what is kept is of no time to come."""
+    advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
+    if state.is_dir():
+        return wrong("signing", f"{state} is a folder: after a restart old messages would pass as new", advice)
     with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
         ahead = ahead_of_clock(state, clock.utc_ns())
         if ahead is None:
             return good("signing", f"the last timestamp is kept in {state}")
-        advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
-        return poor("signing", f"{ahead}: an autopilot that knows the time may be refused", advice)
-    advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
+        clock_advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
+        return poor("signing", f"{ahead}: an autopilot that knows the time may be refused", clock_advice)
     return wrong("signing", f"{state} cannot be written: after a restart old messages would pass as new", advice)
 
 

@@ -125,7 +125,7 @@ def _day(utc_s: float) -> str:
 def check_endpoint(endpoint: str, *, tls: bool) -> str:
     """Return a zenoh endpoint that will do; raises ValueError, a sentence, for one that will not.
 
-    Plain UDP is left out: it loses declarations for good. `quic/` carries datagrams with `?mixed_rel=1`.
+    Plain UDP is left out: it loses declarations for good.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or int(match[4]) > 65535:
@@ -133,6 +133,18 @@ def check_endpoint(endpoint: str, *, tls: bool) -> str:
     if match[1] in SECURE and not tls:
         raise ValueError(f"'{endpoint}' needs tls: root_ca, certificate and private_key")
     return endpoint
+
+
+def with_datagrams(endpoint: str) -> str:
+    """The endpoint, if it is `quic/`, with zenoh's `mixed_rel=1`: poses go as datagrams, commands as a stream.
+
+    One end that has it and one that has not never link, and neither says why; so all ends of ours have it, and
+    `mixed_rel=0` is there for a router of others that has not.
+    """
+    if not endpoint.startswith("quic/") or "mixed_rel=" in endpoint:
+        return endpoint
+    address, hash_mark, settings = endpoint.partition("#")
+    return f"{address}{';' if '?' in address else '?'}mixed_rel=1{hash_mark}{settings}"
 
 
 def peer_config(
@@ -207,11 +219,12 @@ def _no_pictures_by_radio() -> dict[str, Any]:
 def _config(
     mode: str, listen: Sequence[str], connect: Sequence[str], discovery: bool, tls: TlsFiles | None
 ) -> zenoh.Config:
+    listen, connect = [with_datagrams(one) for one in listen], [with_datagrams(one) for one in connect]
     config = zenoh.Config()
     _insert(config, "mode", mode)
     # An empty list would keep the built-in default of listening everywhere.
-    _insert(config, "listen/endpoints", {"router": list(listen), "peer": list(listen), "client": []})
-    _insert(config, "connect/endpoints", list(connect))
+    _insert(config, "listen/endpoints", {"router": listen, "peer": listen, "client": []})
+    _insert(config, "connect/endpoints", connect)
     _insert(config, "scouting/multicast/enabled", discovery)
     _insert(config, "scouting/gossip/enabled", discovery)
     _insert(config, "timestamping/enabled", True)

@@ -61,7 +61,7 @@ def dotted(location: tuple[str | int, ...]) -> str:
 def read_text(path: Path, raising: type[Exception]) -> str:
     """The file's text. Raises `raising`, with the path and the reason."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise raising(f"{path}: cannot be read: {reason}") from error

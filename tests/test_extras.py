@@ -19,6 +19,9 @@ class Installed:
     def find_spec(self, name, path=None, target=None):
         found = (finder.find_spec(name, path, target) for finder in self.finders)
         return None if name.split(".")[0] in missing else next(filter(None, found), None)
+    def find_distributions(self, context):
+        for finder in self.finders:
+            yield from getattr(finder, "find_distributions", lambda _: [])(context)
 sys.meta_path[:] = [Installed(list(sys.meta_path))]
 from importlib import import_module
 main = import_module(sys.argv[2]).main
@@ -54,9 +57,9 @@ def run(missing: set[str], *command: str) -> subprocess.CompletedProcess[str]:
     [
         (None, ("edge.cli", "--help")),
         (None, ("edge.cli", "run", "--help")),
-        ("replay", ("sim_replay.cli", "--help")),
-        ("replay", ("sim_replay.cli", "demo", "--help")),
-        ("replay", ("sim_replay.cli", "radio", "--help")),
+        ("replay", ("sim_replay.launch", "--help")),
+        ("replay", ("sim_replay.launch", "demo", "--help")),
+        ("replay", ("sim_replay.launch", "radio", "--help")),
         ("ground", ("msgs.ground.cli", "watch", "--help")),
     ],
 )
@@ -68,10 +71,30 @@ def test_a_command_starts_with_its_own_packages_alone(extra: str | None, command
     assert done.stdout.startswith("usage: ")
 
 
-def test_what_needs_another_extra_says_which(tmp_path: Path) -> None:
-    done = run(missing_with("replay"), "sim_replay.cli", "radio", "--seconds", "1")
-    assert done.returncode == 2
-    assert "pip install '.[ground]'" in done.stderr
-    done = run(missing_with("replay"), "sim_replay.cli", "generate", "--preset", "unseen", "--out", str(tmp_path / "d"))
-    assert done.returncode == 2
+@pytest.mark.parametrize(
+    ("extra", "command", "needed"),
+    [
+        ("replay", ("sim_replay.launch", "radio", "--seconds", "1"), "ground"),
+        ("replay", ("sim_replay.launch", "generate", "--preset", "unseen", "--out", "OUT"), "render"),
+        (None, ("sim_replay.launch", "demo", "--out", "OUT"), "replay"),
+        (None, ("msgs.ground.cli", "watch"), "ground"),
+        (None, ("msgs.ground.cli", "keys", "list"), "ground"),
+        (None, ("msgs.ground.cli", "view"), "ground"),
+        ("replay", ("trainer.cli", "average", "--out", "OUT", "OUT"), "trainer"),
+    ],
+)
+def test_what_needs_another_extra_says_which(
+    tmp_path: Path, extra: str | None, command: tuple[str, ...], needed: str
+) -> None:
+    out = str(tmp_path / "out")
+    done = run(missing_with(extra), *(out if word == "OUT" else word for word in command))
+    assert done.returncode == 2, done.stderr
+    assert f"pip install '.[{needed}]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_the_bench_times_what_is_there() -> None:
+    done = run(missing_with(None), "edge.cli", "bench", "--runs", "1", "--threads", "1")
+    assert done.returncode == 0, done.stderr
+    assert "the package torch is missing" in done.stderr
+    assert "onnxruntime" in done.stdout.lower()

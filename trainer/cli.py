@@ -200,7 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     # OpenMP threads that spin while they wait cost a busy machine most of its speed. Read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    return exit_code(lambda: _acted(arguments), ConfigError)
+    return exit_code(lambda: _acted(arguments), ConfigError, ["trainer", "render"])
 
 
 def _acted(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ A package offers one under the entry point group GROUP. So nothing that flies de
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -28,6 +29,14 @@ class Engine(Protocol):
 
 
 def other_engines() -> Mapping[str, Engine]:
-    """By name: `openvino` if it is installed, and what the entry points bring. Loading one may take seconds."""
-    own: dict[str, Engine] = {"openvino": openvino.engine} if openvino.version() is not None else {}
-    return own | {entry.name: entry.load() for entry in entry_points(group=GROUP)}
+    """By name: `openvino` if it is installed, and what the entry points bring, as far as what they need is there.
+
+    Loading one may take seconds.
+    """
+    found: dict[str, Engine] = {"openvino": openvino.engine} if openvino.version() is not None else {}
+    for entry in entry_points(group=GROUP):
+        try:
+            found[entry.name] = entry.load()
+        except ModuleNotFoundError as error:
+            print(f"{entry.name} is not timed: the package {error.name} is missing", file=sys.stderr)
+    return found

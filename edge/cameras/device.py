@@ -31,7 +31,9 @@ class DeviceSource(LiveSource):
     """Stamped by the driver, on the monotonic clock, where it does so."""
 
     def __init__(self, settings: DeviceCamera) -> None:
-        super().__init__(settings.device, load_intrinsics(settings.intrinsics))
+        intrinsics = load_intrinsics(settings.intrinsics)
+        intrinsics.scaled_to((settings.width, settings.height), "[camera] width and height ask for")
+        super().__init__(settings.device, intrinsics)
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)

@@ -29,12 +29,12 @@ class Intrinsics:
     image_size_wh: tuple[int, int]
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty: none
 
-    def scaled_to(self, image_size_wh: tuple[int, int]) -> Intrinsics:
+    def scaled_to(self, image_size_wh: tuple[int, int], said_by: str = "the camera gives") -> Intrinsics:
         """The same lens on pictures of another size. Raises InputError unless both sides scale alike, exactly."""
         (w, h), (new_w, new_h) = self.image_size_wh, image_size_wh
         if new_w * h != new_h * w:
             raise InputError(
-                f"these intrinsics are for {w}x{h} pixels, but the camera gives {new_w}x{new_h}, "
+                f"these intrinsics are for {w}x{h} pixels, but {said_by} {new_w}x{new_h}, "
                 "which is not the same picture scaled",
                 INTRINSICS_KEY,
             )
@@ -97,7 +97,8 @@ def read_calibration(path: Path) -> Intrinsics:
         model = storage.getNode("distortion_model").string()
         fisheye = storage.getNode("fisheye_model")
     except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
-        raise InputError(f"calibration {path} is not valid YAML", INTRINSICS_KEY) from error
+        hint = "not YAML as OpenCV reads it: lists stand in brackets, as data: [1.0, 0.0]"
+        raise InputError(f"calibration {path} is {hint}", INTRINSICS_KEY) from error
     if model not in DISTORTION_MODELS:
         raise InputError(
             f"calibration {path}: distortion_model {model} is not one of plumb_bob, rational_polynomial", INTRINSICS_KEY

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import threading
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,7 +20,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 def main(arguments: list[str] | None = None) -> int:
     """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
     options = _parser().parse_args(arguments)
-    return exit_code(lambda: int(options.act(options)), InputError)
+    return exit_code(lambda: int(options.act(options)), InputError, ["ground"])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -217,8 +216,6 @@ def _watch(options: argparse.Namespace) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
-    if find_spec("rerun") is None:
-        raise InputError("view needs the extra `ground`: pip install '.[ground]'")
     from msgs.ground.view.command import ViewOptions, view
 
     if options.web is not None and not 0 < options.web < 65535:

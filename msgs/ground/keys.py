@@ -25,6 +25,7 @@ AUTHORITY = "ca"
 DAYS_MAX = 36500
 _IDENTITY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,62}")
 # Clocks of vehicles without a network may lag.
+_LABEL = "[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
 _BACKDATED = timedelta(days=1)
 
 
@@ -126,7 +127,8 @@ def _alternative_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         pass
-    if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9_.-]*[A-Za-z0-9_])?", host):
+    # All digits and dots it is an address mistyped, which no certificate would ever match.
+    if not re.fullmatch(rf"{_LABEL}(\.{_LABEL})*", host) or not re.search(r"[A-Za-z_]", host):
         raise InputError(f"'{host}' is neither an IP address nor a host name")
     return x509.DNSName(host)
 

@@ -1,6 +1,6 @@
 """The ground's router in a Python process: TLS or QUIC with certificates on both sides, and rules for each identity.
 
-listen = ["quic/0.0.0.0:7447?mixed_rel=1", "tcp/127.0.0.1:7447"]
+listen = ["quic/0.0.0.0:7447", "tcp/127.0.0.1:7447"]
 
 [tls]
 root_ca = "keys/ca.pem"
@@ -49,7 +49,7 @@ class AccessSettings(Section):
 
 
 class RouterSettings(Section):
-    listen: list[str] = Field(min_length=1, description="endpoints: quic/HOST:PORT?mixed_rel=1, tls/, tcp/")
+    listen: list[str] = Field(min_length=1, description="endpoints: quic/HOST:PORT, tls/, tcp/")
     domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
     tls: TlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
     access: AccessSettings | None = Field(default=None, description="who may do what; without it everyone may")

@@ -36,7 +36,7 @@ class Ground:
 
     def endpoint(self, port: int) -> str:
         """What a vehicle connects to, by way of a relay's port or straight."""
-        return f"{self.transport}/{LOOPBACK}:{port}" + ("?mixed_rel=1" if self.transport == "quic" else "")
+        return f"{self.transport}/{LOOPBACK}:{port}"
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from ruamel.yaml import YAML  # as rosbags reads what ROS writes
 
 from edge.calibrate import DRAWN_SQUARE_PX, BoardSettings, draw_board
 from edge.cameras.intrinsics import load_intrinsics
@@ -96,7 +97,7 @@ def test_a_video_of_a_board_becomes_a_file_and_a_person_is_told_how_good_it_is(c
         for _ in range(HELD_FRAMES):
             video.write(cv2.imread(str(picture)))
     video.release()
-    done = cli("calibrate", "board.mp4", "--out", "nose.yaml")
+    done = cli("calibrate", "board.mp4", "--out", "nose.yaml", "--name", '[nose: "left" #1')
     assert done.returncode == 0, done.stderr
     told = re.search(r"reprojection error ([\d.]+) px RMS over \d+ views", done.stdout)
     assert told is not None
@@ -104,6 +105,13 @@ def test_a_video_of_a_board_becomes_a_file_and_a_person_is_told_how_good_it_is(c
     assert f"Reprojection {told[1]} px RMS" in (tmp_path / "nose.yaml").read_text()
     found = load_intrinsics(IntrinsicsSettings(file=tmp_path / "nose.yaml"))
     np.testing.assert_allclose(np.diag(found.K)[:2], np.diag(K)[:2], rtol=0.01)
+    assert YAML(typ="safe").load(tmp_path / "nose.yaml")["camera_name"] == '[nose: "left" #1'
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_pictures_are_looked_at(cli: Cli, tmp_path: Path) -> None:
+    for out in (tmp_path, tmp_path / "none" / "nose.yaml"):
+        done = cli("calibrate", "no-such-video.mp4", "--out", out)
+        assert (done.returncode, done.stderr) == (2, f"{out} cannot be written\n")
 
 
 def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:

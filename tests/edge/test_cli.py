@@ -100,6 +100,17 @@ def test_intrinsics_for_another_resolution_are_refused(cli: Cli, tmp_path: Path,
     assert "1920x1080" in sentence
 
 
+def test_a_size_asked_of_a_device_that_its_calibration_is_not_for_is_refused_though_it_is_not_plugged_in(
+    cli: Cli, tmp_path: Path
+) -> None:
+    text = (
+        '[camera]\ntype = "device"\ndevice = "/dev/video-none"\nwidth = 640\nheight = 480\n'
+        "[camera.intrinsics]\nfx = 2000\nfy = 2000\ncx = 959.5\ncy = 539.5\nwidth = 1920\nheight = 1080\n"
+    )
+    sentence = refusal(cli, tmp_path, text, "check")
+    assert "are for 1920x1080 pixels, but [camera] width and height ask for 640x480" in sentence
+
+
 def test_a_calibration_that_is_not_there_is_named(cli: Cli, tmp_path: Path) -> None:
     sentence = refusal(cli, tmp_path, '[camera]\ntype = "device"\nintrinsics = { file = "none.yaml" }\n', "check")
     place = f"config.toml:3: [camera] intrinsics: calibration {tmp_path / 'none.yaml'}"

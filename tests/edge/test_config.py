@@ -56,6 +56,10 @@ def write(tmp_path: Path, text: str) -> Path:
         (LIVE + "type = 'stream'\nurl = 'flight.mp4'", "config.toml:4: [camera] url: is no network address such as"),
         (LIVE + "type = 'stream'\nurl = 'file:///a.mp4'", "config.toml:4: [camera] url: is no network address such as"),
         (LIVE + "type = 'stream'\nurl = 'RTSP://a/b'", "config.toml:4: [camera] url: is no network address such as"),
+        (
+            LIVE + "type = 'device'\ndevice = 'video0'",
+            "config.toml:4: [camera] device: 'video0' is no device such as /dev",
+        ),
         ("camera = 3", "config.toml:1: [camera]: must hold keys with values"),
         ("zenoh = 3\n" + CAMERA, "config.toml:1: [zenoh]: must hold keys with values"),
         ("[camera\n", "config.toml: not valid TOML: "),
@@ -228,4 +232,16 @@ def test_a_broken_calibration_is_told(tmp_path: Path, text: str) -> None:
     path = tmp_path / "nose.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"nose\.yaml"):
+        read_calibration(path)
+
+
+def test_a_file_that_an_editor_began_with_a_mark_is_read(tmp_path: Path) -> None:
+    write(tmp_path, CAMERA).write_text("\N{ZERO WIDTH NO-BREAK SPACE}" + CAMERA, encoding="utf-8")
+    assert load_config(tmp_path / "config.toml").config.camera.type == "sequence"
+
+
+def test_a_calibration_that_opencv_does_not_read_is_told_as_that(tmp_path: Path) -> None:
+    path = tmp_path / "nose.yaml"
+    path.write_text(ROS_CALIBRATION.replace("data: [-0.1, 0.02, 0.001, -0.002, 0.0]", "data:\n  - -0.1\n  - 0.02"))
+    with pytest.raises(InputError, match=r"nose\.yaml is not YAML as OpenCV reads it: lists stand in brackets"):
         read_calibration(path)

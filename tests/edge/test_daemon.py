@@ -130,7 +130,7 @@ def test_a_ground_that_does_not_answer_by_radio_does_not_keep_the_daemon_from_st
     with socket.socket(type=socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
         links = (
-            f'[zenoh]\nlisten = []\nconnect = ["quic/127.0.0.1:{silent.getsockname()[1]}?mixed_rel=1"]\n'
+            f'[zenoh]\nlisten = []\nconnect = ["quic/127.0.0.1:{silent.getsockname()[1]}"]\n'
             f'tls = {{ root_ca = "{files.root_ca}", certificate = "{files.certificate}", '
             f'private_key = "{files.private_key}" }}\n[mavlink]\nenabled = false\n'
         )

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from edge.doctor import camera_as_told
 from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.links.signing import timestamp_of
@@ -170,6 +171,43 @@ def test_a_camera_that_the_running_daemon_has_is_not_taken_for_a_broken_one(
     assert "the daemon runs" in found["daemon"]["says"]
 
 
+def test_what_the_running_daemon_says_of_its_links_is_taken(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    scene, asked_at = write_swaying_scene(tmp_path / "000001"), free_port()
+    links = f'endpoints = ["udpin:127.0.0.1:0", "serial:{tmp_path}/none:57600"]\n'
+    text = toml(scene, toy_model, asked_at).replace("enabled = false\n", links)
+    assert links in text
+
+    def lacks_attitude() -> bool:
+        running = ask(f"tcp/127.0.0.1:{asked_at}", "uav1") or NONE
+        return "no_attitude" in running["info"].get("reason_kinds", ())
+
+    with flying(tmp_path, text):
+        until(lacks_attitude)
+        code, found = findings(cli, tmp_path, text)
+    assert (code, found["daemon"]["verdict"]) == (1, "wrong")
+    assert "no own attitude" in found["daemon"]["says"]
+    assert "autopilot" in found["daemon"]["advice"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "advice"),
+    [
+        ("camera_stamps", "timestamp"),
+        ("camera_frozen", "moves"),
+        ("camera_lost", "plugged in"),
+        ("no_frame", "plugged"),
+    ],
+)
+def test_each_fault_of_a_camera_that_the_daemon_has_gets_its_own_advice(kind: str, advice: str) -> None:
+    running = {
+        "camera": "/dev/video0",
+        "reason_kinds": ["drops", kind],
+        "reasons": ["3 % of frames dropped", "so it is"],
+    }
+    ((found, _),) = camera_as_told(running)
+    assert (found.verdict, found.says.endswith("says: so it is"), advice in found.advice) == ("wrong", True, True)
+
+
 NO_ROOT_LOOKS = """
 import os
 from pathlib import Path
@@ -228,7 +266,7 @@ def test_a_signing_timestamp_that_cannot_be_kept_is_a_fault(tmp_path: Path) -> N
     assert signing_finding(kept).verdict == "good"
     kept.write_text("5")
     assert signing_finding(kept).verdict == "good"
-    for lost in (tmp_path / "none" / "mavlink.timestamp", Path("/proc/mavlink.timestamp")):
+    for lost in (tmp_path / "none" / "mavlink.timestamp", Path("/proc/mavlink.timestamp"), tmp_path):
         found = signing_finding(lost)
         assert (found.verdict, str(lost) in found.says) == ("wrong", True)
         assert "signing_state" in found.advice

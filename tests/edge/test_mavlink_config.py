@@ -23,6 +23,7 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
         ("[mavlink]\nadsb_icao_address = 0x1000000\n", r":5: \[mavlink\] adsb_icao_address: .* less than or equal"),
         ("[mavlink]\nsystem_id = 7\nvirtual_system_id = 7\n", r"\[mavlink\]: virtual_system_id must not be"),
         ('[mavlink]\nsigning_state = "s"\n', r"\[mavlink\]: signing_state needs signing_key"),
+        ('[mavlink]\nsigning_state = "."\n', r":5: \[mavlink\] signing_state: .* is a folder"),
         (
             '[mavlink]\nallowed_hosts = ["10.0.0.1", "autopilot.local"]\n',
             r":5: \[mavlink\] allowed_hosts\[1\]: .* no address",

@@ -88,7 +88,7 @@ def test_certificates_that_would_not_do_are_refused(tmp_path: Path, spoil: objec
 
 def test_the_link_reaches_the_ground_over_quic_with_its_certificate_and_caps_poses_there(tmp_path: Path) -> None:
     files = make_keys(tmp_path)
-    secure, on_board = free_endpoint().replace("tcp/", "quic/") + "?mixed_rel=1", free_endpoint()
+    secure, on_board = free_endpoint().replace("tcp/", "quic/"), free_endpoint()
     text = f'[zenoh]\nlisten = ["{on_board}"]\nconnect = ["{secure}"]\npose_rate_max_hz = 5\n{TLS}'
     settings = load_config(write(tmp_path, text)).config.zenoh
     link = ZenohLink(settings, "uav1", MOUNT)

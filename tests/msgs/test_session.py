@@ -115,6 +115,22 @@ def test_only_who_holds_our_certificate_gets_in_and_poses_are_thinned_there(
         assert received["ground"] <= 5.0 * elapsed_s + 2
 
 
+@pytest.mark.parametrize(
+    ("listens", "calls"),
+    [("", ""), ("?mixed_rel=1", ""), ("", "?mixed_rel=1"), ("", "?rel=1"), ("?mixed_rel=0", "?mixed_rel=0")],
+)
+def test_two_ends_meet_over_quic_whether_or_not_they_say_that_poses_are_datagrams(
+    identities: Sequence[session.TlsFiles], listens: str, calls: str
+) -> None:
+    ground, uav, _ = identities
+    endpoint = free_endpoint().replace("tcp/", "quic/")
+    with (
+        zenoh.open(session.router_config([endpoint + listens], tls=ground)) as router,
+        client.connect(endpoint + calls, tls=uav) as caller,
+    ):
+        assert list(caller.info.routers_zid()) == [router.zid()]
+
+
 def test_a_router_that_accepts_and_says_nothing_is_soon_parted_with_and_called_again() -> None:
     """Until then neither a vehicle that is told to stop nor a camera that looks for its topic could go on."""
     with socket.create_server(("127.0.0.1", 0)) as mute:

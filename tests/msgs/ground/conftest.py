@@ -52,8 +52,6 @@ def write_router_config(folder: Path, listen: list[str], files: TlsFiles, access
 @pytest.fixture(params=["tls", "quic"])
 def ground(request: pytest.FixtureRequest, tmp_path: Path, keys: dict[str, TlsFiles]) -> Iterator[Ground]:
     secure = free_endpoint().replace("tcp/", f"{request.param}/")
-    if request.param == "quic":
-        secure += "?mixed_rel=1"
     loopback = free_endpoint()
     access = 'vehicles = ["uav1", "uav2"]\noperators = ["alice"]\nreaders = ["screen"]\nloopback_reads = true\n'
     path = write_router_config(tmp_path, [secure, loopback], keys["ground"], access)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import ssl
 import stat
 import subprocess
@@ -95,6 +96,9 @@ def test_nothing_is_overwritten_and_bad_names_are_refused(tmp_path: Path) -> Non
     for name in ("../uav1", "ca", "", "a" * 80, "uav 1"):
         with pytest.raises(InputError, match="is no identity"):
             issue(tmp_path, name)
+    for host in ("192.168..1", "10.0.0.300", "1.2.3", "uav1..local", "-uav1"):
+        with pytest.raises(InputError, match=f"'{re.escape(host)}' is neither an IP address nor a host name"):
+            issue(tmp_path, "uav2", [host])
     with pytest.raises(InputError, match="neither an IP address nor a host name"):
         issue(tmp_path, "uav2", ["10.0.0.7:7447"])
     with pytest.raises(InputError, match="valid for 1 to"):

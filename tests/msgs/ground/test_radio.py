@@ -60,14 +60,14 @@ class Radio:
     """uav1 and the ground's router, and the relay between them."""
 
     def __init__(self, stack: ExitStack, folder: Path, keys: dict[str, TlsFiles], loses: Callable[[], bool]) -> None:
-        secure, self.loopback = free_endpoint().replace("tcp/", "quic/") + "?mixed_rel=1", free_endpoint()
+        secure, self.loopback = free_endpoint().replace("tcp/", "quic/"), free_endpoint()
         access = 'vehicles = ["uav1"]\nloopback_reads = true\n'
         path = write_router_config(folder, [secure, self.loopback], keys["ground"], access)
         self.relay = Relay(int(secure.partition("?")[0].rpartition(":")[2]), loses)
         self.relay.start()
         stack.callback(self.relay.done.set)
         stack.enter_context(open_router(load_router(path), folder))
-        far = f"quic/127.0.0.1:{self.relay.port}?mixed_rel=1"
+        far = f"quic/127.0.0.1:{self.relay.port}"
         self.session = stack.enter_context(zenoh.open(peer_config([], [far], tls=keys["uav1"])))
 
 
