@@ -14,6 +14,7 @@ from edge.types import Track, TrackState
 WINDOW_FRAMES = 900  # of latencies: half a minute at 30 frames a second
 RECENT_NS = 3_000_000_000  # what is wrong is judged by: over, it is soon forgotten
 NO_FRAME_NS = 2_000_000_000
+FIRST_FRAME_NS = 10_000_000_000  # what a stream may take to open; who has given none by then is not there
 DROPS_TOLERATED = 0.1
 ANNOUNCE_NS = 1_000_000_000
 
@@ -164,12 +165,13 @@ def judge(
     wants_attitude: bool,
     no_frame_ns: int = NO_FRAME_NS,
     faults: Sequence[Reason] = (),
+    waited_ns: int = 0,
 ) -> Condition:
-    """How the daemon is. `frame_age_ns` is None before the first frame; `faults` are what else is less well than it
-    should be. Pure."""
+    """How the daemon is. `frame_age_ns` is None before the first frame, which was waited for so long; `faults` are what
+    else is less well than it should be. Pure."""
     if frame_age_ns is None:
-        waiting = Reason("no_camera", "waiting for the camera")
-        return Condition(HealthState.INIT, Activity.WAITING, (waiting, *faults))
+        state = HealthState.INIT if waited_ns <= max(no_frame_ns, FIRST_FRAME_NS) else HealthState.FAULT
+        return Condition(state, Activity.WAITING, (Reason("no_camera", "waiting for the camera"), *faults))
     if frame_age_ns > no_frame_ns:
         silent = Reason("no_frame", f"no frame for {frame_age_ns / 1e9:.0f} s")
         return Condition(HealthState.FAULT, Activity.WAITING, (silent, *faults))
@@ -196,6 +198,7 @@ class Health:
         self.faults: tuple[Reason, ...] = ()  # what others noticed, told as reasons while it is there
         self._stages_ns: dict[str, deque[int]] = {}
         self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number, total ns
+        self._began_ns: int | None = None  # when it was first asked
         self._done_ns: int | None = None
         self._tracks: tuple[Track, ...] = ()
         self._has_attitude = False
@@ -219,6 +222,8 @@ class Health:
 
     def assess(self, now_ns: int) -> Condition:
         self._forget(now_ns)
+        if self._began_ns is None:
+            self._began_ns = now_ns
         return judge(
             self._tracks,
             None if self._done_ns is None else now_ns - self._done_ns,
@@ -227,6 +232,7 @@ class Health:
             self._wants_attitude,
             self.no_frame_ns,
             self.faults,
+            now_ns - self._began_ns,
         )
 
     def snapshot(

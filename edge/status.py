@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +38,32 @@ def status(config: Path | None, connect: str | None, vehicle: str | None, as_jso
 
 
 def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] | None:
-    """`info`, `config` and `model` of the daemon that listens at `endpoint`; None if none answers."""
+    """`info`, `config` and `model` of the daemon that listens at `endpoint`; None if none answers.
+
+    Raises InputError where several answer, as at a router on the ground, and `uav` is `*`.
+    """
     try:
         with zenoh.open(client_config([endpoint], tls=tls)) as session:
-            answers = {what: _ask_one(session, uav, what) for what in ("info", "config", "model")}
-    except zenoh.ZError:
+            vehicles = {str(info.get("vehicle")): info for info in _answers(session, uav, "info")}
+            if len(vehicles) > 1:
+                raise InputError(f"{' and '.join(sorted(vehicles))} answer at {endpoint}: say which with --vehicle")
+            # Of that one alone: what answers first to `*` may be another.
+            answers = {
+                what: next(_answers(session, name, what), None) for name in vehicles for what in ("config", "model")
+            }
+    except (zenoh.ZError, ValueError):
         return None
-    return answers if all(answer is not None for answer in answers.values()) else None
+    if not answers or None in answers.values():
+        return None
+    return {"info": next(iter(vehicles.values())), **answers}
 
 
 def works(info: dict[str, Any]) -> bool:
     """Whether the daemon's loop turns and gives what it is for."""
-    return info.get("state") not in (None, HealthState.FAULT.value) and info.get("age_s", 0.0) < STALE_S
+    return (
+        info.get("state") not in (None, HealthState.INIT.value, HealthState.FAULT.value)
+        and info.get("age_s", 0.0) < STALE_S
+    )
 
 
 def for_a_person(answer: dict[str, Any]) -> str:
@@ -81,7 +96,7 @@ def _headline(info: dict[str, Any]) -> str:
     return f"{state}, {info['activity']}" if state == HealthState.DEGRADED.value else state
 
 
-def _ask_one(session: zenoh.Session, uav: str, what: str) -> dict[str, Any] | None:
+def _answers(session: zenoh.Session, uav: str, what: str) -> Iterator[dict[str, Any]]:
     for reply in session.get(key_of(uav, what), timeout=ANSWER_S):
         if reply.ok is None:
             continue
@@ -90,8 +105,7 @@ def _ask_one(session: zenoh.Session, uav: str, what: str) -> dict[str, Any] | No
         except ValueError:
             continue
         if isinstance(tree, dict):
-            return tree
-    return None
+            yield tree
 
 
 def _address(config: Path | None, connect: str | None, vehicle: str | None) -> tuple[str, str, TlsFiles | None]:

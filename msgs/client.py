@@ -14,6 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import zenoh
 from zenoh import ext, handlers
@@ -22,6 +23,8 @@ from msgs import topics
 from msgs.receive import PoseReceiver, TargetPose
 from msgs.session import TlsFiles, client_config
 from msgs.wire import Refusal
+
+FAILURES_MAX = 64  # different messages of exceptions
 
 
 def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
@@ -41,6 +44,7 @@ class PoseSubscription:
     def __init__(self, subscriber: zenoh.Subscriber, receiver: PoseReceiver) -> None:
         self._subscriber = subscriber
         self._receiver = receiver
+        self._closed = False
 
     @property
     def accepted(self) -> int:
@@ -59,15 +63,24 @@ class PoseSubscription:
                 yield pose
 
     def poll(self) -> TargetPose | None:
-        """The oldest pose waiting, without blocking; None if there is none."""
-        while (sample := self._subscriber.try_recv()) is not None:
-            pose = _receive(self._receiver, sample)
-            if pose is not None:
+        """The oldest pose waiting, without blocking; None if there is none, or it or the session is closed."""
+        while not self._closed:
+            try:
+                sample = self._subscriber.try_recv()
+            except zenoh.ZError:
+                self._closed = True
+                break
+            if sample is None:
+                break
+            if (pose := _receive(self._receiver, sample)) is not None:
                 return pose
         return None
 
     def close(self) -> None:
-        self._subscriber.undeclare()
+        """May be called twice, or after the session's."""
+        self._closed = True
+        with suppress(zenoh.ZError):
+            self._subscriber.undeclare()
 
     def __enter__(self) -> PoseSubscription:
         return self
@@ -115,7 +128,8 @@ class TopicCounts:
             return dict(self._receiver.refused)
 
     def failures(self) -> dict[str, int]:
-        """Exceptions that `on_pose` let out, by message: they are counted here and stop nothing."""
+        """Exceptions that `on_pose` let out, by message, and by type alone where messages are many: they are counted
+        here and stop nothing."""
         with self._lock:
             return dict(self._failures)
 
@@ -145,7 +159,9 @@ class TopicCounts:
             self._on_pose(pose)
         except Exception as error:
             with self._lock:
-                self._failures[f"{type(error).__name__}: {error}"] += 1
+                text = f"{type(error).__name__}: {error}"
+                crowded = len(self._failures) >= FAILURES_MAX and text not in self._failures
+                self._failures[type(error).__name__ if crowded else text] += 1
 
     def _declare(self, session: zenoh.Session) -> None:
         # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
@@ -183,4 +199,10 @@ def subscribe_all(
 
 def _receive(receiver: PoseReceiver, sample: zenoh.Sample) -> TargetPose | None:
     attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-    return receiver.receive(str(sample.key_expr), sample.payload.to_bytes(), attachment, time.time_ns())
+    sender = sender_of(sample)
+    return receiver.receive(str(sample.key_expr), sample.payload.to_bytes(), attachment, time.time_ns(), sender)
+
+
+def sender_of(sample: zenoh.Sample) -> str:
+    """The id of the session that a sample is from, which stamps what it sends; empty where nothing is stamped."""
+    return "" if sample.timestamp is None else str(sample.timestamp.get_id())

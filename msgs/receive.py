@@ -54,8 +54,9 @@ class _Last:
 class PoseReceiver:
     """Takes the poses of one UAV's targets and counts what it refuses, by reason.
 
-    A target has one publisher at a time: of two daemons under one name the first that was heard is believed, until
-    nothing of it was taken for a second, as when it was restarted.
+    A vehicle has one daemon at a time: of two under one name the first that was heard is believed, until nothing of it
+    was taken for a second, as when it was restarted. They are told apart by their zenoh sessions (`sender`), and where
+    those are not known by the publisher of each target.
     Ages compare the sender's clock with ours: `max_age_s` and `max_future_s` must allow for their difference.
     """
 
@@ -68,18 +69,28 @@ class PoseReceiver:
         self._max_future_ns = round(max_future_s * _NS)
         self._sequences: dict[tuple[str, bytes], int] = {}
         self._last: dict[str, _Last] = {}
+        self._sender: tuple[str, int] | None = None  # whose poses are taken, and when one last was
 
-    def receive(self, key: str, payload: bytes, attachment: bytes, now_ns: int) -> TargetPose | None:
-        """The pose in a sample, or None if it is refused. `now_ns` is UTC."""
+    def believes(self, sender: str, now_ns: int) -> bool:
+        """Whether what that session sends, of whatever kind, goes with the poses that are taken; '' may be."""
+        if not sender or self._sender is None or self._sender[0] == sender:
+            return True
+        # Set back, our clock tells nothing of how long the other has been silent.
+        return not 0 <= now_ns - self._sender[1] <= _SILENT_NS
+
+    def receive(self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str = "") -> TargetPose | None:
+        """The pose in a sample, or None if it is refused. `now_ns` is UTC; `sender` names the zenoh session."""
         try:
-            pose = self._judge(key, payload, attachment, now_ns)
+            pose = self._judge(key, payload, attachment, now_ns, sender)
         except PayloadError as error:
             self.refused[error.reason] += 1
             return None
+        if sender:
+            self._sender = sender, now_ns
         self.accepted += 1
         return pose
 
-    def _judge(self, key: str, payload: bytes, attachment: bytes, now_ns: int) -> TargetPose:
+    def _judge(self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str) -> TargetPose:
         row = topics.parse_key(key, self._uav, domain=self._domain)
         if row is None or row[0] is not topics.POSE or row[1] is None:
             raise PayloadError(Refusal.TOPIC)
@@ -90,7 +101,8 @@ class PoseReceiver:
         sequence, _, gid = parsed
         pose = PoseWithCovarianceStamped.decode(payload)
         last = self._last.get(target)
-        # Set back, our clock tells nothing of how long the other has been silent.
+        if not self.believes(sender, now_ns):
+            raise PayloadError(Refusal.PUBLISHER)
         if last is not None and gid != last.gid and 0 <= now_ns - last.arrival_ns <= _SILENT_NS:
             raise PayloadError(Refusal.PUBLISHER)
         if sequence <= self._sequences.get((target, gid), 0):

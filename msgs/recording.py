@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -30,6 +30,7 @@ WAITING_BYTES_MAX = 64 * 1024**2  # pictures are large
 STANDING_MAX = 256  # so that made-up names cannot grow it without bound
 FLUSH_S = 1.0
 RETRY_S = 3.0
+CLOCK_STEP_NS = 500_000_000  # a larger one, as when the time comes from the network, begins another file
 GAPS_S = 10.0  # between two words on a disk that does not keep up
 STOP_TIMEOUT_S = 10.0
 
@@ -57,6 +58,7 @@ class Sample:
     payload: bytes
     log_ns: int  # UTC, when it was recorded
     publish_ns: int  # UTC, when it was put
+    clock_ns: int  # how far UTC was ahead of the monotonic clock when it was recorded
 
 
 class Recorder:
@@ -81,6 +83,7 @@ class Recorder:
         self._woken = False
         self._file: McapFile | None = None
         self._opened_s = 0.0
+        self._clock_ns = 0  # of the file's first sample
         self._retry_s = 0.0
         self._failure: str | None = None
         self._thread: threading.Thread | None = None
@@ -97,7 +100,8 @@ class Recorder:
 
     def record(self, topic: Topic, uav: str, target: str | None, payload: bytes, publish_ns: int) -> None:
         """Take a sample to be written, if it is switched on; never waits. Lost, and counted, when the disk fails."""
-        sample = Sample(topic, topics.topic_name(topic, uav, target), payload, time.time_ns(), publish_ns)
+        log_ns, clock_ns = time.time_ns(), _utc_ahead_ns()
+        sample = Sample(topic, topics.topic_name(topic, uav, target), payload, log_ns, publish_ns, clock_ns)
         with self._changed:
             if topic.cache == 1 and (sample.name in self._standing or len(self._standing) < STANDING_MAX):
                 self._standing[sample.name] = sample
@@ -161,23 +165,33 @@ class Recorder:
         log.warning("%s", text)
         self._tell(logging.WARNING, text)
 
-    def _turn(self, samples: deque[Sample], go_on: bool) -> None:
+    def _turn(self, samples: Sequence[Sample], go_on: bool) -> None:
         """One second's work: write, put it on the disk, and begin another file where the limits say."""
-        if samples or (self._failure is not None and go_on):
+        if not samples and self._failure is not None and go_on:
             self._open(samples)
+        for run in _between_clock_steps(samples):
+            if self._file is not None and abs(run[0].clock_ns - self._clock_ns) > CLOCK_STEP_NS:
+                self._end_file()
+            self._open(run)
+            if self._file is None:
+                return
+            for sample in run:
+                self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         if self._file is None:
             return
-        for sample in samples:
-            self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         self._file.flush()
         aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
         if not go_on or aged or self._file.size >= self._limits.file_bytes_max:
-            file, self._file = self._file, None
-            file.close()
+            self._end_file()
         elif samples:
             self._store.make_room()
 
-    def _open(self, samples: Collection[Sample]) -> None:
+    def _end_file(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+
+    def _open(self, samples: Sequence[Sample]) -> None:
         now_s = time.monotonic()
         if self._file is not None or (self._failure is not None and now_s < self._retry_s):
             return
@@ -185,6 +199,7 @@ class Recorder:
         self._store.make_room()
         self._file = self._store.new_file()
         self._opened_s = now_s
+        self._clock_ns = samples[0].clock_ns if samples else _utc_ahead_ns()
         with self._changed:
             standing = list(self._standing.values())
         # What is told on change alone is repeated, so that each file can be read without those before it.
@@ -218,6 +233,20 @@ class Recorder:
                 self._counters["lost"] += lost + len(self._waiting)
                 self._waiting.clear()
                 self._waiting_bytes = 0
+
+
+def _utc_ahead_ns() -> int:
+    return time.time_ns() - time.monotonic_ns()
+
+
+def _between_clock_steps(samples: Iterable[Sample]) -> list[list[Sample]]:
+    """The samples, in runs within which the clock was not set: of two sides of a step a file would show both as one."""
+    runs: list[list[Sample]] = []
+    for sample in samples:
+        if not runs or abs(sample.clock_ns - runs[-1][0].clock_ns) > CLOCK_STEP_NS:
+            runs.append([])
+        runs[-1].append(sample)
+    return runs
 
 
 class Store:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -50,15 +49,6 @@ def heartbeat(kind: int, condition: Condition) -> Any:
     mode = MODE_ACTIVITY[condition.activity] | MODE_DEGRADED * degraded | MODE_FAULT * fault
     flags = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, flags, mode, status, 3)
-
-
-def primary(tracks: Sequence[Track], chosen_id: int | None) -> Track | None:
-    """The one target that the camera protocol has room for: the chosen, else seen before coasting, lowest number."""
-    return min(
-        tracks,
-        key=lambda t: (t.track_id != chosen_id, t.state is not TrackState.CONFIRMED, t.track_id),
-        default=None,
-    )
 
 
 def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:

@@ -18,6 +18,7 @@ from edge.links import mavlink_messages as words
 from edge.links.allowance import Allowance
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
+from edge.links.mavlink_primary import Primary
 from edge.links.mavlink_rates import sent_rates_hz, wanted_rates_hz
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
 from edge.links.mavlink_rivals import Rivals
@@ -98,6 +99,7 @@ class Station:
         self._text_id = 0
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
         self._rivals = Rivals()
+        self._primary = Primary()
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """Those that carry a valid signature; all of them where nothing is signed."""
@@ -188,7 +190,7 @@ class Station:
         self._reported_ns = now_ns
         tracks = sendable(report, now_ns, self._settings.max_age_ms)
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
-        first = words.primary(tracks, report.chosen_id)
+        first = self._primary.of(report.tracks, tracks, report.chosen_id, now_ns)
         seen = words.image_status(report, first) if self._schedule.due(IMAGE_STATUS, 0, now_ns) else None
         if self.vehicle.contact is not Contact.HEARD:
             return [self._image_status(seen)] if seen is not None else []

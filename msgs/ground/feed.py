@@ -11,7 +11,7 @@ import zenoh
 from zenoh import ext, handlers
 
 from msgs import topics
-from msgs.client import connect
+from msgs.client import connect, sender_of
 from msgs.ground.errors import InputError
 from msgs.session import TlsFiles, check_endpoint
 from msgs.topics import Topic
@@ -30,6 +30,7 @@ class Incoming:
     key: str
     payload: bytes
     attachment: bytes
+    sender: str = ""  # the zenoh session that it is from; empty: not known
 
 
 OnSample = Callable[[Incoming], None]
@@ -98,7 +99,7 @@ def listening(
         row = topics.parse_any_key(key, domain=domain)
         if row is not None:
             attachment = b"" if one.attachment is None else one.attachment.to_bytes()
-            on_sample(Incoming(*row, key, one.payload.to_bytes(), attachment))
+            on_sample(Incoming(*row, key, one.payload.to_bytes(), attachment, sender_of(one)))
 
     def alive(one: zenoh.Sample) -> None:
         uav = alive_uav(str(one.key_expr))

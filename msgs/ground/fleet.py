@@ -21,7 +21,7 @@ from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.ground.feed import Incoming
 from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.receive import PoseReceiver, TargetPose
-from msgs.wire import Array, PayloadError
+from msgs.wire import Array, PayloadError, Refusal
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
@@ -139,7 +139,9 @@ class Fleet:
             if vehicle is None:
                 return None
             if incoming.topic is topics.POSE:
-                pose = vehicle.receiver.receive(incoming.key, incoming.payload, incoming.attachment, now_ns)
+                pose = vehicle.receiver.receive(
+                    incoming.key, incoming.payload, incoming.attachment, now_ns, incoming.sender
+                )
                 return None if pose is None else self._take_pose(vehicle, pose)
             if incoming.topic not in TAKEN:
                 return None
@@ -148,7 +150,17 @@ class Fleet:
             except PayloadError as error:
                 vehicle.receiver.refused[error.reason] += 1
                 return None
+            # Of events history comes, late, of daemons that are gone.
+            if incoming.topic is not topics.EVENTS and not vehicle.receiver.believes(incoming.sender, now_ns):
+                vehicle.receiver.refused[Refusal.PUBLISHER] += 1
+                return None
             return _note(vehicle, message, topics.parse_attachment(incoming.attachment), now_ns)
+
+    def believes(self, incoming: Incoming, now_ns: int) -> bool:
+        """Whether a sample is of the vehicle's own daemon, and not of a second one under its name."""
+        with self._lock:
+            vehicle = self._vehicles.get(incoming.uav)
+            return vehicle is None or vehicle.receiver.believes(incoming.sender, now_ns)
 
     def rows(self, now_ns: int) -> list[VehicleRow]:
         """Every vehicle that was heard, by name; targets not seen for ten seconds are left out."""

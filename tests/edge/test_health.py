@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.estimator.providers import NAMES, choose_provider
-from edge.health import Activity, Condition, HealthState, Reason, judge
+from edge.health import FIRST_FRAME_NS, Activity, Condition, Health, HealthState, Reason, judge
 from edge.logs import CountingHandler
 from edge.outlets import Outlets
 from edge.stages import STAGES, StageClock
@@ -51,6 +51,19 @@ def stand_still(self, *arguments):
 Estimator.track = stand_still
 sys.exit(cli.main(sys.argv[1:]))
 """
+
+
+def test_a_camera_that_never_gave_a_frame_is_a_fault_once_it_has_had_its_time() -> None:
+    health = Health(wants_attitude=False)
+    health.faults = (Reason("camera_lost", "camera lost: /dev/video0 does not open"),)
+    begun = health.assess(5)
+    assert (begun.state, begun.activity) == (HealthState.INIT, Activity.WAITING)
+    assert health.assess(5 + FIRST_FRAME_NS).state is HealthState.INIT
+    late = health.assess(6 + FIRST_FRAME_NS)
+    assert (late.state, late.activity) == (HealthState.FAULT, Activity.WAITING)
+    assert str(late) == "fault: waiting for the camera; camera lost: /dev/video0 does not open"
+    health.no_frame_ns = 2 * FIRST_FRAME_NS
+    assert health.assess(6 + FIRST_FRAME_NS).state is HealthState.INIT, "as the settings have it"
 
 
 def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path: Path, toy_model: Path) -> None:

@@ -4,22 +4,25 @@ import json
 import re
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zenoh
 
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.health import Activity, HealthState
 from edge.stages import STAGES
 from edge.status import ask
-from edge.status_board import StatusBoard
+from edge.status_board import StatusBoard, key_of
 from edge.types import CameraInfo
 from msgs import topics
 from msgs.cdr import DiagnosticArray
 from msgs.client import connect
+from msgs.session import router_config
 from tests.waiting import until
 
 from .conftest import Cli
@@ -75,6 +78,30 @@ def test_status_without_a_daemon_says_so_and_fails(cli: Cli) -> None:
     assert asked.returncode == 1
     assert "no daemon answers at tcp/127.0.0.1" in asked.stdout
     assert "Traceback" not in asked.stderr
+
+
+def test_of_several_vehicles_behind_one_router_status_wants_to_know_which(cli: Cli) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def answer(name: str, what: str) -> Callable[[zenoh.Query], None]:
+        tree = {"vehicle": name, "state": "searching", "age_s": 0.1, "sha256": f"model of {name}"}
+
+        def reply(query: zenoh.Query) -> None:
+            query.reply(key_of(name, what), json.dumps(tree))
+
+        return reply
+
+    with zenoh.open(router_config([endpoint])) as router:
+        for name, what in product(("uav1", "uav2"), ("info", "config", "model")):
+            handler = zenoh.handlers.Callback(answer(name, what), indirect=False)
+            router.declare_queryable(key_of(name, what), handler)
+        asked = cli("status", "--connect", endpoint, "--json")
+        assert asked.returncode == 2
+        assert asked.stderr == f"uav1 and uav2 answer at {endpoint}: say which with --vehicle\n"
+        asked = cli("status", "--connect", endpoint, "--vehicle", "uav2", "--json")
+    answers = json.loads(asked.stdout)
+    assert (asked.returncode, {one["vehicle"] for one in answers.values()}) == (0, {"uav2"})
+    assert answers["model"]["sha256"] == "model of uav2"
 
 
 def test_status_refuses_what_is_no_address(cli: Cli) -> None:

@@ -100,6 +100,29 @@ def test_of_two_daemons_of_one_name_one_is_believed_and_the_other_once_it_has_en
     assert all(b[1] - a[1] > 1_000_000_000 for a, b in pairwise(taken) if a[0] != b[0])
 
 
+def test_of_two_daemons_of_one_name_no_target_of_the_second_is_believed_beside_those_of_the_first(
+    network: Network,
+) -> None:
+    with (
+        zenoh.open(session.peer_config([], [network.endpoint])) as other,
+        client.connect(network.endpoint) as tool,
+        client.subscribe(tool, "uav1", depth=500) as poses,
+        Node(network.daemon, "uav1") as ours,
+        Node(other, "uav1") as theirs,
+    ):
+        first, second = ours.publisher(POSE, "t0"), theirs.publisher(POSE, "t1")
+        until(lambda: poses.poll() is not None, lambda: first.put(pose_now().encode()))
+        taken: list[str] = []
+
+        def turn() -> None:
+            for publisher in (first, second):
+                publisher.put(pose_now().encode())
+            taken.extend(pose.target for pose in iter(poses.poll, None))
+
+        until(lambda: poses.refused[Refusal.PUBLISHER] > 20 and len(taken) > 20, turn)
+    assert set(taken) == {"t0"}
+
+
 def test_a_slow_reader_gets_the_newest_poses(network: Network) -> None:
     arrived = threading.Event()
     with client.connect(network.endpoint) as tool, client.subscribe(tool, "uav1", depth=2) as poses:
@@ -132,6 +155,35 @@ def test_closing_ends_the_iteration(network: Network) -> None:
         poses.close()
         reader.join(timeout=10.0)
         assert not reader.is_alive()
+
+
+def test_what_is_closed_has_no_more_poses_and_may_be_closed_again(network: Network) -> None:
+    with client.connect(network.endpoint) as tool, client.subscribe(tool, "uav1") as poses:
+        poses.close()
+        assert poses.poll() is None
+    with client.connect(network.endpoint) as tool:
+        left = client.subscribe(tool, "uav1")
+    assert left.poll() is None
+    left.close()
+
+
+def test_a_callback_that_fails_in_ever_other_words_is_counted_in_bounded_memory(network: Network) -> None:
+    def fail(pose: TargetPose) -> None:
+        raise ValueError(f"at {pose.sequence}")
+
+    with (
+        client.connect(network.endpoint) as tool,
+        client.subscribe_all(tool, "uav1", fail) as counts,
+        Node(network.daemon, "uav1") as node,
+    ):
+        publisher = node.publisher(POSE, "t0")
+        until(
+            lambda: sum(counts.failures().values()) > 2 * client.FAILURES_MAX,
+            lambda: publisher.put(pose_now().encode()),
+        )
+        failures = counts.failures()
+    assert len(failures) == client.FAILURES_MAX + 1
+    assert failures["ValueError"] == sum(failures.values()) - client.FAILURES_MAX
 
 
 def test_every_topic_is_counted_and_history_reaches_who_comes_late(network: Network) -> None:

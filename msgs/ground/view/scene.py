@@ -66,10 +66,13 @@ class Scene:
     def take(self, incoming: Incoming, now_ns: int) -> None:
         """Draw one sample that came at `now_ns` (UTC)."""
         with self._lock:
+            believed = self._fleet.believes(incoming, now_ns)
             news = self._fleet.take(incoming, now_ns)
             if incoming.topic is topics.POSE:
                 if isinstance(news, TargetRow):
                     self._take_pose(incoming, news, now_ns)
+                return
+            if not believed and incoming.topic is not topics.EVENTS:
                 return
             try:
                 self._take_other(incoming, news, now_ns)

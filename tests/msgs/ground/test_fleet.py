@@ -173,3 +173,42 @@ def test_without_own_attitude_a_row_is_by_the_camera_and_a_lost_target_keeps_its
     (vehicle,) = fleet.rows(NOW_NS + 8 * S)
     assert (vehicle.targets[0].frame, vehicle.targets[0].stamp_ns) == ("ned", NOW_NS + 29 * FRAME_NS)
     assert off_north_deg(vehicle.targets[0]) < 0.01
+
+
+def attitude(stamp_ns: int, yaw_deg: float) -> cdr.TFMessage:
+    """Own ship and camera, which looks along the nose."""
+    q_ned_body = Rotation.from_euler("ZYX", [yaw_deg, 0.0, 0.0], degrees=True).as_quat()
+    q_body_cam = Rotation.from_matrix(R_BODY_CAM).as_quat()
+    links = [
+        (topics.FRAME_BODY_NED, topics.FRAME_BODY, q_ned_body),
+        (topics.FRAME_BODY, topics.FRAME_CAMERA, q_body_cam),
+    ]
+    return cdr.TFMessage(tuple(cdr.TransformStamped(stamp_ns, a, b, np.zeros(3), q) for a, b, q in links))
+
+
+def test_of_two_daemons_of_one_name_one_tells_targets_attitude_and_health() -> None:
+    """One looks north, its attitude thinned as on a radio, the other south."""
+    fleet, seen = Fleet(), set()
+    well, ill = (
+        cdr.DiagnosticArray(NOW_NS, "", (cdr.DiagnosticStatus(level, "uavpose", said, "", ()),))
+        for level, said in ((0, "well"), (2, "ill"))
+    )
+    for k in range(60):
+        now_ns = NOW_NS + k * 100 * MS
+        ours = [incoming(topics.TF, attitude(now_ns, 0.0), k + 1)] if k % 2 == 0 else []
+        ours += [pose(now_ns, k + 1), incoming(topics.DIAGNOSTICS, well, k + 1)]
+        later_ns = now_ns + 10 * MS
+        theirs = [incoming(topics.TF, attitude(later_ns, 180.0), k + 1, OTHER_GID), pose(later_ns, k + 1, 450.0)]
+        theirs.append(
+            incoming(topics.POSE, dataclasses.replace(pose_now(450.0), stamp_ns=later_ns), k + 1, OTHER_GID, "t1")
+        )
+        theirs.append(incoming(topics.DIAGNOSTICS, ill, k + 1, OTHER_GID))
+        for sender, samples in (("a", ours), ("b", theirs)):
+            for one in samples:
+                fleet.take(dataclasses.replace(one, sender=sender), now_ns + 20 * MS)
+        (row,) = fleet.rows(now_ns + 20 * MS)
+        seen |= {(row.health, one.target, round(one.range_m), round(one.bearing_deg)) for one in row.targets}
+    assert seen == {("well", "t0", 300, 0)}
+    assert row.refused == 60 * 4
+    (after,) = [pose(now_ns + 2 * S, 900, 450.0)]
+    assert fleet.take(dataclasses.replace(after, sender="b"), now_ns + 2 * S) is not None, "the first is silent"
