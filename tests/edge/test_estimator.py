@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from edge.errors import InputError
-from edge.estimator.decode import Shown, decode, overlap, pose_covariance
+from edge.estimator.decode import Shown, decode, nearest_expected, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, window_around
@@ -216,6 +217,23 @@ def test_a_size_that_was_not_trained_is_less_sure() -> None:
 def test_two_peaks_on_one_aircraft_are_one_target_and_two_apart_are_two() -> None:
     assert accepted(peaks_of(n=2, apart_px=8.0))[0] == 1
     assert accepted(peaks_of(n=2, apart_px=60.0))[0] == 2
+
+
+def test_of_two_in_a_window_the_one_that_lies_where_the_target_should_be_is_taken() -> None:
+    def at(left_px: float, score: float) -> Estimate:
+        box = np.array([left_px, 0.0, left_px + 40.0, 20.0])
+        return Estimate(score, box, np.eye(3), np.array([0.0, 0.0, 200.0]), np.eye(6), "track")
+
+    here, there = at(0.0, 0.8), at(80.0, 0.95)
+    assert nearest_expected([there, here], [2.0, 0.0, 42.0, 20.0]) is here
+    assert nearest_expected([at(1.0, 0.3), here], [2.0, 0.0, 42.0, 20.0]) is here, "as near, and more sure"
+
+
+@pytest.mark.parametrize(("stage", "offset"), [("acquire", -1.0), ("track", 1.0)])
+def test_each_stage_is_scored_by_its_own_calibration(stage: Literal["acquire", "track"], offset: float) -> None:
+    contract = ModelContract(**(CONTRACT | {"acquire_score": {"offset": -1.0}, "track_score": {"offset": 1.0}}))
+    (e,) = decode(peaks_of(score=0.9), 0, WHOLE, contract, stage, 0.5, Counter())
+    assert e.score == pytest.approx(1.0 / (1.0 + np.exp(-(np.log(9.0) + offset))), rel=1e-4)
 
 
 @given(boxes, boxes)

@@ -210,6 +210,21 @@ def test_streams_rise_each_for_itself_and_new_ones_start_no_earlier_than_a_minut
     assert one.refusal(parsed(signed_frame(now - 61 * 100_000, system=9))) == "replay"
 
 
+def test_a_computer_without_the_time_stamps_after_what_it_heard() -> None:
+    one = signing(utc_ns=lambda: 0)  # 1970
+    heard = timestamp_of(NOW_NS)
+    assert one.refusal(parsed(signed_frame(heard))) is None
+    assert one.next_timestamp() > heard, "else the autopilot would refuse it"
+
+
+def test_a_computer_without_the_time_takes_no_stream_older_than_what_it_heard() -> None:
+    one = signing(utc_ns=lambda: 0)
+    heard = timestamp_of(NOW_NS)
+    assert one.refusal(parsed(signed_frame(heard))) is None
+    assert one.refusal(parsed(signed_frame(heard - 61 * 100_000, system=9))) == "replay"
+    assert one.refusal(parsed(signed_frame(heard - 59 * 100_000, system=9))) is None
+
+
 @given(clock_ns=st.lists(st.integers(0, 4 * 10**18), min_size=1, max_size=20))
 def test_own_timestamps_rise_whatever_the_wall_clock_does_and_keep_up_with_it(clock_ns: list[int]) -> None:
     readings = iter(clock_ns)

@@ -241,6 +241,21 @@ def test_stamps_become_monotonic_time_by_timesync() -> None:
     assert clock.monotonic_ns(sampled_ns + offset_ns, sampled_ns + 15 * MS) == sampled_ns
 
 
+def test_a_stamp_that_timesync_puts_ahead_of_its_arrival_is_of_its_arrival() -> None:
+    sync = TimesyncEstimator()
+    clock = BootClock(sync)
+    exchange(sync, 10_000 * MS, 0, MS, MS)
+    assert clock.monotonic_ns(12_010 * MS, 12_000 * MS) == 12_000 * MS
+
+
+def test_a_crystal_that_runs_slow_makes_no_stamp_old_where_timesync_is_not_answered() -> None:
+    """100 parts in a million are 60 ms after ten minutes, and 3 ms after half a minute."""
+    clock = BootClock(TimesyncEstimator())
+    for now_ms in range(0, 600_000, 1_000):
+        time_ns = clock.monotonic_ns(round(now_ms * MS * (1.0 - 100e-6)), (now_ms + 5) * MS)
+        assert abs(time_ns - now_ms * MS) < 10 * MS
+
+
 def test_a_clock_is_known_less_the_longer_it_was_not_asked_and_least_when_never() -> None:
     sync = TimesyncEstimator()
     clock = BootClock(sync)

@@ -52,6 +52,12 @@ def test_a_position_between_two_far_apart_cuts_no_corner() -> None:
         np.testing.assert_allclose(t_ned_m, circling(time_ms)[0], atol=0.05)
 
 
+def test_in_a_hole_of_seconds_no_position_is_made_up() -> None:
+    told_ms = [*range(0, 1_001, 50), *range(6_000, 7_001, 50)]
+    assert placed(told_ms, 3_500) is None
+    np.testing.assert_allclose(placed(told_ms, 6_500), circling(6_500)[0], atol=0.05)
+
+
 @pytest.mark.parametrize(("gap_ms", "serve"), [(333, True), (1_000, False)])
 def test_a_stream_of_positions_serves_every_picture_or_none(gap_ms: int, serve: bool) -> None:
     """A track changes its frame with each picture that has one and the next that has none."""
@@ -126,6 +132,19 @@ def test_far_from_the_origin_a_target_lies_where_it_is_beside_the_own_ship(lat: 
     assert own_ship.lat_lon_alt is not None
     told = lat_lon_alt_from_ned(own_ship.lat_lon_alt, [10_300.0, 9_800.0, -150.0])
     np.testing.assert_allclose(ned_from_lat_lon_alt(own, told), [300.0, -200.0, -50.0], atol=1.0)
+
+
+def test_a_place_on_the_globe_is_not_told_by_one_of_long_ago() -> None:
+    buffer = OwnShipBuffer()
+    buffer.add_global(0, (47.0, 8.0, 400.0), (0.0, 0.0, 0.0))
+    for time_ms in range(0, 7_001, 20):
+        buffer.add_attitude(time_ms * MS, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_position(time_ms * MS, np.zeros(3), np.zeros(3))
+    soon, later = buffer.at(4_900 * MS), buffer.at(5_200 * MS)
+    assert soon is not None
+    assert later is not None
+    assert soon.lat_lon_alt is not None
+    assert later.lat_lon_alt is None
 
 
 def test_without_local_position_the_own_ship_is_where_it_has_flown_to_and_soon_nowhere() -> None:

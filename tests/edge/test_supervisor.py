@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge import clock
-from edge.config import Config, ConfigFile
+from edge.config import Config, ConfigFile, HealthSettings
 from edge.estimator.model import load_model
 from edge.health import HealthSnapshot, HealthState
 from edge.outlets import Outlets
@@ -56,6 +56,20 @@ def test_a_camera_so_late_that_its_poses_are_withheld_is_no_good_state(
     assert (condition.state is HealthState.DEGRADED) == bool(withheld)
     for link in withheld:
         assert f"{latency_ms} ms from the exposure, [{link}] max_age_ms {AGES[link]:g}" in str(condition)
+
+
+@pytest.mark.parametrize(("latency_ms", "kinds"), [(150, {"slow"}), (50, set())])
+def test_slower_than_the_settings_allow_is_no_good_state(toy_model: Path, latency_ms: int, kinds: set[str]) -> None:
+    supervisor = supervised(toy_model, Outlets(None, None), {})
+    supervisor.apply(HealthSettings(latency_max_ms=100.0))
+    for index in range(3):
+        now_ns = time.monotonic_ns()
+        meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
+        supervisor.frame_done(meta, {"total": latency_ms * 1_000_000}, (), has_attitude=True)
+        supervisor.turn()
+    condition = supervisor.snapshot().condition
+    assert {reason.kind for reason in condition.reasons} == kinds
+    assert (condition.state is HealthState.DEGRADED) == bool(kinds)
 
 
 class Kept(Outlets):

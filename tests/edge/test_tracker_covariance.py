@@ -1,0 +1,101 @@
+"""How sure a track is told to be: in ned, after a doubted stamp, and where one frame is carried over into another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge.tracking import motion as ekf
+from edge.tracking import rotation, so3
+from edge.tracking.motion import STALE_ATTITUDE_RADPS
+from edge.tracking.tracker import Tracker
+from edge.tracking.view import View
+from edge.types import OwnShip, Track
+
+from .test_tracker_parts import LOOKING_NORTH, NORTH_EAST, SIZE_WH, K, sight
+
+MS = 1_000_000
+STILL = OwnShip(1, np.eye(3), np.zeros(3), np.zeros(3), None)
+AHEAD_M = np.array([200.0, 0.0, 0.0])
+
+
+def follow(tracker: Tracker, frames: int = 20) -> tuple[Track, OwnShip]:
+    """The track of a target that crosses 200 m ahead, and the own ship at the last frame."""
+    rng = np.random.default_rng(0)
+    for k in range(frames):
+        own = replace(STILL, time_ns=1 + 33 * k * MS)
+        seen = sight(rng, np.array([0.3 * k, 0.0, 200.0]), NORTH_EAST)
+        (track,) = tracker.update(own.time_ns, [seen], own, K, SIZE_WH)
+    return track, own
+
+
+def test_an_attitude_in_ned_is_no_surer_than_in_the_camera() -> None:
+    track, _ = follow(Tracker(1, LOOKING_NORTH))
+    R_ned_cam = LOOKING_NORTH.R_body_cam
+    assert track.covariance_ned is not None
+    in_cam = np.diag(R_ned_cam @ track.covariance[3:, 3:] @ R_ned_cam.T)
+    assert np.all(np.diag(track.covariance_ned[6:, 6:]) > 0.99 * in_cam)
+
+
+def test_a_velocity_across_a_doubted_stamp_is_forgotten_once_more_after_it() -> None:
+    tracker = Tracker(1, LOOKING_NORTH)
+    _, own = follow(tracker)
+    tracker.doubt_motion()
+    own = replace(own, time_ns=own.time_ns + 1_000 * MS)
+    seen = sight(np.random.default_rng(1), np.array([6.0, 0.0, 200.0]), NORTH_EAST)
+    (track,) = tracker.update(own.time_ns, [seen], own, K, SIZE_WH)
+    assert track.covariance_ned is not None
+    assert np.all(np.sqrt(np.diag(track.covariance_ned)[3:5]) > 50.0)
+
+
+def own_ship_variances(own_ship: OwnShip) -> np.ndarray:
+    """[9] of a target 200 m north: what the own ship's errors do to its place, velocity and attitude."""
+    return np.diag(View.of(0, own_ship, LOOKING_NORTH).own_ship_covariance(AHEAD_M, np.zeros(3)))
+
+
+def test_an_attitude_gone_on_from_leaves_a_target_s_place_and_attitude_in_doubt() -> None:
+    more = own_ship_variances(replace(STILL, attitude_std_rad=0.1)) - own_ship_variances(STILL)
+    np.testing.assert_allclose(more[:3], [0.0, 20.0**2, 20.0**2], atol=1e-6)
+    np.testing.assert_allclose(more[6:], 0.1**2)
+
+
+def test_a_place_told_from_the_own_ship_has_none_of_the_own_place_s_error() -> None:
+    relative = own_ship_variances(replace(STILL, t_ned_body_m=None, v_ned_body_mps=None))
+    assert relative[0] < 1e-9, "along the sight line neither attitude nor own place counts"
+    assert own_ship_variances(STILL)[0] > 1.0
+
+
+def test_a_camera_whose_speed_is_not_told_has_that_at_which_it_came() -> None:
+    """As where a recorded scene is tracked anew: it holds places alone."""
+    silent = replace(STILL, v_ned_body_mps=None)
+    before = View.of(0, silent, LOOKING_NORTH)
+    moved = replace(silent, t_ned_body_m=np.array([2.0, -1.0, 0.5]))
+    np.testing.assert_allclose(View.of(100 * MS, moved, LOOKING_NORTH, before).v_frame_cam_mps, [20.0, -10.0, 5.0])
+    assert View.of(900 * MS, moved, LOOKING_NORTH, before).v_frame_cam_mps is None
+
+
+def test_a_frame_change_by_an_old_attitude_leaves_the_target_in_doubt_across_the_sight_line() -> None:
+    in_ned, in_cam = View.of(0, STILL, LOOKING_NORTH), View.of(0, None, LOOKING_NORTH)
+    estimate = sight(np.random.default_rng(2), np.array([20.0, -10.0, 200.0]), NORTH_EAST)
+    motion, attitude = ekf.begin(estimate, K, in_ned), rotation.begin(estimate, in_ned)
+    fresh, stale = (ekf.reframe(motion, in_ned, in_cam, age_s) for age_s in (0.0, 1.0))
+    across = so3.skew(fresh.t_m)
+    more = (stale.P - fresh.P)[ekf.POSITION, ekf.POSITION]
+    np.testing.assert_allclose(more, STALE_ATTITUDE_RADPS**2 * across @ across.T, atol=1e-6)
+    assert np.sqrt(np.linalg.eigvalsh(more)[-1]) == pytest.approx(STALE_ATTITUDE_RADPS * np.linalg.norm(fresh.t_m))
+    turned, long_turned = (rotation.reframe(attitude, ekf.between(in_ned, in_cam), age_s) for age_s in (0.0, 1.0))
+    np.testing.assert_allclose(long_turned.P - turned.P, STALE_ATTITUDE_RADPS**2 * np.eye(3), atol=1e-9)
+
+
+def test_what_all_frames_share_is_mirrored_with_the_rotation_when_the_other_side_is_taken() -> None:
+    """Along a sight line halfway between north and up, the mirror swaps north and down."""
+    view = View.of(0, STILL, LOOKING_NORTH)
+    begun = rotation.begin(sight(np.random.default_rng(3), np.array([0.0, 0.0, 200.0]), NORTH_EAST), view)
+    wrong = replace(begun, P=np.diag([1.0, 2.0, 3.0]), common=np.diag([4.0, 5.0, 6.0]), picked=-3.0)
+    along = np.array([1.0, 0.0, -1.0]) / np.sqrt(2.0)
+    other = rotation.weighed(wrong, along, None, 0.033, settled=False)
+    assert other.log_odds == pytest.approx(3.0)
+    np.testing.assert_allclose(other.P, np.diag([3.0, 2.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(other.common, np.diag([6.0, 5.0, 4.0]), atol=1e-12)
