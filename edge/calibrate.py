@@ -149,7 +149,7 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
     """Names and gray pictures of a folder, or of a video evenly spread. Raises InputError, naming the file."""
     if source.is_dir():
         for path in list_pictures(source):
-            gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
             if gray is None:
                 raise InputError(f"{path} is not a readable picture")
             yield path.name, np.asarray(gray, dtype=np.uint8)

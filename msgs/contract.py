@@ -22,7 +22,7 @@ import math
 from collections.abc import Mapping
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 METADATA_KEY = "uavpose_contract"
 CONTRACT_VERSION = 1
@@ -38,7 +38,7 @@ class ScoreCalibration(BaseModel):
     it leaves the peak as it is.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     offset: float = 0.0
     slope: float = Field(default=1.0, gt=0)
@@ -69,7 +69,7 @@ def samples_behind(training: Mapping[str, str | int | float]) -> int | None:
 class ModelContract(BaseModel):
     """Everything the daemon must know of a model, and everything a person asks of one."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     version: int = Field(CONTRACT_VERSION, description="version of this contract's layout")
     name: str = Field(description="name of the model")
@@ -77,9 +77,11 @@ class ModelContract(BaseModel):
     backbone: str
     precision: Literal["fp32", "int8"]
     max_peaks: int = Field(ge=1, description="M: targets decoded for each image")
-    acquire_size_wh: tuple[int, int] = Field(description="network input of the whole frame, pixels")
+    acquire_size_wh: tuple[PositiveInt, PositiveInt] = Field(description="network input of the whole frame, pixels")
     acquire_fit: Literal["letterbox", "squash"] = Field(description="how a whole frame is fitted into it")
-    track_size_wh: tuple[int, int] | None = Field(description="network input of a track window; None: no track stage")
+    track_size_wh: tuple[PositiveInt, PositiveInt] | None = Field(
+        description="network input of a track window; None: no track stage"
+    )
     track_window_scale: float = Field(
         gt=1.0, description="side of the window on the frame / longer side of the target's box"
     )

@@ -36,6 +36,8 @@ from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
 from sim_replay.result import judge
 
+_OF_A_FLIGHT, _OF_A_DATASET = ("sequence", "out"), ("model", "split", "every")  # options of `score`
+
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="uavpose-replay", description=__doc__)
@@ -89,9 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     score.add_argument("--sequence", type=Path, metavar="DIR", help="scene folder (default: the one that was flown)")
     score.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: FLIGHT)")
     score.add_argument("--dataset", type=Path, metavar="DIR", help="BOP scene, split or dataset folder")
-    score.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
+    score.add_argument("--model", type=Path, help="ONNX file (default: the shipped one)")
     score.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
-    score.add_argument("--every", type=int, default=1, metavar="N", help="take every N-th picture (default: all)")
+    score.add_argument("--every", type=int, metavar="N", help="take every N-th picture (default: all)")
     score.add_argument("--json", action="store_true", help="print the score as JSON")
     return parser
 
@@ -103,6 +105,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.command == "score":
         if (args.flight is None) == (args.dataset is None):
             raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
+        _check_score_options(args)
         return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
     if args.command == "play" and lockstep.asked_for(args):
         if args.record or args.autopilot != "ardupilot" or bad_link.link_faults(args) != bad_link.LinkFaults():
@@ -120,6 +123,15 @@ def _run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
+def _check_score_options(args: argparse.Namespace) -> None:
+    """Raise InputError for what the other way of scoring takes."""
+    others = _OF_A_DATASET if args.dataset is None else _OF_A_FLIGHT
+    given = ", ".join(f"--{name}" for name in others if getattr(args, name) is not None)
+    if given:
+        one, other = ("--dataset", "FLIGHT") if args.dataset is None else ("FLIGHT", "--dataset")
+        raise InputError(f"{given}: only with {one}, not with {other}")
+
+
 def _score_flight(args: argparse.Namespace, console: Console) -> int:
     flight = read_flight(args.flight)
     sequence = read_sequence(args.sequence or flight.sequence)
@@ -129,22 +141,23 @@ def _score_flight(args: argparse.Namespace, console: Console) -> int:
     told = Console(stderr=True, quiet=True) if args.json else console
     score = report_flight(sequence, flight, args.out or args.flight, told)
     if args.json:
-        print(json.dumps(score, indent=2))
+        print(json.dumps(score, indent=2, allow_nan=False))
     return 0
 
 
 def _score_dataset(args: argparse.Namespace, console: Console) -> int:
-    if args.every < 1:
-        raise InputError(f"--every {args.every}: must be at least 1")
-    model = load_model(args.model, DEFAULT_THREADS)
+    every = 1 if args.every is None else args.every
+    if every < 1:
+        raise InputError(f"--every {every}: must be at least 1")
+    model = load_model(args.model or SHIPPED_MODEL, DEFAULT_THREADS)
     dataset = open_dataset(args.dataset, args.split)
-    pictures = dataset.labelled_frames()[:: args.every]
+    pictures = dataset.labelled_frames()[::every]
     with Progress(console=console, disable=args.json or not console.is_terminal) as progress:
         task = progress.add_task("scoring", total=len(pictures))
         judged = judge_frames(pictures, dataset.models, estimator_answers(model), lambda _: progress.advance(task))
     score = score_of(dataset, method_of(model), judged)
     if args.json:
-        print(json.dumps(score, indent=2))
+        print(json.dumps(score, indent=2, allow_nan=False))
     else:
         console.print(score_table(score))
     return 0

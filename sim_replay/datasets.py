@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from edge.estimator.lens import Lens, lens_of
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.fields import integer, load_json
-from sim_replay.bop.layout import TARGETS_FILE
+from sim_replay.bop.layout import TARGETS_FILE, dataset_of
 from sim_replay.bop.scene import Image, Mask, read_picture_bgr
 
 Array = NDArray[np.float64]
@@ -46,6 +46,7 @@ class DatasetFrame:
     scene: BopScene = field(repr=False)
     target_indices: tuple[int, ...]  # of each target among all that the scene lists for this picture
     truth_known: bool = True  # as sim_replay.bop.BopFrame has it
+    unlisted: tuple[BopTarget, ...] = ()  # others that are there, but test_targets_bop19.json does not ask for
 
     def image_bgr(self) -> Image:
         """The picture as it is on disk [H, W, 3]. Raises BopError."""
@@ -98,9 +99,10 @@ class Dataset:
     def frames(self) -> Iterator[DatasetFrame]:
         """Every frame that has a picture, by scene and image id; of a test split those in test_targets_bop19.json.
 
-        Raises BopError, naming file and key.
+        Raises BopError, naming file and key; at the end, too, if that lists no picture that there is.
         """
         wanted = self._wanted
+        passed_over, listed = 0, False
         for scene in self.scenes:
             sizes: dict[str, tuple[int, int]] = {}
             frames = scene.pictured
@@ -110,9 +112,13 @@ class Dataset:
                 indices: Sequence[int] = range(len(frame.targets))
                 if wanted is not None and _is_test(scene):
                     if (scene.scene_id, frame.image_id) not in wanted:
+                        passed_over += 1
                         continue
+                    listed = True
                     indices = _chosen(frame.targets, wanted[scene.scene_id, frame.image_id])
                 yield self._frame(scene, frame, indices, sizes)
+        if passed_over and not listed:
+            raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
 
     def labelled_frames(self) -> list[DatasetFrame]:
         """Those of frames() whose truth is known: some datasets keep that of their test splits to themselves.
@@ -150,7 +156,8 @@ class Dataset:
         self, scene: BopScene, frame: BopFrame, indices: Sequence[int], sizes: dict[str, tuple[int, int]]
     ) -> DatasetFrame:
         path = scene.image_path(frame)
-        targets = [_with_box(scene, frame, index) for index in indices]
+        unlisted = [index for index in range(len(frame.targets)) if index not in indices]
+        targets = [_with_box(scene, frame, index) for index in (*indices, *unlisted)]
         if any(_unseen(target) for target in targets) and "wh" not in sizes:
             height, width = read_picture_bgr(path).shape[:2]  # of the scene's first; they are alike
             sizes["wh"] = (width, height)
@@ -164,10 +171,11 @@ class Dataset:
             frame.K,
             frame.distortion,
             path,
-            placed,
+            placed[: len(indices)],
             scene,
             tuple(indices),
             frame.truth_known,
+            placed[len(indices) :],
         )
 
 
@@ -180,9 +188,13 @@ def open_dataset(path: Path, split: str | None = None) -> Dataset:
             None takes all that is in `path`.
 
     Raises:
-        BopError: There is no scene, no such split, or a file is not as it should be.
+        BopError: There is no scene, no such split, more than one dataset, or a file is not as it should be.
     """
     scenes = find_scenes(path)
+    holders = {dataset_of(scene): scene for scene in scenes}
+    if len(holders) > 1:
+        told = ", ".join(str(root or f"that of {scene.folder}") for root, scene in holders.items())
+        raise BopError(f"{path}: holds the scenes of more than one dataset: {told}; name one of them")
     splits = list(dict.fromkeys(scene.split for scene in scenes if scene.split))
     if split is not None:
         chosen = [split] if split in splits else [name for name in splits if name.startswith(f"{split}_")]
@@ -242,6 +254,11 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
         mask = scene.whole_mask(frame, index)
     if mask is None:
         return target
+    if mask.any() and target.t_cam_target_m[2] <= 0:
+        raise BopError(
+            f"{scene.folder}: a mask shows obj_id {target.object_id} in picture {frame.image_id}, "
+            "but its cam_t_m2c lies behind the camera"
+        )
     return replace(target, box_visible_xyxy_px=box_of_mask(mask), visible_px=int(mask.sum()))
 
 

@@ -25,6 +25,7 @@ from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
 # How far the first and the last exposure may lie outside the telemetry: one row of the slowest that is taken.
 UNCOVERED_NS_MAX = 110_000_000
+_FPS_LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ def read_scene_truth(folder: Path) -> SceneTruth:
             if target.object_id not in models:
                 raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
-            instance, visible = seen[target.object_id], target.visible_px != 0
+            instance, visible = seen[target.object_id], target.visible_px != 0 and t_m[2] > 0
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
             truths.append(Truth(index, R, t_m, *known, instance=instance, visible=visible))
             seen[target.object_id] += 1
@@ -132,8 +133,10 @@ def read_sequence(folder: Path) -> PlayedSequence:
         fps = float(settings["fps"])
         frame0_ns = int(settings["t0_ns"])
         gimballed = settings.get("mount", "fixed") == "gimbal"
-    if not (math.isfinite(fps) and fps > 0.0):
-        raise InputError(f"{folder / 'sequence.toml'}: fps is {fps:g}; it must be a number above 0")
+    if not (math.isfinite(fps) and fps >= _FPS_LEAST):
+        raise InputError(
+            f"{folder / 'sequence.toml'}: fps is {fps:g}; it must be a number above 0, at least {_FPS_LEAST:g}"
+        )
     telemetry_csv, gimbal = folder / "telemetry.csv", None
     try:
         telemetry = read_telemetry(telemetry_csv)
@@ -186,5 +189,5 @@ def _blame(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]!r} is missing") from error
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: not as expected: {error}") from error

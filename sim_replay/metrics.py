@@ -117,7 +117,10 @@ def rotation_inside(R_est: ArrayLike, R_gt: ArrayLike, covariance: ArrayLike, si
 def nees(
     R_est: ArrayLike, t_est: ArrayLike, R_gt: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """Normalised estimation error squared [...]: e' P^-1 e of the whole pose, of its position and of its rotation."""
+    """Normalised estimation error squared [...]: e' P^-1 e of the whole pose, of its position and of its rotation.
+
+    NaN for each of the three whose covariance is singular: what is told as beyond doubt has no such error.
+    """
     est = np.asarray(R_est, dtype=np.float64)
     turn_rad = so3_log(np.asarray(R_gt, dtype=np.float64) @ np.swapaxes(est, -1, -2))
     shift_m = np.asarray(t_gt, dtype=np.float64) - np.asarray(t_est, dtype=np.float64)
@@ -125,7 +128,9 @@ def nees(
     P = np.asarray(covariance, dtype=np.float64)
 
     def of(part: slice) -> Array:
-        e = error[..., part]
-        return np.sum(e * np.linalg.solve(P[..., part, part], e[..., None])[..., 0], axis=-1)
+        e, of_part = error[..., part], P[..., part, part]
+        sound = np.linalg.slogdet(of_part)[0] != 0.0
+        inverted = np.where(sound[..., None, None], of_part, np.eye(of_part.shape[-1]))
+        return np.where(sound, np.sum(e * np.linalg.solve(inverted, e[..., None])[..., 0], axis=-1), np.nan)
 
     return of(slice(0, 6)), of(slice(0, 3)), of(slice(3, 6))

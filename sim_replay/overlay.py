@@ -91,14 +91,14 @@ def draw_pose(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color
 
 
 class Overlay:
-    """Draws the frames of one replay. Layout follows the height of the frame."""
+    """Draws the frames of one replay. Layout follows the height of the frame; the inset ends where its width does."""
 
     def __init__(self, views: Sequence[FrameView], size_wh: tuple[int, int]) -> None:
         self._views = views
         self._width, self._height = size_wh
         self._unit = self._height / 1080.0
         self._font: Any = cv2.FontFace("sans")
-        self._inset_px = self._px(480)
+        self._inset_px = max(1, min(self._px(480), self._width - 2 * self._px(32)))
         self._inset_left = self._px(32) if self._targets_mostly_right() else self._width - self._px(32) - self._inset_px
         self._series = _series(views)
 

@@ -44,6 +44,7 @@ class Truth(TargetPose):
     points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
     instance: int = field(default=0, kw_only=True)  # which of the targets of that object
     visible: bool = field(default=True, kw_only=True)  # False: the sequence says that nothing of it is to be seen
+    wanted: bool = field(default=True, kw_only=True)  # False: it is there, but the dataset asks nothing of it
 
     @property
     def airframe_label(self) -> str:
@@ -125,13 +126,16 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
     return [Match(truth, found.get(i)) for i, truth in enumerate(truths)], false_poses
 
 
-def statistics(frames: int, matches: Sequence[Match], false_poses: Sequence[TargetPose] = ()) -> dict[str, Any]:
+def statistics(
+    frames: int, matches: Sequence[Match], false_poses: Sequence[TargetPose] = (), also_occupied: Iterable[int] = ()
+) -> dict[str, Any]:
     """All figures of a score: {"overall", "by_range", "by_airframe"}, each of `pose_statistics`'s form.
 
-    `frames` is how many there are; matches and poses name theirs by index 0..frames-1. A range band counts the frames
-    that hold a target in it, and the false positives whose own range lies in it; an airframe has no false positives.
+    `frames` is how many there are; matches and poses name theirs by index 0..frames-1, and so does `also_occupied`
+    those that show an aircraft of which nothing is asked. A range band counts the frames that hold a target in it, and
+    the false positives whose own range lies in it; an airframe has no false positives.
     """
-    with_target = {match.truth.frame for match in matches}
+    with_target = {match.truth.frame for match in matches}.union(also_occupied)
     in_empty = [pose for pose in false_poses if pose.frame not in with_target]
     empty = frames - len(with_target)
     false_rate = lambda poses: _told(metrics.false_positives_per_1000(len(poses), empty))  # noqa: E731

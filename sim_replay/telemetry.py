@@ -58,25 +58,29 @@ class Telemetry:
 def read_telemetry(path: Path) -> Telemetry:
     """Read `telemetry.csv`. Raises TelemetryError."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before UTF-8
             reader = csv.reader(file)
             header = tuple(next(reader, ()))
-            rows = list(reader)
+            lines = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError) as error:
         raise TelemetryError(f"{path}: cannot be read: {getattr(error, 'strerror', 'not UTF-8 text')}") from error
+    except csv.Error as error:
+        raise TelemetryError(f"{path}: line {reader.line_num} is not CSV: {error}") from error
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise TelemetryError(f"{path}: column {missing[0]} is missing")
     order = [header.index(name) for name in COLUMNS]
-    values = np.empty((len(rows), len(COLUMNS) - 1))
-    t_ns = np.empty(len(rows), dtype=np.int64)
-    for line, row in enumerate(rows):
+    values = np.empty((len(lines), len(COLUMNS) - 1))
+    t_ns = np.empty(len(lines), dtype=np.int64)
+    for k, (line, row) in enumerate(lines):
         try:
-            t_ns[line] = int(row[order[0]])
-            values[line] = [float(row[column]) for column in order[1:]]
+            t_ns[k] = int(row[order[0]])
+            values[k] = [float(row[column]) for column in order[1:]]
         except (ValueError, IndexError) as error:
-            raise TelemetryError(f"{path}: line {line + 2} does not hold {len(COLUMNS)} numbers") from error
-    if len(rows) < 2 or not (np.diff(t_ns) > 0).all():
+            raise TelemetryError(f"{path}: line {line} does not hold {len(COLUMNS)} numbers") from error
+        except OverflowError as error:
+            raise TelemetryError(f"{path}: line {line}: t_ns is beyond 64 bits") from error
+    if len(lines) < 2 or not (np.diff(t_ns) > 0).all():
         raise TelemetryError(f"{path}: t_ns must rise over at least two rows")
     if not np.isfinite(values).all() or not np.allclose(np.linalg.norm(values[:, :4], axis=1), 1.0, atol=1e-3):
         raise TelemetryError(f"{path}: a value is not finite or a quaternion is not of unit length")

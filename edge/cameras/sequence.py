@@ -169,7 +169,7 @@ def _flat(numbers: object) -> Array:
 
 
 def _decode(path: Path) -> NDArray[np.uint8]:
-    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image_bgr is None:
         raise InputError(f"{path} is not a readable picture")
     return np.asarray(image_bgr, dtype=np.uint8)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.bop import BopFrame, SceneWriter
+from sim_replay.bop.write import write_picture
 
 INDICES = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
 PICTURES = ("rgb", "mask", "mask_visib")
@@ -57,6 +58,8 @@ class SceneStore:
         self._lock = (self._part / "lock").open("w")
         fcntl.flock(self._lock, fcntl.LOCK_EX)  # the process that was stopped may still be at its last frame
         self._entries = dict(_journal_entries(self._part / "journal.jsonl"))
+        if self._keep_raw:  # a picture that is gone or torn is made again
+            self._entries = {number: entry for number, entry in self._entries.items() if self._raw(number) is not None}
         text = "".join(_journal_line(number, entry) for number, entry in self._entries.items())
         replace_text(self._part / "journal.jsonl", text)
         self._write_indices()
@@ -95,14 +98,16 @@ class SceneStore:
     def raw_images(self) -> Iterator[Image]:
         """The pictures kept so far, in order."""
         for number in sorted(self._entries):
-            yield np.asarray(cv2.imread(str(self._raw_path(number)), cv2.IMREAD_COLOR), np.uint8)
+            pixels = self._raw(number)
+            if pixels is None:
+                raise OSError(f"{self._raw_path(number)} is not a readable picture")
+            yield np.asarray(pixels, np.uint8)
 
     def replace_images(self, images: Iterator[Image]) -> None:
         """Put these pictures in the place of those stored, in order."""
         fresh = self._part / "replaced.jpg"
         for number, image in zip(sorted(self._entries), images, strict=True):
-            if not cv2.imwrite(str(fresh), image, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]):
-                raise OSError(f"{fresh} cannot be written")
+            write_picture(fresh, image, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])
             os.replace(fresh, self.folder / "rgb" / f"{number:06d}.jpg")
 
     def finish(self, files: Mapping[str, Callable[[Path], None]], last: str) -> None:
@@ -118,8 +123,12 @@ class SceneStore:
     def _store_raw(self, number: int, image_bgr: Image) -> None:
         path = self._raw_path(number)
         path.parent.mkdir(exist_ok=True)
-        if not cv2.imwrite(str(path), image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f"{path} cannot be written")
+        write_picture(path, image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+    def _raw(self, number: int) -> Image | None:
+        """None: there is none that can be read."""
+        path = self._raw_path(number)
+        return cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None  # type: ignore[return-value]
 
     def _write_indices(self) -> None:
         for name in INDICES:

@@ -83,7 +83,10 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
         _take_frame(counts, split, frame, size[0] * size[1], names)
     flown = _toml(scene.folder / "sequence.toml")
     if flown.get("airframe") and "flight_seed" in flown:
-        counts.flights[split].add((str(flown["airframe"]), int(flown["flight_seed"])))
+        seed = flown["flight_seed"]
+        if not isinstance(seed, int):
+            raise InputError(f"{scene.folder / 'sequence.toml'}: flight_seed is not a whole number: {seed!r}")
+        counts.flights[split].add((str(flown["airframe"]), seed))
 
 
 def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sim_replay.bop.records import MM_PER_M, Array, BopError
 
+_DIGITS_MOST = 18  # of a picture's number, in 64 bits
 ROTATION_TOLERANCE = 0.02  # of R R^T from the unit matrix: single precision and rounded files pass, a shear does not
 
 
@@ -23,6 +24,10 @@ def load_json(path: Path) -> Any:
         raise BopError(f"{path} cannot be read: {getattr(error, 'strerror', 'not UTF-8 text')}") from error
     except json.JSONDecodeError as error:
         raise BopError(f"{path} line {error.lineno} is not JSON: {error.msg}") from error
+    except RecursionError as error:
+        raise BopError(f"{path} nests lists or objects too deep") from error
+    except ValueError as error:  # of a number of thousands of digits
+        raise BopError(f"{path} cannot be read: {error}") from error
 
 
 def load_object(path: Path, optional: bool = False) -> dict[str, Any]:
@@ -42,8 +47,8 @@ def by_number(path: Path, entries: dict[str, Any]) -> dict[int, Any]:
 
 def number_key(path: Path, key: str) -> int:
     """The number that a picture or model goes by. Raises BopError."""
-    if not key.isdecimal():
-        raise BopError(f"{path}: {key!r} is not the number of a picture or model")
+    if not key.isdecimal() or len(key) > _DIGITS_MOST:
+        raise BopError(f"{path}: {key[:80]!r} is not the number of a picture or model")
     return int(key)
 
 

@@ -58,7 +58,7 @@ def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]
         raise BopError(f"{source.gt}: {key!r} is not a list of objects")
     if info is not None and (not isinstance(info, list) or len(info) != len(poses)):
         raise BopError(f"{source.gt_info}: {key!r} does not list the {len(poses)} objects of {source.gt.name}")
-    return [
+    targets = [
         BopTarget(
             integer(source.gt, key, entry, "obj_id"),
             rotation(source.gt, key, entry, "cam_R_m2c"),
@@ -67,23 +67,37 @@ def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]
         )
         for index, entry in enumerate(poses)
     ]
+    for target in targets:
+        if not target.t_cam_target_m.any():
+            raise BopError(f"{source.gt}: 'cam_t_m2c' of {key!r} puts obj_id {target.object_id} into the camera itself")
+        if target.t_cam_target_m[2] <= 0 and target.box_visible_xyxy_px is not None and target.visible_px != 0:
+            raise BopError(
+                f"{source.gt}: 'cam_t_m2c' of {key!r} puts obj_id {target.object_id} behind the camera, "
+                f"but {source.gt_info.name} has a 'bbox_visib' of it"
+            )
+    return targets
 
 
 def _seen(path: Path, key: str, entry: Any) -> dict[str, Any]:
     """What scene_gt_info says of a target; its visible box is what others build on, the rest may be absent."""
-    seen: dict[str, Any] = {"box_visible_xyxy_px": _box(path, key, entry, "bbox_visib")}
-    if "bbox_obj" in entry:
-        seen["box_whole_xyxy_px"] = _box(path, key, entry, "bbox_obj")
+    seen: dict[str, Any] = {}
+    if not isinstance(entry, dict):
+        raise BopError(f"{path}: {key!r} does not hold what is seen of each object")
     for field, name in (("visible_px", "px_count_visib"), ("whole_px", "px_count_all")):
         if name in entry:
             seen[field] = integer(path, key, entry, name)
+    seen["box_visible_xyxy_px"] = _box(path, key, entry, "bbox_visib", seen.get("visible_px", 0))
+    if "bbox_obj" in entry:
+        seen["box_whole_xyxy_px"] = _box(path, key, entry, "bbox_obj", seen.get("whole_px", 0))
     if seen["box_visible_xyxy_px"] is None:
         seen["visible_px"] = 0
     return seen
 
 
-def _box(path: Path, key: str, entry: Any, name: str) -> Array | None:
+def _box(path: Path, key: str, entry: Any, name: str, pixels: int) -> Array | None:
     x, y, width, height = matrix(path, key, entry, name, (4,))
+    if pixels > 0 and min(width, height) == 0:
+        width, height = max(width, 1), max(height, 1)  # bop_toolkit's sides are one pixel short
     if width <= 0 or height <= 0:
         return None
     return np.array([x, y, x + width, y + height]) - 0.5

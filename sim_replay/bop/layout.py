@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count, pairwise
 from pathlib import Path
 
 from sim_replay.bop.model_frame import MODEL_FRAME_FILE, read_model_frames
@@ -22,7 +23,7 @@ TARGETS_FILE = "test_targets_bop19.json"
 def find_scenes(path: Path) -> tuple[BopScene, ...]:
     """The scenes in `path`, a scene, split or dataset folder, by split and number; their files are not read yet.
 
-    Raises BopError if there is none.
+    Raises BopError if there is none, or two of one split have one number.
     """
     if not path.is_dir():
         raise BopError(f"{path} is not a folder")
@@ -50,6 +51,11 @@ def find_root(folder: Path) -> Path | None:
         if models_folder(candidate) is not None or any(path.is_file() for path in named):
             return candidate
     return next((c for c in (here, *here.parents[:2]) if (c / "camera.json").is_file()), None)
+
+
+def dataset_of(scene: BopScene) -> Path | None:
+    """The dataset that holds the scene; None where nothing tells, as where a camera.json lies in the scene itself."""
+    return None if scene.root == _absolute(scene.folder) else scene.root
 
 
 def _absolute(folder: Path) -> Path:
@@ -90,21 +96,24 @@ def _scene(folder: Path) -> BopScene:
 
 
 def _root_and_split(folder: Path, holder: Path) -> tuple[Path | None, str | None]:
-    """The dataset of `folder` and the split's name, if `holder`, which holds the pictures' scenes, is a split."""
+    """The dataset of `folder`, and its split's name if `holder`, which holds the scenes, is one or lies in one."""
     root = find_root(folder)
     if root is not None:
-        return root, holder.name if root in holder.parents else None
+        return root, holder.relative_to(root).parts[0] if root in holder.parents else None
     named = re.match(r"train|val|test", holder.name)
     return (holder.parent, holder.name) if named else (None, None)
 
 
 def _numbered(scenes: list[BopScene]) -> tuple[BopScene, ...]:
-    """Sorted; where folder names are no numbers, or one number comes twice, scenes count from 0 in each split."""
-    ordered = sorted(scenes, key=lambda scene: (scene.split or "", scene.scene_id, str(scene.folder)))
+    """Sorted; in each split, scenes whose folders are no numbers count on above the highest. Raises BopError."""
+    ordered = sorted(scenes, key=lambda s: (s.split or "", s.scene_id < 0, s.scene_id, str(s.folder)))
     out = []
-    for split in dict.fromkeys(scene.split for scene in ordered):
-        group = [scene for scene in ordered if scene.split == split]
-        ids = [scene.scene_id for scene in group]
-        clear = min(ids) >= 0 and len(set(ids)) == len(ids)
-        out += [scene if clear else replace(scene, scene_id=index) for index, scene in enumerate(group)]
+    for split in dict.fromkeys((dataset_of(scene), scene.split) for scene in ordered):
+        group = [scene for scene in ordered if (dataset_of(scene), scene.split) == split]
+        for before, after in pairwise(group):
+            if before.scene_id == after.scene_id >= 0:
+                both = f"{before.folder} and {after.folder}"
+                raise BopError(f"{both}: both are scene {after.scene_id} of one split; give one of them another number")
+        above = count(max(scene.scene_id for scene in group) + 1)
+        out += [scene if scene.scene_id >= 0 else replace(scene, scene_id=next(above)) for scene in group]
     return tuple(out)

@@ -198,7 +198,7 @@ def _tell_once_of_dark_pictures(folder: Path) -> None:
 
 
 def _pixels(path: Path, flags: int) -> NDArray[Any]:
-    pixels = cv2.imread(str(path), flags)
+    pixels = cv2.imread(str(path), flags | cv2.IMREAD_IGNORE_ORIENTATION)  # labels are of the pixels as they lie
     if pixels is None:
         raise BopError(f"{path} is not a readable picture")
     return pixels

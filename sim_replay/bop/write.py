@@ -54,8 +54,7 @@ class SceneWriter:
                 written as the silhouette too, unless the target's `whole_px` says that more of it exists.
         """
         path = self.folder / "rgb" / f"{frame.image_id:06d}.jpg"
-        if not cv2.imwrite(str(path), image_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality]):
-            raise OSError(f"{path} cannot be written")
+        write_picture(path, image_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         for index, mask in enumerate(masks):
             self._write_mask("mask_visib", frame.image_id, index, mask)
             if not whole_masks and frame.targets[index].whole_px in (None, frame.targets[index].visible_px):
@@ -71,8 +70,7 @@ class SceneWriter:
 
     def _write_mask(self, kind: str, image_id: int, index: int, mask: NDArray[np.bool_]) -> None:
         path = self.folder / kind / f"{image_id:06d}_{index:06d}.png"
-        if not cv2.imwrite(str(path), mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 9]):
-            raise OSError(f"{path} cannot be written")
+        write_picture(path, mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
     def close(self) -> None:
         """Write scene_camera.json, scene_gt.json and scene_gt_info.json for the frames so far."""
@@ -82,6 +80,14 @@ class SceneWriter:
         _write_lines(
             self.folder / "scene_gt_info.json", {f.image_id: [_info_entry(t) for t in f.targets] for f in frames}
         )
+
+
+def write_picture(path: Path, pixels: NDArray[np.uint8], how: Sequence[int]) -> None:
+    """Encode by the name's suffix, `how` being OpenCV's flags. Raises OSError, also where imwrite overlooks one."""
+    encoded, data = cv2.imencode(path.suffix, pixels, how)
+    if not encoded:
+        raise OSError(f"{path} cannot be written")
+    path.write_bytes(data.tobytes())
 
 
 def _write_lines(path: Path, entries: Mapping[int, Any]) -> None:

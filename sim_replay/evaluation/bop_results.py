@@ -7,6 +7,7 @@ three numbers parted by spaces, of the dataset's model axes, t in millimetres; t
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from edge.errors import InputError
 from sim_replay.bop.records import MM_PER_M
 from sim_replay.datasets import Dataset, DatasetFrame
-from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame
+from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame, is_seen
 from sim_replay.score import TargetPose
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -79,6 +80,10 @@ def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
 def file_answers(path: Path, dataset: Dataset) -> Answerer:
     """Answers from a results file; poses of pictures that are not asked for stay unused.
 
+    Of each object, a picture has as many poses held against the truth as aircraft of it are there: as in BOP those of
+    the best score, of equal ones the first, or the truth would choose. Where one has none, it is the best of those
+    that name an object which is not there (a model-free method names none). The rest are false.
+
     Raises InputError if the file is not as it should be, none of its rows is of the dataset's pictures, or two splits
     of the dataset share a scene's number.
     """
@@ -95,9 +100,28 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
     def answer(index: int, picture: DatasetFrame) -> Answer:
         rows = by_picture.get((picture.scene_id, picture.image_id), [])
         times_s = [row.time_s for row in rows if row.time_s >= 0]
-        return Answer(tuple(_pose(index, row, picture) for row in rows), 1e3 * max(times_s) if times_s else None)
+        best = _best(rows, [t.object_id for t in (*picture.targets, *picture.unlisted) if is_seen(t)])
+        kept, surplus = ([row for row in rows if (id(row) in best) is one] for one in (True, False))
+        return Answer(
+            tuple(_pose(index, row, picture) for row in kept),
+            1e3 * max(times_s) if times_s else None,
+            surplus=tuple(_pose(index, row, picture) for row in surplus),
+        )
 
     return answer
+
+
+def _best(rows: Sequence[ResultRow], there: Sequence[int]) -> set[int]:
+    """Which rows, by id(), count for the aircraft that are `there`, told by their objects."""
+    left, best = Counter(there), set()
+    others = []
+    for row in sorted(rows, key=lambda row: -row.score):
+        if left[row.object_id] > 0:
+            left[row.object_id] -= 1
+            best.add(id(row))
+        elif row.object_id not in there:
+            others.append(id(row))
+    return best.union(others[: left.total()])
 
 
 def _pose(index: int, row: ResultRow, picture: DatasetFrame) -> TargetPose:

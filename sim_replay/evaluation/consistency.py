@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from msgs.geometry import Array
 from sim_replay import metrics
 from sim_replay.evaluation.instances import instances
 from sim_replay.evaluation.judge import JudgedFrame
@@ -14,41 +15,49 @@ from sim_replay.score import Match, stacked
 
 DEGREES_OF_FREEDOM = 3
 SHARE_INSIDE = 0.95
+_Scene = tuple[str, int]  # folder and number: those of an imagewise dataset share a folder
 
 
 def consistency(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
-    """{"flights", "position", "rotation"}; None where no pose has a covariance, rotation None where none is known.
+    """{"flights", "singular", "position", "rotation"}; None where no pose has a covariance.
 
     e' P^-1 e (Bar-Shalom's NEES) is averaged over the frames of each flight, one target through one scene. Frames of a
     flight share most of their error, so a flight counts as one draw of chi-square with 3 degrees of freedom: the mean
     over n honest flights is 3 and lies inside `bounds_95` 95 times in 100, and 95 % of them lie inside their own.
     A mean below says that covariances are too wide, one above that they are too narrow. Rotation's is over the poses
-    that tell one, and over the flights that have such a pose.
+    that tell one, and over the flights that have such a pose: None where none has. A covariance that has no inverse,
+    of position or of rotation, tells no such error: `singular` counts the poses with one, and they are in no mean.
     """
     flights = [_mean_nees(matches) for matches in _flights(judged).values()]
     if not flights:
         return None
-    position, rotation = np.array(flights).T
-    turned = rotation[np.isfinite(rotation)]
+    position, rotation, singular = np.array(flights).T
     return {
         "flights": len(flights),
-        "position": _judged(position),
-        "rotation": _judged(turned) if turned.size else None,
+        "singular": int(singular.sum()),
+        "position": _judged(position[np.isfinite(position)]),
+        "rotation": _judged(rotation[np.isfinite(rotation)]),
     }
 
 
-def _mean_nees(matches: Sequence[Match]) -> tuple[float, float]:
-    """Mean of position's and of rotation's normalised error squared, the latter NaN where no pose tells a rotation.
+def _mean_nees(matches: Sequence[Match]) -> tuple[float, float, int]:
+    """Mean of position's and of rotation's normalised error squared, and how many poses are left out of one or both.
 
-    Each match has an estimate with covariance.
+    NaN where no pose has such an error, or tells a rotation. Each match has an estimate with covariance.
     """
     estimates = [match.estimate for match in matches if match.estimate is not None]
     R_gt, t_gt = stacked([match.truth for match in matches])
     R_est, t_est = stacked(estimates)
     covariance = np.array([estimate.covariance for estimate in estimates])
     _, position, rotation = metrics.nees(R_est, t_est, R_gt, t_gt, covariance)
-    turned = rotation[[estimate.rotation_known for estimate in estimates]]
-    return float(position.mean()), float(turned.mean()) if turned.size else np.nan
+    known = np.array([estimate.rotation_known for estimate in estimates], dtype=np.bool_)
+    singular = np.isnan(position) | (known & np.isnan(rotation))
+    return _mean(position), _mean(rotation[known]), int(singular.sum())
+
+
+def _mean(values: Array) -> float:
+    told = values[~np.isnan(values)]
+    return float(told.mean()) if told.size else np.nan
 
 
 def bounds_95(flights: int) -> tuple[float, float]:
@@ -60,21 +69,24 @@ def bounds_95(flights: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _flights(judged: Sequence[JudgedFrame]) -> dict[tuple[str, int, int], list[Match]]:
-    by_scene: dict[str, list[Match]] = {}
+def _flights(judged: Sequence[JudgedFrame]) -> dict[tuple[_Scene, int, int], list[Match]]:
+    by_scene: dict[_Scene, list[Match]] = {}
     for frame in judged:
-        by_scene.setdefault(str(frame.picture.scene.folder), []).extend(frame.matches)
-    flights: dict[tuple[str, int, int], list[Match]] = {}
-    for scene, matches in by_scene.items():
+        scene = frame.picture.scene
+        by_scene.setdefault((str(scene.folder), scene.scene_id), []).extend(frame.matches)
+    flights: dict[tuple[_Scene, int, int], list[Match]] = {}
+    for of_scene, matches in by_scene.items():
         truths = [match.truth for match in matches]
         numbers = instances(truths, [truth.t_cam_target_m for truth in truths])
         for match, number in zip(matches, numbers, strict=True):
             if match.estimate is not None and match.estimate.covariance is not None:
-                flights.setdefault((scene, match.truth.object_id, number), []).append(match)
+                flights.setdefault((of_scene, match.truth.object_id, number), []).append(match)
     return flights
 
 
-def _judged(means: np.ndarray) -> dict[str, Any]:
+def _judged(means: Array) -> dict[str, Any] | None:
+    if not means.size:
+        return None
     low, high = bounds_95(1)
     return {
         "nees_mean": round(float(means.mean()), 4),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from edge.errors import InputError
-from sim_replay.bop import Model
+from sim_replay.bop import BopTarget, Model
 from sim_replay.datasets import Dataset, DatasetFrame
 from sim_replay.score import Match, TargetPose, Truth, latency_statistics, match_poses, statistics
 
@@ -19,6 +19,7 @@ class Answer:
     poses: tuple[TargetPose, ...]
     time_ms: float | None  # it took; None: not known
     measured: tuple[TargetPose, ...] | None = None  # what a tracker was given of this picture; None: no tracker
+    surplus: tuple[TargetPose, ...] = ()  # poses beyond the aircraft there are: false, wherever they lie
 
 
 Answerer = Callable[[int, DatasetFrame], Answer]  # the index is what the poses name as their frame
@@ -33,16 +34,23 @@ class JudgedFrame:
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
     measured: tuple[Match, ...] = ()  # of the same targets, what a tracker was given of them; empty without one
+    not_asked: tuple[Truth, ...] = ()  # others that are there: who finds them is neither right nor wrong
+
+
+def is_seen(target: BopTarget) -> bool:
+    """Whether something of it may be seen: the dataset says so, or does not say and it is not behind the camera."""
+    known = target.visible_px is not None or target.box_visible_xyxy_px is not None
+    return target.visible_px != 0 if known else bool(target.t_cam_target_m[2] > 0)
 
 
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
-    """The picture's targets of which something is seen, with size, name and model points.
+    """The picture's targets of which something is seen, with size, name and model points; then those not asked for.
 
     Raises InputError for an object without a model.
     """
     truths = []
-    for target in picture.targets:
-        if target.visible_px == 0:
+    for target, wanted in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
+        if not is_seen(target):
             continue
         model = models.get(target.object_id)
         if model is None:
@@ -59,6 +67,7 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
                 model.diameter_m,
                 model.name,
                 model.points_m,
+                wanted=wanted,
             )
         )
     return truths
@@ -78,10 +87,21 @@ def judge_frames(
         matches, false_poses = match_poses(truths, answered.poses)
         measured = match_poses(truths, answered.measured)[0] if answered.measured is not None else ()
         judged.append(
-            JudgedFrame(picture, tuple(matches), tuple(false_poses), answered.time_ms, measured=tuple(measured))
+            JudgedFrame(
+                picture,
+                _wanted(matches),
+                (*false_poses, *answered.surplus),
+                answered.time_ms,
+                measured=_wanted(measured),
+                not_asked=tuple(truth for truth in truths if not truth.wanted),
+            )
         )
         on_frame(judged[-1])
     return judged
+
+
+def _wanted(matches: Sequence[Match]) -> tuple[Match, ...]:
+    return tuple(match for match in matches if match.truth.wanted)
 
 
 def score_of(dataset: Dataset, method: dict[str, Any], judged: Sequence[JudgedFrame]) -> dict[str, Any]:
@@ -96,5 +116,5 @@ def score_of(dataset: Dataset, method: dict[str, Any], judged: Sequence[JudgedFr
         "split": dataset.split,
         "method": method,
         "time_ms": latency_statistics([frame.time_ms for frame in judged if frame.time_ms is not None]),
-        **statistics(len(judged), matches, false_poses),
+        **statistics(len(judged), matches, false_poses, [truth.frame for frame in judged for truth in frame.not_asked]),
     }

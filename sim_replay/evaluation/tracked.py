@@ -61,7 +61,7 @@ class _Sequence:
             return cls(scene, DEFAULT_FPS, False, places, errors)
         try:
             fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
-        except (OSError, KeyError, ValueError, TypeError) as error:
+        except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: 'fps' is not a number that can be read") from error
         if not (np.isfinite(fps) and fps > 0):
             raise InputError(f"{path}: 'fps' is not above zero")

@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from edge.errors import InputError
 from sim_replay.ground_truth import PlayedSequence, read_sequence
+from sim_replay.recorded.scene_files import is_unpacked
 
 SCENE = "sequence"  # folder in `out` that holds what was unpacked
 UNFINISHED = "sequence.part"  # the same while pictures are unpacked into it
@@ -28,7 +29,7 @@ def open_sequence(path: Path, out: Path, console: Console) -> PlayedSequence:
             raise InputError(f"{path}: is not {WHAT}")
         return read_sequence(path)
     scene = out / SCENE
-    if scene.exists() and not (scene / "sequence.toml").is_file():
+    if scene.exists() and not is_unpacked(scene):
         raise InputError(f"{scene}: is in the way: pictures would be unpacked there")
     unfinished = out / UNFINISHED
     shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was killed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from sim_replay.bop.records import BopFrame
 from sim_replay.bop.write import SceneWriter
 
 JPEG_QUALITY = 95
+_SOURCE = "source"  # key of sequence.toml, of unpacked scenes alone
 
 
 def add_picture(
@@ -44,7 +46,7 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
 def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
     """sequence.toml of a finished scene whose labels nobody knows; `source` is where the pictures are from."""
     entries = {
-        "source": str(source),
+        _SOURCE: str(source),
         "fps": fps,
         "t0_ns": frame0_ns,
         "R_body_cam": mount.R_body_cam.tolist(),
@@ -55,3 +57,12 @@ def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, 
     (folder / "sequence.toml").write_text("".join(lines), encoding="utf-8")
     for name in ("scene_gt.json", "scene_gt_info.json"):  # empty lists would say that there is no target
         (folder / name).unlink(missing_ok=True)
+
+
+def is_unpacked(folder: Path) -> bool:
+    """Whether `folder` holds a scene that was unpacked here, can be unpacked again, and was given no labels since."""
+    try:
+        entries = tomllib.loads((folder / "sequence.toml").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return _SOURCE in entries and not (folder / "scene_gt.json").exists()

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edge.errors import InputError
-from sim_replay.play import Recording
+from sim_replay.play import Record, Recording
+from sim_replay.result import latency_ms as latency_ms_of
+from sim_replay.result import pose_of
 
 FLIGHT_JSON, RECEIVED_JSONL = "flight.json", "received.jsonl"
 _PEER_OF = {"target_relative": "autopilot", "pose": "subscriber", "diagnostics": "subscriber"}
@@ -91,5 +95,22 @@ def _read_received(path: Path, recording: Recording) -> None:
         try:
             record = json.loads(line)
             recording.take(record.pop("peer"), record)
-        except (ValueError, KeyError, AttributeError, TypeError) as error:
-            raise InputError(f"{path}: line {number} is not a record of a peer") from error
+            _check(record, recording)
+        except KeyError as error:
+            raise InputError(f"{path}: line {number} is not a record of a peer: it has no {error.args[0]!r}") from error
+        except (ValueError, AttributeError, TypeError, OverflowError, RecursionError) as error:
+            raise InputError(f"{path}: line {number} is not a record of a peer: {error}") from error
+
+
+def _check(record: Record, recording: Recording) -> None:
+    """Raise KeyError, ValueError or TypeError for a pose that cannot be judged."""
+    if record["event"] not in ("pose", "target_relative"):
+        return
+    pose = pose_of(record, 0)
+    latency_ms = float(record["age_ms"]) if record["event"] == "pose" else latency_ms_of(record, recording)
+    if pose.t_cam_target_m.shape != (3,) or pose.R_cam_target.shape != (3, 3):
+        raise ValueError("its pose is not three metres and a quaternion")
+    if pose.covariance is not None and pose.covariance.shape != (6, 6):
+        raise ValueError("its covariance is not of six by six")
+    if not np.isfinite([*pose.t_cam_target_m, latency_ms, float(recording.capture_ns(record))]).all():
+        raise ValueError("a number is not finite")

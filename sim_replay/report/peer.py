@@ -102,7 +102,8 @@ def nees(matches: Sequence[Match]) -> dict[str, dict[str, float] | None] | None:
 
     For an honest covariance the mean is the degrees of freedom and 95 % lie below their chi-square quantile. Errors of
     neighbouring frames are alike, so the mean of one flight scatters more than its count says. Position is over all
-    poses, pose and rotation over those that tell a rotation. None: no covariances, or no such pose.
+    poses, pose and rotation over those that tell a rotation. None: no covariances, or no such pose. `singular` counts
+    those that are left out because their covariance has no inverse.
     """
     sure = [(truth, estimate) for truth, estimate in pairs(matches) if estimate.covariance is not None]
     if not sure:
@@ -119,7 +120,8 @@ def nees(matches: Sequence[Match]) -> dict[str, dict[str, float] | None] | None:
     }
 
 
-def _honesty(nees: Array, dof: int) -> dict[str, float] | None:
+def _honesty(told: Array, dof: int) -> dict[str, float] | None:
+    nees = told[~np.isnan(told)]
     if nees.size == 0:
         return None
     return {
@@ -127,6 +129,7 @@ def _honesty(nees: Array, dof: int) -> dict[str, float] | None:
         "median": round(float(np.median(nees)), 4),
         "degrees_of_freedom": dof,
         "within_95pct": round(float((nees <= CHI2_95[dof]).mean()), 4),
+        "singular": len(told) - len(nees),
     }
 
 

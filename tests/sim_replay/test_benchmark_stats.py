@@ -134,3 +134,11 @@ def test_a_contact_sheet_boxes_the_targets_and_is_small(dataset: Path, tmp_path:
             found.append([columns.min(), rows.min(), columns.max(), rows.max()])
     assert len(found) == 3  # the fourth picture shows no target
     assert min(np.abs(np.array(box) - expected).max() for box in found) <= 2
+
+
+@pytest.mark.parametrize("seed", ['"abc"', "inf", "1.5"])
+def test_a_flight_seed_that_is_no_number_is_told(dataset: Path, seed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = dataset / "train" / "000000" / "sequence.toml"
+    path.write_text(f'airframe = "glider"\nflight_seed = {seed}\n')
+    assert main(["stats", "--dataset", str(dataset)]) == 2
+    assert f"{path}: flight_seed is not a whole number" in capsys.readouterr().err

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import resource
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -143,3 +145,40 @@ def test_video_keeps_number_and_order_and_loses_more_at_a_lower_bitrate() -> Non
     again = list(through_h264(iter(sent), 30.0, 100))
     first = list(through_h264(iter(sent), 30.0, 100))
     assert all((a == b).all() for a, b in zip(again, first, strict=True))
+
+
+@contextmanager
+def full_disk(free_bytes: int) -> Iterator[None]:
+    """No file gets larger than that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("keep_raw", [False, True])
+def test_a_picture_that_the_disk_has_no_room_for_is_an_error_and_no_frame(tmp_path: Path, keep_raw: bool) -> None:
+    noise = np.random.default_rng(4).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    frame, _, masks = _frame(0)
+    with SceneStore(tmp_path / "scene", 20 if keep_raw else 100, keep_raw=keep_raw) as store:
+        with full_disk(4096), pytest.raises(OSError, match="File too large"):
+            store.add(frame, noise, masks, masks)
+        assert store.done == frozenset()
+    with SceneStore(tmp_path / "scene", 90, keep_raw=keep_raw) as store:
+        assert store.done == frozenset()
+
+
+@pytest.mark.parametrize("torn", [0, 0.5])
+def test_a_frame_whose_raw_picture_is_torn_is_made_again(tmp_path: Path, torn: float) -> None:
+    folder = tmp_path / "scene"
+    with SceneStore(folder, 90, keep_raw=True) as store:
+        for number in range(3):
+            _add(store, number)
+    raw = folder / ".part" / "raw" / "000001.png"
+    raw.write_bytes(raw.read_bytes()[: int(torn * raw.stat().st_size)])
+    with SceneStore(folder, 90, keep_raw=True) as store:
+        assert store.done == {0, 2}
+        _add(store, 1)
+        assert [int(image.mean()) for image in store.raw_images()] == [40, 50, 60]

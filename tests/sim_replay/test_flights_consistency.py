@@ -180,3 +180,26 @@ def test_a_late_stamp_turns_the_attitude_of_a_turning_camera() -> None:
     errors = OwnShipErrors(np.random.default_rng(1), np.zeros(3), errors.position_m, 0.02)
     R = errors.attitude(np.eye(3), np.array([0.0, 0.0, 1.5]))
     assert Rotation.from_matrix(R).as_rotvec() == pytest.approx([0.0, 0.0, 0.03], abs=5 * view.ATTITUDE_JITTER_RAD)
+
+
+def test_a_covariance_without_an_inverse_is_counted_and_left_out() -> None:
+    frames = flights(1.0)
+    first = frames[0].matches[0]
+    assert first.estimate is not None
+    flat = replace(first, estimate=replace(first.estimate, covariance=np.zeros((6, 6))))
+    found = consistency([replace(frames[0], matches=(flat,)), *frames[1:]])
+    assert found is not None
+    assert (found["flights"], found["singular"]) == (FLIGHTS, 1)
+    assert found["position"] == consistency(frames)["position"]  # a flight's frames share their error
+    alone = consistency([replace(frames[0], matches=(flat,))])
+    assert alone == {"flights": 1, "singular": 1, "position": None, "rotation": None}
+
+
+def test_scenes_that_share_a_folder_are_flights_of_their_own() -> None:
+    together = [
+        replace(frame, picture=replace(frame.picture, scene=BopScene(Path("train"), frame.picture.scene_id)))
+        for frame in flights(1.0)
+    ]
+    found = consistency(together)
+    assert found is not None
+    assert found["flights"] == FLIGHTS

@@ -64,3 +64,20 @@ def test_every_other_picture_is_a_sequence(flight: Path) -> None:
 def test_a_rate_that_is_none_is_refused(fps: str, flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(flight, "fps = 10.0", f"fps = {fps}")
     assert f"{flight / 'sequence.toml'}: fps is {float(fps):g}; it must be a number above 0" in refusal(flight, capsys)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("t0_ns = 0", "t0_ns = inf", "not as expected"),
+        ("fps = 10.0", "fps = 1" + "0" * 400, "not as expected"),
+        ("fps = 10.0", "fps = 1e-320", "it must be a number above 0, at least 0.001"),
+    ],
+)
+def test_a_number_that_no_clock_counts_to_is_refused(
+    before: str, after: str, words: str, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(flight, before, after)
+    told = refusal(flight, capsys)
+    assert f"{flight / 'sequence.toml'}: " in told
+    assert words in told

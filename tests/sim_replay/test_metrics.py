@@ -169,3 +169,13 @@ def test_recall_and_false_positives_count_what_their_names_say() -> None:
     assert metrics.false_positives_per_1000(3, 54) == pytest.approx(55.5556, abs=1e-3)
     assert metrics.false_positives_per_1000(0, 54) == 0.0
     assert metrics.false_positives_per_1000(2, 0) is None
+
+
+def test_a_covariance_without_an_inverse_has_no_nees_and_leaves_the_others_theirs() -> None:
+    flat = np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+    pose, position, rotation = metrics.nees(
+        [IDENTITY] * 2, np.zeros((2, 3)), [IDENTITY] * 2, np.full((2, 3), 2.0), [flat, np.eye(6)]
+    )
+    np.testing.assert_array_equal(pose, [np.nan, 12.0])
+    np.testing.assert_array_equal(position, [np.nan, 12.0])
+    np.testing.assert_array_equal(rotation, [0.0, 0.0])

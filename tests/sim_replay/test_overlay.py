@@ -129,3 +129,13 @@ def test_the_video_plays_back_every_frame_at_its_rate(tmp_path: Path) -> None:
     assert frames[0].shape == (360, 640, 3)
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0)
     assert np.abs(frames[5].astype(int) - overlay.draw(5, background)).mean() < 6
+
+
+@pytest.mark.parametrize("size_wh", [(480, 1280), (720, 1680), (64, 64)])
+def test_a_tall_or_small_picture_is_drawn_on_too(size_wh: tuple[int, int]) -> None:
+    width, height = size_wh
+    tall = np.array([[900.0, 0.0, width / 2], [0.0, 900.0, height / 2], [0.0, 0.0, 1.0]])
+    views = [replace(view(frame, 5.0), K=tall) for frame in range(2)]
+    image = Overlay(views, size_wh).draw(1, np.zeros((height, width, 3), np.uint8))
+    assert image.shape == (height, width, 3)
+    assert image.any()

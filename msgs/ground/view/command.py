@@ -22,7 +22,8 @@ from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, listening, session
 from msgs.ground.fleet import TAKEN, Fleet
 from msgs.ground.view.layout import blueprint
-from msgs.ground.view.recorded import samples
+from msgs.ground.view.recorded import check_opens, samples
+from msgs.ground.view.saving import saved
 from msgs.ground.view.scene import Scene
 from msgs.session import TlsFiles
 
@@ -52,6 +53,7 @@ class ViewOptions:
 
 def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]) -> int:
     """Show until `stop` is set, or all of the recordings and end; 0. Raises InputError for bad input."""
+    _check_recordings(options)
     rec = rr.RecordingStream(APPLICATION)
     rec.set_log_tick_enabled(False)
     rec.set_log_time_enabled(False)
@@ -61,40 +63,48 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
         rec.send_blueprint(blueprint(uavs, live=not options.recordings))
 
     scene = Scene(rec, fleet, options.size_m, arrange)
-    with _opened(rec, options, say):
+    with _opened(rec, options, stop, say):
         if options.recordings:
             _play(options, scene, stop, say)
         else:
             _listen(options, scene, stop, say)
         scene.finish()
-        rec.flush()
-        if options.recordings and options.web_port is not None:
-            stop.wait()
-        rec.disconnect()
     into = f" into {options.save}" if options.save is not None else ""
     refused = sum(one.refused for one in fleet.rows(time.time_ns()))
     say(f"{scene.drawn} poses drawn{into}" + (f", {refused} samples refused" if refused else ""))
     return 0
 
 
+def _check_recordings(options: ViewOptions) -> None:
+    """Raise InputError for a recording that does not open, or that --save would overwrite."""
+    for path in options.recordings:
+        check_opens(path)
+        if options.save is not None and options.save.exists() and options.save.samefile(path):
+            raise InputError(f"--save {options.save}: is the recording {path} itself")
+
+
 @contextmanager
-def _opened(rec: rr.RecordingStream, options: ViewOptions, say: Callable[[str], None]) -> Iterator[None]:
+def _opened(
+    rec: rr.RecordingStream, options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
+) -> Iterator[None]:
     """Where the recording goes: a file, a server for browsers on this machine, or a window that stays."""
     if options.save is not None:
-        try:
-            options.save.touch()
-        except OSError as error:
-            raise InputError(f"--save {options.save}: cannot be written: {error.strerror}") from error
-        rec.save(options.save)
-        yield
+        with saved(rec, options.save, stop):
+            yield
     elif options.web_port is not None:
         with _server(options.web_port) as address:
             rec.connect_grpc(address)
             say(f"open http://{_LOOPBACK}:{options.web_port}/?url={quote(address, safe=':/')}")
             yield
+            rec.flush()
+            if options.recordings:
+                stop.wait()
+            rec.disconnect()
     else:
         rec.spawn()
         yield
+        rec.flush()
+        rec.disconnect()
 
 
 @contextmanager

@@ -299,7 +299,7 @@ def test_what_is_told_live_is_drawn_until_told_to_stop(network: Network, tmp_pat
             for topic, _, payload, _ in frame(now_ns, now_ns):
                 publishers[topic.name].put(payload)
 
-        until(lambda: path.exists() and publishers[topics.POSE.name].sequence >= 100, put)
+        until(lambda: publishers[topics.POSE.name].sequence >= 100, put)
     viewer.terminate()
     _, said = viewer.communicate(timeout=60)
     assert viewer.returncode == 0

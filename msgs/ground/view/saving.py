@@ -1,0 +1,90 @@
+"""`--save`: a file for Rerun's viewer that is there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rerun as rr
+
+from msgs.ground.errors import InputError
+
+_CHUNK_BYTES = 1 << 20
+
+
+class _Writer(threading.Thread):
+    """Writes what comes out of a pipe to `path`. Once that fails, `error` says why and the rest goes nowhere."""
+
+    def __init__(self, source: int, path: Path, stop: threading.Event) -> None:
+        super().__init__(name="save", daemon=True)
+        self.error: OSError | None = None
+        self._source, self._path, self._stop_all = source, path, stop
+
+    def run(self) -> None:
+        with open(self._source, "rb", buffering=0) as source:
+            try:
+                with self._path.open("wb") as file:
+                    shutil.copyfileobj(source, file, _CHUNK_BYTES)
+            except OSError as error:
+                self.error = error
+                self._stop_all.set()
+                while source.read(_CHUNK_BYTES):
+                    pass
+
+
+@contextmanager
+def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event) -> Iterator[None]:
+    """What is logged inside goes to `path`, put there when all is written: until then, what was there stays.
+
+    Where a recording ends in the middle, what came before is put there if nothing was. Sets `stop` as soon as no more
+    can be written. Raises InputError, and leaves nothing behind then.
+    """
+    whole = Path(os.path.realpath(path))  # a link stays one
+    if whole.exists() and not whole.is_file():
+        raise InputError(f"--save {path}: is there and is no file")
+    unfinished, replaces = whole.with_name(f".{whole.name}.part"), whole.exists()
+    try:
+        unfinished.touch()
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    # Rerun's own file never says that the disk is full, and then waits for ever: it gets a pipe, the file is ours.
+    read_end, write_end = os.pipe()
+    writer = _Writer(read_end, unfinished, stop)
+    writer.start()
+    try:
+        try:
+            rec.save(f"/dev/fd/{write_end}")
+        finally:
+            os.close(write_end)
+        broken: InputError | None = None
+        try:
+            yield
+        except InputError as error:
+            broken = error
+        rec.disconnect()
+        writer.join()
+        if writer.error is not None:
+            raise _unwritable(path, writer.error) from writer.error
+        if broken is None or not replaces:
+            _put(unfinished, whole, path)
+        if broken is not None:
+            raise broken
+    finally:
+        rec.disconnect()
+        writer.join()
+        unfinished.unlink(missing_ok=True)
+
+
+def _put(unfinished: Path, whole: Path, asked: Path) -> None:
+    try:
+        os.replace(unfinished, whole)
+    except OSError as error:
+        raise _unwritable(asked, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"--save {path}: cannot be written: {error.strerror}")

@@ -1,0 +1,96 @@
+"""`uavpose-ground view --save`: what lies at that name stays until a whole file takes its place."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+
+from msgs.ground.cli import main
+
+from .flight import record
+
+OLD = b"an older file"
+LIMIT_BYTES = 50_000  # of files: a disk that is full in the middle
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    record(tmp_path / "flight.mcap", 5)
+    (tmp_path / "out.rrd").write_bytes(OLD)
+    return tmp_path / "flight.mcap"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_whole_file_takes_the_place_of_the_old_one_and_nothing_else_is_left(flight: Path) -> None:
+    out, link = flight.with_name("out.rrd"), flight.with_name("link.rrd")
+    link.symlink_to(out)
+    assert main(["view", str(flight), "--save", str(link)]) == 0
+    assert link.is_symlink()
+    assert len(RrdReader(out).recordings()) == 1
+    assert out.read_bytes()[-12:].startswith(b"RRF2FOOT")  # the viewer finds its way about by what stands at the end
+    assert names(flight.parent) == ["flight.mcap", "link.rrd", "out.rrd"]
+
+
+def test_the_recording_itself_is_not_overwritten(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, link = flight.read_bytes(), flight.with_name("link.rrd")
+    link.symlink_to(flight)
+    for save in (flight, flight.parent / "." / flight.name, link):
+        assert main(["view", str(flight), "--save", str(save)]) == 2
+        assert f"--save {save}: is the recording {flight} itself" in capsys.readouterr().err
+    assert flight.read_bytes() == whole
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("flihgt.mcap", "cannot be read: No such file"), ("out.rrd", "is no whole")]
+)
+def test_a_recording_that_does_not_open_is_told_before_anything_is_drawn(
+    flight: Path, capsys: pytest.CaptureFixture[str], name: str, words: str
+) -> None:
+    out, bad = flight.with_name("out.rrd"), flight.with_name("other") / name
+    bad.parent.mkdir()
+    if name == "out.rrd":
+        bad.write_bytes(OLD)
+    assert main(["view", str(flight), str(bad), "--save", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert f"{bad}: {words}" in said
+    assert "flight.mcap: read" not in said
+    assert out.read_bytes() == OLD
+
+
+def test_a_recording_that_ends_in_the_middle_leaves_the_old_file_and_is_a_file_where_there_was_none(flight: Path) -> None:
+    flight.write_bytes(flight.read_bytes()[:-2000])
+    assert main(["view", str(flight), "--save", str(flight.with_name("out.rrd"))]) == 2
+    assert flight.with_name("out.rrd").read_bytes() == OLD
+    assert names(flight.parent) == ["flight.mcap", "out.rrd"]
+    assert main(["view", str(flight), "--save", str(flight.with_name("new.rrd"))]) == 2
+    assert len(RrdReader(flight.with_name("new.rrd")).recordings()) == 1, "what came before the cut"
+
+
+def test_what_is_no_file_is_not_replaced(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = flight.with_name("folder")
+    folder.mkdir()
+    assert main(["view", str(flight), "--save", str(folder)]) == 2
+    assert f"--save {folder}: is there and is no file" in capsys.readouterr().err
+    assert main(["view", str(flight), "--save", str(folder / "no" / "out.rrd")]) == 2
+    assert "cannot be written: No such file or directory" in capsys.readouterr().err
+
+
+def test_on_a_full_disk_a_sentence_ends_it_and_no_half_file_is_left(flight: Path) -> None:
+    command = [Path(sys.executable).parent / "uavpose-ground", "view", flight, "--save", flight.with_name("out.rrd")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT_BYTES, LIMIT_BYTES)),
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "out.rrd: cannot be written: File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert flight.with_name("out.rrd").read_bytes() == OLD
+    assert names(flight.parent) == ["flight.mcap", "out.rrd"]

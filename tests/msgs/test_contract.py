@@ -1,0 +1,46 @@
+"""What a model file may say of itself: numbers that are finite, inputs that have a size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from msgs.contract import ModelContract
+
+WHOLE: dict[str, Any] = {
+    "name": "toy", "configuration": "edge", "backbone": "none", "precision": "fp32", "max_peaks": 1,
+    "acquire_size_wh": (640, 384), "acquire_fit": "squash", "track_size_wh": (256, 256), "track_window_scale": 1.8,
+    "acquire_score_min": 0.5, "track_score_min": 0.5, "trained_range_m": (50.0, 600.0),
+    "trained_focal_px": (500.0, 9000.0), "trained_box_px": (8.0, 256.0), "airframes": ["toy"], "training": {},
+    "metrics": {}, "weights_sha256": "0" * 64,
+}  # fmt: skip
+NAN, INF = float("nan"), float("inf")
+
+
+def test_a_whole_contract_is_read() -> None:
+    assert ModelContract.model_validate(WHOLE).track_size_wh == (256, 256)
+    assert ModelContract.model_validate(WHOLE | {"track_size_wh": None}).track_size_wh is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"acquire_size_wh": (0, 384)},
+        {"track_size_wh": (256, -256)},
+        {"track_window_scale": INF},
+        {"depth_limits_m": (NAN, 600.0)},
+        {"trained_range_m": (50.0, INF)},
+        {"pixel_mean_bgr": (NAN, 0.0, 0.0)},
+        {"metrics": {"recall": NAN}},
+        {"training": {"seconds": INF}},
+        {"acquire_score": {"offset": NAN}},
+        {"track_score": {"slope": INF}},
+    ],
+)
+def test_a_number_that_is_none_is_refused_by_its_key(wrong: dict[str, Any]) -> None:
+    (key,) = wrong
+    with pytest.raises(ValidationError) as error:
+        ModelContract.model_validate(WHOLE | wrong)
+    assert {fault["loc"][0] for fault in error.value.errors()} == {key}

@@ -1,0 +1,130 @@
+"""Which poses of a results file count, and what counts where a list of targets leaves aircraft out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sim_replay.bop import BopError
+from sim_replay.datasets import DatasetFrame, open_dataset
+from sim_replay.evaluation.bop_results import file_answers
+from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
+from sim_replay.score import TargetPose
+from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
+
+TURNED = Rotation.from_euler("z", 180, degrees=True).as_matrix()
+Row = tuple[int, float, float, bool]  # obj_id, score, x in metres, whether it is turned the right way
+LEFT, RIGHT = -5.0, 5.0  # metres: where two aircraft are, well apart for their size of 6 m at 200 m
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Object 1 left and right in picture 0, nothing in picture 1."""
+    root = tmp_path / "hawks"
+    write_models_info(root)
+    scene = write_scene(root / "test" / "000000", (0, 1), masks=False)
+    poses = [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": [1e3 * x, 0, 2e5]} for x in (LEFT, RIGHT)]
+    write_json(scene / "scene_gt.json", {"0": poses, "1": []})
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60}
+    write_json(scene / "scene_gt_info.json", {"0": [seen, seen], "1": []})
+    return root
+
+
+def results(folder: Path, rows: Sequence[Row], picture: int = 0) -> Path:
+    path = folder / "m_hawks-test.csv"
+    lines = ["scene_id,im_id,obj_id,score,R,t,time"]
+    for obj_id, score, x_m, right in rows:
+        R = " ".join(str(v) for v in (np.eye(3) if right else TURNED).ravel())
+        lines.append(f"0,{picture},{obj_id},{score},{R},{1e3 * x_m} 0 200000,-1")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def judged(root: Path, rows: Sequence[Row], picture: int = 0) -> list[JudgedFrame]:
+    dataset = open_dataset(root)
+    answers = file_answers(results(root.parent, rows, picture), dataset)
+    return judge_frames(dataset.labelled_frames(), dataset.models, answers)
+
+
+def turns_deg(frames: Sequence[JudgedFrame]) -> list[float | None]:
+    return [m.rotation_error_deg and round(m.rotation_error_deg) for m in frames[0].matches]
+
+
+def test_the_score_chooses_among_several_poses_of_one_aircraft_and_not_the_truth(root: Path) -> None:
+    aside = [(1, 0.9, LEFT + 1.0, False), (1, 0.1, LEFT, True), (1, 0.8, RIGHT, True)]
+    for rows in (aside, aside[::-1]):
+        frames = judged(root, rows)
+        assert turns_deg(frames) == [180, 0]
+        assert [pose.score for pose in frames[0].false_poses] == [0.1]
+
+
+def test_of_equal_scores_the_first_count(root: Path) -> None:
+    frames = judged(root, [(1, 1.0, LEFT, True), (1, 1.0, RIGHT, True), (1, 1.0, RIGHT, False)])
+    assert turns_deg(frames) == [0, 0]
+    assert len(frames[0].false_poses) == 1
+
+
+def test_who_names_no_object_or_another_one_fills_what_is_left_by_score(root: Path) -> None:
+    assert turns_deg(judged(root, [(0, 0.5, LEFT, True), (0, 0.9, RIGHT, False)])) == [0, 180]
+    frames = judged(root, [(1, 0.2, LEFT, False), (7, 0.3, LEFT, True), (7, 0.9, RIGHT, True)])
+    assert turns_deg(frames) == [180, 0]
+    assert len(frames[0].false_poses) == 1
+
+
+def test_poses_in_an_empty_picture_stay_false_alarms(root: Path) -> None:
+    dataset = open_dataset(root)
+    score = score_of(dataset, {}, judged(root, [(1, 0.9, LEFT, True)], picture=1))
+    assert score["overall"]["false_positives_per_1000"] == 1000.0
+
+
+def listed(root: Path, *targets: dict[str, int]) -> None:
+    write_json(root / "test_targets_bop19.json", targets)
+
+
+def said(*x_m: float) -> Any:
+    poses = [np.array([x, 0.0, 200.0]) for x in x_m]
+    return lambda index, _: Answer(tuple(TargetPose(index, np.eye(3), t_m) for t_m in poses), None)
+
+
+def test_a_pose_of_an_aircraft_that_is_not_asked_for_is_neither_right_nor_wrong(root: Path) -> None:
+    listed(root, {"scene_id": 0, "im_id": 0, "obj_id": 1, "inst_count": 1})
+    dataset = open_dataset(root)
+    pictures = dataset.labelled_frames()
+    assert [len(pictures[0].targets), len(pictures[0].unlisted)] == [1, 1]
+    score = score_of(dataset, {}, judge_frames(pictures, dataset.models, said(LEFT, RIGHT)))
+    overall = score["overall"]
+    assert (overall["targets"], overall["recall"], overall["false_poses"]) == (1, 1.0, 0)
+    only_other = judge_frames(pictures, dataset.models, said(RIGHT))
+    assert [match.estimate for match in only_other[0].matches] == [None]
+    assert only_other[0].false_poses == ()
+    both = judged(root, [(1, 0.9, RIGHT, True), (1, 0.8, LEFT, True)])
+    assert turns_deg(both) == [0]
+    assert both[0].false_poses == ()
+
+
+def test_a_picture_that_shows_but_what_is_not_asked_for_is_not_empty(root: Path) -> None:
+    listed(root, {"scene_id": 0, "im_id": 0, "obj_id": 9}, {"scene_id": 0, "im_id": 1, "obj_id": 9})
+    dataset = open_dataset(root)
+    for told_in, false_alarms in ((0, 0.0), (1, 1000.0)):  # of the one that shows none
+
+        def answer(index: int, picture: DatasetFrame, told_in: int = told_in) -> Answer:
+            return said(40.0)(index, picture) if index == told_in else Answer((), None)
+
+        frames = judge_frames(dataset.labelled_frames(), dataset.models, answer)
+        overall = score_of(dataset, {}, frames)["overall"]
+        assert overall["false_poses"] == 1
+        assert overall["false_positives_per_1000"] == false_alarms
+
+
+def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:
+    for targets in ([], [{"scene_id": 3, "im_id": 0, "obj_id": 1}]):
+        listed(root, *targets)
+        with pytest.raises(BopError, match=r"test_targets_bop19\.json: lists none of the 2 pictures"):
+            open_dataset(root).labelled_frames()
+    assert json.loads((root / "test_targets_bop19.json").read_text())

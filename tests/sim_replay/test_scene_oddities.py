@@ -1,0 +1,115 @@
+"""What a scene may say of a target that is thin, hidden or behind the camera; numbers that no file should hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sim_replay.bop import BopError, read_scene
+from sim_replay.cli import main
+from sim_replay.datasets import open_dataset
+from sim_replay.evaluation.judge import truths_of
+from sim_replay.ground_truth import read_scene_truth
+from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    write_models_info(tmp_path / "hawks")
+    return write_scene(tmp_path / "hawks" / "test" / "000001", masks=False)
+
+
+def seen(scene: Path, **info: Any) -> Any:
+    write_json(scene / "scene_gt_info.json", {"0": [info]})
+    return read_scene(scene).frames[0].targets[0]
+
+
+def placed(scene: Path, *t_mm: float) -> None:
+    write_json(scene / "scene_gt.json", {"0": [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": t_mm}]})
+
+
+def test_a_side_of_nil_is_one_pixel_where_pixels_are_counted(scene: Path) -> None:
+    thin = seen(scene, bbox_visib=[50, 40, 20, 0], bbox_obj=[50, 40, 0, 0], px_count_visib=21, px_count_all=1)
+    np.testing.assert_array_equal(thin.box_visible_xyxy_px, [49.5, 39.5, 69.5, 40.5])
+    np.testing.assert_array_equal(thin.box_whole_xyxy_px, [49.5, 39.5, 50.5, 40.5])
+    assert thin.visible_px == 21
+    dataset = open_dataset(scene)
+    assert len(truths_of(0, dataset.labelled_frames()[0], dataset.models)) == 1
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        {"bbox_visib": [-1, -1, -1, -1], "px_count_visib": 5},
+        {"bbox_visib": [50, 40, 20, 0], "px_count_visib": 0},
+        {"bbox_visib": [0, 0, 0, 0]},
+    ],
+)
+def test_a_box_that_is_none_is_of_a_hidden_target(scene: Path, info: dict[str, Any]) -> None:
+    hidden = seen(scene, **info)
+    assert (hidden.box_visible_xyxy_px, hidden.visible_px) == (None, 0)
+
+
+def test_what_is_seen_lies_before_the_camera(scene: Path) -> None:
+    write_json(scene / "scene_gt_info.json", {"0": [{"bbox_visib": [9, 9, 5, 5]}]})
+    for z_mm in (0.0, -2e5):
+        placed(scene, 5e3, 0, z_mm)
+        with pytest.raises(BopError, match=r"scene_gt\.json: 'cam_t_m2c' of '0' puts obj_id 1 behind the camera"):
+            read_scene(scene)
+    (scene / "scene_gt_info.json").unlink()
+    mask = np.zeros((120, 160), np.uint8)
+    mask[40:50, 40:60] = 255
+    (scene / "mask_visib").mkdir()
+    cv2.imwrite(str(scene / "mask_visib" / "000000_000000.png"), mask)
+    with pytest.raises(BopError, match="a mask shows obj_id 1 in picture 0, but its cam_t_m2c lies behind the camera"):
+        open_dataset(scene).labelled_frames()
+
+
+def test_what_is_not_seen_may_lie_behind_the_camera_and_is_not_missed(scene: Path) -> None:
+    placed(scene, 5e3, 0, -2e5)
+    for info in ({"bbox_visib": [-1, -1, -1, -1]}, {"bbox_visib": [9, 9, 5, 5], "px_count_visib": 0}, None):
+        if info is None:
+            (scene / "scene_gt_info.json").unlink()
+        else:
+            seen(scene, **info)
+        dataset = open_dataset(scene)
+        assert truths_of(0, dataset.labelled_frames()[0], dataset.models) == []
+        assert not read_scene_truth(scene).shows_target
+
+
+def test_a_target_in_the_camera_itself_is_refused(scene: Path) -> None:
+    placed(scene, 0, 0, 0)
+    with pytest.raises(BopError, match="puts obj_id 1 into the camera itself"):
+        read_scene(scene)
+
+
+def test_a_picture_lies_as_its_pixels_do_whatever_its_exif_says(scene: Path) -> None:
+    path = scene / "rgb" / "000000.jpg"
+    data = path.read_bytes()
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # turned by a quarter
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+    assert cv2.imread(str(path)).shape == (160, 120, 3)
+    assert read_scene(scene).image_bgr(read_scene(scene).frames[0]).shape == (120, 160, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 100_000, "nests lists or objects too deep"),
+        ('{"0": [{"obj_id": ' + "9" * 5000 + "}]}", "cannot be read"),
+        ('{"' + "1" * 5000 + '": []}', "is not the number of a picture"),
+    ],
+)
+def test_a_file_that_json_chokes_on_is_a_sentence(
+    scene: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (scene / "scene_gt.json").write_text(text)
+    assert main(["stats", "--dataset", str(scene)]) == 2
+    told = capsys.readouterr().err
+    assert f"{scene / 'scene_gt.json'}" in told
+    assert words in told
+    assert len(told) < 500

@@ -1,0 +1,48 @@
+"""telemetry.csv as spreadsheets and people leave it: read, or refused in a sentence that names the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_replay.telemetry import COLUMNS, TelemetryError, read_telemetry
+
+
+def rows() -> list[str]:
+    still = "1,0,0,0,0,0,0,0,0,0,0,0,0,47.0,8.0,400.0"
+    return [",".join(COLUMNS), *(f"{k * 20_000_000},{still}" for k in range(4))]
+
+
+def write(path: Path, lines: list[str], encoding: str = "utf-8") -> Path:
+    path.write_text("\n".join(lines) + "\n", encoding=encoding)
+    return path
+
+
+def test_a_mark_before_the_header_and_a_blank_line_at_the_end_are_passed_over(tmp_path: Path) -> None:
+    plain = read_telemetry(write(tmp_path / "a.csv", rows()))
+    for path in (
+        write(tmp_path / "b.csv", rows(), "utf-8-sig"),
+        write(tmp_path / "c.csv", [*rows(), ""]),
+    ):
+        told = read_telemetry(path)
+        np.testing.assert_array_equal(told.t_ns, plain.t_ns)
+        np.testing.assert_array_equal(told.values, plain.values)
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "words"),
+    [
+        ("9" * 25, "line 3: t_ns is beyond 64 bits"),
+        ('"' + "9" * 200_000 + '"', "line 3 is not CSV: field larger than"),
+        ("soon", "line 3 does not hold 17 numbers"),
+    ],
+)
+def test_a_number_that_is_none_is_told_with_its_line(tmp_path: Path, t_ns: str, words: str) -> None:
+    lines = rows()
+    lines[2] = f"{t_ns},{lines[2].split(',', 1)[1]}"
+    path = write(tmp_path / "telemetry.csv", lines)
+    with pytest.raises(TelemetryError) as error:
+        read_telemetry(path)
+    assert str(error.value).startswith(f"{path}: {words}")

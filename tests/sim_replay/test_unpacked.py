@@ -1,0 +1,51 @@
+"""What `play` removes to make room for a video's pictures: what it made itself, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from edge.errors import InputError
+from sim_replay.recorded.opened import open_sequence
+from sim_replay.telemetry import Telemetry, write_telemetry
+
+LENS = "{ fx = 300.0, fy = 300.0, cx = 31.5, cy = 23.5, width = 64, height = 48 }"
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    video = cv2.VideoWriter(str(tmp_path / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for _ in range(5):
+        video.write(np.full((48, 64, 3), 90, np.uint8))
+    video.release()
+    values = np.zeros((40, 16))
+    values[:, 0] = 1.0
+    write_telemetry(tmp_path / "own.csv", Telemetry(np.arange(40) * 20_000_000, values))
+    path = tmp_path / "flight.toml"
+    path.write_text(f'video = "film.mp4"\ntelemetry = "own.csv"\nintrinsics = {LENS}\n')
+    return path
+
+
+def test_pictures_are_unpacked_again_where_they_were(film: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert len(open_sequence(film, out, Console(quiet=True)).scene.images) == 5
+
+
+@pytest.mark.parametrize("who", ["made by generate", "labelled since", "nobody's"])
+def test_a_scene_that_was_not_unpacked_here_is_in_the_way_and_stays(film: Path, tmp_path: Path, who: str) -> None:
+    scene = tmp_path / "out" / "sequence"
+    if who == "labelled since":
+        open_sequence(film, tmp_path / "out", Console(quiet=True))
+        (scene / "scene_gt.json").write_text("{}")
+    else:
+        scene.mkdir(parents=True)
+        (scene / "sequence.toml").write_text('command = "generate"\nfps = 30.0\n' if who == "made by generate" else "[")
+    before = sorted(path.name for path in scene.rglob("*"))
+    with pytest.raises(InputError, match="is in the way"):
+        open_sequence(film, tmp_path / "out", Console(quiet=True))
+    assert sorted(path.name for path in scene.rglob("*")) == before
