@@ -12,7 +12,7 @@ import pytest
 from edge import clock
 from edge.config import Config, ConfigFile, HealthSettings
 from edge.estimator.model import load_model
-from edge.health import HealthSnapshot, HealthState
+from edge.health import Condition, HealthSnapshot, HealthState
 from edge.outlets import Outlets
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
@@ -32,6 +32,16 @@ def supervised(toy_model: Path, outlets: Outlets, links: dict[str, dict[str, boo
     return Supervisor(config.health, True, outlets, board, lambda: {}, lambda _: ())
 
 
+def after_frames(supervisor: Supervisor, latency_ms: int) -> Condition:
+    """What is said after three frames that took so long from their exposure."""
+    for index in range(3):
+        now_ns = time.monotonic_ns()
+        meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
+        supervisor.frame_done(meta, {"total": latency_ms * 1_000_000}, (), has_attitude=True)
+        supervisor.turn()
+    return supervisor.snapshot().condition
+
+
 @pytest.mark.parametrize(
     ("latency_ms", "links_on", "withheld"),
     [
@@ -46,12 +56,7 @@ def test_a_camera_so_late_that_its_poses_are_withheld_is_no_good_state(
 ) -> None:
     links = {name: {"enabled": name in links_on} for name in AGES}
     supervisor = supervised(toy_model, Outlets(None, None), links)
-    for index in range(3):
-        now_ns = time.monotonic_ns()
-        meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
-        supervisor.frame_done(meta, {"total": latency_ms * 1_000_000}, (), has_attitude=True)
-        supervisor.turn()
-    condition = supervisor.snapshot().condition
+    condition = after_frames(supervisor, latency_ms)
     assert {reason.kind for reason in condition.reasons} == {f"{link}_too_old" for link in withheld}
     assert (condition.state is HealthState.DEGRADED) == bool(withheld)
     for link in withheld:
@@ -62,12 +67,7 @@ def test_a_camera_so_late_that_its_poses_are_withheld_is_no_good_state(
 def test_slower_than_the_settings_allow_is_no_good_state(toy_model: Path, latency_ms: int, kinds: set[str]) -> None:
     supervisor = supervised(toy_model, Outlets(None, None), {})
     supervisor.apply(HealthSettings(latency_max_ms=100.0))
-    for index in range(3):
-        now_ns = time.monotonic_ns()
-        meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
-        supervisor.frame_done(meta, {"total": latency_ms * 1_000_000}, (), has_attitude=True)
-        supervisor.turn()
-    condition = supervisor.snapshot().condition
+    condition = after_frames(supervisor, latency_ms)
     assert {reason.kind for reason in condition.reasons} == kinds
     assert (condition.state is HealthState.DEGRADED) == bool(kinds)
 

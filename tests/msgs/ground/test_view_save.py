@@ -65,7 +65,9 @@ def test_a_recording_that_does_not_open_is_told_before_anything_is_drawn(
     assert out.read_bytes() == OLD
 
 
-def test_a_recording_that_ends_in_the_middle_leaves_the_old_file_and_is_a_file_where_there_was_none(flight: Path) -> None:
+def test_a_recording_that_ends_in_the_middle_leaves_an_old_file_and_is_a_file_where_there_is_none(
+    flight: Path,
+) -> None:
     flight.write_bytes(flight.read_bytes()[:-2000])
     assert main(["view", str(flight), "--save", str(flight.with_name("out.rrd"))]) == 2
     assert flight.with_name("out.rrd").read_bytes() == OLD
