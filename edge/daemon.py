@@ -152,7 +152,8 @@ class Pipeline:
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
         estimates = self._estimate(frame, expected, pointed_at, clock)
-        tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion)
+        chosen_id = self._by_hand.chosen_id
+        tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion, chosen_id)
         self._by_hand.settle(tracks)
         for text in self._by_hand.news():
             self._outlets.event(logging.INFO, text)

@@ -23,7 +23,8 @@ LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
 def status(config: Path | None, connect: str | None, vehicle: str | None, as_json: bool) -> int:
-    """Print how the daemon is; 0 if it works, 1 if it does not answer, stands still or is in FAULT.
+    """Print how the daemon is; 0 if it works, 1 if it does not answer, waits for its first frame, stands
+    still or is in FAULT.
 
     Raises InputError for an address or name that is none, or a configuration that keeps zenoh off.
     """

@@ -60,6 +60,11 @@ class Sample:
     publish_ns: int  # UTC, when it was put
     clock_ns: int  # how far UTC was ahead of the monotonic clock when it was recorded
 
+    @property
+    def monotonic_ns(self) -> int:
+        """When it was recorded, by the clock that nobody sets."""
+        return self.log_ns - self.clock_ns
+
 
 class Recorder:
     """Writes `<stem>_<number>_<UTC>.mcap` files into a folder; used from any thread.
@@ -144,13 +149,16 @@ class Recorder:
                 samples, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
                 go_on, stopping = self._wanted and not self._stopping, self._stopping
             self._tell_gaps()
-            try:
-                self._turn(samples, go_on)
+            runs = _between_clock_steps(samples) or [[]]
+            while runs:
+                try:
+                    self._turn(runs[0], go_on or len(runs) > 1)
+                except Exception as error:
+                    # A full disk as a rule; but whatever it is, it must not silently end the recorder.
+                    self._fail(error, sum(map(len, runs)))
+                    break
                 with self._changed:
-                    self._counters["recorded"] += len(samples)
-            except Exception as error:
-                # A full disk as a rule; but whatever it is, it must not silently end the recorder.
-                self._fail(error, len(samples))
+                    self._counters["recorded"] += len(runs.pop(0))
             if stopping:
                 return
 
@@ -166,19 +174,15 @@ class Recorder:
         self._tell(logging.WARNING, text)
 
     def _turn(self, samples: Sequence[Sample], go_on: bool) -> None:
-        """One second's work: write, put it on the disk, and begin another file where the limits say."""
-        if not samples and self._failure is not None and go_on:
+        """One second's work: write, put it on the disk, and begin another file where the limits or the clock say."""
+        if samples and abs(samples[0].clock_ns - self._clock_ns) > CLOCK_STEP_NS:
+            self._end_file()
+        if samples or (self._failure is not None and go_on):
             self._open(samples)
-        for run in _between_clock_steps(samples):
-            if self._file is not None and abs(run[0].clock_ns - self._clock_ns) > CLOCK_STEP_NS:
-                self._end_file()
-            self._open(run)
-            if self._file is None:
-                return
-            for sample in run:
-                self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         if self._file is None:
             return
+        for sample in samples:
+            self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         self._file.flush()
         aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
         if not go_on or aged or self._file.size >= self._limits.file_bytes_max:
@@ -205,7 +209,7 @@ class Recorder:
         # What is told on change alone is repeated, so that each file can be read without those before it.
         began_ns = min((one.log_ns for one in samples), default=time.time_ns())
         for one in standing:
-            if one not in samples:
+            if one not in samples and (not samples or one.monotonic_ns <= samples[-1].monotonic_ns):
                 self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns)
         if self._failure is not None:
             self._set_failure(None)

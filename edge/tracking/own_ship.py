@@ -231,19 +231,19 @@ def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> flo
     return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * since_s * until_s
 
 
-def _usual_gap_ns(samples: deque) -> int | None:
-    """Median time between the last few samples; None: there are too few to tell."""
+def _usual_gaps_ns(samples: deque) -> list[int]:
+    """Times between the last few samples, shortest first."""
     times = [samples[i].time_ns for i in range(max(len(samples) - USUAL_OF, 0), len(samples))]
-    gaps = sorted(b - a for a, b in pairwise(times))
-    return gaps[len(gaps) // 2] if gaps else None
+    return sorted(b - a for a, b in pairwise(times))
 
 
-def _reach_ns(samples: deque, ahead_ns: tuple[int, int] = ATTITUDE_AHEAD_NS) -> int | None:
+def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
     """How long after the last sample it can be gone on from; None: too few come, and they serve no frame."""
-    gap_ns = _usual_gap_ns(samples)
-    least_ns, most_ns = ahead_ns
-    if gap_ns is None:
+    gaps_ns = _usual_gaps_ns(samples)
+    least_ns, most_ns = ATTITUDE_AHEAD_NS
+    if not gaps_ns:
         return least_ns
+    gap_ns = gaps_ns[len(gaps_ns) // 2]
     return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else None
 
 
@@ -268,12 +268,13 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
 
 
 def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array] | None:
-    after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples, (POSITION_AHEAD_MAX_NS,) * 2)
-    if after == 0 or reach_ns is None:
+    after, gaps_ns = _first_after(samples, time_ns), _usual_gaps_ns(samples)
+    # Rare ones would serve a frame now and then; what is lost of frequent ones makes some gaps longer, not all.
+    if after == 0 or (gaps_ns and gaps_ns[0] > POSITION_AHEAD_MAX_NS):
         return None
     a = samples[after - 1]
     if after == len(samples):
-        if time_ns - a.time_ns > reach_ns:
+        if time_ns - a.time_ns > POSITION_AHEAD_MAX_NS:
             return None
         return a.t_ned_m + a.v_ned_mps * ((time_ns - a.time_ns) / NS_PER_S), a.v_ned_mps
     b = samples[after]

@@ -2,7 +2,7 @@
 
 A target is tentative until it was seen CONFIRM_HITS times, coasts on prediction when it is missed, and is lost, and
 its number free again, after COAST_MAX_S. A position that stays outside the gate but under the same box wins after
-PERSISTENT frames. Of two targets that have taken turns at one aircraft for COAST_MAX_S the younger goes.
+PERSISTENT frames. Of two targets that have taken turns at one aircraft for long (`doubles.py`) one goes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from edge.tracking import motion as ekf
 from edge.tracking import rotation
 from edge.tracking.association import Pair, associate
 from edge.tracking.boxes import RANGE_MIN_M, SAME_BOX_IOU, BoxModel, inside, iou
+from edge.tracking.doubles import Doubles
 from edge.tracking.heading import Flight
 from edge.tracking.motion import Innovation, Motion
 from edge.tracking.rotation import Attitude
@@ -41,7 +42,6 @@ class Target:
     score: float
     measured_ns: int
     born_ns: int
-    alone_ns: int  # when last it was seen and no target was missed that could have been what was seen
     state: TrackState = TrackState.TENTATIVE
     hits: int = 1
     misses: int = 0
@@ -60,6 +60,7 @@ class Tracker:
     _view: View | None = None  # the camera at the last frame
     _tracks: tuple[Track, ...] = ()
     _motion_doubted: bool = False
+    _doubles: Doubles = field(default_factory=Doubles)
     _wanted: Estimate | None = None  # of the frame to come, to be a target before all others
 
     def predict(
@@ -112,9 +113,11 @@ class Tracker:
         K: Array,
         image_size_wh: Size,
         distortion: tuple[float, ...] = (),
+        chosen_id: int | None = None,
     ) -> tuple[Track, ...]:
         """Take in what was seen in the frame taken at `capture_ns`; returns all tracks, by track_id.
 
+        `chosen_id`: which target a person chose.
         A frame not later than the last is dropped and counted: the tracks stay as they were.
         """
         if self.is_late(capture_ns):
@@ -139,8 +142,8 @@ class Tracker:
         for i, target in enumerate(self._targets):
             if i not in hit and not _taken_over(target, spare, lens, view):
                 _miss(target)
-        doubles = self._doubles(pairs, capture_ns)
-        self._targets = [t for t in self._targets if t.track_id not in doubles and _alive(t, lens, view, image_size_wh)]
+        double = self._double(pairs, bool(spare), chosen_id, capture_ns)
+        self._targets = [t for t in self._targets if t.track_id != double and _alive(t, lens, view, image_size_wh)]
         self._give_birth(spare, lens, view)
         if self._motion_doubted:
             self._forget_motion()
@@ -175,18 +178,19 @@ class Tracker:
             rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
         )
 
-    def _doubles(self, pairs: list[Pair], time_ns: int) -> set[int]:
-        """Numbers of targets that are an aircraft that another already is: one is seen now and one then, never both."""
-        for pair in pairs:
-            if not pair.left_out:
-                self._targets[pair.target].alone_ns = time_ns
-        found = set()
-        for pair in pairs:
-            for rival in pair.left_out:
-                two = self._targets[pair.target], self._targets[rival]
-                if all((time_ns - target.alone_ns) / NS_PER_S > COAST_MAX_S for target in two):
-                    found.add(max(two, key=lambda t: (t.born_ns, t.track_id)).track_id)
-        return found
+    def _double(self, pairs: list[Pair], more: bool, chosen_id: int | None, time_ns: int) -> int | None:
+        """Number of a target, missed now, that is an aircraft that another is too: not the chosen, else the younger.
+
+        `more`: something was seen that no target took. It may be who was missed.
+        """
+        keys = [(target.track_id, target.born_ns) for target in self._targets]
+        turns = [(keys[pair.target], keys[other]) for pair in pairs for other in pair.left_out]
+        both = {keys[pair.target] for pair in pairs} | ({missed for _, missed in turns} if more else set())
+        for seen, missed in self._doubles.among(both, [] if more else turns, time_ns):
+            goes = min(seen, missed, key=lambda key: (key[0] == chosen_id, -key[1], -key[0]))
+            if goes == missed:
+                return missed[0]
+        return None
 
     def _give_birth(self, estimates: list[Estimate], lens: Lens, view: View) -> None:
         wanted, self._wanted = self._wanted, None
@@ -199,8 +203,7 @@ class Tracker:
                 continue  # two windows saw one target
             motion, attitude = ekf.begin(estimate, lens.K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, lens)
-            now = (view.time_ns,) * 3
-            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, *now))
+            self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view: View) -> None:

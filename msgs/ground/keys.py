@@ -24,8 +24,8 @@ from msgs.session import TlsFiles
 AUTHORITY = "ca"
 DAYS_MAX = 36500
 _IDENTITY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,62}")
-# Clocks of vehicles without a network may lag.
 _LABEL = "[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?"
+# Clocks of vehicles without a network may lag.
 _BACKDATED = timedelta(days=1)
 
 

@@ -68,7 +68,7 @@ def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]
         for index, entry in enumerate(poses)
     ]
     for target in targets:
-        if not target.t_cam_target_m.any():
+        if not target.t_cam_target_m.any() and target.visible_px != 0:
             raise BopError(f"{source.gt}: 'cam_t_m2c' of {key!r} puts obj_id {target.object_id} into the camera itself")
         if target.t_cam_target_m[2] <= 0 and target.box_visible_xyxy_px is not None and target.visible_px != 0:
             raise BopError(

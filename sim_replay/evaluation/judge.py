@@ -46,13 +46,15 @@ def is_seen(target: BopTarget) -> bool:
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
     """The picture's targets of which something is seen, with size, name and model points; then those not asked for.
 
-    Raises InputError for an object without a model.
+    Raises InputError for an object without a model that is asked for; of others it is passed over.
     """
     truths = []
     for target, wanted in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
         if not is_seen(target):
             continue
         model = models.get(target.object_id)
+        if model is None and not wanted:
+            continue
         if model is None:
             raise InputError(
                 f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models; "

@@ -42,7 +42,7 @@ def score_table(score: dict[str, Any]) -> Group:
     if overall["rotations_not_known"]:
         caption += f"\nposes whose rotation is not known, in no E_r and no hit: {overall['rotations_not_known']}"
     if score.get("consistency") is not None:
-        caption += f"\n{_consistency(score['consistency'])}"
+        caption += f"\n{consistency_line(score['consistency'])}"
     if score.get("filtering") is not None:
         caption += f"\n{_filtering(score['filtering'])}"
     table = Table("", title=title, caption=caption, title_justify="left", caption_justify="left")
@@ -68,11 +68,16 @@ def _calibration(group: dict[str, Any]) -> str:
     return "truth inside one sigma (an honest one: 68 %): " + ", ".join(shares)
 
 
-def _consistency(found: dict[str, Any]) -> str:
-    low, high = found["position"]["bounds_95"]
-    means = ", ".join(f"{name} {found[name]['nees_mean']:.2f}" for name in ("position", "rotation") if found[name])
+def consistency_line(found: dict[str, Any]) -> str:
+    told = {name: found[name] for name in ("position", "rotation") if found[name]}
+    if not told:
+        return f"no covariance of {found['singular']} poses can be inverted: they tell no error"
+    low, high = next(iter(told.values()))["bounds_95"]
+    means = ", ".join(f"{name} {one['nees_mean']:.2f}" for name, one in told.items())
+    left_out = f"; {found['singular']} poses left out, their covariance has no inverse" if found["singular"] else ""
     return (
         f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
+        f"{left_out}"
     )
 
 

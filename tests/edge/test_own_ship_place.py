@@ -13,6 +13,14 @@ from edge.tracking.own_ship import OwnShipBuffer
 MS = 1_000_000
 
 
+def test_of_frequent_positions_some_may_be_lost() -> None:
+    """Three a second, of which the two before the last do not come."""
+    told_ms = [*range(0, 9_000, 333)]
+    del told_ms[-3:-1]
+    for time_ms in (told_ms[-1] + 10, told_ms[-1] + 300):
+        assert placed(told_ms, time_ms) is not None
+
+
 def test_position_is_interpolated_extrapolated_and_then_unknown_while_attitude_stays() -> None:
     buffer = OwnShipBuffer()
     for k in range(100):

@@ -109,6 +109,38 @@ def test_of_two_side_by_side_the_one_that_goes_is_soon_lost(kind: str, apart_m: 
     assert {count for t, count in counts if t > 5.0} == {1}
 
 
+def test_of_three_side_by_side_of_whom_one_or_other_is_missed_in_each_frame_none_is_dropped() -> None:
+    three = [np.array([8.0 * i, 0.0, 200.0 + 4.0 * i]) for i in range(3)]
+
+    def seen(t: float) -> list[np.ndarray]:
+        return [place for i, place in enumerate(three) if t < 1.0 or i != round(30 * t) % 3]
+
+    assert {count for t, count in tracked("cam", seen, 9.0) if t > 0.5} == {3}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_that_are_often_missed_at_few_frames_a_second_are_two(seed: int) -> None:
+    missed = np.random.default_rng(seed).random((90, 2)) < 0.5
+    missed[:6] = False
+    rng, tracker, counts = np.random.default_rng(0), Tracker(4, LOOKING_NORTH), []
+    for i in range(90):
+        places = [np.array([8.0 * k, 0.0, 200.0]) for k in range(2) if not missed[i, k]]
+        seen = [sight(rng, place, NORTH_EAST) for place in places]
+        counts.append(len(tracker.update(1 + i * 200_000_000, seen, None, K, SIZE_WH)))
+    assert set(counts[2:]) == {2}
+
+
+def test_who_is_chosen_stays_when_two_targets_are_one_aircraft() -> None:
+    rng, tracker, chosen = np.random.default_rng(0), Tracker(4, LOOKING_NORTH), None
+    for i in range(210):
+        place = np.array([8.0 * (i >= 60), 0.0, 200.0])
+        tracks = tracker.update(1 + round(i * 1e9 / 30), [sight(rng, place, NORTH_EAST)], None, K, SIZE_WH, (), chosen)
+        chosen = tracks[-1].track_id if i == 75 else chosen
+        if i == 75:
+            assert len(tracks) == 2
+    assert [track.track_id for track in tracks] == [chosen]
+
+
 @pytest.mark.parametrize("knock_px", [80.0, 200.0])
 def test_after_a_knock_of_the_camera_one_aircraft_is_one_target_again(knock_px: float) -> None:
     knock_m = np.array([knock_px * 200.0 / K[0, 0], 0.0, 0.0])

@@ -34,6 +34,9 @@ def test_each_side_of_a_step_of_the_clock_is_a_file(
         for k in range(5):
             recorder.record(topics.POSE, "uav1", "t0", b"%d %d" % (behind_ns, k), 1)
             written += 1
+        if behind_ns == 0:
+            recorder.record(topics.CAMERA_INFO, "uav1", None, b"other lens", 1)
+            written += 1
         if flush_s < 1:
             until(lambda count=written: recorder.counters()["recorded"] == count)  # type: ignore[misc]
     recorder.stop()
@@ -43,6 +46,9 @@ def test_each_side_of_a_step_of_the_clock_is_a_file(
             messages = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages()]
         assert all(one[0] <= other[0] for one, other in pairwise(messages))
         assert messages[-1][0] - messages[0][0] < 60 * 10**9
-        assert messages[0][1] == b"lens", "each can be read by itself"
-        told.append([data for _, data in messages[1:]])
-    assert told == [[b"%d %d" % (ns, k) for k in range(5)] for ns in (3 * DAY_NS, 0, 2_000_000_000)]
+        told.append([data for _, data in messages])
+    poses = [[b"%d %d" % (ns, k) for k in range(5)] for ns in (3 * DAY_NS, 0, 2_000_000_000)]
+    assert told[0] == [b"lens", *poses[0]]
+    assert [one for one in told[1] if one != b"lens"] == [*poses[1], b"other lens"]
+    assert told[2] == [b"other lens", *poses[2]], "what is told on change alone is told again"
+    assert recorder.counters() == {"recorded": written}

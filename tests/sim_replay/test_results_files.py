@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
+from sim_replay.evaluation.table import consistency_line
 from sim_replay.score import TargetPose
 from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
 
@@ -128,3 +130,22 @@ def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:
         with pytest.raises(BopError, match=r"test_targets_bop19\.json: lists none of the 2 pictures"):
             open_dataset(root).labelled_frames()
     assert json.loads((root / "test_targets_bop19.json").read_text())
+
+
+def test_a_distractor_without_a_model_is_passed_over_where_it_is_not_asked_for(root: Path) -> None:
+    truth = json.loads((root / "test" / "000000" / "scene_gt.json").read_text())
+    truth["0"][1]["obj_id"] = 77
+    write_json(root / "test" / "000000" / "scene_gt.json", truth)
+    listed(root, {"scene_id": 0, "im_id": 0, "obj_id": 1, "inst_count": 1})
+    frames = judged(root, [(1, 0.9, LEFT, True)])
+    assert (turns_deg(frames), frames[0].false_poses) == ([0], ())
+
+
+def test_covariances_that_cannot_be_inverted_are_told_in_the_table() -> None:
+    console = Console(record=True, width=200)
+    rotation = {"nees_mean": 3.1, "bounds_95": [0.2, 9.3]}
+    for found in ({"position": None, "rotation": rotation}, {"position": None, "rotation": None}):
+        console.print(consistency_line({"flights": 1, "singular": 4, **found}))
+    said = console.export_text()
+    assert "mean of 1 flights (honest: 0.2 to 9.3): rotation 3.10; 4 poses left out" in said
+    assert "no covariance of 4 poses can be inverted" in said

@@ -85,6 +85,7 @@ def test_a_target_in_the_camera_itself_is_refused(scene: Path) -> None:
     placed(scene, 0, 0, 0)
     with pytest.raises(BopError, match="puts obj_id 1 into the camera itself"):
         read_scene(scene)
+    assert seen(scene, bbox_visib=[-1, -1, -1, -1], px_count_visib=0).visible_px == 0, "one that nobody sees may be"
 
 
 def test_a_picture_lies_as_its_pixels_do_whatever_its_exif_says(scene: Path) -> None:

@@ -89,7 +89,8 @@ def _opened(
 ) -> Iterator[None]:
     """Where the recording goes: a file, a server for browsers on this machine, or a window that stays."""
     if options.save is not None:
-        with saved(rec, options.save, stop):
+        # A live view is whole whenever it is ended.
+        with saved(rec, options.save, stop, lambda: not (options.recordings and stop.is_set())):
             yield
     elif options.web_port is not None:
         with _server(options.web_port) as address:

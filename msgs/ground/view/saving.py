@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -37,11 +37,11 @@ class _Writer(threading.Thread):
 
 
 @contextmanager
-def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event) -> Iterator[None]:
+def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: Callable[[], bool]) -> Iterator[None]:
     """What is logged inside goes to `path`, put there when all is written: until then, what was there stays.
 
-    Where a recording ends in the middle, what came before is put there if nothing was. Sets `stop` as soon as no more
-    can be written. Raises InputError, and leaves nothing behind then.
+    What ends in the middle, by an exception or as not `complete`, is put there if nothing was. Sets `stop` as soon as
+    no more can be written. Raises InputError, and leaves nothing behind then.
     """
     whole = Path(os.path.realpath(path))  # a link stays one
     if whole.exists() and not whole.is_file():
@@ -60,19 +60,22 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event) -> Iterato
             rec.save(f"/dev/fd/{write_end}")
         finally:
             os.close(write_end)
-        broken: InputError | None = None
+        broken: BaseException | None = None
         try:
             yield
-        except InputError as error:
+        except BaseException as error:
             broken = error
         rec.disconnect()
         writer.join()
         if writer.error is not None:
             raise _unwritable(path, writer.error) from writer.error
-        if broken is None or not replaces:
+        kept = replaces and not (broken is None and complete())
+        if not kept:
             _put(unfinished, whole, path)
         if broken is not None:
             raise broken
+        if kept:
+            raise InputError(f"--save {path}: ended before all was drawn; the file that was there stays")
     finally:
         rec.disconnect()
         writer.join()

@@ -5,12 +5,17 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
+import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
 from msgs.ground.cli import main
+from msgs.ground.errors import InputError
+from msgs.ground.view.saving import saved
 
 from .flight import record
 
@@ -74,6 +79,36 @@ def test_a_recording_that_ends_in_the_middle_leaves_an_old_file_and_is_a_file_wh
     assert names(flight.parent) == ["flight.mcap", "out.rrd"]
     assert main(["view", str(flight), "--save", str(flight.with_name("new.rrd"))]) == 2
     assert len(RrdReader(flight.with_name("new.rrd")).recordings()) == 1, "what came before the cut"
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_a_recording_broken_off_replaces_no_old_file_and_a_live_view_does(flight: Path, old: bool) -> None:
+    out, stop = flight.with_name("out.rrd"), threading.Event()
+    out.unlink() if not old else None
+    rec = rr.RecordingStream("broken_off")
+    with pytest.raises(InputError, match="the file that was there stays") if old else nullcontext():  # noqa: SIM117
+        with saved(rec, out, stop, complete=lambda: False):
+            rec.log("a", rr.TextLog("one"))
+    assert (out.read_bytes() == OLD) == old
+    with saved(rr.RecordingStream("live"), out, stop, complete=lambda: True):
+        pass
+    assert out.read_bytes() != OLD
+
+
+def test_what_an_unforeseen_end_leaves_is_kept_where_there_was_nothing(flight: Path) -> None:
+    new = flight.with_name("new.rrd")
+
+    def end_in_the_middle(path: Path) -> None:
+        rec = rr.RecordingStream("ended")
+        with saved(rec, path, threading.Event(), lambda: True):
+            rec.log("a", rr.TextLog("one"))
+            raise RuntimeError("unforeseen")
+
+    for path in (new, flight.with_name("out.rrd")):
+        with pytest.raises(RuntimeError, match="unforeseen"):
+            end_in_the_middle(path)
+    assert len(RrdReader(new).recordings()) == 1
+    assert flight.with_name("out.rrd").read_bytes() == OLD
 
 
 def test_what_is_no_file_is_not_replaced(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
