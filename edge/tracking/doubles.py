@@ -14,6 +14,7 @@ Key = tuple[int, int]  # number and birth
 @dataclass
 class _Turns:
     since_ns: int
+    last_ns: int
     count: int = 0
 
 
@@ -28,10 +29,14 @@ class Doubles:
 
         Of `both`, any two were seen at once.
         """
-        fresh = {pair: t for pair, t in self._turns.items() if not pair <= both and time_ns - t.since_ns < 5 * TURNS_NS}
-        self._turns, found = fresh, []
+        # A target that nobody has seen for so long is gone, and its turns with it.
+        self._turns = {
+            pair: one for pair, one in self._turns.items() if not pair <= both and time_ns - one.last_ns <= TURNS_NS
+        }
+        found = []
         for seen, missed in turns:
-            known = self._turns.setdefault(frozenset((seen, missed)), _Turns(time_ns))
+            known = self._turns.setdefault(frozenset((seen, missed)), _Turns(time_ns, time_ns))
+            known.last_ns = time_ns
             known.count += 1
             if known.count >= TURNS_MIN and time_ns - known.since_ns > TURNS_NS:
                 found.append((seen, missed))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from edge.tracking import so3
 from edge.tracking.association import best_pairs
+from edge.tracking.doubles import TURNS_MIN, Doubles
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, TrackState
 
@@ -139,6 +140,17 @@ def test_who_is_chosen_stays_when_two_targets_are_one_aircraft() -> None:
         if i == 75:
             assert len(tracks) == 2
     assert [track.track_id for track in tracks] == [chosen]
+
+
+def test_two_that_take_turns_for_very_long_at_few_frames_a_second_are_one_at_last() -> None:
+    doubles, found = Doubles(), []
+    for second in range(30):
+        one, other = ((0, 1), (1, 5)) if second % 2 else ((1, 5), (0, 1))
+        found.append(doubles.among({one}, [(one, other)], second * 10**9))
+    assert not any(found[: TURNS_MIN - 1])
+    assert all(found[TURNS_MIN - 1 :])
+    assert doubles.among({(0, 1), (1, 5)}, [], 30 * 10**9) == []
+    assert doubles.among({(0, 1)}, [((0, 1), (1, 5))], 31 * 10**9) == [], "both were seen at once"
 
 
 @pytest.mark.parametrize("knock_px", [80.0, 200.0])
