@@ -123,7 +123,8 @@ class MavlinkSettings(Section):
     endpoints: list[Endpoint] = Field(
         default=["udpin:127.0.0.1:14550"],
         min_length=1,
-        description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD; spoken on at once",
+        description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD; the autopilot's own link first; "
+        "spoken on at once",
     )
     system_id: int | None = Field(
         default=None, ge=1, le=255, description="the vehicle's; default: taken from its heartbeat"

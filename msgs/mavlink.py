@@ -120,8 +120,7 @@ def pack(mav: Any, message: Any, *, unknown: Collection[str] = ()) -> bytes:
     return packed
 
 
-def pack_target_relative(
-    mav: Any,
+def target_relative(
     *,
     utc_us: int,
     target_id: int,
@@ -130,16 +129,16 @@ def pack_target_relative(
     attitude_std_rad: float,
     q_cam_target_wxyz: Sequence[float] | None,
     q_ned_cam_wxyz: Sequence[float] | None,
-) -> bytes:
-    """TARGET_RELATIVE (511) with the target's full pose in `cam` (frame OTHER), as one MAVLink 2 packet.
+) -> Any:
+    """TARGET_RELATIVE (511) with the target's full pose in `cam` (frame OTHER), for `pack`.
 
     Vectors are [3], quaternions [4] of unit length; `q_cam_target_wxyz` None: the target's attitude is not known,
-    `q_ned_cam_wxyz` None: the own one; all zeros say so. `utc_us` is the exposure time. Raises ValueError for a value
-    that is not finite, no rotation, or does not fit its field.
+    `q_ned_cam_wxyz` None: the own one; all zeros say so. `utc_us` is the exposure time. Raises ValueError for what is
+    no vector or no rotation; `pack` does for a value that is not finite or does not fit its field.
     """
     q_target = _Q_UNKNOWN if q_cam_target_wxyz is None else _unit_quaternion("q_target", q_cam_target_wxyz)
     q_sensor = _Q_UNKNOWN if q_ned_cam_wxyz is None else _unit_quaternion("q_sensor", q_ned_cam_wxyz)
-    message = MAVLink_target_relative_message(
+    return MAVLink_target_relative_message(
         utc_us,
         target_id,
         TARGET_OBS_FRAME_OTHER,
@@ -150,7 +149,11 @@ def pack_target_relative(
         q_sensor,
         dialect.LANDING_TARGET_TYPE_VISION_OTHER,
     )
-    return pack(mav, message)
+
+
+def pack_target_relative(mav: Any, **pose: Any) -> bytes:
+    """`target_relative` of a pose, as one MAVLink 2 packet. Raises ValueError as it and `pack` do."""
+    return pack(mav, target_relative(**pose))
 
 
 def _floats(field: str, values: Sequence[float], count: int) -> tuple[float, ...]:

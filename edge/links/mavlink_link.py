@@ -15,6 +15,7 @@ from pathlib import Path
 from edge import clock
 from edge.config import MavlinkSettings
 from edge.health import Condition
+from edge.links.mavlink_packing import Letter, Packer
 from edge.links.mavlink_peer import Endpoint
 from edge.links.mavlink_station import Station
 from edge.links.mavlink_vehicle import Contact
@@ -58,6 +59,7 @@ class MavlinkLink:
         signing: Signing | None = None,
     ) -> None:
         self._settings = settings
+        self._signing = signing
         self._station = Station(settings, own_ship, camera_info, requests, signing)
         self._endpoints: list[Endpoint] = []
         self._counted = self._count()  # replaced whole by the thread, so that nobody waits for it
@@ -75,10 +77,10 @@ class MavlinkLink:
     def start(self) -> None:
         """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
         station = self._station
-        for text in self._settings.endpoints:
-            transport = open_transport(text)
-            hosts, judges = self._settings.allowed_hosts, (station.authentic, station.introduces, station.outruns)
-            self._endpoints.append(Endpoint(transport, hosts, station.refused, *judges))
+        for number, text in enumerate(self._settings.endpoints):
+            transport, packer = open_transport(text), Packer(number, self._signing)
+            hosts = self._settings.allowed_hosts
+            self._endpoints.append(Endpoint(transport, hosts, station.refused, station.recognition, packer))
         for end in (self._wake, self._woken):
             end.setblocking(False)
         if not clock.stepped():  # else each step takes its turn here
@@ -207,26 +209,22 @@ class MavlinkLink:
         now_ns = clock.monotonic_ns()
         if condition is not None:
             self._station.health(condition, now_ns)
-        packings: list[Callable[[], Iterable[bytes]]] = []
         if report is not None:
-            packings.append(partial(self._packed_in_time, report, now_ns))
-        packings += [partial(self._station.event, severity, text, now_ns) for severity, text in events]
-        for packing in packings:
             try:
-                self._send(packing())
+                self._send(self._in_time(report, now_ns))
             except ValueError as error:
-                # A value that no field holds: this is not sent, the next may be.
-                self._station.counters["unpackable"] += 1
-                log.warning("mavlink: not sent: %s", error)
+                self._unpackable(error)
+        for severity, text in events:
+            self._send(self._station.event(severity, text, now_ns))
 
-    def _packed_in_time(self, report: Report, now_ns: int) -> Iterator[bytes]:
-        """The report's frames one by one, each while the process has not been held up since the report's age was
+    def _in_time(self, report: Report, now_ns: int) -> Iterator[Letter]:
+        """The report's messages one by one, each while the process has not been held up since the report's age was
         looked at."""
-        for data in self._station.report(report, now_ns):
+        for letter in self._station.report(report, now_ns):
             if clock.monotonic_ns() - now_ns > HELD_UP_MAX_NS:
                 self._station.counters["held_up"] += 1
                 return
-            yield data
+            yield letter
 
     def _hear(self, number: int, endpoint: Endpoint) -> None:
         now_ns = clock.monotonic_ns()
@@ -234,8 +232,7 @@ class MavlinkLink:
         while now_ns < until_ns and (received := endpoint.transport.receive()) is not None:
             now_ns = clock.monotonic_ns()
             messages = endpoint.believed(received, now_ns)
-            for reply in self._station.take(messages, number, now_ns):
-                self._station.counters["send_failed"] += not endpoint.send(reply)
+            self._send(self._station.take(messages, number, now_ns), [endpoint])
 
     def _tick(self, now_ns: int) -> None:
         was = self._station.vehicle.contact
@@ -247,7 +244,7 @@ class MavlinkLink:
             self._told = (vehicle.system_id, vehicle.autopilot)
             for sentence in self._station.withheld():
                 log.warning("mavlink: %s", sentence)
-        for sentence in self._station.rivals():
+        for sentence in self._station.recognition.news():
             log.warning("mavlink: %s", sentence)
             self.event(dialect.MAV_SEVERITY_WARNING, sentence)
         self._send(out.everywhere)
@@ -255,7 +252,15 @@ class MavlinkLink:
         if home is not None:
             self._send(out.home, self._endpoints[home : home + 1])
 
-    def _send(self, frames: Iterable[bytes], endpoints: Sequence[Endpoint] | None = None) -> None:
-        for data in frames:
-            for endpoint in self._endpoints if endpoints is None else endpoints:
-                self._station.counters["send_failed"] += not endpoint.send(data)
+    def _send(self, letters: Iterable[Letter], endpoints: Sequence[Endpoint] | None = None) -> None:
+        for letter in letters:
+            try:
+                for endpoint in self._endpoints if endpoints is None else endpoints:
+                    self._station.counters["send_failed"] += not endpoint.send(letter)
+            except ValueError as error:
+                self._unpackable(error)
+
+    def _unpackable(self, error: ValueError) -> None:
+        """A value that no field holds: this is not sent, the next may be."""
+        self._station.counters["unpackable"] += 1
+        log.warning("mavlink: not sent: %s", error)

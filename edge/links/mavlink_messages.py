@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from edge.health import Activity, Condition, HealthState
+from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
 from edge.links.outgoing import rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, CameraInfo, Report, Track, TrackState
+from msgs import mavlink
 from msgs.geometry import euler_from_R, q_wxyz_from_R
-from msgs.mavlink import dialect, pack_target_relative
+from msgs.mavlink import dialect
 
 NAN = math.nan
 # Fields whose definition gives NaN the meaning "not known".
@@ -51,12 +53,11 @@ def heartbeat(kind: int, condition: Condition) -> Any:
     return dialect.MAVLink_heartbeat_message(kind, dialect.MAV_AUTOPILOT_INVALID, flags, mode, status, 3)
 
 
-def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
-    """TARGET_RELATIVE (511), packed: the full pose in `cam`; its timestamp is UNIX time of the exposure, µs."""
+def target_relative(track: Track, utc_us: int) -> Any:
+    """TARGET_RELATIVE (511): the full pose in `cam`; its timestamp is UNIX time of the exposure, µs."""
     R_ned_cam = None if track.R_ned_target is None else track.R_ned_target @ track.R_cam_target.T
     variance = np.diag(track.covariance)
-    return pack_target_relative(
-        mav,
+    return mavlink.target_relative(
         utc_us=utc_us,
         target_id=track.track_id,
         t_cam_target_m=track.t_cam_target_m.tolist(),
@@ -68,12 +69,16 @@ def target_relative(mav: Any, track: Track, utc_us: int) -> bytes:
 
 
 def image_status(report: Report, track: Track | None) -> Any:
-    """CAMERA_TRACKING_IMAGE_STATUS (275): the box as shares of the picture, 0..1; idle without a track."""
+    """CAMERA_TRACKING_IMAGE_STATUS (275): the box as shares of the picture, 0..1; idle without a track. One that lies
+    outside is no rectangle in the picture: the target is predicted, and none is told."""
     if track is None:
         return idle_image_status()
     # Pixel centres are integers, so the picture's edge lies half a pixel before 0.
     shares = (track.box_xyxy_px.reshape(2, 2) + 0.5) / np.array(report.image_size_wh)
     (left, top), (right, bottom) = np.clip(shares, 0.0, 1.0).tolist()
+    if right <= left or bottom <= top:
+        predicted = (dialect.CAMERA_TRACKING_STATUS_FLAGS_COASTING, dialect.CAMERA_TRACKING_MODE_RECTANGLE, 0)
+        return dialect.MAVLink_camera_tracking_image_status_message(*predicted, *[NAN] * 7)
     return dialect.MAVLink_camera_tracking_image_status_message(
         TRACKING_STATUS[track.state],
         dialect.CAMERA_TRACKING_MODE_RECTANGLE,
@@ -145,14 +150,36 @@ def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_m
     )
 
 
+def interval_request(system_id: int, message_id: int, rate_hz: float) -> Any:
+    """COMMAND_LONG (76) that asks the autopilot of a system for a message at a rate."""
+    # PX4 refuses the command unless the parameters it does not know are zero.
+    return dialect.MAVLink_command_long_message(
+        system_id, AUTOPILOT_COMPONENT, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
+        message_id, 1e6 / rate_hz, 0, 0, 0, 0, 0,
+    )  # fmt: skip
+
+
 def statustexts(severity: int, text: str, text_id: int) -> list[Any]:
     """STATUSTEXT (253), in chunks of 50 bytes if need be; `text_id` 1..65535 ties them together."""
-    data = text.encode()
-    chunks = [data[i : i + STATUSTEXT_BYTES] for i in range(0, len(data), STATUSTEXT_BYTES)] or [b""]
+    chunks = _cut(text.encode())
     shared = text_id if len(chunks) > 1 else 0
     if shared and len(chunks[-1]) == STATUSTEXT_BYTES:
         chunks.append(b"")  # a null is what tells the last chunk: without one the whole text is waited for in vain
     return [dialect.MAVLink_statustext_message(severity, chunk, shared, i) for i, chunk in enumerate(chunks)]
+
+
+def _cut(data: bytes) -> list[bytes]:
+    """UTF-8 in pieces that a STATUSTEXT holds, at least one. None ends inside a character, as receivers decode each by
+    itself; where a character would, spaces fill the piece, as a null would end the text.
+    """
+    pieces = []
+    while len(data) > STATUSTEXT_BYTES:
+        end = STATUSTEXT_BYTES
+        while data[end] & 0xC0 == 0x80:  # in the middle of a character
+            end -= 1
+        pieces.append(data[:end].ljust(STATUSTEXT_BYTES))
+        data = data[end:]
+    return [*pieces, data]
 
 
 def _largest_std(P: Array) -> float:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 RESUMED_HZ = math.inf  # to `set_rate`: the rate that holds, or the default of what is off
+ASKED_NS = 1_000_000_000  # what was asked for once and could not be told for so long is not told later
 EARLY_SHARE = 0.1  # a message may come this share of its interval early: frames jitter
 
 
@@ -16,7 +17,7 @@ class Schedule:
         self._default_hz = dict(default_hz)
         self._hz = dict(default_hz)
         self._due_ns: dict[tuple[int, int], int] = {}
-        self._once: set[int] = set()
+        self._once: dict[int, int] = {}  # message id, until ns
 
     @property
     def message_ids(self) -> set[int]:
@@ -28,15 +29,14 @@ class Schedule:
             hz = self._hz[message_id] or None
         self._hz[message_id] = self._default_hz[message_id] if hz is None else hz
 
-    def ask_once(self, message_id: int) -> None:
-        """Let the next opportunity be taken whatever the rate."""
-        self._once.add(message_id)
+    def ask_once(self, message_id: int, now_ns: int) -> None:
+        """Let the next opportunity within ASKED_NS be taken whatever the rate."""
+        self._once[message_id] = now_ns + ASKED_NS
 
     def due(self, message_id: int, instance: int, now_ns: int) -> bool:
         """Whether to send now; it then counts as sent. False for what is not scheduled at all."""
         hz = self._hz.get(message_id, 0.0)
-        if message_id in self._once:
-            self._once.discard(message_id)
+        if now_ns <= self._once.pop(message_id, -1):
             return message_id in self._hz
         if hz == 0.0:
             return False

@@ -1,13 +1,13 @@
-"""Both components we are on MAVLink, onboard computer and camera: messages in, frames out, no socket.
+"""Both components we are on MAVLink, onboard computer and camera: messages in, messages out, no socket.
 
-Every time comes in as an argument (monotonic ns). Used by one thread. Links are known by number; telemetry is taken
-from one of them alone, the home link, where the autopilot was heard first, until it falls silent there.
+Every time comes in as an argument (monotonic ns). Used by one thread. Links are known by number, in the order of
+preference; telemetry is taken from one of them alone, the home link.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,11 +18,13 @@ from edge.links import mavlink_messages as words
 from edge.links.allowance import Allowance
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
+from edge.links.mavlink_packing import Letter
 from edge.links.mavlink_primary import Primary
 from edge.links.mavlink_rates import sent_rates_hz, wanted_rates_hz
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT, COMMANDS, is_autopilot_heartbeat, misaddressed
-from edge.links.mavlink_rivals import Rivals
+from edge.links.mavlink_recognition import Recognition
 from edge.links.mavlink_schedule import Schedule
+from edge.links.mavlink_sight import Sight
 from edge.links.mavlink_table import (
     ADSB_VEHICLE,
     ATTITUDE,
@@ -46,12 +48,11 @@ from edge.requests import RequestQueue
 from edge.tracking.clock import TimesyncEstimator
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report, Track
-from msgs.mavlink import MAVLink, dialect, pack
+from msgs.mavlink import dialect
 
 SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, to make ourselves known to a peer that waits for us
 HEARTBEAT_NS = 1_000_000_000
 HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stuck, and no heartbeat may hide that
-HOME_SILENT_NS = 3_000_000_000
 FRAMELESS_NS = 1_000_000_000  # no report for longer: nothing is tracked, and who draws the box is told so
 TIMESYNC_NS = 200_000_000
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
@@ -60,10 +61,10 @@ STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
 @dataclass
 class Outgoing:
-    """Frames for every peer, and for the home link alone."""
+    """For every peer, and for the home link alone."""
 
-    everywhere: list[bytes] = field(default_factory=list)
-    home: list[bytes] = field(default_factory=list)
+    everywhere: list[Letter] = field(default_factory=list)
+    home: list[Letter] = field(default_factory=list)
 
 
 class Station:
@@ -81,67 +82,35 @@ class Station:
         self.refused: Counter[str] = Counter()
         self.timesync = TimesyncEstimator()
         self.vehicle = Vehicle(settings.system_id, wanted_rates_hz(settings, own_ship), STANDS_IN)
-        self.home: int | None = None
+        self.recognition = Recognition(self.vehicle, settings.system_id, signing, self.refused)
         self._settings = settings
         self._camera = camera
         self._requests = requests
-        self._signing = signing
         self._telemetry = Telemetry(own_ship, self.timesync, settings.gimbal_component_id)
         self._utc = UtcClock()
         self._components = (settings.component_id, settings.camera_component_id)
-        self._packers = {component: MAVLink(None, srcComponent=component) for component in self._components}
-        self._virtual = MAVLink(None, settings.virtual_system_id, settings.component_id)
         self._schedule = Schedule(sent_rates_hz(settings))
         self._computer = ComputerReader()
-        self._home_heard_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
+        self._heartbeat_due_ns = self._timesync_due_ns = 0
         self._health: tuple[Condition, int] | None = None
-        self._reported_ns: int | None = None
+        self._sight: Sight | None = None
         self._text_id = 0
+        self._held_text: tuple[int, str] | None = None  # what is wrong, until there is a vehicle to say it for
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
-        self._rivals = Rivals()
         self._primary = Primary()
 
-    def authentic(self, messages: Iterable[Any]) -> list[Any]:
-        """Those that carry a valid signature; all of them where nothing is signed."""
-        if self._signing is None:
-            return list(messages)
-        believed = []
-        for message in messages:
-            reason = self._signing.refusal(message)
-            if reason is None:
-                believed.append(message)
-            else:
-                self.refused[reason] += 1
-        return believed
-
-    def introduces(self, message: Any) -> bool:
-        """Whether a stranger's message is the heartbeat of an autopilot that we would listen to."""
-        return is_autopilot_heartbeat(message) and self._settings.system_id in (None, message.get_srcSystem())
-
     @property
-    def outruns(self) -> Callable[[Any, int], bool] | None:
-        """Whether a stranger's heartbeat, at a time, proves by its signature that who is heeded tells what was held
-        back; None: nothing is signed."""
-        signing = self._signing
-        return (
-            None if signing is None else lambda message, ns: self.introduces(message) and signing.outruns(message, ns)
-        )
+    def home(self) -> int | None:
+        """The link that telemetry is asked for and taken from."""
+        return self.recognition.home.link
 
-    def take(self, messages: Iterable[Any], link: int, now_ns: int) -> list[bytes]:
+    def take(self, messages: Iterable[Any], link: int, now_ns: int) -> list[Letter]:
         """Take authentic messages from a trusted address of a link; returns replies to it."""
-        replies: list[bytes] = []
+        replies: list[Letter] = []
         for message in messages:
-            if (message.get_srcSystem(), message.get_srcComponent()) == (self.vehicle.system_id, AUTOPILOT_COMPONENT):
-                self.vehicle.spoke(now_ns)
-                if link == self.home:
-                    self._home_heard_ns = now_ns
+            self.recognition.heard(message, link, now_ns)
             if is_autopilot_heartbeat(message):
-                ours = self._meet(message, link, now_ns)
-                self._count(message, None if ours else "not_our_autopilot")
-                if ours:
-                    self._rivals.forget(message.get_srcSystem())
-                else:
-                    self._rivals.heard(message.get_srcSystem(), now_ns)
+                self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
                 continue
             reason = self._misdirected(message, link)
             self._count(message, reason)
@@ -157,12 +126,14 @@ class Station:
         """Let time pass: heartbeats, own computer, time synchronisation, requests for rates."""
         self.vehicle.tick(now_ns)
         out = Outgoing()
-        if now_ns >= self._heartbeat_due_ns and self._health and now_ns - self._health[1] <= HEALTH_AGE_MAX_NS:
+        if now_ns >= self._heartbeat_due_ns and (condition := self._condition(now_ns)) is not None:
             self._heartbeat_due_ns = now_ns + HEARTBEAT_NS
-            condition = self._health[0]
-            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
-            out.everywhere.append(self._packed(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
-        frameless = self._reported_ns is not None and now_ns - self._reported_ns > FRAMELESS_NS
+            out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
+            out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
+        if self._held_text is not None and self.vehicle.system_id is not None:
+            out.everywhere += self._texts(*self._held_text)
+            self._held_text = None
+        frameless = self._sight is not None and not self._in_sight(now_ns)
         if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
             out.everywhere.append(self._image_status(words.idle_image_status()))
         if self.vehicle.contact is not Contact.HEARD:
@@ -171,13 +142,13 @@ class Station:
             out.everywhere += self._computer_status(now_ns)
         if now_ns >= self._timesync_due_ns:
             self._timesync_due_ns = now_ns + TIMESYNC_NS
-            out.home.append(self._packed(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
+            out.home.append(self._letter(dialect.MAVLink_timesync_message(0, self.timesync.request(now_ns))))
         wanted = self.vehicle.request(now_ns)
         if wanted is not None:
-            out.home.append(self._packed(self._interval_request(*wanted)))
+            out.home.append(self._letter(words.interval_request(self._system_id, *wanted)))
         return out
 
-    def report(self, report: Report, now_ns: int) -> list[bytes]:
+    def report(self, report: Report, now_ns: int) -> list[Letter]:
         """What goes out for one frame, as far as each message's rate allows.
 
         Nothing before there is a vehicle. While its autopilot is silent, what is seen in the picture alone: who draws
@@ -187,10 +158,10 @@ class Station:
         self._camera = replace(self._camera, image_size_wh=report.image_size_wh, K=report.K)
         if self.vehicle.contact is Contact.WAITING:
             return []
-        self._reported_ns = now_ns
         tracks = sendable(report, now_ns, self._settings.max_age_ms)
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
         first = self._primary.of(report.tracks, tracks, report.chosen_id, now_ns)
+        self._sight = Sight(report, tracks, first, now_ns)
         seen = words.image_status(report, first) if self._schedule.due(IMAGE_STATUS, 0, now_ns) else None
         if self.vehicle.contact is not Contact.HEARD:
             return [self._image_status(seen)] if seen is not None else []
@@ -200,53 +171,39 @@ class Station:
         geo_due = first is not None and self._schedule.due(GEO_STATUS, 0, now_ns)
         place = words.geo_status(report, first) if first is not None and geo_due else None
         if place is not None:
-            out.append(self._packed(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
+            out.append(self._letter(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
         return out + self._traffic(report, tracks, first, now_ns)
 
-    def event(self, severity: int, text: str, now_ns: int) -> list[bytes]:
+    def event(self, severity: int, text: str, now_ns: int) -> list[Letter]:
         """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. What is wrong goes out always, what is only news
-        (a person who drags a point over the picture makes much of it) as far as a radio carries it."""
-        if severity > dialect.MAV_SEVERITY_WARNING and not self._news.take(now_ns):
+        (a person who drags a point over the picture makes much of it) as far as a radio carries it.
+
+        Before there is a vehicle to speak for, nothing does; the last of what is wrong, once there is."""
+        wrong = severity <= dialect.MAV_SEVERITY_WARNING
+        if self.vehicle.system_id is None:
+            self._held_text = (severity, text) if wrong else self._held_text
+            return []
+        if not wrong and not self._news.take(now_ns):
             self.counters["news_left_out"] += 1
             return []
-        self._text_id = self._text_id % 65535 + 1
-        return [self._packed(message) for message in words.statustexts(severity, text, self._text_id)]
+        return self._texts(severity, text)
 
     def withheld(self) -> list[str]:
         """Sentences: what the settings ask for and this vehicle does not get."""
         settings, found = self._settings, []
         if settings.target_relative and TARGET_RELATIVE not in self._enabled():
             found.append("TARGET_RELATIVE is not sent to PX4; target_relative_to_px4 = true sends it")
-        if self._traffic_ids and self._virtual.srcSystem == self.vehicle.system_id:
+        if self._traffic_ids and self._virtual_id_taken:
             found.append(f"neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {self._system_id}")
         return found
 
-    def rivals(self) -> list[str]:
-        """Sentences, each once: who else could be the own autopilot, where the settings do not tell."""
-        if self._settings.system_id is not None or self.vehicle.contact is not Contact.HEARD:
-            return []
-        ours = self.vehicle.system_id
-        return [
-            f"autopilots {ours} and {system} are heard; {ours}, the first, is taken for our own: set system_id"
-            for system in self._rivals.news()
-        ]
-
     def _meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
         before = self.vehicle.system_id
-        # Not at another link's word: to PX4 goes less than to others.
-        home_speaks = self.home not in (None, link) and now_ns - self._home_heard_ns <= HOME_SILENT_NS
-        autopilot = None if home_speaks else heartbeat.autopilot
-        if not self.vehicle.heartbeat(heartbeat.get_srcSystem(), autopilot, now_ns):
-            return False
+        ours = self.recognition.meet(heartbeat, link, now_ns)
         if before not in (None, self.vehicle.system_id):
             self._telemetry.forget(now_ns)  # another vehicle's clock, attitude and origin
             self.timesync.clear()
-        if link != self.home and not home_speaks:
-            self.home = link
-            self.vehicle.ask_anew()
-        if link == self.home:
-            self._home_heard_ns = now_ns
-        return True
+        return ours
 
     def _misdirected(self, message: Any, link: int) -> str | None:
         vehicle_id = self.vehicle.system_id
@@ -258,14 +215,17 @@ class Station:
         if message.get_msgId() in COMMANDS:
             allowed = self._settings.commanders
             return None if not allowed or message.get_srcSystem() in allowed else "not_a_commander"
-        return None if link == self.home else "other_link"
+        # Who asks for our clock gets it where it asks; answers to us were asked for at home.
+        asks_time = message.get_msgId() == TIMESYNC and message.tc1 == 0
+        return None if link == self.home or asks_time else "other_link"
 
-    def _believe(self, message: Any, now_ns: int) -> list[bytes]:
+    def _believe(self, message: Any, now_ns: int) -> list[Letter]:
         message_id = message.get_msgId()
         self.vehicle.arrived(message_id, now_ns)
         if message_id == TIMESYNC:
             if message.tc1 == 0:
-                return [self._packed(dialect.MAVLink_timesync_message(now_ns, message.ts1))]
+                # The clock of our stamps: PX4 adds what it learns here to the one of TARGET_RELATIVE.
+                return [self._letter(dialect.MAVLink_timesync_message(self._utc.utc_ns(now_ns), message.ts1))]
             self.counters["timesync_refused"] += not self.timesync.reply(message.tc1, message.ts1, now_ns)
         elif message_id == COMMAND_ACK:
             if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -286,40 +246,61 @@ class Station:
                 self.refused[reason] += 1
         return []
 
-    def _obey(self, command: Any, now_ns: int) -> list[bytes]:
+    def _obey(self, command: Any, now_ns: int) -> list[Letter]:
         width_px, height_px = self._camera.image_size_wh
         reply = answer(command, self._enabled(), width_px / height_px)
         result = reply.result
-        if reply.request is not None and not self._requests.put(reply.request):
+        refused = reply.request is not None and not self._requests.put(reply.request)
+        if refused or (reply.send_once is not None and not self._tells(reply.send_once, now_ns)):
             result = dialect.MAV_RESULT_TEMPORARILY_REJECTED
         camera = command.target_component == self._settings.camera_component_id
         asker = (command.get_srcSystem(), command.get_srcComponent())
         ack = dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *asker)
-        out = [self._packed(ack, camera=camera)]
-        if reply.interval is not None and result == reply.result:
+        out = [self._letter(ack, camera=camera)]
+        if result != reply.result:
+            return out
+        if reply.interval is not None:
             self._schedule.set_rate(*reply.interval)
-        if reply.send_once == CAMERA_INFORMATION:
+        return out if reply.send_once is None else out + self._once(reply.send_once, now_ns)
+
+    def _tells(self, message_id: int, now_ns: int) -> bool:
+        """Whether there is anything now that a message could say."""
+        if message_id in (CAMERA_INFORMATION, IMAGE_STATUS):
+            return True
+        if message_id == HEARTBEAT:
+            return self._condition(now_ns) is not None
+        if self.vehicle.contact is not Contact.HEARD:
+            return False
+        seen = self._sight if self._in_sight(now_ns) else None
+        return message_id == COMPUTER_STATUS or (seen is not None and seen.tells(message_id))
+
+    def _once(self, message_id: int, now_ns: int) -> list[Letter]:
+        """A message at once where nothing else is needed for it; else it goes as soon as it can be told."""
+        if message_id == CAMERA_INFORMATION:
             boot_ms = now_ns // 1_000_000 % 2**32
             information = words.camera_information(self._camera, self._settings.sensor_width_mm, boot_ms)
-            out.append(self._packed(information, camera=True, unknown=words.CAMERA_INFORMATION_UNKNOWN))
-        elif reply.send_once == HEARTBEAT:
+            return [self._letter(information, camera=True, unknown=words.CAMERA_INFORMATION_UNKNOWN)]
+        if message_id == IMAGE_STATUS and not self._in_sight(now_ns):
+            return [self._image_status(words.idle_image_status())]
+        if message_id == HEARTBEAT:
             self._heartbeat_due_ns = 0
-        elif reply.send_once is not None:
-            self._schedule.ask_once(reply.send_once)
-        return out
+        else:
+            self._schedule.ask_once(message_id, now_ns)
+        return []
 
-    def _interval_request(self, message_id: int, rate_hz: float) -> Any:
-        # PX4 refuses the command unless the parameters it does not know are zero.
-        return dialect.MAVLink_command_long_message(
-            self._system_id, AUTOPILOT_COMPONENT, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
-            message_id, 1e6 / rate_hz, 0, 0, 0, 0, 0,
-        )  # fmt: skip
+    def _condition(self, now_ns: int) -> Condition | None:
+        """As the loop told it; None: it is stuck."""
+        return self._health[0] if self._health and now_ns - self._health[1] <= HEALTH_AGE_MAX_NS else None
+
+    def _in_sight(self, now_ns: int) -> bool:
+        """Whether frames come."""
+        return self._sight is not None and now_ns - self._sight.seen_ns <= FRAMELESS_NS
 
     def _enabled(self) -> set[int]:
         """Ids that may go out to this autopilot."""
         to_px4 = self.vehicle.autopilot == dialect.MAV_AUTOPILOT_PX4
         withheld = {TARGET_RELATIVE} if to_px4 and not self._settings.target_relative_to_px4 else set()
-        return self._schedule.message_ids - withheld
+        return self._schedule.message_ids - withheld - (self._traffic_ids if self._virtual_id_taken else set())
 
     @property
     def _traffic_ids(self) -> set[int]:
@@ -328,13 +309,15 @@ class Station:
     def _wants_target_relative(self, track: Track, now_ns: int) -> bool:
         return TARGET_RELATIVE in self._enabled() and self._schedule.due(TARGET_RELATIVE, track.track_id, now_ns)
 
-    def _target_relative(self, report: Report, track: Track) -> bytes:
-        self.counters["sent_TARGET_RELATIVE"] += 1
-        utc_us = self._utc.utc_ns(report.meta.capture_ns) // 1000
-        return words.target_relative(self._packer(camera=False), track, utc_us)
+    @property
+    def _virtual_id_taken(self) -> bool:
+        return self._settings.virtual_system_id == self.vehicle.system_id
 
-    def _traffic(self, report: Report, tracks: list[Track], first: Track | None, now_ns: int) -> list[bytes]:
-        if self._virtual.srcSystem == self.vehicle.system_id:
+    def _target_relative(self, report: Report, track: Track) -> Letter:
+        return self._letter(words.target_relative(track, self._utc.utc_ns(report.meta.capture_ns) // 1000))
+
+    def _traffic(self, report: Report, tracks: list[Track], first: Track | None, now_ns: int) -> list[Letter]:
+        if self._virtual_id_taken:
             self.counters["virtual_system_id_taken"] += bool(self._traffic_ids)
             return []
         messages = []
@@ -344,40 +327,35 @@ class Station:
         if address is not None:
             due = [track for track in tracks if self._schedule.due(ADSB_VEHICLE, track.track_id, now_ns)]
             messages += [adsb_vehicle(report, track, address, now_ns) for track in due]
-        return [self._signed(self._virtual, message) for message in messages if message is not None]
+        return [self._letter(message, virtual=True) for message in messages if message is not None]
 
-    def _image_status(self, status: Any) -> bytes:
-        return self._packed(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN)
+    def _image_status(self, status: Any) -> Letter:
+        return self._letter(status, camera=True, unknown=words.IMAGE_STATUS_UNKNOWN)
 
-    def _computer_status(self, now_ns: int) -> list[bytes]:
+    def _texts(self, severity: int, text: str) -> list[Letter]:
+        self._text_id = self._text_id % 65535 + 1
+        return [self._letter(message) for message in words.statustexts(severity, text, self._text_id)]
+
+    def _computer_status(self, now_ns: int) -> list[Letter]:
         try:
             status = self._computer.read()
         except (OSError, ValueError, LookupError):
             self.counters["computer_unread"] += 1
             return []
-        return [self._packed(onboard_computer_status(status, self._utc.utc_ns(now_ns) // 1000))]
+        return [self._letter(onboard_computer_status(status, self._utc.utc_ns(now_ns) // 1000))]
 
     @property
     def _system_id(self) -> int:
         return self.vehicle.system_id or SYSTEM_ID_UNTIL_HEARD
 
-    def _packer(self, camera: bool) -> Any:
+    def _letter(
+        self, message: Any, *, camera: bool = False, virtual: bool = False, unknown: tuple[str, ...] = ()
+    ) -> Letter:
+        """From the onboard computer, or the camera, or the virtual system."""
+        self.counters[f"sent_{message.get_type()}"] += 1
         settings = self._settings
-        packer = self._packers[settings.camera_component_id if camera else settings.component_id]
-        packer.srcSystem = self._system_id
-        if self._signing is not None:
-            self._signing.prepare(packer)
-        return packer
-
-    def _packed(self, message: Any, *, camera: bool = False, unknown: tuple[str, ...] = ()) -> bytes:
-        self.counters[f"sent_{message.get_type()}"] += 1
-        return pack(self._packer(camera), message, unknown=unknown)
-
-    def _signed(self, packer: Any, message: Any) -> bytes:
-        if self._signing is not None:
-            self._signing.prepare(packer)
-        self.counters[f"sent_{message.get_type()}"] += 1
-        return pack(packer, message)
+        system_id = settings.virtual_system_id if virtual else self._system_id
+        return Letter(message, system_id, settings.camera_component_id if camera else settings.component_id, unknown)
 
     def _count(self, message: Any, refusal: str | None) -> None:
         if refusal is None:

@@ -113,7 +113,7 @@ class Telemetry:
         rates_radps = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         if self._jumps.attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps):
             self.attitude_jumps += 1
-            self._own_ship.clear()
+            self._own_ship.clear(same_autopilot=True)
             self._attitudes_from_ns = now_ns + JUMP_REST_NS
         if now_ns < self._attitudes_from_ns:
             return True
@@ -123,7 +123,7 @@ class Telemetry:
         t_ned_m, v_ned_mps = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
         if self._jumps.position(time_ns, t_ned_m, v_ned_mps):
             self.position_jumps += 1
-            self._own_ship.clear(same_axes=True)
+            self._own_ship.clear(same_axes=True, same_autopilot=True)
             self._positions_from_ns = now_ns + JUMP_REST_NS
         return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
 
@@ -150,7 +150,7 @@ class Telemetry:
         time_ns = clock.monotonic_ns(up_ns, now_ns)
         if self._jumps.gimbal(time_ns, R_from_q_wxyz(message.q), frame):
             self.gimbal_jumps += 1
-            self._own_ship.clear()
+            self._own_ship.clear(same_autopilot=True)
             self._gimbals_from_ns = now_ns + JUMP_REST_NS
         if now_ns < self._gimbals_from_ns:
             return None

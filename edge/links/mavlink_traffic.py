@@ -24,17 +24,17 @@ NS_PER_MS = 1_000_000
 
 
 def follow_target(report: Report, track: Track) -> Any | None:
-    """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a place on the globe.
+    """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a place on the globe or before
+    the velocity is known: ArduPilot takes the one in the message whatever est_capabilities says.
 
     Acceleration and turn rate are not estimated and left 0, as est_capabilities says.
     """
-    place = _place(report.own_ship, track)
+    place, velocity = _place(report.own_ship, track), _velocity_mps(report.own_ship, track)
     R, P = track.R_ned_target, track.covariance_ned
-    if place is None or R is None or P is None:
+    if place is None or velocity is None or R is None or P is None:
         return None
-    velocity = _velocity_mps(report.own_ship, track)
     turned = rotation_known(track)
-    known = POSITION_KNOWN | ATTITUDE_KNOWN * turned | VELOCITY_KNOWN * (velocity is not None)
+    known = POSITION_KNOWN | VELOCITY_KNOWN | ATTITUDE_KNOWN * turned
     horizontal_std_m = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
     lat, lon, alt = place
     return dialect.MAVLink_follow_target_message(
@@ -43,7 +43,7 @@ def follow_target(report: Report, track: Track) -> Any | None:
         round(lat * 1e7),
         round(lon * 1e7),
         alt,
-        velocity or [0.0] * 3,
+        velocity,
         [0.0] * 3,
         q_wxyz_from_R(R).tolist() if turned else [0.0] * 4,
         [0.0] * 3,

@@ -15,6 +15,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 
+from edge.links.mavlink_succession import Succession
 from edge.tracking.clock import RebootDetector
 
 LOST_NS = 5_000_000_000
@@ -65,7 +66,7 @@ class Stream:
 
 
 class Vehicle:
-    """`system_id` None: taken from the first autopilot heartbeat, and from another one's after that one fell silent.
+    """`system_id` None: taken from the first autopilot heartbeat; after that one fell silent as `Succession` has it.
 
     `rates_hz` by message id; `stands_in` has of a message that is one the id that it stands in for.
     """
@@ -80,6 +81,7 @@ class Vehicle:
         self.asked_again = 0
         self.refusals = 0  # answers other than ACCEPTED
         self._fixed = system_id is not None
+        self._succession = Succession()
         self._heartbeat_ns: int | None = None
         self._spoke_ns: int | None = None
         self._boot = RebootDetector()
@@ -90,11 +92,11 @@ class Vehicle:
 
     def heartbeat(self, system_id: int, autopilot: int | None, now_ns: int) -> bool:
         """An autopilot's heartbeat; False if it is another vehicle's. `autopilot` None: its kind stays as it is."""
-        if self.system_id is not None and system_id != self.system_id:
-            # Who still tells anything is there, though a crowded line may have lost its heartbeats.
-            silent = self._spoke_ns is None or now_ns - self._spoke_ns > LOST_NS
-            if self._fixed or self.contact is Contact.HEARD or not silent:
-                return False
+        if self._fixed and system_id != self.system_id:
+            return False
+        if not self._fixed and not self._succession.takes(system_id, self._silent(now_ns), now_ns):
+            return False
+        if self.system_id not in (None, system_id):
             self._forget()
         self.system_id = system_id
         self.autopilot = self.autopilot if autopilot is None else autopilot
@@ -105,6 +107,19 @@ class Vehicle:
     def spoke(self, now_ns: int) -> None:
         """Anything from our autopilot."""
         self._spoke_ns = now_ns
+        self._succession.spoke(now_ns)
+
+    def noticed(self, system_id: int, now_ns: int) -> None:
+        """An autopilot's heartbeat from where ours is not: it is not taken for ours by that, and may never be."""
+        self._succession.noticed(system_id, now_ns)
+
+    def was_own(self, system_id: int) -> bool:
+        """Whether a system was taken for our own until it fell silent, and another is now."""
+        return self._succession.is_former(system_id)
+
+    def is_stranger(self, system_id: int) -> bool:
+        """Whether a system is known to be another aircraft's."""
+        return self._succession.is_stranger(system_id)
 
     def boot_time(self, boot_ms: int) -> bool:
         """A stamp of the autopilot's; True if it says that the autopilot has started again."""
@@ -159,6 +174,11 @@ class Vehicle:
             return True
         better = self._streams[self._stands_in[stream.message_id]]
         return better.times_asked >= IN_VAIN and better.measured_hz(now_ns) == 0.0
+
+    def _silent(self, now_ns: int) -> bool:
+        # Who still tells anything is there, though a crowded line may have lost its heartbeats.
+        quiet = self._spoke_ns is None or now_ns - self._spoke_ns > LOST_NS
+        return quiet and self.contact is not Contact.HEARD
 
     def _forget(self) -> None:
         self._boot = RebootDetector()

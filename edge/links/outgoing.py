@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,10 +17,11 @@ NS_PER_MS = 1e6
 
 
 def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
-    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, measured lately, finite and consistent."""
+    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, measured lately, finite and consistent. One
+    whose covariance in ned is none is not known there, and fit in the camera's frame."""
     oldest_ns = now_ns - round(max_age_ms * NS_PER_MS)
     return [
-        track
+        _of_what_is_known(track)
         for track in report.tracks
         if track.state is not TrackState.TENTATIVE and track.measured_ns >= oldest_ns and _whole(track)
     ]
@@ -28,6 +30,12 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
 def rotation_known(track: Track) -> bool:
     """Whether the covariance leaves any meaning to how the target is turned; else no link may tell an attitude."""
     return float(np.trace(track.covariance[3:, 3:])) <= 3.0 * UNSURE_ROTATION_RAD**2
+
+
+def _of_what_is_known(track: Track) -> Track:
+    if track.covariance_ned is None or is_covariance(track.covariance_ned):
+        return track
+    return replace(track, R_ned_target=None, t_ned_target_m=None, v_ned_target_mps=None, covariance_ned=None)
 
 
 def _whole(track: Track) -> bool:

@@ -74,9 +74,10 @@ class Signing:
             self._save(self._reserved)
         return self._last
 
-    def prepare(self, mav: Any) -> None:
-        """Let a pymavlink packer sign its next message."""
+    def prepare(self, mav: Any, link_id: int = 0) -> None:
+        """Let a pymavlink packer sign its next message, as one of a link (0..255)."""
         mav.signing.secret_key = self._key
+        mav.signing.link_id = link_id
         mav.signing.sign_outgoing = True
         mav.signing.timestamp = self.next_timestamp()
 
@@ -85,7 +86,7 @@ class Signing:
 
         The hash comes first: what is not signed with our key leaves no trace in what is remembered of streams.
         """
-        reason = self._not_ours(message)
+        reason = self.unproven(message)
         if reason is not None:
             return reason
         stream, timestamp = _stamp(message)
@@ -104,7 +105,7 @@ class Signing:
 
         By the order of stamps, not by their time: autopilots that hear no time of others only count on.
         """
-        if self._not_ours(message) is not None:
+        if self.unproven(message) is not None:
             return False
         stream, timestamp = _stamp(message)
         last = self._streams.get(stream)
@@ -115,7 +116,9 @@ class Signing:
             ahead = self._ahead[stream] = (timestamp, now_ns)
         return now_ns - ahead[1] > HELD_BACK_MAX_NS
 
-    def _not_ours(self, message: Any) -> str | None:
+    def unproven(self, message: Any) -> str | None:
+        """ "unsigned" or "signature" where a parsed message is not signed with our key, else None. It may be a replay;
+        nothing is remembered of it."""
         if not message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED:
             return "unsigned"
         frame = bytes(message.get_msgbuf())
@@ -152,6 +155,7 @@ def load_state(path: Path) -> int:
 def _save_state(path: Path, stamp: int) -> None:
     scratch = path.with_name(path.name + ".new")
     try:
+        # No fsync: it could hold up poses on a slow card, and ext4 writes a file out before another takes its name.
         scratch.write_text(str(stamp), encoding="ascii")
         scratch.replace(path)
     except OSError as error:

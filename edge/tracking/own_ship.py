@@ -80,6 +80,7 @@ class OwnShipBuffer:
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
         self._positions: deque[_Position] = deque(maxlen=KEPT)
         self._global: _Global | None = None
+        self._in_local_ned = False  # whether this autopilot tells positions in its local ned frame
         self._axes_epoch = self._origin_epoch = 0
 
     def add_attitude(
@@ -105,24 +106,31 @@ class OwnShipBuffer:
         """Position and velocity [3] of the body origin in the local ned frame."""
         sample = _Position(time_ns, np.array(t_ned_m, dtype=np.float64), np.array(v_ned_mps, dtype=np.float64))
         with self._lock:
+            self._in_local_ned = True
             return _append(self._positions, sample)
 
     def add_global(
         self, time_ns: int, lat_lon_alt: tuple[float, float, float], v_ned_mps: tuple[float, float, float]
     ) -> bool:
-        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: they place ned's."""
+        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: they place ned's.
+
+        Of an autopilot that tells positions in local ned too it is of use while these come: ArduPilot goes on telling
+        the last place, standing still, when it does not know its position any more, but ends the local one.
+        """
         with self._lock:
             if self._global is not None and time_ns <= self._global.time_ns:
                 return False
             self._global = _Global(time_ns, lat_lon_alt, np.array(v_ned_mps, dtype=np.float64))
             return True
 
-    def clear(self, *, same_axes: bool = False) -> None:
+    def clear(self, *, same_axes: bool = False, same_autopilot: bool = False) -> None:
         """Forget all: the autopilot, or its filter, has started again, and its local origin with it.
 
         `same_axes`: what is attitude now was so before. Else north may have been another, or the gimbal's zero.
+        `same_autopilot`: what it tells and what not is as before.
         """
         with self._lock:
+            self._in_local_ned = self._in_local_ned and same_autopilot
             self._origin_epoch += 1
             self._axes_epoch += not same_axes
             self._attitudes.clear()
@@ -179,6 +187,8 @@ class OwnShipBuffer:
             return None
         place, age_ns = self._global.lat_lon_alt, time_ns - self._global.time_ns
         if not in_local_ned:
+            if self._in_local_ned and not _goes_on(self._positions, time_ns):
+                return None
             flown_m = self._global.v_ned_mps * (age_ns / NS_PER_S)
             return lat_lon_alt_from_ned(place, flown_m) if abs(age_ns) <= POSITION_AHEAD_MAX_NS else None
         then = _position_at(self._positions, self._global.time_ns)
@@ -245,6 +255,15 @@ def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
         return least_ns
     gap_ns = gaps_ns[len(gaps_ns) // 2]
     return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else None
+
+
+def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
+    """Whether they still come, though perhaps too rarely to be of use themselves."""
+    if not samples:
+        return False
+    gaps_ns = _usual_gaps_ns(samples)
+    usual_ns = gaps_ns[len(gaps_ns) // 2] if gaps_ns else 0
+    return time_ns - samples[-1].time_ns <= min(max(usual_ns * 3 // 2, POSITION_AHEAD_MAX_NS), POSITION_GAP_MAX_NS)
 
 
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:

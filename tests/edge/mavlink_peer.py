@@ -7,7 +7,7 @@ import os
 import select
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from edge.config import MavlinkSettings
 from edge.links.mavlink_link import MavlinkLink
+from edge.links.mavlink_packing import Letter, Packer
 from edge.links.signing import Signing
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
@@ -219,6 +220,13 @@ def hear(own_ship: OwnShipBuffer, peer: Peer, rotation: Rotation) -> None:
         return now is not None and np.allclose(now.R_ned_body, rotation.as_matrix(), atol=1e-6)
 
     peer.settle(heard, "attitude", lambda: peer.attitude(rotation))
+
+
+def on_the_wire(letters: Iterable[Letter], packer: Packer | None = None) -> list[Any]:
+    """Messages as who is at the other end of an endpoint reads them."""
+    packer = packer or Packer(0, None)
+    reader = FrameReader(datagram=True)
+    return [message for letter in letters for message in reader.feed(packer.packed(letter))]
 
 
 def alone(wire: Udp) -> bool:

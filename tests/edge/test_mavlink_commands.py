@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge.config import MavlinkSettings
+from edge.links.mavlink_station import Station
 from edge.requests import RequestQueue, StopTracking, TrackBox
-from msgs.mavlink import dialect
+from edge.tracking.own_ship import OwnShipBuffer
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet, on_the_wire
 from .reports import BOX_XYXY_PX, SIZE_WH, K
 from .reports import make_report as report
 from .reports import make_track as track
@@ -230,3 +233,57 @@ def test_the_box_told_is_the_chosen_targets() -> None:
         link.publish(replace(report(track(now), other, now_ns=now), chosen_id=1))
         status = peer.named("CAMERA_TRACKING_IMAGE_STATUS")
     assert status.rec_top_x == pytest.approx((BOX_XYXY_PX[0] + 200.5) / SIZE_WH[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("message_id", [511.0, 276.0, 144.0, 246.0])
+def test_what_there_is_nothing_to_tell_of_is_turned_down_for_now(message_id: float) -> None:
+    with linked(follow_target=True, adsb_icao_address=1) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(512, message_id)
+        assert peer.named("COMMAND_ACK").result == dialect.MAV_RESULT_TEMPORARILY_REJECTED, "no frame came"
+        in_cam_only = {"R_ned_target": None, "t_ned_target_m": None, "v_ned_target_mps": None, "covariance_ned": None}
+        for fields in ([], [in_cam_only]):
+            active = len(fields)
+
+            def is_told(message: Any, active: int = active) -> bool:
+                return message.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and message.tracking_status == active
+
+            def publish(fields: list[dict[str, None]] = fields) -> None:
+                link.publish(report(*(track(time.monotonic_ns(), **one) for one in fields), own_ship=False))
+
+            peer.until(is_told, "what the camera sees", publish)
+            peer.command(512, message_id)
+            expected = ACCEPTED if message_id == 511.0 and fields else dialect.MAV_RESULT_TEMPORARILY_REJECTED
+            assert peer.named("COMMAND_ACK").result == expected
+
+
+def test_that_nothing_is_tracked_can_be_asked_for_without_a_frame() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(512, 275.0)
+        assert peer.named("COMMAND_ACK").result == ACCEPTED
+        status = peer.named("CAMERA_TRACKING_IMAGE_STATUS")
+        assert status.tracking_status == dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
+
+
+@pytest.mark.parametrize(("later_s", "told"), [(0.5, True), (1.1, False), (180.0, False)])
+def test_what_was_asked_for_once_comes_soon_or_never(later_s: float, told: bool) -> None:
+    """Its stream is switched off; the target that was there when it was asked for is gone for a while."""
+    station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
+    mav, began_ns = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=1), 10**12
+
+    def tell(message: Any, now_ns: int) -> list[Any]:
+        return on_the_wire(station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns))
+
+    def seen(now_ns: int) -> set[str]:
+        tell(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3), now_ns)
+        return {m.get_type() for m in on_the_wire(station.report(report(track(now_ns), now_ns=now_ns), now_ns))}
+
+    def asks(command: int, *params: float) -> int:
+        long = dialect.MAVLink_command_long_message(SYSTEM_ID, 100, command, 0, *params, *[0.0] * (7 - len(params)))
+        (ack,) = tell(long, began_ns)
+        return int(ack.result)
+
+    assert "CAMERA_TRACKING_GEO_STATUS" in seen(began_ns)
+    assert asks(511, 276.0, -1.0) == asks(512, 276.0) == ACCEPTED
+    assert ("CAMERA_TRACKING_GEO_STATUS" in seen(began_ns + round(later_s * 1e9))) is told

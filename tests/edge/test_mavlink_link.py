@@ -369,9 +369,9 @@ def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up(step
     link._station.take(FrameReader(datagram=True).feed(bytes(beat)), 0, stepped)
     for held_up_ns in (HELD_UP_MAX_NS, HELD_UP_MAX_NS + 1):
         began_ns = clock.monotonic_ns()
-        frames = link._packed_in_time(report(track(began_ns), now_ns=began_ns), began_ns)
-        assert next(frames)
+        letters = link._in_time(report(track(began_ns), now_ns=began_ns), began_ns)
+        assert next(letters)
         clock.step_to(began_ns + held_up_ns)
-        assert (list(frames) == []) == (held_up_ns > HELD_UP_MAX_NS)
+        assert (list(letters) == []) == (held_up_ns > HELD_UP_MAX_NS)
     link.stop()
     assert link._count()["held_up"] == 1

@@ -15,6 +15,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Track, TrackState
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
+from .mavlink_peer import on_the_wire
 from .reports import OWN_NED_M, R_NED_CAM, SIZE_WH, K, make_report, make_track
 
 FRAME_NS = 33_333_333
@@ -45,8 +46,7 @@ def test_nobody_is_led_to_another_aircraft_while_the_one_told_is_missed(chosen_i
             station.take(FrameReader(datagram=True).feed(HEARTBEAT.pack(autopilot)), 0, now_ns)
         seen_ns = seen_ns if frame in missed else now_ns
         report = make_report(near(now_ns, seen_ns), far(now_ns), now_ns=now_ns)
-        for data in station.report(replace(report, chosen_id=chosen_id), now_ns):
-            told += FrameReader(datagram=True).feed(data)
+        told += on_the_wire(station.report(replace(report, chosen_id=chosen_id), now_ns))
     places = {(one.lat, one.lon) for one in told if one.get_type() == "FOLLOW_TARGET"}
     ranges_m = {round(one.dist) for one in told if one.get_type() == "CAMERA_TRACKING_GEO_STATUS"}
     boxes = {one.point_x for one in told if one.get_type() == "CAMERA_TRACKING_IMAGE_STATUS" and one.tracking_status}

@@ -15,7 +15,7 @@ from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import CAMERA, SYSTEM_ID
+from .mavlink_peer import CAMERA, SYSTEM_ID, on_the_wire
 from .reports import TRACKING, make_report, make_track
 
 SECONDS, FPS = 20, 60
@@ -39,7 +39,7 @@ def flown(settings: MavlinkSettings, autopilot: int) -> tuple[Counter[str], dict
         station.health(TRACKING, now_ns)
         out = station.tick(now_ns)
         sent = [*out.everywhere, *out.home, *station.report(make_report(make_track(now_ns), now_ns=now_ns), now_ns)]
-        for message in FrameReader(datagram=False).feed(b"".join(sent)):
+        for message in on_the_wire(sent):
             went[message.get_type()] += 1
             if message.get_type() == "COMMAND_LONG":
                 asked_hz[int(message.param1)] = 1e6 / message.param2

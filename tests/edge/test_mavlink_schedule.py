@@ -38,7 +38,7 @@ def test_targets_have_a_rhythm_each_and_off_is_off(gaps_ns: list[int]) -> None:
         assert not schedule.due(MESSAGE + 1, 0, now_ns), "what is not scheduled never goes"
     schedule.set_rate(MESSAGE, 0.0)
     assert not schedule.due(MESSAGE, 0, now_ns + 10**12)
-    schedule.ask_once(MESSAGE)
+    schedule.ask_once(MESSAGE, now_ns + 10**12)
     assert [schedule.due(MESSAGE, 0, now_ns + 10**12) for _ in range(2)] == [True, False]
     schedule.set_rate(MESSAGE, None)
     assert schedule.due(MESSAGE, 0, now_ns + 2 * 10**12)

@@ -20,8 +20,8 @@ from edge.types import Mount
 from msgs.geometry import rotation_angle
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, hear, linked, meet
-from .reports import TRACKING
+from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, hear, linked, meet, on_the_wire
+from .reports import TRACKING, make_report, make_track
 
 
 def test_own_attitude_is_stamped_with_the_time_it_was_measured() -> None:
@@ -96,7 +96,7 @@ def test_own_attitude_goes_on_when_the_autopilots_milliseconds_wrap_after_49_day
         if now_ns % (1_000 * ms) == 0:
             beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
             tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
-        asked = [m for data in station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        asked = on_the_wire(station.tick(now_ns).home)
         for question in (m for m in asked if m.get_type() == "TIMESYNC" and synced):
             tell(dialect.MAVLink_timesync_message(up_ns + ms, question.ts1), now_ns + 2 * ms)
         attitude = dialect.MAVLink_attitude_quaternion_message(up_ns // ms % 2**32, 1.0, 0, 0, 0, 0, 0, 0)
@@ -128,13 +128,32 @@ def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
 
 
 def test_our_clock_is_told_to_who_asks() -> None:
+    """The one that stamps what we send: who lays it on an own clock by these answers can place our stamps."""
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
-        before_ns = time.monotonic_ns()
+        before_ns = time.time_ns() - 1_000_000
         peer.send(dialect.MAVLink_timesync_message(0, 123_456_789))
         reply = peer.until(lambda m: m.get_type() == "TIMESYNC" and m.tc1 != 0, "reply")
         assert reply.ts1 == 123_456_789
-        assert before_ns <= reply.tc1 <= time.monotonic_ns()
+        assert before_ns <= reply.tc1 <= time.time_ns() + 1_000_000
+
+
+def test_px4_places_a_pose_on_its_own_clock_by_our_answers() -> None:
+    """It learns how far the clock of our answers lies from its own, and adds that to the stamps that we send."""
+    station = Station(MavlinkSettings(target_relative_to_px4=True), OwnShipBuffer(), CAMERA, RequestQueue())
+    mav, now_ns = MAVLink(None, srcSystem=1, srcComponent=1), time.monotonic_ns()
+    own_us = now_ns // 1000 - 50_000_000  # it started 50 s after this host
+
+    def tell(message: Any) -> list[Any]:
+        return on_the_wire(station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns))
+
+    tell(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_PX4, 0, 0, 4, 3))
+    (answer,) = tell(dialect.MAVLink_timesync_message(0, own_us * 1000))
+    offset_us = own_us - answer.tc1 // 1000
+    exposed_ns = now_ns - 30_000_000
+    told = on_the_wire(station.report(make_report(make_track(now_ns), now_ns=exposed_ns), now_ns))
+    (stamp_us,) = (m.timestamp for m in told if m.get_type() == "TARGET_RELATIVE")
+    assert stamp_us + offset_us == pytest.approx(own_us - 30_000, abs=2)
 
 
 def test_a_refused_rate_is_counted_and_asked_for_less_often() -> None:
@@ -171,7 +190,7 @@ def test_attitude_in_angles_is_asked_for_where_none_comes_as_a_quaternion(has_qu
             tell(dialect.MAVLink_attitude_quaternion_message(now_ns // ms, 1.0, 0, 0, 0, 0, 0, 0), now_ns)
         if dialect.MAVLINK_MSG_ID_ATTITUDE in rates_hz:
             tell(dialect.MAVLink_attitude_message(now_ns // ms, 0, 0, 0, 0, 0, 0), now_ns)
-        asked = [m for data in station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        asked = on_the_wire(station.tick(now_ns).home)
         for question in (m for m in asked if m.get_type() == "COMMAND_LONG"):
             answer(question, now_ns)
     assert own_ship.at(1_014_990 * ms) is not None

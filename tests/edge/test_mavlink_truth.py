@@ -8,12 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from edge.config import MavlinkSettings
 from edge.links import mavlink_messages as words
+from edge.links.mavlink_station import Station
 from edge.links.mavlink_traffic import adsb_vehicle, follow_target
 from edge.links.outgoing import sendable
-from msgs.mavlink import FrameReader, MAVLink
+from edge.requests import RequestQueue
+from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import TrackState
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
+from .mavlink_peer import CAMERA, on_the_wire
 from .reports import make_report, make_track
 
 NOW_NS = 5_000_000_000
@@ -41,7 +49,7 @@ def test_a_velocity_against_the_own_ship_is_not_told_as_one_over_ground() -> Non
 
 def test_the_attitude_s_uncertainty_is_that_of_all_its_axes() -> None:
     track = make_track(NOW_NS, covariance=np.diag([0.09, 0.16, 144.0, 0.01, 0.02, 0.03]))
-    (message,) = FrameReader(datagram=True).feed(words.target_relative(MAVLink(None), track, 1))
+    message = words.target_relative(track, 1)
     assert message.yaw_std == pytest.approx(math.sqrt(0.02))
 
 
@@ -72,3 +80,48 @@ def test_a_target_to_follow_is_as_sure_across_and_in_height_as_its_track() -> No
 def test_a_track_that_cannot_be_is_not_sent(spoilt: dict[str, Any]) -> None:
     whole, broken = make_track(NOW_NS), make_track(NOW_NS, track_id=1, **spoilt)
     assert sendable(make_report(whole, broken, now_ns=NOW_NS), NOW_NS, 500.0) == [whole]
+
+
+@pytest.mark.parametrize("variance", [-1e-9, -4.0])
+def test_a_covariance_in_ned_that_is_none_costs_what_is_told_in_ned_alone(variance: float) -> None:
+    station = Station(MavlinkSettings(follow_target=True), OwnShipBuffer(), CAMERA, RequestQueue())
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3)
+    station.take(FrameReader(datagram=True).feed(beat.pack(MAVLink(None, srcSystem=1, srcComponent=1))), 0, NOW_NS)
+    spoilt = VARIANCES_NED.copy()
+    spoilt[8] = variance
+    broken = make_track(NOW_NS, track_id=0, covariance_ned=np.diag(spoilt))
+    report = make_report(broken, make_track(NOW_NS, track_id=1), now_ns=NOW_NS)
+    told = on_the_wire(station.report(report, NOW_NS))
+    poses = {message.id: list(message.q_sensor) for message in told if message.get_type() == "TARGET_RELATIVE"}
+    assert set(poses) == {0, 1}
+    assert (any(poses[0]), any(poses[1])) == (False, True), "how the camera is turned was told by the same filter"
+    assert "CAMERA_TRACKING_IMAGE_STATUS" in {message.get_type() for message in told}
+    assert not {"CAMERA_TRACKING_GEO_STATUS", "FOLLOW_TARGET"} & {message.get_type() for message in told}
+
+
+@pytest.mark.parametrize(
+    "box_xyxy_px", [(1950, 500, 1990, 520), (-90, 500, -20, 520), (900, -60, 950, -9), (900, 1090, 950, 1150)]
+)
+def test_a_predicted_box_outside_the_picture_is_no_rectangle_in_it(box_xyxy_px: tuple[float, ...]) -> None:
+    box = np.array(box_xyxy_px, dtype=np.float64)
+    coasting = make_track(NOW_NS, state=TrackState.COASTING, box_xyxy_px=box)
+    status = words.image_status(make_report(coasting, now_ns=NOW_NS), coasting)
+    assert status.tracking_status == dialect.CAMERA_TRACKING_STATUS_FLAGS_COASTING
+    assert status.target_data == 0, "no data in the status"
+    corners = (status.rec_top_x, status.rec_top_y, status.rec_bottom_x, status.rec_bottom_y)
+    assert all(map(math.isnan, (*corners, status.point_x, status.point_y)))
+
+
+def test_a_predicted_box_that_the_picture_s_edge_cuts_ends_there() -> None:
+    coasting = make_track(NOW_NS, state=TrackState.COASTING, box_xyxy_px=np.array([1900.0, 500.0, 1990.0, 520.0]))
+    status = words.image_status(make_report(coasting, now_ns=NOW_NS), coasting)
+    assert (status.rec_top_x, status.rec_bottom_x) == pytest.approx((1900.5 / 1920, 1.0))
+
+
+# Spaces stand in where a piece ends before a character that it has no room for.
+@given(st.text(st.characters(codec="utf-8", exclude_characters="\0 "), max_size=120))
+def test_each_piece_of_a_text_can_be_read_by_itself(text: str) -> None:
+    pieces = [bytes(message._text_raw) for message in words.statustexts(4, text, 1)]
+    assert "".join(piece.decode() for piece in pieces).replace(" ", "") == text
+    assert all(len(piece) == 50 and b"\0" not in piece for piece in pieces[:-1]), "a null would end the text"
+    assert len(pieces) == 1 or len(pieces[-1]) < 50

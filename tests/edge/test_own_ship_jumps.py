@@ -15,7 +15,7 @@ from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, OwnShip
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
-from .mavlink_peer import CAMERA
+from .mavlink_peer import CAMERA, on_the_wire
 
 MS = 1_000_000
 BEGIN_NS = 1_000_000 * MS
@@ -43,7 +43,7 @@ class Autopilot:
         if k_ms % 1000 == 0:
             beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
             self.tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
-        asked = [m for data in self.station.tick(now_ns).home for m in FrameReader(datagram=True).feed(data)]
+        asked = on_the_wire(self.station.tick(now_ns).home)
         for question in (m for m in asked if m.get_type() == "TIMESYNC"):
             self.tell(dialect.MAVLink_timesync_message(now_ns, question.ts1), now_ns)
         if k_ms % 20 == 3:

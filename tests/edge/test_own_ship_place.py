@@ -168,3 +168,37 @@ def test_without_local_position_the_own_ship_is_where_it_has_flown_to_and_soon_n
     assert -180.0 <= soon.lat_lon_alt[1] < -179.99, "a longitude beyond 180 degrees is none"
     assert later is not None
     assert later.lat_lon_alt is None, "25 m of unknown flight are no place to tell"
+
+
+@pytest.mark.parametrize(("gap_ms", "lost_ms", "nowhere_from_ms"), [(50, 3_000, 3_500), (1_000, 3_000, 4_600)])
+def test_a_place_that_stands_still_after_the_local_position_has_ended_is_not_told(
+    gap_ms: int, lost_ms: int, nowhere_from_ms: int
+) -> None:
+    """ArduPilot that has lost its position goes on with GLOBAL_POSITION_INT: the last place, at no speed."""
+    buffer = OwnShipBuffer()
+    places: dict[int, tuple[float, float, float] | None] = {}
+    for time_ms in range(0, 20_000, 20):
+        flown_m = np.array([25.0 * min(time_ms, lost_ms) / 1e3, 0.0, -100.0])
+        buffer.add_attitude(time_ms * MS, [1, 0, 0, 0], np.zeros(3))
+        if time_ms % gap_ms < 20 and time_ms < lost_ms:
+            buffer.add_position(time_ms * MS, flown_m, [25.0, 0.0, 0.0])
+        if time_ms % 200 == 0:
+            speed_mps = 25.0 if time_ms < lost_ms else 0.0
+            buffer.add_global(time_ms * MS, lat_lon_alt_from_ned((47.0, 8.0, 400.0), flown_m), (speed_mps, 0.0, 0.0))
+        own_ship = buffer.at(time_ms * MS)
+        assert own_ship is not None
+        places[time_ms] = own_ship.lat_lon_alt
+    assert all(place is not None for time_ms, place in places.items() if gap_ms + 400 <= time_ms < lost_ms)
+    assert {place for time_ms, place in places.items() if time_ms > nowhere_from_ms} == {None}
+
+
+def test_a_filter_that_jumps_and_then_knows_no_position_leaves_no_place_either() -> None:
+    for same_autopilot in (True, False):
+        buffer = OwnShipBuffer()
+        buffer.add_position(0, np.zeros(3), np.zeros(3))
+        buffer.clear(same_autopilot=same_autopilot)
+        buffer.add_attitude(990 * MS, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_global(980 * MS, (47.0, 8.0, 400.0), (0.0, 0.0, 0.0))
+        own_ship = buffer.at(1_000 * MS)
+        assert own_ship is not None
+        assert (own_ship.lat_lon_alt is None) == same_autopilot, "another one may tell the globe alone"
