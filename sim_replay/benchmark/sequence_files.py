@@ -80,7 +80,8 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
             add_frame(store, film, number, job.labels_only)
             tell(FrameNews(plan.index, made=1))
         if squeezed and plan.h264_kbps is not None:
-            store.replace_images(through_h264(store.raw_images(), plan.fps / job.every, plan.h264_kbps))
+            # At the full rate, whatever is left out: a picture then has as many bits as it would among all of them.
+            store.replace_images(through_h264(store.raw_images(), plan.fps, plan.h264_kbps))
         K, size, distortion = film.K, film.size_wh_px, film.distortion
         store.finish(
             {

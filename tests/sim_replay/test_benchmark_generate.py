@@ -261,3 +261,20 @@ def test_the_lenses_chosen_are_written_down(dataset: Path) -> None:
     focal_px = json.loads((dataset / "lenses.json").read_text())
     for number, name in enumerate(SCENES):
         assert read_scene(dataset / name).frames[0].K[0, 0] == pytest.approx(focal_px[str(number)], abs=1e-6)
+
+
+def test_fewer_pictures_of_a_stream_are_no_clearer_than_all_of_them(tmp_path: Path) -> None:
+    preset = tmp_path / "stream.toml"
+    streamed = PRESET[: PRESET.index("[[compression]]")] + "[[compression]]\nh264_kbps = [100, 100]\n"
+    streamed = streamed.replace("sequence_frames = [4, 5]", "sequence_frames = [9, 9]")
+    streamed = streamed.replace("train = { sequences = 2, frames = 8 }", "train = { sequences = 1, frames = 9 }")
+    preset.write_text(streamed.replace("test = { sequences = 1, frames = 5 }", "test = { sequences = 1, frames = 9 }"))
+    for name, every in (("all", "1"), ("fourths", "4")):
+        assert _generate(preset, tmp_path / name, "--split", "train", "--every", every, "--workers", "1") == 0
+
+    def detail(name: str, number: int) -> float:
+        picture = cv2.imread(str(next((tmp_path / name).glob(f"train/*/rgb/{number:06d}.*"))), cv2.IMREAD_GRAYSCALE)
+        return float(np.abs(cv2.Laplacian(picture, cv2.CV_32F)).mean())
+
+    for number in (4, 8):
+        assert detail("fourths", number) < 1.3 * detail("all", number)
