@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
-from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.reload import load_configured
+from edge.types import CameraInfo
+
+Found = TypeVar("Found")
 
 
 def check(file: ConfigFile) -> list[str]:
-    """Lines for a person on what the configuration holds. Raises InputError on the first thing that does not do."""
-    config = file.config
-    with file.blame("zenoh", "tls"):
-        _check_certificates(config.zenoh)
-    model = load_configured(file)
-    with file.blame(*camera_key(config.camera)):
-        source, camera, opened = open_source(config.camera)
-        source.close()
+    """Lines for a person on what the configuration holds. Raises InputError: a line for each part that does not do."""
+    config, faults = file.config, list[str]()
+    _tried(lambda: _check_certificates(file), faults)
+    model = _tried(lambda: load_configured(file), faults)
+    found = _tried(lambda: _camera(file), faults)
+    if model is None or found is None or faults:
+        raise InputError("\n".join(faults))
+    camera, opened = found
     contract = model.contract
     name, (width, height) = camera.name, camera.image_size_wh
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
@@ -29,6 +34,7 @@ def check(file: ConfigFile) -> list[str]:
         f"model    {model.path.name}: {contract.name} {contract.precision}, {stages}, sha256 {model.sha256[:12]}",
         f"runs on  {model.provider}" + (f": {model.fallback_reason}" if model.fallback_reason else ""),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
+        + (f", {len(camera.distortion)} coefficients of distortion" if any(camera.distortion) else ", no distortion")
         + ("" if opened else "; it does not answer now and will be tried again"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
         f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",
@@ -36,7 +42,26 @@ def check(file: ConfigFile) -> list[str]:
     ]
 
 
-def _check_certificates(settings: ZenohSettings) -> None:
-    doubt = None if settings.tls is None else settings.tls.files().doubt()
-    if doubt is not None:
-        raise InputError(doubt)
+def _tried(look: Callable[[], Found], faults: list[str]) -> Found | None:
+    """What a look finds; None where it finds a fault, which is added."""
+    try:
+        return look()
+    except InputError as error:
+        faults.append(str(error))
+        return None
+
+
+def _camera(file: ConfigFile) -> tuple[CameraInfo, bool]:
+    """What the camera gives, and whether it opened. Raises InputError."""
+    with file.blame(*camera_key(file.config.camera)):
+        source, camera, opened = open_source(file.config.camera)
+        source.close()
+    return camera, opened
+
+
+def _check_certificates(file: ConfigFile) -> None:
+    tls = file.config.zenoh.tls
+    with file.blame("zenoh", "tls"):
+        doubt = None if tls is None else tls.files().doubt()
+        if doubt is not None:
+            raise InputError(doubt)

@@ -115,16 +115,8 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    from edge.calibrate import (
-        BoardSettings,
-        board_squares,
-        calibrate,
-        refuse_unwritable,
-        report,
-        to_json,
-        write_board,
-        write_calibration,
-    )
+    from edge.calibrate import calibrate, refuse_unwritable, report, to_json, write_calibration
+    from edge.calibrate_board import BoardSettings, board_squares, write_board
 
     squares = board_squares(options.squares)
     board = BoardSettings(options.pattern, squares, options.dictionary, options.marker_share)

@@ -17,7 +17,8 @@ edge.config_reference`, and held current by a test.
 
     uavpose-edge check --config flight.toml
 
-names every fault with file, line and key. A key that is not here is refused. Paths are taken from the file's own
+names every key at fault with file and line; once the keys do, what is wrong with the certificates, the model and the
+camera that they name, the first fault of each. A key that is not here is refused. Paths are taken from the file's own
 folder. `systemctl reload` reads the file again: [install.md](install.md) says what changes in flight.
 """
 SHIPPED = "the shipped model"

@@ -104,9 +104,7 @@ class Pipeline:
         model = self._estimator.model
         name = f"{model.contract.name} ({model.contract.precision}) on {model.provider}"
         log.info("ready: %s, camera %s", name, self._board.camera.name)
-        if model.fallback_reason is not None:
-            log.warning("model: %s", model.fallback_reason)
-            self._outlets.event(logging.WARNING, f"model: {model.fallback_reason}")
+        self._tell_fallback()
         self.supervisor.ready()
 
     def fly(self, stop: threading.Event) -> None:
@@ -217,7 +215,10 @@ class Pipeline:
                 self._tracker.make_room(there)
         clock.estimated(self._estimator.model.take_runs_ns())
         for i, place in enumerate(places, start=len(held)):
-            if (look := seen[i]) is not None and not self._estimator.confirms(place, [look]):
+            look = seen[i]
+            if look is None or lies_on(look.box_xyxy_px, held):
+                continue  # a sight of a target that is held, surer than its own window's, needs no place to agree
+            if not self._estimator.confirms(place, [look]):
                 seen[i] = None
         return [estimate for estimate in seen if estimate is not None]
 
@@ -235,10 +236,19 @@ class Pipeline:
         new = self._reloader.take(self._board.file, self._estimator, self._board.camera, self._outlets.event)
         if new is None:
             return
-        if new.estimator is not self._estimator:
+        replaced = new.estimator is not self._estimator
+        if replaced:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
         self._acquire_every_n = new.file.config.estimator.acquire_every_n
         self.supervisor.apply(new.file.config.health)
         log.info("%s", new.said)
         self._outlets.event(logging.INFO, new.said)
+        if replaced:
+            self._tell_fallback()
+
+    def _tell_fallback(self) -> None:
+        reason = self._estimator.model.fallback_reason
+        if reason is not None:
+            log.warning("model: %s", reason)
+            self._outlets.event(logging.WARNING, f"model: {reason}")

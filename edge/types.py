@@ -40,6 +40,7 @@ class CameraInfo:
     image_size_wh: tuple[int, int]
     K: Array  # [3, 3], pixel centres at integers; a zooming sequence's frames carry their own
     frame_rate_hz: float | None  # None: not known beforehand
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] (plumb bob); empty: none
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt
 
 METADATA_KEY = "uavpose_contract"
 CONTRACT_VERSION = 1
@@ -66,6 +66,19 @@ def samples_behind(training: Mapping[str, str | int | float]) -> int | None:
     return None if before is None or "samples" not in training else int(training["samples"]) + int(before)
 
 
+def _span(low_high: tuple[float, float]) -> tuple[float, float]:
+    if not 0.0 < low_high[0] < low_high[1]:
+        raise ValueError("takes two numbers above 0, the lower one first")
+    return low_high
+
+
+def _span_or_point(low_high: tuple[float, float]) -> tuple[float, float]:
+    return low_high if 0.0 < low_high[0] == low_high[1] else _span(low_high)
+
+
+Span = Annotated[tuple[float, float], AfterValidator(_span)]
+
+
 class ModelContract(BaseModel):
     """Everything the daemon must know of a model, and everything a person asks of one."""
 
@@ -93,14 +106,13 @@ class ModelContract(BaseModel):
         None, description="what the graph subtracts from a pixel's bytes; None: the file is older than this key"
     )
     pixel_std_bgr: tuple[float, float, float] | None = Field(None, description="and divides the rest by")
-    depth_limits_m: tuple[float, float] = Field(
+    depth_limits_m: Span = Field(
         (50.0, 600.0), description="the graph keeps its depths within; one told at a limit may lie beyond it"
     )
-    trained_range_m: tuple[float, float]
-    trained_focal_px: tuple[float, float]
-    trained_box_px: tuple[float, float] = Field(
-        description="longer side of the visible box in network pixels, as trained"
-    )
+    trained_range_m: Span
+    # One fixed camera whose frames are shown whole has one focal length.
+    trained_focal_px: Annotated[tuple[float, float], AfterValidator(_span_or_point)]
+    trained_box_px: Span = Field(description="longer side of the visible box in network pixels, as trained")
     airframes: list[str] = Field(description="airframe classes in the training data")
     data: str = Field("", description="what it was trained on; empty: the file is older than this key")
     training: dict[str, str | int | float] = Field(

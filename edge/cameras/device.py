@@ -11,6 +11,7 @@ from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
 from edge.cameras.stamps import StampCheck
 from edge.config_camera import DeviceCamera
+from edge.types import CameraInfo
 
 log = logging.getLogger(__name__)
 
@@ -32,11 +33,16 @@ class DeviceSource(LiveSource):
 
     def __init__(self, settings: DeviceCamera) -> None:
         intrinsics = load_intrinsics(settings.intrinsics)
-        intrinsics.scaled_to((settings.width, settings.height), "[camera] width and height ask for")
+        asked_wh = (settings.width, settings.height)
+        self._asked = intrinsics.scaled_to(asked_wh, "[camera] width and height ask for")
         super().__init__(settings.device, intrinsics)
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
+
+    def nominal(self) -> CameraInfo:
+        """What is known before the camera answers: the picture that is asked of it."""
+        return self._info(self._asked, None)
 
     def _connect(self) -> cv2.VideoCapture:
         settings = self._settings

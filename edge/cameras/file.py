@@ -53,7 +53,7 @@ class FileSource:
         )
         self._intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(size_wh)
         self._start_ns, self._next = None, 0
-        return CameraInfo(path.name, size_wh, self._intrinsics.K, self._fps)
+        return CameraInfo(path.name, size_wh, self._intrinsics.K, self._fps, self._intrinsics.distortion)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame, not before its time. Raises EndOfStream after the last, InputError if none can be read."""

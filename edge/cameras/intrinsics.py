@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ FOCAL_RATIO_MAX = 2.0  # pixels are as wide as high, or in anamorphic pictures n
 OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, a principal point may lie outside the picture, which may be cut out
 CLEAR_SHARE = 0.5  # of its sides, in the picture's middle, that a lens must show without folding
 ROUNDING = 1e-6  # what a tool that multiplies matrices leaves where K has its zeros and its one
+YAML_HEAD = "%YAML:1.0\n---\n"  # without it OpenCV takes nothing for YAML
 
 
 @dataclass(frozen=True)
@@ -83,21 +85,24 @@ def read_calibration(path: Path) -> Intrinsics:
     Both ROS camera_calibration and OpenCV write these keys. Raises InputError.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError(f"calibration {path} cannot be read: {reason}", INTRINSICS_KEY) from error
-    if not text.startswith("%YAML"):
-        text = "%YAML:1.0\n---\n" + text.removeprefix("---\n")
+    read = _as_opencv_reads(text)
     try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(read, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         size_wh = (_side_px(storage, path, "image_width"), _side_px(storage, path, "image_height"))
         K = pinhole(_matrix(storage, path, "camera_matrix"), f"calibration {path}: camera_matrix", INTRINSICS_KEY)
+        if storage.getNode("distortion_coefficients").empty():
+            missing = "distortion_coefficients is missing; a camera without distortion says data: []"
+            raise InputError(f"calibration {path}: {missing}", INTRINSICS_KEY)
         distortion = _matrix(storage, path, "distortion_coefficients")
         model = storage.getNode("distortion_model").string()
         fisheye = storage.getNode("fisheye_model")
     except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
-        hint = "not YAML as OpenCV reads it: lists stand in brackets, as data: [1.0, 0.0]"
+        reason = _opencv_reason(error, lines_before=read.count("\n") - text.count("\n"))
+        hint = f"not YAML as OpenCV reads it{reason}; lists stand in brackets, as data: [1.0, 0.0]"
         raise InputError(f"calibration {path} is {hint}", INTRINSICS_KEY) from error
     if model not in DISTORTION_MODELS:
         raise InputError(
@@ -112,6 +117,25 @@ def read_calibration(path: Path) -> Intrinsics:
             f"calibration {path}: distortion_coefficients takes 4, 5 or 8 numbers (plumb bob)", INTRINSICS_KEY
         )
     return Intrinsics(K, size_wh, tuple(float(d) for d in distortion))
+
+
+def _as_opencv_reads(text: str) -> str:
+    """The same YAML, line by line, without what OpenCV cannot read and nobody needs: comments behind values, the
+    camera's name."""
+    plain = re.sub(r"(?m)(?:^|[ \t]+)#.*$", "", text)
+    plain = re.sub(r"(?m)^camera_name\s*:.*$", "", plain)
+    return plain if plain.startswith("%YAML") else YAML_HEAD + plain.removeprefix("---\n")
+
+
+def _opencv_reason(error: Exception, lines_before: int) -> str:
+    """`, line N: what OpenCV says`; empty where it does not say. `lines_before`: of its text that the file has not."""
+    said = re.search(r"\((\d+)\): (.+)", str(error.__cause__ or error))
+    if said is None:
+        return ""
+    words = said[2].partition(" in function")[0].strip()
+    if words.count("'") % 2:
+        words = words.removesuffix("'")  # OpenCV 5 quotes all of it
+    return f", line {int(said[1]) - lines_before}: {words.rstrip('!')}"
 
 
 def pinhole(numbers: Array, named: str, key: tuple[str, ...] = ()) -> Array:

@@ -34,7 +34,7 @@ class LiveSource(ABC):
 
     def nominal(self) -> CameraInfo:
         """What is known before the camera answers: the calibration's."""
-        return CameraInfo(self._name, self._intrinsics.image_size_wh, self._intrinsics.K, None)
+        return self._info(self._intrinsics, None)
 
     def open(self) -> CameraInfo:
         """Raises SourceLost while the camera does not answer, InputError if the intrinsics do not fit its picture."""
@@ -53,7 +53,7 @@ class LiveSource(ABC):
             raise
         self._capture = capture
         fps = capture.get(cv2.CAP_PROP_FPS)
-        return CameraInfo(self._name, size_wh, self._fitted.K, fps if fps > 0 else None)
+        return self._info(self._fitted, fps if fps > 0 else None)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame that can be decoded; the others are left out, counted, and have their sequence numbers.
@@ -87,6 +87,9 @@ class LiveSource(ABC):
         if self._capture is not None:
             self._capture.release()
             self._capture = None
+
+    def _info(self, fitted: Intrinsics, fps: float | None) -> CameraInfo:
+        return CameraInfo(self._name, fitted.image_size_wh, fitted.K, fps, fitted.distortion)
 
     def _refitted(self, size_wh: tuple[int, int]) -> Intrinsics:
         """Raises SourceLost: opened again, the camera may be in its own mode."""

@@ -30,6 +30,8 @@ SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
 PUBLISHER_SILENT_NS = 1_000_000_000  # then another may take its place
+# A picture turned by what its EXIF says would be of another camera than was calibrated.
+DECODING = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
 
 class ZenohSource:
@@ -56,7 +58,8 @@ class ZenohSource:
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0)
 
     def nominal(self) -> CameraInfo:
-        return CameraInfo(self._settings.topic, self._intrinsics.image_size_wh, self._intrinsics.K, None)
+        lens = self._intrinsics
+        return CameraInfo(self._settings.topic, lens.image_size_wh, lens.K, None, lens.distortion)
 
     def open(self) -> CameraInfo:
         """Raises SourceLost while nothing answers at the endpoint. The publisher may come later."""
@@ -143,9 +146,12 @@ class ZenohSource:
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8] | None:
-    """JPEG or PNG to [H, W, 3] BGR, or None."""
+    """JPEG or PNG of 8 bits to [H, W, 3] BGR as its sensor read it out, or None.
+
+    Of deeper pictures nobody knows how bright they are meant: 12 bits in 16 would be nearly black.
+    """
     try:
-        image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), DECODING)
     except cv2.error:
         return None
-    return None if image_bgr is None else np.asarray(image_bgr, dtype=np.uint8)
+    return None if image_bgr is None or image_bgr.dtype != np.uint8 else np.asarray(image_bgr, dtype=np.uint8)

@@ -97,19 +97,30 @@ class Model:
         return taken
 
     def warm_up(self) -> None:
-        """One inference at each size. Raises InputError if the graph does not run or its outputs' shapes are wrong."""
-        contract = self.contract
-        for width, height in filter(None, (contract.acquire_size_wh, contract.track_size_wh)):
-            image = np.zeros((1, height, width, 3), dtype=np.uint8)
-            K = np.array([[[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]]])
-            try:
-                peaks = self.run(image, K)
-            except Exception as error:  # ONNX Runtime's errors have no common base of their own
-                raise InputError(f"model {self.path} does not run at {width}x{height}: {error}") from error
-            for name, tail in OUTPUT_TAILS.items():
-                shape, wanted = getattr(peaks, name).shape, (1, contract.max_peaks, *tail)
-                if shape != wanted:
-                    raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
+        """One inference at each size, and one of two windows at once, as soon as there are two targets.
+
+        Raises InputError if the graph does not run or its outputs' shapes are wrong.
+        """
+        self._try(1, self.contract.acquire_size_wh)
+        if self.contract.track_size_wh is not None:
+            for count in (1, 2):
+                self._try(count, self.contract.track_size_wh)
+
+    def _try(self, count: int, size_wh: tuple[int, int]) -> None:
+        """Run `count` black pictures. Raises InputError."""
+        width, height = size_wh
+        images = np.zeros((count, height, width, 3), dtype=np.uint8)
+        K = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
+        try:
+            peaks = self.run(images, np.stack([K] * count))
+        except Exception as error:  # ONNX Runtime's errors have no common base of their own
+            pictures = "" if count == 1 else f" with {count} pictures at once"
+            reason = " ".join(str(error).split())
+            raise InputError(f"model {self.path} does not run at {width}x{height}{pictures}: {reason}") from error
+        for name, tail in OUTPUT_TAILS.items():
+            shape, wanted = getattr(peaks, name).shape, (count, self.contract.max_peaks, *tail)
+            if shape != wanted:
+                raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
 
 
 def load_model(path: Path, threads: int, spinning: bool = False, provider: Provider = "cpu") -> Model:

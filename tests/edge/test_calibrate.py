@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML  # as rosbags reads what ROS writes
 
-from edge.calibrate import DRAWN_SQUARE_PX, BoardSettings, draw_board
+from edge.calibrate_board import DRAWN_SQUARE_PX, BoardSettings, draw_board
 from edge.cameras.intrinsics import load_intrinsics
 from edge.config_camera import IntrinsicsSettings
 
@@ -141,6 +141,10 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
         (["grey", "--dictionary", "3X3_7"], "--dictionary: OpenCV has no 3X3_7"),
         (["grey", "--squares", "30x30", "--dictionary", "4X4_50"], "fewer markers than the 450"),
         (["mixed"], "is 320x240, those before 640x480"),
+        (["grey", "--pattern", "chessboard", "--squares", "3x9"], "a chessboard needs at least 4x4 squares"),
+        (["grey", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners, and a view needs 8"),
+        (["--draw", "board.png", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners"),
+        (["--draw", "board.png", "--squares", "2x9"], "a ChArUco board needs at least 3x3 squares"),
     ],
 )
 def test_what_is_wrong_is_said(cli: Cli, tmp_path: Path, arguments: list[str], sentence: str) -> None:
@@ -155,13 +159,15 @@ def test_what_is_wrong_is_said(cli: Cli, tmp_path: Path, arguments: list[str], s
     assert "Traceback" not in done.stderr
 
 
-def test_a_drawn_board_is_one_that_is_found(cli: Cli, tmp_path: Path) -> None:
-    assert cli("calibrate", "--draw", "board.png", "--squares", "7x5").returncode == 0
+@pytest.mark.parametrize(("pattern", "squares"), [("charuco", "7x5"), ("charuco", "5x3"), ("chessboard", "4x4")])
+def test_a_drawn_board_is_one_that_is_found(cli: Cli, tmp_path: Path, pattern: str, squares: str) -> None:
+    board = ("--pattern", pattern, "--squares", squares)
+    assert cli("calibrate", "--draw", "board.png", *board).returncode == 0
     picture = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
     small = cv2.resize(picture, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(tmp_path / "board.png"), small)
     (tmp_path / "one").mkdir()
     (tmp_path / "board.png").rename(tmp_path / "one" / "board.png")
-    done = cli("calibrate", "one", "--squares", "7x5")
+    done = cli("calibrate", "one", *board)
     assert "1 of 1 pictures show the board" in done.stderr

@@ -44,6 +44,21 @@ def message(index: int, size_wh: tuple[int, int] = SIZE_WH, stamp_ns: int | None
     return CompressedImage(now_ns, "camera_optical_frame", "png", png.tobytes()).encode()
 
 
+def deep_png() -> bytes:
+    """As of a mono camera of 12 bits: nearly black, if the upper 8 of its 16 were taken."""
+    _, png = cv2.imencode(".png", np.full((SIZE_WH[1], SIZE_WH[0]), 4095, np.uint16))
+    return bytes(png.tobytes())
+
+
+def turned_jpeg(index: int) -> bytes:
+    """A picture whose EXIF says that it is to be shown turned by a quarter."""
+    _, jpeg = cv2.imencode(".jpg", picture(index))
+    orientation = b"II*\0\x08\0\0\0\x01\0" + b"\x12\x01\x03\0\x01\0\0\0\x06\0\0\0" + b"\0\0\0\0"
+    body = b"Exif\0\0" + orientation
+    data = jpeg.tobytes()
+    return bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
+
+
 @contextmanager
 def router(port: int) -> Iterator[TopicPublisher]:
     """A router with a ROS 2 node behind it that publishes `nose/image/compressed`."""
@@ -85,6 +100,15 @@ def test_a_zenoh_topic_is_a_camera_stamped_by_its_publisher() -> None:
         assert frame.K[0, 0] == 300
 
 
+def test_a_picture_is_taken_as_its_sensor_read_it_out_however_it_says_it_is_held() -> None:
+    port = free_port()
+    with router(port) as publisher, closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        payload = CompressedImage(time.time_ns(), "camera_optical_frame", "jpeg", turned_jpeg(7)).encode()
+        frame = put_until_read(source, publisher, payload)
+    assert (frame.image_bgr.shape[1], frame.image_bgr.shape[0]) == SIZE_WH
+
+
 def reading(source: ZenohSource, stop: threading.Event) -> Frame | None:
     try:
         return source.read(stop)
@@ -103,6 +127,7 @@ def test_what_is_no_picture_on_the_topic_is_counted_and_what_is_lost_shows_as_a_
         for reason, payload in (
             ("undecodable", message(2)[:40]),
             ("undecodable", CompressedImage(1, "", "jpeg", b"no jpeg").encode()),
+            ("undecodable", CompressedImage(1, "", "png", deep_png()).encode()),
             ("misfit", message(3, (300, 200))),
         ):
             before = source.counts[reason]

@@ -14,7 +14,7 @@ from msgs.ground.keys import init_authority, issue
 from tests.certificates import redate
 
 from .conftest import Cli
-from .toy_model import write_toy_model
+from .toy_model import ONE_PICTURE_GRAPH, write_toy_model
 
 OFF = "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
 
@@ -48,7 +48,7 @@ def test_a_configuration_that_flies_is_checked_and_flown(cli: Cli, tmp_path: Pat
     (tmp_path / "config.toml").write_text(text + OFF)
     checked = cli("check", "--config", "config.toml")
     assert checked.returncode == 0, checked.stderr
-    assert "1920x1080" in checked.stdout
+    assert "1920x1080, focal length 2000.0 x 2000.0 px, no distortion\n" in checked.stdout
     assert "toy fp32" in checked.stdout
     flown = cli("run", "--config", "config.toml")
     assert flown.returncode == 0, flown.stderr
@@ -74,13 +74,15 @@ def test_a_certificate_of_another_day_is_told_by_check_and_keeps_nobody_from_fly
 
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_model_that_does_not_do_is_named(cli: Cli, tmp_path: Path, text: str, toy_model: Path, command: str) -> None:
-    corrupt, strange = tmp_path / "corrupt.onnx", tmp_path / "strange.onnx"
+    corrupt, strange, single = (tmp_path / f"{name}.onnx" for name in ("corrupt", "strange", "single"))
     corrupt.write_bytes(toy_model.read_bytes()[:300])
     write_toy_model(strange, metadata='{"version": 99}')
+    write_toy_model(single, graph=ONE_PICTURE_GRAPH)
     for path, reason in (
         (tmp_path / "none.onnx", "No such file"),
         (corrupt, "not a loadable ONNX file"),
         (strange, "contract version 99"),
+        (single, "does not run at 256x256 with 2 pictures at once"),
     ):
         sentence = refusal(cli, tmp_path, text.replace(str(toy_model), str(path)) + OFF, command)
         assert sentence.startswith("config.toml:6: [model] path: ")
@@ -109,6 +111,28 @@ def test_a_size_asked_of_a_device_that_its_calibration_is_not_for_is_refused_tho
     )
     sentence = refusal(cli, tmp_path, text, "check")
     assert "are for 1920x1080 pixels, but [camera] width and height ask for 640x480" in sentence
+
+
+def test_a_device_that_is_not_plugged_in_is_told_as_the_picture_that_is_asked_of_it(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text(
+        '[camera]\ntype = "device"\ndevice = "/dev/video-none"\nwidth = 960\nheight = 540\n[camera.intrinsics]\n'
+        "fx = 2000\nfy = 2000\ncx = 959.5\ncy = 539.5\nwidth = 1920\nheight = 1080\ndistortion = [-0.1, 0, 0, 0, 0]\n"
+    )
+    checked = cli("check", "--config", "config.toml")
+    assert checked.returncode == 0, checked.stderr
+    told = "/dev/video-none: 960x540, focal length 1000.0 x 1000.0 px, 5 coefficients of distortion; it does not answer"
+    assert told in checked.stdout
+
+
+def test_a_model_and_a_calibration_that_are_not_there_are_both_named(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text(
+        '[camera]\ntype = "device"\nintrinsics = { file = "none.yaml" }\n[model]\npath = "none.onnx"\n'
+    )
+    done = cli("check", "--config", "config.toml")
+    assert done.returncode == 2
+    model, camera = done.stderr.splitlines()
+    assert model.startswith("config.toml:5: [model] path: ")
+    assert camera.startswith("config.toml:3: [camera] intrinsics: ")
 
 
 def test_a_calibration_that_is_not_there_is_named(cli: Cli, tmp_path: Path) -> None:

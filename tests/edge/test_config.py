@@ -182,6 +182,7 @@ def test_calibrations_of_ros_and_opencv_are_read(tmp_path: Path, text: str) -> N
         ("width: 1280", "width: [1280]", "image_width holds a list"),
         ("height: 720", "height: ~", "image_height holds '~'"),
         ("image_height: 720\n", "", "image_height is missing"),
+        ("coefficients", "coeffs", r"distortion_coefficients is missing; a camera without distortion says data: \[\]"),
     ],
 )  # fmt: skip
 def test_a_calibration_with_what_is_no_number_or_no_camera_is_told_with_its_key(
@@ -221,6 +222,37 @@ def test_a_lens_that_shows_nothing_in_the_corners_is_a_lens() -> None:
     assert load_intrinsics(IntrinsicsSettings(distortion=[-0.3, 0.0, 0.0, 0.0], **numbers)).distortion[0] == -0.3
 
 
+@pytest.mark.parametrize(
+    ("written", "instead"),
+    [
+        ("camera_name: nose", "camera_name: HD Pro Webcam (046d:082d)"),
+        ("camera_name: nose", "camera_name: USB 2.0 Camera: left"),
+        ("camera_name: nose", "camera_name:"),
+        ("camera_name: nose", 'camera_name: "[nose"'),
+        ("image_width", "\N{ZERO WIDTH NO-BREAK SPACE}image_width"),  # as an editor may begin a file
+        ("plumb_bob", "plumb_bob  # k1 k2 p1 p2 k3"),
+        ("image_height: 720", "image_height: 720\t# as it reads out\n# focused at infinity"),
+    ],
+)
+def test_a_calibration_is_read_whatever_its_camera_is_called_and_its_comments_say(
+    tmp_path: Path, written: str, instead: str
+) -> None:
+    assert ROS_CALIBRATION.count(written) == 1
+    path = tmp_path / "nose.yaml"
+    path.write_text(ROS_CALIBRATION.replace(written, instead), encoding="utf-8")
+    intrinsics = read_calibration(path)
+    assert intrinsics.image_size_wh == (1280, 720)
+    assert intrinsics.distortion == (-0.1, 0.02, 0.001, -0.002, 0.0)
+
+
+@pytest.mark.parametrize(("cols", "data"), [("5", "0.0, 0.0, 0.0, 0.0, 0.0"), ("0", "")])
+def test_a_calibration_without_distortion_says_so_as_ros_does(tmp_path: Path, cols: str, data: str) -> None:
+    path = tmp_path / "nose.yaml"
+    text = ROS_CALIBRATION.replace("cols: 5", f"cols: {cols}").replace("-0.1, 0.02, 0.001, -0.002, 0.0", data)
+    path.write_text(text)
+    assert not any(load_intrinsics(IntrinsicsSettings(file=path)).distortion)
+
+
 def test_what_a_product_of_matrices_leaves_of_a_zero_is_rounding(tmp_path: Path) -> None:
     path = tmp_path / "nose.yaml"
     path.write_text(ROS_CALIBRATION.replace("0.0, 0.0, 1.0]", "-3e-17, 2.2e-16, 1.0000000000000002]"))
@@ -242,6 +274,14 @@ def test_a_file_that_an_editor_began_with_a_mark_is_read(tmp_path: Path) -> None
 
 def test_a_calibration_that_opencv_does_not_read_is_told_as_that(tmp_path: Path) -> None:
     path = tmp_path / "nose.yaml"
-    path.write_text(ROS_CALIBRATION.replace("data: [-0.1, 0.02, 0.001, -0.002, 0.0]", "data:\n  - -0.1\n  - 0.02"))
-    with pytest.raises(InputError, match=r"nose\.yaml is not YAML as OpenCV reads it: lists stand in brackets"):
-        read_calibration(path)
+    for written, instead, line, said in (
+        ("data: [-0.1, 0.02, 0.001, -0.002, 0.0]", "data:\n  - -0.1\n  - 0.02", 13, "Incorrect indentation"),
+        ("  cols: 5", "\tcols: 5", 11, "Tabs are prohibited in YAML"),
+        ("0.0]\n", "0.0]\nnonsense\n", 13, "Missing ':'"),
+    ):
+        text = ROS_CALIBRATION.replace(written, instead)
+        for head, lines in (("", 0), ("---\n", 1), ("%YAML 1.2\n---\n", 2)):
+            path.write_text(head + text)
+            with pytest.raises(InputError, match=r"nose\.yaml is not YAML as OpenCV reads it") as refused:
+                read_calibration(path)
+            assert f", line {line + lines}: {said}; lists stand in brackets" in str(refused.value)

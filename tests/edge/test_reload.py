@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import queue
 import re
 import signal
 import subprocess
@@ -14,15 +16,18 @@ import cv2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from zenoh import handlers
 
 from edge.config import SHIPPED_MODEL, Config
 from edge.reload import Reloader, needs_restart, with_live_keys
 from edge.requests import ReloadOutcome
 from edge.status import ask
+from msgs.cdr import Log
 from msgs.client import connect, subscribe
+from msgs.contract import ModelContract
 
 from .flying import Flight, flying, free_port, toml, write_swaying_scene
-from .toy_model import write_toy_model
+from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
 
 
 @pytest.fixture(scope="module")
@@ -78,12 +83,18 @@ def test_a_new_model_takes_over_between_frames_and_the_track_lives_on(
 def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Path, swaying: Path, port: int) -> None:
     model, config = tmp_path / "flown.onnx", tmp_path / "config.toml"
     before, good = sha256(model), toml(swaying, model, port)
-    torn, other = tmp_path / "torn.onnx", tmp_path / "other.onnx"
+    torn, other, single, backwards = (tmp_path / f"{name}.onnx" for name in ("torn", "other", "single", "backwards"))
     torn.write_bytes(model.read_bytes()[:300])
     write_toy_model(other, metadata=json.dumps({"version": 99}))
+    write_toy_model(single, graph=ONE_PICTURE_GRAPH)
+    # A contract that the daemon would divide by, or find nothing within.
+    spans = json.loads(ModelContract(**CONTRACT).model_dump_json()) | {"trained_box_px": [0.0, 0.0]}
+    write_toy_model(backwards, metadata=json.dumps(spans))
     for text, words in (
         (good.replace(str(model), str(torn)), "[model] path: model"),
         (good.replace(str(model), str(other)), "contract version 99"),
+        (good.replace(str(model), str(single)), "with 2 pictures at once"),
+        (good.replace(str(model), str(backwards)), "contract key trained_box_px: takes two numbers above 0"),
         (good.replace(str(model), str(tmp_path / "none.onnx")), "No such file"),
         (good + "[health]\nmood = 3\n", "[health] mood: unknown key"),
         ("[camera", "not valid TOML"),
@@ -101,10 +112,29 @@ def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Pa
     assert "nothing has changed" in flight.until("reloaded: ")
 
 
+def test_a_provider_that_a_new_model_falls_back_from_is_warned_of(
+    flight: Flight, tmp_path: Path, swaying: Path, port: int
+) -> None:
+    text = toml(swaying, tmp_path / "flown.onnx", port)
+    (tmp_path / "config.toml").write_text(text.replace("threads = 1", 'threads = 1\nprovider = "openvino"'))
+    events: queue.Queue[Log] = queue.Queue()
+    with connect(f"tcp/127.0.0.1:{port}") as session:
+        heard = handlers.Callback(lambda sample: events.put(Log.decode(sample.payload.to_bytes())), indirect=False)
+        subscriber = session.declare_subscriber("*/uav1/events/**", heard)
+        flight.process.send_signal(signal.SIGHUP)
+        sentence = "model: this ONNX Runtime was built without OpenVINO"
+        assert " WARNING " in flight.until(sentence)
+        while not (event := events.get(timeout=60)).msg.startswith(sentence):
+            pass
+        subscriber.undeclare()
+    assert event.level == logging.WARNING
+
+
 def test_a_calibration_made_anew_in_the_same_file_is_named(tmp_path: Path, swaying: Path, port: int) -> None:
     calibration, model = tmp_path / "camera.yaml", tmp_path / "flown.onnx"
     write_toy_model(model)
     matrix = "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{f}, 0, 500, 0, {f}, 400, 0, 0, 1]\n"
+    matrix += "distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}\n"
     numbers = "image_width: {w}\nimage_height: {h}\n" + matrix
     height, width = cv2.imread(str(swaying / "rgb" / "000000.png")).shape[:2]
     calibration.write_text(numbers.format(w=width, h=height, f=900))

@@ -3,50 +3,32 @@
 from __future__ import annotations
 
 import os
-import threading
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from edge import threads
-from edge.config import SHIPPED_MODEL, Config, ConfigFile
+from edge.config import SHIPPED_MODEL
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
 from edge.estimator.lens import Lens
 from edge.estimator.model import load_model
-from edge.health import Reason
-from edge.outlets import Outlets
-from edge.reload import Reloader
 from edge.requests import RequestQueue, StopTracking, TrackBox
 from edge.search import PLACE_AGE_MAX_NS, Search
-from edge.status_board import StatusBoard
-from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import Array, CameraInfo, Estimate, Frame, FrameMeta, Report, TrackState
+from edge.types import Array, Estimate, Frame, FrameMeta, TrackState
 from msgs.contract import ScoreCalibration
 from tests.waiting import until
 
-from .toy_scene import SIZE_WH, TARGET_WH, K, draw
+from .looping import HELD, OTHER, PERIOD_NS, Ear, Gated, box_around, frame, looping
+from .toy_scene import SIZE_WH, K, draw
 
-HELD, OTHER = (500.5, 420.5), (1400.5, 700.5)
-PERIOD_NS = 33_000_000
+# Of a target that a larger window shows smaller, this one makes the model surer.
+SURER_OF_SMALL = ScoreCalibration(offset=1.5, slope=0.2, size_slope=-0.5, size_cap_px=1000.0)
+BESIDE_PX = np.array([10.5, -89.5, 190.5, 90.5])  # of a target's middle: a larger box that does not lie on its own
 LOWEST = 19  # priority that the kernel knows
-
-
-def box_around(center_px: tuple[float, float]) -> Array:
-    half = (np.array(TARGET_WH) - 1) / 2 + 0.5
-    return np.array([*(np.array(center_px) - half), *(np.array(center_px) + half)])
-
-
-def frame(index: int, *centers_px: tuple[float, float]) -> Frame:
-    picture = np.maximum.reduce([draw(center) for center in centers_px])
-    time_ns = 1_000_000_000 + index * PERIOD_NS
-    return Frame(FrameMeta(index, time_ns, time_ns), picture, K)
 
 
 @pytest.fixture
@@ -119,22 +101,6 @@ def test_after_a_gap_in_the_frames_a_place_from_before_it_is_not_looked_into(sea
     assert search.places(seen.meta.capture_ns + 8_000_000_000, [], 4) == []
 
 
-class Gated(Estimator):
-    """Its search of the whole frame ends when it is let, with what it is told."""
-
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self.gate, self.begun = threading.Event(), threading.Event()
-        self.sees: list[Estimate] | Exception = []
-
-    def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
-        self.begun.set()
-        assert self.gate.wait(60)
-        if isinstance(self.sees, Exception):
-            raise self.sees
-        return self.sees
-
-
 def test_the_model_looks_over_whole_frames_at_a_lower_priority_than_through_windows() -> None:
     before = set(os.listdir("/proc/self/task"))
     model = load_model(SHIPPED_MODEL, 3)
@@ -168,51 +134,6 @@ def test_one_search_at_a_time(search: Search, gated: Gated) -> None:
     assert not search.begin(gated, frame(1, OTHER), [])
     gated.gate.set()
     until(lambda: search.begin(gated, frame(2, OTHER), []))
-
-
-class Ear(Outlets):
-    """Keeps what the loop tells."""
-
-    def __init__(self) -> None:
-        super().__init__(None, None)
-        self.reports: list[Report] = []
-
-    def publish(self, report: Report) -> None:
-        self.reports.append(report)
-
-
-class Supply:
-    """Frames one after the other."""
-
-    def start(self, settle: Any) -> None: ...
-
-    def newest(self, timeout_s: float) -> Frame | None:
-        return None
-
-    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        return ()
-
-    def counters(self) -> dict[str, int]:
-        return {"captured": 0, "dropped": 0}
-
-    def stop(self) -> None: ...
-
-
-@contextmanager
-def looping(gated: Gated, max_targets: int = 4) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
-    config = Config.model_validate({
-        "camera": {"type": "sequence", "path": "/scene"}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
-        "estimator": {"acquire_every_n": 5, "max_targets": max_targets},
-    })  # fmt: skip
-    board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))
-    ear, requests = Ear(), RequestQueue()
-    pipeline = Pipeline(board, gated, OwnShipBuffer(), ear, Supply(), requests, Reloader())
-    pipeline.search.start()
-    try:
-        yield pipeline, ear, requests
-    finally:
-        gated.gate.set()
-        pipeline.search.stop()
 
 
 @pytest.fixture
@@ -366,9 +287,8 @@ def test_a_person_s_stop_holds_against_a_search_under_way(
 
 
 def test_pointing_beside_a_target_that_is_held_chooses_it_and_throws_none_out(gated: Gated) -> None:
-    """The window that is pointed at is larger, so it shows the target smaller; of that, this model is surer."""
-    score = ScoreCalibration(offset=1.5, slope=0.2, size_slope=-0.5, size_cap_px=1000.0)
-    gated.model.contract = gated.model.contract.model_copy(update={"track_score": score})
+    """The window that is pointed at is larger, so it shows the target smaller."""
+    gated.model.contract = gated.model.contract.model_copy(update={"track_score": SURER_OF_SMALL})
     with looping(gated, max_targets=2) as (loop, ear, requests):
         gated.sees = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
         gated.gate.set()
@@ -380,8 +300,7 @@ def test_pointing_beside_a_target_that_is_held_chooses_it_and_throws_none_out(ga
         before = ear.reports[-1].tracks
         assert [track.state for track in before] == [TrackState.CONFIRMED] * 2
 
-        beside_px = np.tile(OTHER, 2) + np.array([10.5, -89.5, 190.5, 90.5])
-        left, top, right, bottom = (beside_px / np.tile(SIZE_WH, 2)).tolist()
+        left, top, right, bottom = ((np.tile(OTHER, 2) + BESIDE_PX) / np.tile(SIZE_WH, 2)).tolist()
         requests.put(TrackBox((left, top, right, bottom)))
         for index in range(12, 15):
             loop._process(frame(index, HELD, OTHER))
@@ -389,6 +308,25 @@ def test_pointing_beside_a_target_that_is_held_chooses_it_and_throws_none_out(ga
     for report in ear.reports[-3:]:
         assert [(track.state, track.born_ns) for track in report.tracks] == held
         assert report.chosen_id == before[1].track_id
+
+
+def test_a_false_place_beside_a_target_that_is_held_takes_no_sight_of_it_away(gated: Gated) -> None:
+    """The window around the place shows the target better than its own; the place itself is as good as nothing."""
+    gated.model.contract = gated.model.contract.model_copy(update={"track_score": SURER_OF_SMALL})
+    with looping(gated, max_targets=3) as (loop, ear, _):
+        (seen,) = gated.sees = [e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+        gated.gate.set()
+        for index in range(6):
+            loop._process(frame(index, HELD))
+        until(lambda: loop.search.counters()["searches"] == 1)
+        gated.sees = [replace(seen, score=0.01, box_xyxy_px=np.tile(OTHER, 2) + BESIDE_PX)]
+        for index in range(6, 12):
+            loop._process(frame(index, HELD, OTHER))
+        until(lambda: loop.search.counters()["searches"] == 2)
+        for index in range(12, 15):
+            loop._process(frame(index, HELD, OTHER))
+    for report in ear.reports[8:]:
+        assert [track.measured_ns for track in report.tracks] == [report.meta.capture_ns] * 2
 
 
 def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated) -> None:

@@ -89,6 +89,11 @@ toy (uint8[N, H, W, 3] image, float[N, 3, 3] K) => (
 }
 """
 
+# The same, exported for one picture at a time.
+ONE_PICTURE_GRAPH = GRAPH.replace(
+    "uint8[N, H, W, 3] image, float[N, 3, 3] K", "uint8[1, H, W, 3] image, float[1, 3, 3] K"
+)
+
 CONTRACT: dict[str, Any] = {
     "version": 1,
     "name": "toy",

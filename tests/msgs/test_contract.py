@@ -24,6 +24,11 @@ def test_a_whole_contract_is_read() -> None:
     assert ModelContract.model_validate(WHOLE | {"track_size_wh": None}).track_size_wh is None
 
 
+def test_a_model_of_one_fixed_camera_has_one_focal_length() -> None:
+    one = ModelContract.model_validate(WHOLE | {"trained_focal_px": (700.0, 700.0)})
+    assert one.trained_focal_px == (700.0, 700.0)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -32,6 +37,13 @@ def test_a_whole_contract_is_read() -> None:
         {"track_window_scale": INF},
         {"depth_limits_m": (NAN, 600.0)},
         {"trained_range_m": (50.0, INF)},
+        {"trained_range_m": (600.0, 50.0)},
+        {"trained_range_m": (0.0, 600.0)},
+        {"trained_box_px": (0.0, 0.0)},
+        {"trained_box_px": (200.0, 200.0)},
+        {"trained_focal_px": (9000.0, 500.0)},
+        {"trained_focal_px": (0.0, 0.0)},
+        {"depth_limits_m": (-50.0, 600.0)},
         {"pixel_mean_bgr": (NAN, 0.0, 0.0)},
         {"metrics": {"recall": NAN}},
         {"training": {"seconds": INF}},
@@ -39,7 +51,7 @@ def test_a_whole_contract_is_read() -> None:
         {"track_score": {"slope": INF}},
     ],
 )
-def test_a_number_that_is_none_is_refused_by_its_key(wrong: dict[str, Any]) -> None:
+def test_a_number_that_is_none_or_a_span_that_holds_none_is_refused_by_its_key(wrong: dict[str, Any]) -> None:
     (key,) = wrong
     with pytest.raises(ValidationError) as error:
         ModelContract.model_validate(WHOLE | wrong)
