@@ -21,7 +21,7 @@ from sim_replay.benchmark import commands as benchmark
 from sim_replay.datasets import open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE, report_flight, show
 from sim_replay.evaluation.judge import judge_frames, score_of
-from sim_replay.evaluation.table import score_table
+from sim_replay.evaluation.table import score_table, table_console
 from sim_replay.faults import run as faults
 from sim_replay.golden import run as golden
 from sim_replay.ground_truth import read_sequence
@@ -159,7 +159,7 @@ def _score_dataset(args: argparse.Namespace, console: Console) -> int:
     if args.json:
         print(json.dumps(score, indent=2, allow_nan=False))
     else:
-        console.print(score_table(score))
+        table_console().print(score_table(score))
     return 0
 
 

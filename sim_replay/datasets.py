@@ -120,6 +120,13 @@ class Dataset:
         if passed_over and not listed:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
 
+    def pictured_frames(self) -> Iterator[DatasetFrame]:
+        """Every frame that has a picture, whatever test_targets_bop19.json lists. Raises BopError."""
+        for scene in self.scenes:
+            sizes: dict[str, tuple[int, int]] = {}
+            for frame in scene.pictured:
+                yield self._frame(scene, frame, range(len(frame.targets)), sizes)
+
     def labelled_frames(self) -> list[DatasetFrame]:
         """Those of frames() whose truth is known: some datasets keep that of their test splits to themselves.
 

@@ -167,6 +167,7 @@ def summary_table(score: dict[str, Any]) -> Table:
         "depth error, mean": _text(overall["depth_error_rel"]["mean"], "{:.2%}"),
         "pose within 10° and 5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
         "capture to MAVLink, p50 / p95 / p99": _percentiles(score["latency_ms"]),
+        "withheld by MAVLink, unconfirmed or too old": _text(score["latency_ms"]["tracks_withheld"], "{:d}"),
         "frames dropped": _text(score["dropped_frames"], "{:d}"),
     }
     rows["model"] = f"{score['model']['file']} ({score['model']['precision']})"
@@ -180,6 +181,8 @@ def _pair(values: dict[str, float | None], form: str) -> str:
 
 
 def _percentiles(values: dict[str, float | None]) -> str:
+    if values["p50"] is None:
+        return "–"
     return " / ".join(_text(values[name], "{:.1f}") for name in ("p50", "p95", "p99")) + " ms"
 
 

@@ -7,10 +7,13 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
+from edge.cameras.sequence import frames_of
 from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
@@ -18,6 +21,7 @@ from msgs.geometry import Array
 from sim_replay.bop import BopFrame, Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
+from sim_replay.evaluation.judge import is_seen
 from sim_replay.gimbal import R_GIMBAL_CAM, GimbalTrack, track_of
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
@@ -30,7 +34,10 @@ _FPS_LEAST = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
-    """A BOP scene; frames are counted from 0 in the order of their picture numbers."""
+    """A BOP scene; frames are counted from 0 in the order of their picture numbers.
+
+    A frame that was not recorded stands there with picture and camera of the one before.
+    """
 
     folder: Path
     images: list[Path]
@@ -40,6 +47,7 @@ class SceneTruth:
     distortions: list[Distortion | None]  # of each picture on disk; None: a pinhole camera
     cameras_world: list[tuple[Array, Array] | None]  # R_world_cam [3, 3], t_world_cam_m [3]; None: not known
     truth_known: bool  # False: no file tells what a picture shows, so no truths does not mean that all are empty
+    unrecorded: frozenset[int] = frozenset()  # frames without a picture of their own
 
     @property
     def name(self) -> str:
@@ -80,18 +88,17 @@ class PlayedSequence:
 def read_scene_truth(folder: Path) -> SceneTruth:
     """Read a BOP scene folder and its dataset's models. Raises InputError, naming file and key."""
     scene = read_scene(folder)
-    models = Dataset(folder.name, scene.root or folder, scene.split, (scene,)).models
-    frames = scene.pictured
+    dataset = Dataset(folder.name, scene.root or folder, scene.split, (scene,))
+    models, frames = dataset.models, scene.pictured
     truths = []
-    for index, frame in enumerate(frames):
+    for index, picture in enumerate(dataset.pictured_frames()):
         seen: Counter[int] = Counter()
-        for target in frame.targets:
+        for target in picture.targets:
             if target.object_id not in models:
                 raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
-            instance, visible = seen[target.object_id], target.visible_px != 0 and t_m[2] > 0
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
-            truths.append(Truth(index, R, t_m, *known, instance=instance, visible=visible))
+            truths.append(Truth(index, R, t_m, *known, instance=seen[target.object_id], visible=is_seen(target)))
             seen[target.object_id] += 1
     return SceneTruth(
         folder,
@@ -123,10 +130,14 @@ def extents_of(model: Model) -> Extents:
 def read_sequence(folder: Path) -> PlayedSequence:
     """Read a scene with its sequence.toml and telemetry.csv. Raises InputError, naming file and key.
 
-    Its picture numbers must be evenly spaced, and the telemetry must span all exposures.
+    Its picture numbers must be evenly spaced, unless it was made of a recording; the telemetry must span all exposures.
     """
     scene = read_scene_truth(folder)
-    _check_spacing(scene)
+    frames = frames_of(folder, [int(path.stem) for path in scene.images])
+    if frames == list(range(len(frames))):
+        _check_spacing(scene)
+    else:
+        scene = _with_unrecorded(scene, frames)
     with _blame(folder / "sequence.toml") as path:
         settings = tomllib.loads(path.read_text(encoding="utf-8"))
         mount = MountSettings(R_body_cam=settings["R_body_cam"], t_body_cam_m=settings["t_body_cam_m"]).mount()
@@ -144,8 +155,27 @@ def read_sequence(folder: Path) -> PlayedSequence:
         raise InputError(str(error)) from error
     check_spans(telemetry, telemetry_csv, frame0_ns, len(scene.images), fps)
     if gimballed:
-        gimbal, mount = _gimbal(folder, frame0_ns, fps), Mount(R_GIMBAL_CAM, mount.t_body_cam_m)
+        gimbal, mount = _gimbal(folder, frames, frame0_ns, fps), Mount(R_GIMBAL_CAM, mount.t_body_cam_m)
     return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal)
+
+
+def _with_unrecorded(scene: SceneTruth, frames: list[int]) -> SceneTruth:
+    """The scene over all frames of the sequence; `frames` says which of them its pictures are, and rises."""
+    of_frame = _newest(frames)
+    return replace(
+        scene,
+        images=[scene.images[k] for k in of_frame],
+        K=[scene.K[k] for k in of_frame],
+        truths=[replace(truth, frame=frames[truth.frame]) for truth in scene.truths],
+        distortions=[scene.distortions[k] for k in of_frame],
+        cameras_world=[scene.cameras_world[k] for k in of_frame],
+        unrecorded=frozenset(range(len(of_frame))) - set(frames),
+    )
+
+
+def _newest(frames: list[int]) -> list[int]:
+    """For each frame of the sequence, the place of its picture, or of the last before it, among the pictures."""
+    return [int(k) for k in np.searchsorted(frames, np.arange(frames[-1] + 1), side="right") - 1]
 
 
 def check_spans(telemetry: Telemetry, path: Path, frame0_ns: int, frames: int, fps: float) -> None:
@@ -170,14 +200,17 @@ def _check_spacing(scene: SceneTruth) -> None:
             )
 
 
-def _gimbal(folder: Path, frame0_ns: int, fps: float) -> GimbalTrack:
-    """What scene_camera.json tells of a camera whose world is local NED. Raises InputError."""
+def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> GimbalTrack:
+    """What scene_camera.json tells of a camera whose world is local NED. Raises InputError.
+
+    `frames` says which frame of the sequence each picture is.
+    """
     R_cam_ned = [frame.R_cam_world for frame in read_scene(folder).pictured]
     known = [R for R in R_cam_ned if R is not None]
     if len(known) < max(len(R_cam_ned), 2):
         path = folder / "scene_camera.json"
         raise InputError(f"{path}: 'cam_R_w2c' is missing: it says how the gimbal was turned at every frame")
-    return track_of(known, frame0_ns, fps)
+    return track_of([known[k] for k in _newest(frames)], frame0_ns, fps)
 
 
 @contextmanager

@@ -51,7 +51,7 @@ class Recording:
     start_at_ns: int
     utc_minus_monotonic_ns: int
     mavlink_port: int
-    zenoh_endpoint: str
+    zenoh_endpoint: str  # empty in lock-step
     daemon_exit: int | None = None
     daemon_counters: dict[str, int] = field(default_factory=dict)  # its own, as it said when it stopped
     poses: list[Record] = field(default_factory=list)  # sim_replay.subscriber's `pose`
@@ -67,6 +67,11 @@ class Recording:
             lists[record["event"]].append(record)
         elif record["event"] == "summary":
             (self.mavlink if name == "autopilot" else self.zenoh).update(record)
+
+    @property
+    def in_lockstep(self) -> bool:
+        """Whether time stood still while the daemon worked: then ages and latencies say nothing."""
+        return not self.zenoh_endpoint
 
     def capture_ns(self, record: Record) -> int:
         """Exposure time, monotonic, of a pose or target record."""

@@ -13,7 +13,7 @@ from sim_replay.evaluation.instances import instances
 from sim_replay.ground_truth import PlayedSequence, SceneTruth
 from sim_replay.overlay import FrameView
 from sim_replay.play import Record, Recording
-from sim_replay.report.peer import peer_figures
+from sim_replay.report.peer import peer_figures, percentiles
 from sim_replay.score import Match, TargetPose, Truth, frame_of, latency_statistics, match_poses, statistics
 
 PEERS = ("subscriber", "autopilot")
@@ -39,11 +39,16 @@ class Result:
 
     @property
     def latencies_ms(self) -> dict[int, float]:
-        """By frame: capture to the first TARGET_RELATIVE of that frame."""
+        """By frame: capture to the first TARGET_RELATIVE of that frame; empty in lock-step."""
         first: dict[int, float] = {}
-        for frame, age_ms in self.autopilot.ages:
+        for frame, age_ms in told_ages(self.autopilot, self.recording):
             first.setdefault(frame, age_ms)
         return first
+
+
+def told_ages(peer: PeerResult, recording: Recording) -> tuple[tuple[int, float], ...]:
+    """The ages that tell something: none in lock-step, where all are zero."""
+    return () if recording.in_lockstep else peer.ages
 
 
 def pose_of(record: Record, frame: int) -> TargetPose:
@@ -121,19 +126,20 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
     is what each peer received, as `sim_replay.report.peer.peer_figures` has it.
     """
     recording, subscriber = result.recording, result.subscriber
-    frames = len(sequence.scene.images)
+    frames = len(sequence.scene.images) - len(sequence.scene.unrecorded)
     return {
         "sequence": sequence.scene.name,
         "poses": len(recording.poses),
         "stray_poses": subscriber.strays,
         **statistics(frames, subscriber.matches, subscriber.false_poses),
-        "latency_ms": latency_statistics([latency_ms(record, recording) for record in recording.targets]),
+        "latency_ms": _latency_ms(recording),
         "dropped_frames": recording.daemon_counters.get("dropped", 0),
         "peers": {
             name: {
                 "poses": len(peer.ages) + peer.strays,
                 "stray_poses": peer.strays,
                 **peer_figures(frames, sequence.fps, peer.matches, peer.false_poses, peer.ages),
+                "age_ms": percentiles([age_ms for _, age_ms in told_ages(peer, recording)]),
             }
             for name, peer in zip(PEERS, (subscriber, result.autopilot), strict=True)
         },
@@ -143,6 +149,16 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
         "zenoh_refused": recording.zenoh.get("refused", {}),
         "model": model,
     }
+
+
+def _latency_ms(recording: Recording) -> dict[str, float | None]:
+    """Capture to MAVLink. Of `tracks_withheld`, which MAVLink did not tell, no percentile knows: not confirmed yet, or
+    too old. All null in lock-step."""
+    if recording.in_lockstep:
+        return {**latency_statistics([]), "tracks_withheld": None}
+    withheld = recording.daemon_counters.get("mavlink_tracks_withheld", 0)
+    told = latency_statistics([latency_ms(record, recording) for record in recording.targets])
+    return {**told, "tracks_withheld": withheld}
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:

@@ -86,7 +86,7 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from sim_replay.evaluation.table import score_table
+    from sim_replay.evaluation.table import score_table, table_console
     from trainer.config import ConfigError, refuse_no_folder
     from trainer.evaluate_dataset import DatasetRequest, OwnShipTold, evaluate_dataset
 
@@ -115,7 +115,7 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(evaluation.score, indent=2, allow_nan=False))
     else:
-        Console().print(score_table(evaluation.score))
+        table_console().print(score_table(evaluation.score))
     names = [path.name for path in files if not path.name.startswith("sequence_")]
     drawn = f"{len(files) - len(names)} sequence_*.png"
     errors.print(f"written to {arguments.out}: {', '.join([*names, drawn])}", highlight=False, soft_wrap=True)

@@ -33,7 +33,7 @@ from trainer.sources import window_sampler
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
-ANY_SIZE_PX = (0.0, 1e6)  # of what nobody has measured: nothing is untrained
+ANY_SIZE_PX = (1e-3, 1e6)  # of what nobody has measured: nothing is untrained
 UNREACHABLE_SCORE = 1.0
 EMPTY_SHARE = 0.12
 

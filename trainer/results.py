@@ -8,9 +8,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from msgs.settings import read_toml
+from sim_replay.datasets import open_dataset
+from sim_replay.evaluation.judge import is_seen
+from sim_replay.offline import InputError
 from trainer.config import ConfigError, made_folder
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
 
@@ -28,6 +31,7 @@ TEST_SPLIT = "test"  # what is trained on and chosen by lies beside it
 KEPT_METRICS = ("E_", "rot_", "depth_", "pose_", "bearing_", "recall", "false_alarms")
 HISTORY = Path(__file__).parent / "checkpoints" / "history.jsonl"
 Cell = Callable[[Mapping[str, Any]], float | None]
+Pictures = tuple[str | int | None, ...]  # dataset, split, every, frames, targets, mode, own ship
 
 
 def _at(*keys: str, scale: float = 1.0) -> Cell:
@@ -73,14 +77,12 @@ def measure(
     """
     scores = []
     for dataset in datasets:
-        manifest = _manifest(dataset)
-        split = TEST_SPLIT if (dataset / TEST_SPLIT).is_dir() else None
-        recipe = manifest.get("command", "")
+        split, modes = _split(dataset), _modes(dataset)
+        recipe = _manifest(dataset).get("command", "")
         if recipe and split:
             recipe += f" --split {split}"
         for model in models:
-            # Only a sequence that has every frame can be followed.
-            for mode in ("frames", "track") if manifest.get("every", 1) == 1 else ("frames",):
+            for mode in modes:
                 request = DatasetRequest(model=model, dataset=dataset, split=split, mode=mode)
                 score = evaluate_dataset(request).score
                 scores.append({**score, "dataset": dataset.name, "recipe": recipe})
@@ -101,19 +103,41 @@ def read_beside(paths: Sequence[Path]) -> list[dict[str, Any]]:
     return beside
 
 
-def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], scores: Sequence[Mapping[str, Any]]) -> None:
-    """Raises ConfigError where one beside does not tell of the same pictures as any of the scores."""
-    known = {_pictures(score) for score in scores}
+def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], datasets: Sequence[Path]) -> None:
+    """Raises ConfigError where one beside does not tell of what is measured on any of the datasets."""
+    known = {pictures for dataset in datasets for pictures in _to_judge(dataset)} if beside else set()
     for score in beside:
         if _pictures(score) not in known:
             raise ConfigError(f"{_called(score['method'])}: was measured on other pictures: {_pictures(score)}")
 
 
-def _pictures(score: Mapping[str, Any]) -> tuple[str | int | None, ...]:
+def _pictures(score: Mapping[str, Any]) -> Pictures:
     """What was judged, and how; scores written before own_ship and every were told have neither."""
     overall = score["overall"]
     which = score["dataset"], score["split"], score.get("every", 1), overall["frames"], overall["targets"]
     return *which, score["mode"], score.get("own_ship")
+
+
+def _to_judge(dataset: Path) -> list[Pictures]:
+    """The same of what `measure` makes of a dataset, by its labels alone. Raises ConfigError."""
+    try:
+        opened = open_dataset(dataset, _split(dataset))
+        pictures = opened.labelled_frames()
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    targets = sum(is_seen(target) for picture in pictures for target in picture.targets)
+    own_ship = {"frames": None, "track": DatasetRequest().own_ship}
+    which = dataset.name, opened.split, DatasetRequest().every, len(pictures), targets
+    return [(*which, mode, own_ship[mode]) for mode in _modes(dataset)]
+
+
+def _split(dataset: Path) -> str | None:
+    return TEST_SPLIT if (dataset / TEST_SPLIT).is_dir() else None
+
+
+def _modes(dataset: Path) -> tuple[Literal["frames", "track"], ...]:
+    """Only a sequence that has every frame can be followed."""
+    return ("frames", "track") if _manifest(dataset).get("every", 1) == 1 else ("frames",)
 
 
 def _called(method: Mapping[str, Any]) -> str:
@@ -297,12 +321,12 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.runs:
         history = gathered(history, arguments.runs)
     datasets, beside = datasets_in(arguments.benchmark), read_beside(arguments.beside)
+    refuse_other_pictures(beside, datasets)
     for path in arguments.model:
         read_contract(path)
     made_folder(arguments.out)
     scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
     (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")
-    refuse_other_pictures(beside, scores)
     extra = "".join(f" --model {path}" for path in arguments.model)
     extra += "".join(f" --beside {path}" for path in arguments.beside)
     command = f"uavpose-trainer results --benchmark {arguments.benchmark}{extra} --out {arguments.out}"

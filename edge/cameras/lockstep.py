@@ -3,7 +3,7 @@
 One line a step, answered `ok` when the loop has come round and the links have sent what it told them:
 
     time NS      let it be NS (monotonic); what the peers sent before is heard
-    frame INDEX  picture INDEX of the sequence is exposed now
+    frame INDEX  frame INDEX of the sequence is exposed now
 
 `ready` goes out first, when the daemon is warm. The recording is over when the player hangs up.
 """

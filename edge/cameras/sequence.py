@@ -1,13 +1,18 @@
-"""A BOP scene played in real time: frame k is exposed at start + k / fps on the monotonic clock."""
+"""A BOP scene played in real time: frame k is exposed at start + k / fps on the monotonic clock.
+
+A scene made of a recording has no picture of a frame that was not recorded: to who reads it, that one was dropped.
+"""
 
 from __future__ import annotations
 
 import json
 import threading
 import time
+import tomllib
 from collections import Counter, deque
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -23,6 +28,7 @@ from edge.types import Array, CameraInfo, Frame, FrameMeta
 
 DECODED_AHEAD = 2
 DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself knows pinhole cameras alone
+SOURCE_KEY = "source"  # of sequence.toml, in scenes made of a video or a recording: what was filmed
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
@@ -33,6 +39,7 @@ class ScenePicture:
     path: Path
     K: Array  # [3, 3], pixel centres at integers
     distortion: tuple[float, ...]  # k1 k2 p1 p2 k3; empty: none
+    frame: int | None = None  # of the sequence, from 0; None: the one after that of the picture before
 
 
 class SequenceSource:
@@ -44,6 +51,7 @@ class SequenceSource:
         self._settings = settings
         self.counts: Counter[str] = Counter()
         self._pictures: list[ScenePicture] = []
+        self._frames: list[int] = []  # of the sequence, that each of them is
         self._image_size_wh = (0, 0)
         self._start_ns: int | None = None
         self._next = 0
@@ -58,12 +66,14 @@ class SequenceSource:
         self._image_size_wh = (first.shape[1], first.shape[0])
         if self._settings.intrinsics is not None:
             given = load_intrinsics(self._settings.intrinsics).scaled_to(self._image_size_wh)
-            self._pictures = [ScenePicture(p.path, given.K, given.distortion) for p in self._pictures]
+            self._pictures = [replace(p, K=given.K, distortion=given.distortion) for p in self._pictures]
+        self._frames = [index if p.frame is None else p.frame for index, p in enumerate(self._pictures)]
         self._decoder = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
         self._start_ns, self._next = self._settings.start_at_ns, 0
         self._ahead.clear()
         self._decode_ahead(self._next)
-        return CameraInfo(folder.name, self._image_size_wh, self._pictures[0].K, self._settings.fps)
+        K, distortion = self._pictures[0].K, self._pictures[0].distortion
+        return CameraInfo(folder.name, self._image_size_wh, K, self._settings.fps, distortion)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next exposed frame. Raises EndOfStream after the last, InputError on an unreadable picture."""
@@ -84,15 +94,17 @@ class SequenceSource:
             raise InputError(f"{self._at(index).path} differs in size from the first picture of the scene")
         self._next = index + 1
         self._decode_ahead(self._next)
-        meta = FrameMeta(index, capture_ns, time.monotonic_ns())
+        meta = FrameMeta(self._frame(index), capture_ns, time.monotonic_ns())
         picture = self._at(index)
         return Frame(meta, image_bgr, picture.K, picture.distortion)
 
     def exposed_now(self, index: int, sequence: int) -> Frame:
-        """Picture `index` as if exposed this instant, the camera's frame `sequence`. Raises InputError."""
-        if not self._exists(index):
-            raise InputError(f"{self._settings.path} has no picture {index}: it has {len(self._pictures)}")
-        picture, now_ns = self._at(index), clock.monotonic_ns()
+        """Frame `index` as if exposed this instant, the camera's frame `sequence`. Raises InputError."""
+        frames = self._frames[-1] + 1
+        wanted = index % frames if self._settings.loop else index
+        if wanted not in self._frames:
+            raise InputError(f"{self._settings.path} has no picture {index} among its {frames} frames")
+        picture, now_ns = self._pictures[self._frames.index(wanted)], clock.monotonic_ns()
         return Frame(FrameMeta(sequence, now_ns, now_ns), _decode(picture.path), picture.K, picture.distortion)
 
     def close(self) -> None:
@@ -110,9 +122,14 @@ class SequenceSource:
     def _at(self, index: int) -> ScenePicture:
         return self._pictures[index % len(self._pictures)]
 
+    def _frame(self, index: int) -> int:
+        """The number of frame of a picture, counted on from round to round."""
+        rounds, within = divmod(index, len(self._frames))
+        return rounds * (self._frames[-1] + 1) + self._frames[within]
+
     def _exposure_ns(self, index: int) -> int:
         assert self._start_ns is not None
-        return self._start_ns + round(index * 1e9 / self._settings.fps)
+        return self._start_ns + round(self._frame(index) * 1e9 / self._settings.fps)
 
     def _decode_ahead(self, index: int) -> None:
         assert self._decoder is not None
@@ -146,7 +163,25 @@ def read_scene(folder: Path) -> list[ScenePicture]:
     missing = sorted(set(paths) - set(lenses))
     if missing:
         raise InputError(f"{index} has no camera for picture {missing[0]}")
-    return [ScenePicture(paths[number], *lenses[number]) for number in sorted(paths)]
+    numbers = sorted(paths)
+    frames = frames_of(folder, numbers)
+    return [ScenePicture(paths[number], *lenses[number], frame) for number, frame in zip(numbers, frames, strict=True)]
+
+
+def frames_of(folder: Path, numbers: Sequence[int]) -> list[int]:
+    """Which frame of the sequence each picture is, from 0, by the growing `numbers` of the scene's pictures.
+
+    They follow each other, whatever their numbers; in a scene made of a recording a number left out is a frame that was
+    not recorded. Raises InputError if sequence.toml cannot be read.
+    """
+    path = folder / "sequence.toml"
+    try:
+        recorded = SOURCE_KEY in tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        recorded = False
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    return [number - numbers[0] for number in numbers] if recorded else list(range(len(numbers)))
 
 
 def _camera(index: Path, key: str, entry: object) -> tuple[Array, tuple[float, ...]]:

@@ -12,11 +12,12 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import zenoh
+from zenoh import CongestionControl, Reliability
 
 from edge import clock
 from edge.clock import UtcClock
@@ -326,5 +327,7 @@ class Desk:
     def _publisher(self, node: Node, topic: Topic, target: str | None) -> TopicPublisher:
         key = (topic.name, target)
         if key not in self._publishers:
+            if clock.stepped():  # the player waits for all that a frame gives: nothing may be lost for want of room
+                topic = replace(topic, reliability=Reliability.RELIABLE, congestion=CongestionControl.BLOCK)
             self._publishers[key] = node.publisher(topic, target)
         return self._publishers[key]

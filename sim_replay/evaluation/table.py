@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rich.console import Group
+from rich.console import Console, Group
 from rich.table import Table
 
+WIDTH = 130  # of tables where there is no terminal to ask
 _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "targets": lambda group: str(group["targets"]),
     "found": lambda group: _text(group["recall"], "{:.1%}"),
@@ -31,6 +32,14 @@ _AIRFRAME_COLUMNS = {
     "Pose@10°/5 %": "Pose",
     "ADD-0.1d": "ADD-0.1d",
 }
+
+
+def table_console(stderr: bool = False) -> Console:
+    """Where there is no terminal, as wide as tables need: nobody can widen a file."""
+    console = Console(stderr=stderr)
+    if not console.is_terminal:
+        console.width = max(console.width, WIDTH)
+    return console
 
 
 def score_table(score: dict[str, Any]) -> Group:

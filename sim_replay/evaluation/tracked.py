@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from edge.cameras.sequence import frames_of
 from edge.config import EstimatorSettings, MavlinkSettings
 from edge.errors import InputError
 from edge.estimator.estimator import Estimator
@@ -45,7 +46,8 @@ class _Sequence:
     scene: BopScene
     fps: float
     in_ned: bool
-    places: dict[int, tuple[int, BopFrame]]  # by image id: its place in the sequence
+    places: dict[int, tuple[int, BopFrame]]  # by image id: its place among the scene's pictures
+    frames: list[int]  # of the sequence, that each of them is
     errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
@@ -58,17 +60,17 @@ class _Sequence:
         errors = OwnShipErrors.of_flight(scene.folder.name) if own_ship == "usual" else None
         path = scene.folder / "sequence.toml"
         if not path.is_file():
-            return cls(scene, DEFAULT_FPS, False, places, errors)
+            return cls(scene, DEFAULT_FPS, False, places, list(range(len(places))), errors)
         try:
             fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
         except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: 'fps' is not a number that can be read") from error
         if not (np.isfinite(fps) and fps > 0):
             raise InputError(f"{path}: 'fps' is not above zero")
-        return cls(scene, fps, True, places, errors)
+        return cls(scene, fps, True, places, frames_of(scene.folder, list(places)), errors)
 
     def capture_ns(self, image_id: int) -> int:
-        return FIRST_FRAME_NS + round(self.places[image_id][0] * 1e9 / self.fps)
+        return FIRST_FRAME_NS + round(self.frames[self.places[image_id][0]] * 1e9 / self.fps)
 
     def own_ship(self, image_id: int) -> OwnShip | None:
         """The camera as a vehicle of its own: nose along the optical axes, mount nil."""
@@ -89,7 +91,7 @@ class _Sequence:
         before, after = _place(self.scene.frames[first]), _place(self.scene.frames[last])
         if before is None or after is None or first == last:
             return np.zeros(3), np.zeros(3)
-        dt_s = (last - first) / self.fps
+        dt_s = (self.frames[last] - self.frames[first]) / self.fps
         return so3_log(after[0] @ before[0].T) / dt_s, (after[1] - before[1]) / dt_s
 
 

@@ -23,39 +23,44 @@ DIGITS = 9
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far a field's numbers may be off: `least`, plus `share` of the expected value's (a list's: norm's) size."""
+    """How far a number may be off: `least`, plus `share` of the expected one's size, or of the norm of all its list."""
 
-    least: float
+    least: float | tuple[float, ...]  # of all the numbers of a list, or of each
     share: float = 0.0
+    of_norm: bool = False
 
-    def allows(self, expected: Sequence[float]) -> float:
-        return self.least + self.share * math.hypot(*expected)
+    def allows(self, expected: Sequence[float]) -> list[float]:
+        """Of each number of a field."""
+        least = self.least if isinstance(self.least, tuple) else (self.least,) * len(expected)
+        sizes = [math.hypot(*expected)] * len(expected) if self.of_norm else [abs(value) for value in expected]
+        return [one + self.share * size for one, size in zip(least, sizes, strict=True)]
 
 
-POSITION = Tolerance(0.2, 0.01)  # m
+POSITION = Tolerance(0.2, 0.01, of_norm=True)  # m
 ROTATION_DEG = 2.0
-DEVIATION = Tolerance(0.02, 0.1)
+DEVIATION_M, DEVIATION_MPS, DEVIATION_RAD = Tolerance(0.02, 0.1), Tolerance(0.1, 0.1), Tolerance(0.005, 0.1)
+DEVIATIONS = Tolerance((0.02, 0.02, 0.02, 0.005, 0.005, 0.005), 0.1)  # of position, m, and of rotation, rad
 # By record and field; what is not here is OTHER if it is a float, and exact if not.
 TOLERANCES = {
     ("pose", "t_cam_target_m"): POSITION,
-    ("pose", "std"): DEVIATION,
+    ("pose", "std"): DEVIATIONS,
     ("TARGET_RELATIVE", "x"): Tolerance(2.0),
     ("TARGET_RELATIVE", "y"): Tolerance(2.0),
     ("TARGET_RELATIVE", "z"): Tolerance(0.2, 0.01),
-    ("TARGET_RELATIVE", "pos_std"): DEVIATION,
-    ("TARGET_RELATIVE", "yaw_std"): DEVIATION,
+    ("TARGET_RELATIVE", "pos_std"): DEVIATION_M,
+    ("TARGET_RELATIVE", "yaw_std"): DEVIATION_RAD,
     ("CAMERA_TRACKING_GEO_STATUS", "lat"): Tolerance(300),  # 1e-7 degrees: 3 m
     ("CAMERA_TRACKING_GEO_STATUS", "lon"): Tolerance(300),
     ("CAMERA_TRACKING_GEO_STATUS", "alt"): Tolerance(2.0),
     ("CAMERA_TRACKING_GEO_STATUS", "dist"): Tolerance(0.2, 0.01),
-    ("CAMERA_TRACKING_GEO_STATUS", "h_acc"): DEVIATION,
-    ("CAMERA_TRACKING_GEO_STATUS", "v_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "h_acc"): DEVIATION_M,
+    ("CAMERA_TRACKING_GEO_STATUS", "v_acc"): DEVIATION_M,
     ("CAMERA_TRACKING_GEO_STATUS", "vel_n"): Tolerance(1.0, 0.05),
     ("CAMERA_TRACKING_GEO_STATUS", "vel_e"): Tolerance(1.0, 0.05),
     ("CAMERA_TRACKING_GEO_STATUS", "vel_d"): Tolerance(1.0, 0.05),
-    ("CAMERA_TRACKING_GEO_STATUS", "vel_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "vel_acc"): DEVIATION_MPS,
     ("CAMERA_TRACKING_GEO_STATUS", "hdg"): Tolerance(math.radians(3.0)),
-    ("CAMERA_TRACKING_GEO_STATUS", "hdg_acc"): DEVIATION,
+    ("CAMERA_TRACKING_GEO_STATUS", "hdg_acc"): DEVIATION_RAD,
 }
 OTHER = Tolerance(0.005, 0.01)
 QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
@@ -163,7 +168,8 @@ def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
         if all(isinstance(value, int) for value in (*old, *new)):
             return said
         tolerance = OTHER
-    error, allowed = max(abs(a - b) for a, b in zip(old, new, strict=True)), tolerance.allows(old)
+    off = [(abs(a - b), allowed) for a, b, allowed in zip(old, new, tolerance.allows(old), strict=True)]
+    error, allowed = max(off, key=lambda one: one[0] - one[1])
     return None if error <= allowed else f"{said}: {error:.4g} off, {allowed:.4g} allowed"
 
 

@@ -54,8 +54,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     gate = Gate(sequence.fps, args.speed, args.pause, args.step, console.input)
     told = args.step or args.pause is not None
     remove_flight(args.out)
-    for name in (POSES_JSONL, MESSAGES_JSONL):
-        (args.out / name).unlink(missing_ok=True)
 
     with Progress(console=console, disable=told or not console.is_terminal) as progress:
         task = progress.add_task("playing", total=len(settings.frames))
@@ -63,7 +61,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         def after_frame(frame: int, poses: list[Record]) -> None:
             progress.advance(task)
             if told:
-                console.print(_line(frame, poses), highlight=False, soft_wrap=True)
+                text = f"frame {frame}: not recorded" if frame in sequence.scene.unrecorded else _line(frame, poses)
+                console.print(text, highlight=False, soft_wrap=True)
 
         outputs = play_lockstep(settings, gate.before, after_frame)
     outputs.write(args.out)

@@ -41,7 +41,7 @@ AfterFrame = Callable[[int, list[Record]], None]
 
 @dataclass(frozen=True)
 class LockstepSettings:
-    """What is played: the pictures from `start` to before `stop` (None: to the last), `rounds` times over."""
+    """What is played: the frames from `start` to before `stop` (None: to the last), `rounds` times over."""
 
     sequence: PlayedSequence
     model: Path
@@ -51,7 +51,7 @@ class LockstepSettings:
 
     @property
     def frames(self) -> list[int]:
-        """Numbers of the pictures, in the order they are shown."""
+        """Their numbers, in the order they are shown."""
         return list(range(self.start, len(self.sequence.scene.images))[: self._count]) * self.rounds
 
     @property
@@ -76,8 +76,8 @@ class Outputs:
 
 
 def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_frame: AfterFrame) -> Outputs:
-    """Play the sequence. `before_frame` hears each picture's number first and may take its time; `after_frame` hears it
-    again with the poses that came of it.
+    """Play the sequence. `before_frame` hears each frame's number first and may take its time; `after_frame` hears it
+    again with the poses that came of it, none of a frame that was not recorded.
 
     Raises:
         InputError: the daemon refuses what it is given.
@@ -131,7 +131,7 @@ class Flight:
                 gimbal = looped_gimbal(gimbal, first_ns, round_s, settings.rounds)
             telemetry, first_ns = looped(telemetry, first_ns, round_s, settings.rounds), 0
         self._fps = sequence.fps
-        self._frames = frames
+        self._frames, self._unrecorded = frames, sequence.scene.unrecorded
         self._first_ns = BASE_NS + first_ns
         self._frame0_ns = frame0_ns = self._first_ns - offset_ns
         autopilot = Autopilot(telemetry, BASE_NS, BASE_NS - BOOT_BEFORE_START_NS, gimbal=gimbal)
@@ -151,6 +151,9 @@ class Flight:
             before_frame(frame)
             exposed_ns = self._first_ns + round(count * 1e9 / self._fps)
             self._stepper.advance(exposed_ns)
+            if frame in self._unrecorded:
+                after_frame(frame, [])
+                continue
             self._stepper.expose(frame)
             after_frame(frame, self._subscriber.collect(frame, exposed_ns))
 

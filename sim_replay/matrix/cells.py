@@ -17,7 +17,7 @@ from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.offline import method_of
 from sim_replay.pace import at_speed
 from sim_replay.play import PlayError, PlaySettings, play
-from sim_replay.report.flight_files import RecordedFlight, write_flight
+from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 from sim_replay.report.peer import percentiles
 from sim_replay.result import judge, score_json
 
@@ -47,6 +47,7 @@ def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) ->
     name = sequence.scene.name
     out.mkdir(parents=True, exist_ok=True)
     flown = at_speed(sequence, speed, out)
+    remove_flight(out)
     try:
         recording = play(PlaySettings(flown, out, model.path), lambda _recording, _record: None)
     except PlayError as error:

@@ -10,13 +10,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.estimator.model import Model, load_model
 from sim_replay.demo import BUNDLED_SEQUENCE
+from sim_replay.evaluation.table import table_console
 from sim_replay.faults.run import timeline_path
 from sim_replay.faults.timeline import Timeline, load_timeline
 from sim_replay.ground_truth import PlayedSequence, read_sequence
@@ -25,7 +25,6 @@ from sim_replay.matrix.datasets import flyable
 
 EXIT_WRONG = 1
 SPEEDS = (0.25, 4.0)
-WIDTH = 130  # of the table where there is no terminal to ask
 
 
 def register(commands: Any) -> None:
@@ -75,9 +74,7 @@ def run(args: argparse.Namespace) -> int:
     if NO_FAULT not in faults and all(sequence.scene.target_free for sequence, _ in sequences):
         raise InputError(f"--fault: no sequence shows a target, which faults are judged by; say --fault {NO_FAULT}")
     args.out.mkdir(parents=True, exist_ok=True)
-    console = Console(stderr=args.json)
-    if not console.is_terminal:
-        console.width = WIDTH
+    console = table_console(stderr=args.json)
     for sequence, name in sequences:
         if timelines and sequence.scene.target_free:
             console.print(f"{name}: shows no target, which faults are judged by: flown without them", highlight=False)

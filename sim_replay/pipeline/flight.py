@@ -60,6 +60,7 @@ class Flight:
     targets: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
     diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
     poses_ns: list[int] = field(default_factory=list)  # when each was received over zenoh
+    poses_utc_ns: list[int] = field(default_factory=list)  # the exposures that they are of
     usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
     logged: list[tuple[int, int]] = field(default_factory=list)  # when a line of its log came, and its bytes
     ended: threading.Event = field(default_factory=threading.Event)  # a process has
@@ -88,6 +89,7 @@ class Flight:
             self.diagnostics.append(record)
         elif record["event"] == "pose":
             self.poses_ns.append(heard_ns)
+            self.poses_utc_ns.append(record["capture_utc_ns"])
 
 
 def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from edge.config import MavlinkSettings
 from edge.health import WINDOW_FRAMES
 from edge.stages import STAGES
 from sim_replay.pipeline.flight import Flight
@@ -15,6 +17,7 @@ from sim_replay.pipeline.flight import Flight
 SETTLE_S = 1.0  # after the sequence began again: the target has jumped and must be found anew
 FLAT_FROM_MINUTES = 60.0
 FAST_ABOVE_HZ = 31.0
+SENT_MAX_HZ = MavlinkSettings().target_relative_rate_hz
 PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
 
 
@@ -43,6 +46,8 @@ def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[
         "dropped": counters.get("dropped"),
         "poses_mavlink": len(flight.targets),
         "poses_zenoh": len(flight.poses_ns),
+        "poses_withheld": poses_withheld(flight, fps, period_s),
+        **{name: counters.get(name) for name in ("mavlink_tracks_withheld", "zenoh_tracks_withheld")},
         "capture_to_mavlink_ms": latency,
         "stages_ms": stages,
         **cpu(flight, counters.get("captured")),
@@ -62,6 +67,7 @@ def budgets(result: dict[str, Any]) -> list[Budget]:
     return [
         *([] if fast else [p50_ms]),
         _budget("capture to MAVLink, tracking, p99", 33.0 if fast else 25.0, steady.get("p99"), "ms"),
+        _budget("poses withheld by MAVLink, tracking", 0.0, result["poses_withheld"], ""),
         _budget("inference in the loop, p50 (track)", 8.0, result["stages_ms"].get("inference", {}).get("p50"), "ms"),
         _budget("frames dropped", 0.0, result["dropped"], ""),
         _budget("resident memory, largest", 400.0, memory.get("max"), "MB"),
@@ -84,6 +90,25 @@ def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, f
     ms = [(record["received_ns"] - capture_ns) * 1e-6 for capture_ns, record in pairs]
     steady = [value for value, since in zip(ms, since_s, strict=True) if since >= SETTLE_S]
     return {"all": _percentiles(ms), "steady": _percentiles(steady)}
+
+
+def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
+    """Poses that the subscriber got and the autopilot did not: too old for MAVLink, whose limit is the lower one. No
+    latency tells of them.
+
+    Without SETTLE_S after each new begin, where what coasts is withheld too; None at more frames a second than
+    TARGET_RELATIVE is sent. The daemon's own `mavlink_tracks_withheld` counts what is not confirmed yet as well.
+    """
+    if fps > SENT_MAX_HZ:
+        return None
+    told_utc_ns = [record["capture_utc_us"] * 1000 for record in flight.targets]
+    had, told = (
+        Counter(round((utc_ns - flight.utc_minus_monotonic_ns - flight.start_at_ns) * 1e-9 * fps) for utc_ns in stamps)
+        for stamps in (flight.poses_utc_ns, told_utc_ns)
+    )
+    flown = range(min(told), max(told) + 1) if told else range(max(had, default=0) + 1)  # while both were listened to
+    missed = had - told
+    return sum(count for frame, count in missed.items() if frame in flown and frame / fps % period_s >= SETTLE_S)
 
 
 def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[str, dict[str, float]]:
@@ -160,6 +185,8 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
             yield f"{name:40} {ms['p50']:8.2f} {ms['p95']:8.2f} {ms['p99']:8.2f}"
     yield ""
     yield f"{result['captured']} frames, {result['poses_mavlink']} poses at the autopilot"
+    if result["poses_withheld"]:
+        yield f"{result['poses_withheld']} more were too old to be sent to it: no latency to MAVLink tells of them"
     if result["cpu_cores"] is not None:
         waited = result["cpu_cores_waited_for"]
         yield f"{result['cpu_cores']:.2f} cores busy, {waited:.2f} waited for while other processes had them"

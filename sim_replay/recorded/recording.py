@@ -2,15 +2,13 @@
 
 Pictures are played at a constant rate, each in the slot nearest its exposure, and the telemetry is bent so that the
 attitude at every picture's exposure is the one that was recorded. Pictures from before the first and after the last
-attitude are left out. A slot whose picture was not recorded shows the one
-before again, which the daemon takes for a frozen camera and drops.
+attitude are left out. A picture's number is its slot: one that is left out was not recorded, and is a dropped frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -64,14 +62,11 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
     gimballed = any(np.linalg.norm(so3_log(mounts[0].R_body_cam.T @ m.R_body_cam)) > _FIXED_RAD for m in mounts)
     with SceneWriter(folder, JPEG_QUALITY) as writer:
         of_picture = dict(zip(kept.tolist(), slots.tolist(), strict=True))
-        after = dict(pairwise(slots.tolist())) | {int(slots[-1]): int(slots[-1]) + 1}
 
         def write(index: int, image: CompressedImage) -> None:
-            if index not in of_picture:
-                return
-            R_ned_cam, t_ned_cam_m = _camera_at(recorded, own_ns, recorded.picture_ns[index])
-            for slot in range(of_picture[index], after[of_picture[index]]):
-                _add(writer, slot, image, recorded.lens[index], R_ned_cam, t_ned_cam_m)
+            if index in of_picture:
+                R_ned_cam, t_ned_cam_m = _camera_at(recorded, own_ns, recorded.picture_ns[index])
+                _add(writer, of_picture[index], image, recorded.lens[index], R_ned_cam, t_ned_cam_m)
                 on_picture()
 
         _read(paths, write)

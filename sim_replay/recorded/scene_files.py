@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.cameras.sequence import SOURCE_KEY
 from edge.types import Array, Mount
 from msgs.settings import toml_value
 from sim_replay.bop import Distortion
@@ -16,7 +17,6 @@ from sim_replay.bop.records import BopFrame
 from sim_replay.bop.write import SceneWriter
 
 JPEG_QUALITY = 95
-_SOURCE = "source"  # key of sequence.toml, of unpacked scenes alone
 
 
 def add_picture(
@@ -46,7 +46,7 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
 def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
     """sequence.toml of a finished scene whose labels nobody knows; `source` is where the pictures are from."""
     entries = {
-        _SOURCE: str(source),
+        SOURCE_KEY: str(source),
         "fps": fps,
         "t0_ns": frame0_ns,
         "R_body_cam": mount.R_body_cam.tolist(),
@@ -65,4 +65,4 @@ def is_unpacked(folder: Path) -> bool:
         entries = tomllib.loads((folder / "sequence.toml").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return _SOURCE in entries and not (folder / "scene_gt.json").exists()
+    return SOURCE_KEY in entries and not (folder / "scene_gt.json").exists()

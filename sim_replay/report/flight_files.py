@@ -10,11 +10,16 @@ from typing import Any
 import numpy as np
 
 from edge.errors import InputError
-from sim_replay.play import Record, Recording
+from sim_replay.play import MESSAGES_JSONL, Record, Recording
 from sim_replay.result import latency_ms as latency_ms_of
 from sim_replay.result import pose_of
 
 FLIGHT_JSON, RECEIVED_JSONL = "flight.json", "received.jsonl"
+# What `demo`, `play` and `score` write into a flight's folder. The daemon's recordings are its user's.
+WRITTEN = (
+    *(FLIGHT_JSON, RECEIVED_JSONL, MESSAGES_JSONL, "poses.jsonl", "config.toml", "daemon.log", "gimbal.csv"),
+    *("score.json", "frames.jsonl", "report.html", "overlay.mp4", "overlay.png"),
+)
 _PEER_OF = {"target_relative": "autopilot", "pose": "subscriber", "diagnostics": "subscriber"}
 
 
@@ -34,8 +39,8 @@ def is_flight(folder: Path) -> bool:
 
 
 def remove_flight(folder: Path) -> None:
-    """Remove what an earlier replay left there, so that it is not taken for the one that begins now."""
-    for name in (FLIGHT_JSON, RECEIVED_JSONL):
+    """Remove what an earlier replay wrote there, so that it is not taken for the one that begins now."""
+    for name in WRITTEN:
         (folder / name).unlink(missing_ok=True)
 
 

@@ -19,7 +19,7 @@ from sim_replay.play import Recording
 from sim_replay.report import plots
 from sim_replay.report.moments import film, jpeg_url, worst_moments
 from sim_replay.report.plots import HealthSample
-from sim_replay.result import PEERS, Result
+from sim_replay.result import PEERS, Result, told_ages
 
 TEMPLATE = "report.html.j2"
 _POSTER_WIDTH_PX = 960
@@ -38,7 +38,8 @@ def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any],
     matches = result.subscriber.matches
     frames, fps = len(sequence.scene.images), sequence.fps
     video, stills = film(drawn / "overlay.mp4")
-    ages = dict(zip(PEERS, (result.subscriber.ages, result.autopilot.ages), strict=True))
+    received = zip(PEERS, (result.subscriber, result.autopilot), strict=True)
+    ages = {name: told_ages(peer, result.recording) for name, peer in received}
     svg = {
         "pose": plots.pose_over_time(matches, frames, fps),
         "trajectory": plots.trajectory(matches, sequence.scene),

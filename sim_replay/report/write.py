@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import Image, Overlay, showcase_index, write_video
 from sim_replay.report.flight_files import RecordedFlight
-from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, score_json
+from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, score_json, told_ages
 
 
 def write_report(
@@ -45,13 +45,14 @@ def write_report(
 def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:
     """One a frame: each visible target with what each peer received of it, its errors, and that pose's age."""
     peers = dict(zip(PEERS, (result.subscriber, result.autopilot), strict=True))
-    told = {name: _by_frame(peer) for name, peer in peers.items()}
+    told = {name: _by_frame(peer, told_ages(peer, result.recording)) for name, peer in peers.items()}
     for frame, image in enumerate(sequence.scene.images):
         at_peers = {name: frames[frame] for name, frames in told.items()}
-        yield {"frame": frame, "t_s": round(frame / sequence.fps, 6), "image": image.name, **at_peers}
+        name = None if frame in sequence.scene.unrecorded else image.name
+        yield {"frame": frame, "t_s": round(frame / sequence.fps, 6), "image": name, **at_peers}
 
 
-def _by_frame(peer: PeerResult) -> defaultdict[int, dict[str, Any]]:
+def _by_frame(peer: PeerResult, ages: Iterable[tuple[int, float]]) -> defaultdict[int, dict[str, Any]]:
     """What a peer had of each frame; of one that nothing is known of, empty lists."""
     told: defaultdict[int, dict[str, Any]] = defaultdict(lambda: {"targets": [], "false_poses": 0, "age_ms": []})
     for match in peer.matches:
@@ -59,7 +60,7 @@ def _by_frame(peer: PeerResult) -> defaultdict[int, dict[str, Any]]:
         told[match.truth.frame]["targets"].append({**target_record(match), "track": track})
     for pose in peer.false_poses:
         told[pose.frame]["false_poses"] += 1
-    for frame, age_ms in peer.ages:
+    for frame, age_ms in ages:
         told[frame]["age_ms"].append(round(age_ms, 3))
     return told
 

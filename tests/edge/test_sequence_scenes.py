@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
+from edge.cameras.capture import Capture
 from edge.cameras.sequence import DISTORTION_KEY, SequenceSource
 from edge.cameras.source import EndOfStream
 from edge.config_camera import IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
 from edge.types import Frame
+from tests.waiting import until
 
 SIZE_WH = (320, 180)
 LENS = (-0.25, 0.08, 0.002, -0.001, -0.01)
@@ -112,4 +114,44 @@ def test_a_picture_without_a_camera_is_told(scene: Path) -> None:
     del cameras["20"]
     (scene / "scene_camera.json").write_text(json.dumps(cameras))
     with pytest.raises(InputError, match="no camera for picture 20"):
+        SequenceSource(SequenceCamera(type="sequence", path=scene)).open()
+
+
+def test_a_number_left_out_of_what_was_recorded_is_a_frame_that_was_dropped(scene: Path) -> None:
+    (scene / "sequence.toml").write_text('source = "flight.mcap"\nfps = 100.0\n')
+    settings = SequenceCamera(type="sequence", path=scene, fps=100, loop=True)
+    with closing(SequenceSource(settings)) as source:
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(2)]
+        assert frames[0].meta.sequence % 15 in (0, 13, 14)  # of 15 frames a round, pictures 7, 20 and 21
+        apart = frames[1].meta.sequence - frames[0].meta.sequence
+        assert frames[1].meta.capture_ns - frames[0].meta.capture_ns == pytest.approx(apart * 1e7, abs=1)
+        shown = source.exposed_now(13, 0).image_bgr
+        np.testing.assert_array_equal(shown[:, :, 0], dots(camera(300.0), (0.0,) * 5))
+        np.testing.assert_array_equal(source.exposed_now(15 + 13, 1).image_bgr, shown)
+        with pytest.raises(InputError, match="no picture 12 among its 15 frames"):
+            source.exposed_now(12, 2)
+    (scene / "sequence.toml").write_text("fps = 100.0\n")  # not recorded: any numbers, one after the other
+    assert [frame.meta.sequence for frame in play(scene)] == [0, 1, 2]
+
+
+def test_a_gap_counts_as_dropped_frames_and_not_as_a_frozen_camera(scene: Path) -> None:
+    (scene / "sequence.toml").write_text('source = "flight.mcap"\nfps = 20.0\n')
+    source = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=20))
+    source.open()
+    capture = Capture(source, opened=True)
+    capture.start()
+    try:
+        counted = capture.counters
+        until(lambda: counted()["captured"] + counted()["dropped_at_source"] == 15, what="the last frame")
+    finally:
+        capture.stop()
+    assert counted()["captured"] <= 3
+    assert counted()["frozen"] == 0
+
+
+@pytest.mark.parametrize("text", ["fps = ", "\xff"])
+def test_a_sequence_toml_that_cannot_be_read_is_told(text: str, scene: Path) -> None:
+    (scene / "sequence.toml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"000012/sequence\.toml: cannot be read"):
         SequenceSource(SequenceCamera(type="sequence", path=scene)).open()

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Message
 from mcap.writer import Writer
 from rich.console import Console
 
@@ -22,6 +24,7 @@ from msgs.geometry import R_from_euler, R_from_q_wxyz, q_wxyz_from_R, so3_log
 from sim_replay.cli import main
 from sim_replay.ground_truth import read_sequence
 from sim_replay.recorded.opened import open_sequence
+from sim_replay.report.flight_files import remove_flight
 from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
 from tests.waiting import until
 
@@ -127,9 +130,14 @@ def test_the_daemons_own_recording_flies_again(
         np.testing.assert_allclose(poses[frame]["t_cam_target_m"], was, rtol=0.05, atol=0.5)
     _attitude_as_flown(read_telemetry(tmp_path / "again/sequence/telemetry.csv"))
 
+    # What a flight leaves behind is known by name, but for what was recorded and unpacked.
+    for folder, left in (("first", ["recordings"]), ("again", ["sequence"])):
+        remove_flight(tmp_path / folder)
+        assert [one.name for one in (tmp_path / folder).iterdir()] == left
 
-def without_attitude_before(log_ns: int, path: Path, cut: Path) -> None:
-    """Copy a recording, but for what it tells of the own ship before then."""
+
+def copied(path: Path, cut: Path, keep: Callable[[str, Message], bool]) -> Path:
+    """A recording with those messages alone that are to be kept, by topic."""
     with path.open("rb") as source, cut.open("wb") as target:
         writer = Writer(target)
         writer.start()
@@ -140,11 +148,12 @@ def without_attitude_before(log_ns: int, path: Path, cut: Path) -> None:
                 channels[channel.id] = writer.register_channel(
                     channel.topic, channel.message_encoding, schema_id, channel.metadata
                 )
-            if message.log_time >= log_ns or not channel.topic.endswith("/tf"):
+            if keep(channel.topic, message):
                 writer.add_message(
                     channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
                 )
         writer.finish()
+    return cut
 
 
 def test_pictures_from_before_the_first_attitude_are_left_out(flown: Path, toy_model: Path, tmp_path: Path) -> None:
@@ -153,13 +162,44 @@ def test_pictures_from_before_the_first_attitude_are_left_out(flown: Path, toy_m
     (path,) = (tmp_path / "first/recordings").glob("*.mcap")
     with path.open("rb") as file:
         kept = [message for _, _, message in make_reader(file).iter_messages("/uav1/image/compressed")]
-    cut = tmp_path / "cut.mcap"
-    without_attitude_before(kept[10].log_time, path, cut)
+    from_ns = kept[10].log_time
+    cut = copied(path, tmp_path / "cut.mcap", lambda topic, one: one.log_time >= from_ns or not topic.endswith("/tf"))
     sequence = open_sequence(cut, tmp_path / "again", Console(quiet=True))
     first = [CompressedImage.decode(message.data).data for message in kept].index(sequence.scene.images[0].read_bytes())
     assert 8 <= first <= 12
     first_ns = read_telemetry(sequence.telemetry_csv).t_ns[0]
     assert abs(first_ns) < 60_000_000  # its attitude is its own
+
+
+def test_what_was_not_recorded_is_a_dropped_frame_and_no_picture_shown_again(
+    flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
+) -> None:
+    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
+    assert recorded.returncode == 0, recorded.stderr
+    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
+    gap = range(15, 21)  # by the scene's numbers
+
+    def keep(topic: str, message: Message) -> bool:
+        return not topic.endswith("/image/compressed") or frame_of(CompressedImage.decode(message.data).data) not in gap
+
+    cut = copied(path, tmp_path / "cut.mcap", keep)
+    again = replay("play", "--lockstep", "--step", "--sequence", cut, "--model", toy_model, "--out", tmp_path / "again")
+    assert again.returncode == 0, again.stderr
+    sequence = read_sequence(tmp_path / "again/sequence")
+    first = frame_of(sequence.scene.images[0].read_bytes())  # a busy host may have let the first pictures pass
+    missing = {frame - first for frame in gap}
+    assert missing <= sequence.scene.unrecorded
+    shown = {int(one.stem): frame_of(one.read_bytes()) for one in (tmp_path / "again/sequence/rgb").iterdir()}
+    assert shown == {number: number + first for number in shown}
+    assert not missing & shown.keys()
+    poses = poses_of(tmp_path / "again")
+    assert not missing & poses.keys()
+    assert {frame - first for frame in range(21, 30)} & poses.keys()
+    for frame, pose in poses.items():
+        if frame + first in as_it_was:
+            was = as_it_was[frame + first]["t_cam_target_m"]
+            np.testing.assert_allclose(pose["t_cam_target_m"], was, rtol=0.05, atol=0.5)
+    assert f"frame {gap[0] - first}: not recorded" in again.stdout
 
 
 def write_film(folder: Path, picture: Path, frames: int, row_s: float = 0.02) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_replay.golden.compare import DEVIATION, POSITION, ROTATION_DEG, differences, reduced
+from sim_replay.golden.compare import POSITION, ROTATION_DEG, differences, reduced
 from sim_replay.golden.run import CASES, read_golden
 from sim_replay.lockstep.player import Outputs
 from sim_replay.play import Recording
@@ -54,7 +54,7 @@ def test_the_same_outputs_do_not_differ_and_a_quaternion_has_two_names() -> None
 def test_a_position_may_be_off_by_its_tolerance_and_no_more(off_m: float, axis: int, sign: int) -> None:
     t_m = list(POSE["t_cam_target_m"])  # type: ignore[call-overload]
     t_m[axis] += sign * off_m
-    allowed_m = POSITION.least + POSITION.share * math.hypot(*POSE["t_cam_target_m"])  # type: ignore[misc]
+    allowed_m = POSITION.allows(POSE["t_cam_target_m"])[0]  # type: ignore[arg-type]
     found = told(held(), held(t_cam_target_m=t_m))
     if off_m > allowed_m + 1e-6:
         assert len(found) == 1
@@ -73,12 +73,32 @@ def test_a_rotation_is_judged_by_its_angle(angle_deg: float) -> None:
         assert all(f"{angle_deg:.2f}° apart" in text for text in found)
 
 
-def test_a_covariance_that_says_something_else_is_found() -> None:
-    covariance = copy.deepcopy(POSE["covariance"])
-    covariance[2][2] *= (1 + 8 * DEVIATION.share) ** 2  # type: ignore[index]
-    assert [text.split(" is ")[0] for text in told(held(), held(covariance=covariance))] == [
-        "+0.700 s pose frame 7 t0: std"
-    ]
+def with_std(std: list[float]) -> list[dict[str, Any]]:
+    covariance = [[std[row] ** 2 if row == column else 0.0 for column in range(6)] for row in range(6)]
+    return held(covariance=covariance)
+
+
+@given(st.integers(0, 5), st.floats(-0.3, 0.3))
+def test_each_standard_deviation_is_held_by_itself(number: int, share: float) -> None:
+    """However large the depth's is."""
+    std = [0.9, 0.12, 30.0, 0.08, 0.07, 0.07]
+    other = std.copy()
+    other[number] *= 1 + share
+    least = 0.02 if number < 3 else 0.005
+    off, allowed = abs(share) * std[number], least + 0.1 * std[number]
+    found = told(with_std(std), with_std(other))
+    if off > allowed + 1e-6:
+        assert [text.split(" is ")[0] for text in found] == ["+0.700 s pose frame 7 t0: std"]
+        assert f"{allowed:.4g} allowed" in found[0]
+    elif off < allowed - 1e-6:
+        assert found == []
+
+
+def test_a_covariance_of_nothing_but_depth_is_found_at_both_peers() -> None:
+    assert len(told(with_std([0.9, 0.12, 30.0, 0.08, 0.07, 0.07]), with_std([0.0, 0.0, 30.0, 0.0, 0.0, 0.0]))) == 1
+    told_relative = {**held()[1], "kind": "TARGET_RELATIVE", "id": 0, "pos_std": [0.9, 0.12, 30.0]}
+    (found,) = told([told_relative], [{**told_relative, "pos_std": [0.0, 0.0, 30.0]}])
+    assert found.startswith("+0.700 s TARGET_RELATIVE from 1/191: pos_std is [0 0 30], expected [0.9 0.12 30]: 0.9 off")
 
 
 def test_what_is_missing_and_what_is_new_is_named_in_the_order_of_time() -> None:

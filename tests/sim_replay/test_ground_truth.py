@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from sim_replay.cli import main
 from sim_replay.ground_truth import read_scene_truth, read_sequence
+from sim_replay.play import Recording
+from sim_replay.result import judge, score_json
 from tests.sim_replay.toy_flight import write_toy_flight
 
 FRAMES = 30
@@ -51,6 +55,38 @@ def test_a_gap_in_the_numbers_of_a_flown_sequence_is_refused(flight: Path, capsy
         (flight / "rgb" / f"{number:06d}.png").unlink()
     assert "picture 13 follows picture 10, but 1 follows 0" in refusal(flight, capsys)
     assert len(read_scene_truth(flight).images) == FRAMES - 2  # as stills they are taken
+
+
+def test_what_labels_do_not_say_of_who_is_seen_is_seen_by_the_model_as_evaluate_does(dark_spot_scene: Path) -> None:
+    """A target 200 m away and 120 m aside is in front of the camera, and outside its picture."""
+    gt = dark_spot_scene / "scene_gt.json"
+    poses = json.loads(gt.read_text())
+    poses["1"][0]["cam_t_m2c"][0] = 120_000.0
+    gt.write_text(json.dumps(poses))
+    assert [truth.visible for truth in read_scene_truth(dark_spot_scene).truths] == [True, False, True, True]
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60}
+    (dark_spot_scene / "scene_gt_info.json").write_text(json.dumps({"1": [seen]}))  # what is said counts
+    assert all(truth.visible for truth in read_scene_truth(dark_spot_scene).truths)
+
+
+def test_the_pictures_of_a_recording_keep_their_times_and_its_labels_their_pictures(
+    flight: Path, dark_spot_scene: Path
+) -> None:
+    change(flight, "fps = 10.0", 'fps = 10.0\nsource = "flight.mcap"')
+    for number in (11, 12):
+        (flight / "rgb" / f"{number:06d}.png").unlink()
+    scene = read_sequence(flight).scene
+    assert [len(listed) for listed in (scene.images, scene.K, scene.distortions, scene.cameras_world)] == [FRAMES] * 4
+    assert [path.stem for path in scene.images[9:15]] == [f"{number:06d}" for number in (9, 10, 10, 10, 13, 14)]
+    assert scene.unrecorded == {11, 12}
+
+    for name in ("telemetry.csv", "sequence.toml"):
+        shutil.copyfile(flight / name, dark_spot_scene / name)
+    (dark_spot_scene / "rgb" / "000002.jpg").unlink()
+    sequence = read_sequence(dark_spot_scene)
+    assert [truth.frame for truth in sequence.scene.truths] == [0, 1, 3]
+    score = score_json(sequence, judge(sequence, Recording(0, 0, 1, "tcp/127.0.0.1:1")), {})
+    assert (score["overall"]["frames"], score["overall"]["targets"]) == (4, 3)
 
 
 def test_every_other_picture_is_a_sequence(flight: Path) -> None:

@@ -76,6 +76,17 @@ def test_the_command_shows_the_score_as_a_table(dark_spot_scene: Path, dark_spot
         assert words in done.stdout
 
 
+def test_a_table_that_is_written_to_a_file_is_whole(dark_spot_scene: Path, dark_spot_model: Path) -> None:
+    info = dark_spot_scene.parents[1] / "models" / "models_info.json"
+    models = json.loads(info.read_text())
+    models["1"]["name"] = "tandem-wing-loitering-munition-with-pusher-propeller"
+    info.write_text(json.dumps(models))
+    done = score_command("--dataset", dark_spot_scene.parents[1], "--model", dark_spot_model)
+    (row,) = [line for line in done.stdout.splitlines() if "propeller" in line]
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert (cells[0], cells[1:3], cells[-1]) == (models["1"]["name"], ["4", "100.0%"], "100.0%")
+
+
 def test_bad_input_is_told_in_a_sentence_with_exit_code_2(dark_spot_scene: Path, dark_spot_model: Path) -> None:
     poses = json.loads((dark_spot_scene / "scene_gt.json").read_text())
     del poses["0"][0]["cam_t_m2c"]

@@ -19,7 +19,15 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
 from sim_replay.pipeline import flight as pipeline_flight
 from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped, sped_up
-from sim_replay.pipeline.report import WINDOW_FRAMES, cpu, mavlink_latency_ms, memory_mb, report, stage_latency_ms
+from sim_replay.pipeline.report import (
+    WINDOW_FRAMES,
+    cpu,
+    mavlink_latency_ms,
+    memory_mb,
+    report,
+    stage_latency_ms,
+    table,
+)
 from sim_replay.pipeline.usage import Usage, usage_of
 from sim_replay.play import PlayError
 from sim_replay.telemetry import read_telemetry
@@ -100,6 +108,22 @@ def test_budgets_are_met_missed_or_not_judged() -> None:
     assert judged["resident memory, largest"] is None
 
 
+def test_what_was_too_old_for_the_autopilot_is_counted_since_no_latency_tells_of_it() -> None:
+    flight = heard([1.5, 2.0, 6.5], [12.0, 12.0, 12.0])
+    captures_s = [0.0, 1.5, 2.0, 2.0333, 2.0667, 5.5, 6.5, 6.5333]  # at the seam and after the last: no lateness
+    flight.poses_utc_ns = [UTC_NS + START_NS + round(capture_s * 1e9) for capture_s in captures_s]
+    flight.diagnostics = [{"values": {"mavlink_tracks_withheld": "9", "zenoh_tracks_withheld": "4"}}]
+    result = report(flight, 30.0, PERIOD_S, 2.0)
+    assert (result["poses_withheld"], result["mavlink_tracks_withheld"], result["zenoh_tracks_withheld"]) == (2, 9, 4)
+    assert {one["name"]: one["met"] for one in result["budgets"]}["poses withheld by MAVLink, tracking"] is False
+    assert "2 more were too old to be sent to it" in table(result)
+    flight.poses_utc_ns = flight.poses_utc_ns[:3]
+    result = report(flight, 30.0, PERIOD_S, 2.0)
+    assert {one["name"]: one["met"] for one in result["budgets"]}["poses withheld by MAVLink, tracking"] is True
+    assert "too old" not in table(result)
+    assert report(flight, 60.0, PERIOD_S, 2.0)["poses_withheld"] is None  # more than it is sent
+
+
 def test_sixty_frames_a_second_have_a_budget_of_their_own() -> None:
     for p99_ms, met in ((32.0, True), (34.0, False)):
         judged = report(heard([2.0, 3.0], [p99_ms, p99_ms]), 60.0, PERIOD_S, 2.0)["budgets"]
@@ -165,7 +189,8 @@ def test_the_daemon_is_flown_for_seconds(tmp_path: Path) -> None:
     assert result["cpu_cores"] > 0
     assert 50.0 < result["memory_mb"]["max"] < 2000.0
     assert {"capture", "inference", "total"} <= set(result["stages_ms"])
-    assert len(result["budgets"]) == 7
+    assert len(result["budgets"]) == 8
+    assert result["poses_withheld"] is not None
 
 
 LONG_S = 3600.0  # until frame 0: a test that waited for it would never end

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
+from rich.console import Console
 
 from edge.health import Activity, Condition, HealthState
 from sim_replay.cli import main
+from sim_replay.demo import summary_table
 from sim_replay.ground_truth import PlayedSequence, read_sequence
 from sim_replay.lockstep import command
 from sim_replay.lockstep.player import Outputs
 from sim_replay.play import PlayError, Recording
 from sim_replay.report import moments
-from sim_replay.report.flight_files import RecordedFlight, read_flight, write_flight
+from sim_replay.report.flight_files import RecordedFlight, read_flight, remove_flight, write_flight
 from sim_replay.report.page import health_of
 from sim_replay.report.plots import STATE_COLORS
 from sim_replay.report.write import write_report
+from sim_replay.result import judge, score_json
 from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
 
 START_NS, UTC_NS, FPS = 50_000_000_000, 1_700_000_000_000_000_000, 30.0
@@ -100,6 +105,43 @@ def test_the_command_scores_what_each_peer_received(flight: Path, capsys: pytest
     frames = [json.loads(line) for line in (flight / "frames.jsonl").read_text().splitlines()]
     assert [frame["subscriber"]["targets"][0]["track"] for frame in frames[:4]] == ["t0", None, "t0", "t0"]
     assert frames[4]["subscriber"]["targets"] == []
+
+
+def test_a_new_flight_removes_what_is_left_of_the_last_and_nothing_else(flight: Path) -> None:
+    assert main(["score", str(flight)]) == 0
+    (flight / "recordings").mkdir()
+    users = [flight / "recordings/uav1_000003.mcap", flight / "notes.txt", flight / "overlay.mp4.txt"]
+    for path in users:
+        path.touch()
+    assert (flight / "report.html").is_file()
+    remove_flight(flight)
+    assert sorted(path for path in flight.rglob("*") if path.is_file()) == sorted(users)
+
+
+def test_in_lock_step_there_is_no_age_and_no_latency(flown: PlayedSequence, tmp_path: Path) -> None:
+    made = replace(recording(flown, {0, 1, 2, 3}), zenoh_endpoint="", daemon_counters={})
+    flight = RecordedFlight(flown.scene.folder, MODEL, made)
+    score, _ = write_report(flown, flight, tmp_path, lambda: None)
+    assert set(score["latency_ms"].values()) == {None}
+    for peer in score["peers"].values():
+        assert (peer["poses"], peer["overall"]["recall"]) == (4, 1.0)
+        assert set(peer["age_ms"].values()) == {None}
+    frames = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
+    assert all(frame[name]["age_ms"] == [] for frame in frames for name in ("subscriber", "autopilot"))
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(summary_table(score))
+    assert re.search(r"capture to MAVLink, p50 / p95 / p99 +│ – +│", shown.get())
+
+
+def test_what_mavlink_withheld_is_told_beside_its_latency(flown: PlayedSequence) -> None:
+    made = replace(recording(flown, {0, 2}), daemon_counters={"dropped": 1, "mavlink_tracks_withheld": 7})
+    score = score_json(flown, judge(flown, made), MODEL)
+    assert score["latency_ms"]["tracks_withheld"] == 7
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(summary_table(score))
+    assert re.search(r"withheld by MAVLink, unconfirmed or too old +│ 7 ", shown.get())
 
 
 def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -103,7 +105,7 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
     path = tmp_path / "metrics.json"
     path.write_text(json.dumps(other))
     beside = read_beside([path])
-    refuse_other_pictures(beside, scores)
+    refuse_other_pictures(beside, [CROSSING])
     rows = [line for line in page(scores, "the command", "", beside).splitlines() if line.startswith("| ")]
     first = [row.split(" | ")[:2] for row in rows[1:5]]
     assert [row[0] for row in first] == [
@@ -115,11 +117,11 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
     assert first[2][1] == "other_crossing-all.csv"
 
     track = {**scores[1], "method": other["method"]}
-    refuse_other_pictures([track], scores)
+    refuse_other_pictures([track], [CROSSING])
     fewer = {**other, "overall": {**other["overall"], "frames": 3}}
     for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
         with pytest.raises(ConfigError, match="other pictures"):
-            refuse_other_pictures([unlike], scores)
+            refuse_other_pictures([unlike], [CROSSING])
     for text in ("no json", "{}", "[]"):
         path.write_text(text)
         with pytest.raises(ConfigError, match=str(path)):
@@ -189,6 +191,23 @@ def test_what_is_wrong_is_told_before_anything_is_measured_or_changed(
     assert main(["results", *given, *arguments]) == 2
     assert told.format(tmp=tmp_path) in capsys.readouterr().err
     assert (tmp_path / "history.jsonl").read_bytes() == HISTORY.read_bytes()
+
+
+def test_what_stands_beside_other_pictures_is_refused_before_the_hours_of_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    dataset = tmp_path / "benchmark" / "crossing"
+    shutil.copytree(CROSSING, dataset, copy_function=os.symlink)
+    (dataset / "dataset.toml").touch()
+    score = {"dataset": "crossing", "split": None, "mode": "frames", "overall": {"frames": 150, "targets": 149}}
+    beside = tmp_path / "metrics.json"
+    beside.write_text(json.dumps({**score, "method": {"file": "other.csv"}}))
+    monkeypatch.setattr("trainer.results.measure", lambda *_: pytest.fail("it measured"))
+    given = ["--benchmark", str(dataset.parent), "--beside", str(beside), "--out", str(tmp_path / "out")]
+    assert main(["results", *given]) == 2
+    told = "other.csv: was measured on other pictures: ('crossing', None, 1, 150, 149, 'frames', None)"
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_without_datasets_is_named(tmp_path: Path) -> None:
