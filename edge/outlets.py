@@ -58,12 +58,15 @@ class Outlets:
 
     def tell(self, condition: Condition) -> None:
         """A change of state, as an event."""
-        self.event(LEVELS.get(condition.state, logging.INFO), str(condition))
+        self._say(LEVELS.get(condition.state, logging.INFO), str(condition), of_state=True)
 
     def event(self, level: int, text: str) -> None:
         """Something an operator should know; from any thread."""
+        self._say(level, text)
+
+    def _say(self, level: int, text: str, of_state: bool = False) -> None:
         if self._mavlink is not None:
-            self._mavlink.event(MAV_SEVERITY[level], text)
+            self._mavlink.event(MAV_SEVERITY[level], text, of_state)
         if self._zenoh is not None:
             self._zenoh.publish_event(level, text)
 

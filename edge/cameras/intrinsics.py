@@ -123,7 +123,7 @@ def _as_opencv_reads(text: str) -> str:
     """The same YAML, line by line, without what OpenCV cannot read and nobody needs: comments behind values, the
     camera's name."""
     plain = re.sub(r"(?m)(?:^|[ \t]+)#.*$", "", text)
-    plain = re.sub(r"(?m)^camera_name\s*:.*$", "", plain)
+    plain = re.sub(r"(?m)^camera_name[ \t]*:.*$(?:\n[ \t]+\S.*$)*", lambda name: "\n" * name[0].count("\n"), plain)
     return plain if plain.startswith("%YAML") else YAML_HEAD + plain.removeprefix("---\n")
 
 

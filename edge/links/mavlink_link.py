@@ -66,7 +66,7 @@ class MavlinkLink:
         self._mail_lock = threading.Lock()
         self._report: Report | None = None
         self._condition: Condition | None = None
-        self._events: deque[tuple[int, str]] = deque(maxlen=EVENTS_WAITING)
+        self._events: deque[tuple[int, str, bool]] = deque(maxlen=EVENTS_WAITING)
         self._replaced = self._lost_events = 0
         self._stopping = threading.Event()
         self._wake, self._woken = socket.socketpair()
@@ -99,11 +99,12 @@ class MavlinkLink:
         with self._mail_lock:
             self._condition = condition
 
-    def event(self, severity: int, text: str) -> None:
-        """Tell the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info)."""
+    def event(self, severity: int, text: str, of_state: bool = False) -> None:
+        """Tell the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info). What tells the daemon's state
+        holds until the next that does."""
         with self._mail_lock:
             self._lost_events += len(self._events) == EVENTS_WAITING
-            self._events.append((severity, text))
+            self._events.append((severity, text, of_state))
         self._poke()
 
     def settle(self) -> None:
@@ -214,8 +215,8 @@ class MavlinkLink:
                 self._send(self._in_time(report, now_ns))
             except ValueError as error:
                 self._unpackable(error)
-        for severity, text in events:
-            self._send(self._station.event(severity, text, now_ns))
+        for severity, text, of_state in events:
+            self._send(self._station.event(severity, text, now_ns, of_state))
 
     def _in_time(self, report: Report, now_ns: int) -> Iterator[Letter]:
         """The report's messages one by one, each while the process has not been held up since the report's age was

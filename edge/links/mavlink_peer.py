@@ -31,8 +31,8 @@ class Judge(Protocol):
     def authentic(self, messages: list[Any]) -> list[Any]:
         """Leaves out what is not signed as it must."""
 
-    def introduces(self, message: Any) -> bool:
-        """Whether it is a heartbeat for which its sender is heeded where nobody is."""
+    def introduces(self, message: Any, now_ns: int) -> bool:
+        """Whether it is a heartbeat for which its sender is heeded where nobody is; another's is remembered."""
 
     def displaces(self, message: Any, now_ns: int) -> bool:
         """Whether it is one for which its sender is heeded in the place of another."""
@@ -77,7 +77,7 @@ class Endpoint:
             return []
         messages = self._judge.authentic(messages)
         if stranger:
-            if not any(self._judge.introduces(message) for message in messages):
+            if not any([self._judge.introduces(message, now_ns) for message in messages]):
                 self._refused["stranger"] += 1
                 return []
             self._found = received.sender

@@ -27,6 +27,7 @@ class Recognition:
         self._signing = signing
         self._refused = refused
         self._rivals = Rivals()
+        self._left = Rivals()  # who is heard while our own is not
         self._changes: list[str] = []
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
@@ -42,8 +43,11 @@ class Recognition:
                 self._refused[reason] += 1
         return believed
 
-    def introduces(self, message: Any) -> bool:
-        """Whether a stranger's message is the heartbeat of an autopilot that we would listen to."""
+    def introduces(self, message: Any, now_ns: int) -> bool:
+        """Whether a stranger's message is the heartbeat of an autopilot that we would listen to. Another aircraft's is
+        remembered."""
+        if is_autopilot_heartbeat(message) and self.is_stranger(message):
+            self._heard_other(message.get_srcSystem(), now_ns)
         named = self._named in (None, message.get_srcSystem())
         return is_autopilot_heartbeat(message) and named and not self.is_stranger(message)
 
@@ -60,7 +64,7 @@ class Recognition:
         system = message.get_srcSystem()
         if self._signing is None or self._signing.unproven(message) is None:
             self._notice(system, now_ns)
-        if not self.introduces(message):
+        if not self.introduces(message, now_ns):
             return False
         return self._vehicle.was_own(system) if self._signing is None else self._signing.outruns(message, now_ns)
 
@@ -77,9 +81,10 @@ class Recognition:
         # Not at another link's word: to PX4 goes less than to others.
         at_home = system != before or self.home.may_be(link, now_ns)
         if not vehicle.heartbeat(system, heartbeat.autopilot if at_home else None, now_ns):
-            self._rivals.heard(system, now_ns)
+            self._heard_other(system, now_ns)
             return False
         self._rivals.forget(system)
+        self._left = Rivals()
         if before not in (None, system):
             self.home.forget()
             since = f"autopilot {before} is silent; {system}, first heard since, is taken for our own: set system_id"
@@ -93,8 +98,14 @@ class Recognition:
 
     def news(self) -> list[str]:
         """Sentences, each once: who else could be the own autopilot, and who is now, where the settings do not tell."""
-        if self._named is not None or self._vehicle.contact is not Contact.HEARD:
+        if self._named is not None or self._vehicle.contact is Contact.WAITING:
             return []
+        if self._vehicle.contact is Contact.LOST:
+            lost = self._vehicle.system_id
+            return [
+                f"autopilot {lost} is silent; {system}, heard, is held for another's: set system_id if it is not"
+                for system in self._left.news()
+            ]
         changes, self._changes = self._changes, []
         ours = self._vehicle.system_id
         return changes + [
@@ -105,4 +116,7 @@ class Recognition:
     def _notice(self, system_id: int, now_ns: int) -> None:
         if self._named is None and self._vehicle.system_id not in (None, system_id):
             self._vehicle.noticed(system_id, now_ns)
-            self._rivals.heard(system_id, now_ns)
+            self._heard_other(system_id, now_ns)
+
+    def _heard_other(self, system_id: int, now_ns: int) -> None:
+        (self._left if self._vehicle.contact is Contact.LOST else self._rivals).heard(system_id, now_ns)

@@ -6,7 +6,7 @@ preference; telemetry is taken from one of them alone, the home link.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -55,6 +55,7 @@ HEARTBEAT_NS = 1_000_000_000
 HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stuck, and no heartbeat may hide that
 FRAMELESS_NS = 1_000_000_000  # no report for longer: nothing is tracked, and who draws the box is told so
 TIMESYNC_NS = 200_000_000
+TEXTS_HELD = 4
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
@@ -95,7 +96,9 @@ class Station:
         self._health: tuple[Condition, int] | None = None
         self._sight: Sight | None = None
         self._text_id = 0
-        self._held_text: tuple[int, str] | None = None  # what is wrong, until there is a vehicle to say it for
+        # Until there is a vehicle to say it for: what went wrong, and in which state the daemon is.
+        self._held_texts: deque[tuple[int, str]] = deque(maxlen=TEXTS_HELD)
+        self._held_state: tuple[int, str] | None = None
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
         self._primary = Primary()
 
@@ -130,9 +133,8 @@ class Station:
             self._heartbeat_due_ns = now_ns + HEARTBEAT_NS
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
-        if self._held_text is not None and self.vehicle.system_id is not None:
-            out.everywhere += self._texts(*self._held_text)
-            self._held_text = None
+        if self.vehicle.system_id is not None:
+            out.everywhere += self._held()
         frameless = self._sight is not None and not self._in_sight(now_ns)
         if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
             out.everywhere.append(self._image_status(words.idle_image_status()))
@@ -174,19 +176,29 @@ class Station:
             out.append(self._letter(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
         return out + self._traffic(report, tracks, first, now_ns)
 
-    def event(self, severity: int, text: str, now_ns: int) -> list[Letter]:
+    def event(self, severity: int, text: str, now_ns: int, of_state: bool = False) -> list[Letter]:
         """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. What is wrong goes out always, what is only news
         (a person who drags a point over the picture makes much of it) as far as a radio carries it.
 
-        Before there is a vehicle to speak for, nothing does; the last of what is wrong, once there is."""
+        Before there is a vehicle to speak for, nothing does. Once there is, the last of what went wrong, and of what
+        tells the daemon's state (`of_state`) the very last, if that is wrong."""
         wrong = severity <= dialect.MAV_SEVERITY_WARNING
         if self.vehicle.system_id is None:
-            self._held_text = (severity, text) if wrong else self._held_text
+            if of_state:
+                self._held_state = (severity, text) if wrong else None
+            elif wrong:
+                self._held_texts.append((severity, text))
             return []
         if not wrong and not self._news.take(now_ns):
             self.counters["news_left_out"] += 1
             return []
         return self._texts(severity, text)
+
+    def _held(self) -> list[Letter]:
+        held = [*self._held_texts, *([] if self._held_state is None else [self._held_state])]
+        self._held_texts.clear()
+        self._held_state = None
+        return [letter for text in held for letter in self._texts(*text)]
 
     def withheld(self) -> list[str]:
         """Sentences: what the settings ask for and this vehicle does not get."""

@@ -228,6 +228,7 @@ def test_a_lens_that_shows_nothing_in_the_corners_is_a_lens() -> None:
         ("camera_name: nose", "camera_name: HD Pro Webcam (046d:082d)"),
         ("camera_name: nose", "camera_name: USB 2.0 Camera: left"),
         ("camera_name: nose", "camera_name:"),
+        ("camera_name: nose", "camera_name:\n  nose: left"),
         ("camera_name: nose", 'camera_name: "[nose"'),
         ("image_width", "\N{ZERO WIDTH NO-BREAK SPACE}image_width"),  # as an editor may begin a file
         ("plumb_bob", "plumb_bob  # k1 k2 p1 p2 k3"),

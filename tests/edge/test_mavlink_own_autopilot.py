@@ -71,11 +71,22 @@ def tilt_of(R_ned_body: np.ndarray) -> float:
 
 
 def test_another_aircraft_that_was_heard_beside_ours_is_never_taken_for_it() -> None:
-    air = Airspace(ours=lambda s: s < 10.0 or s >= 60.0, other=lambda s: s >= 3.0)
+    air = Airspace(ours=lambda s: s < 15.0 or s >= 60.0, other=lambda s: s >= 3.0)
     tilts = air.fly(65)
-    assert {tilt for second, tilt in tilts.items() if 1.0 <= second < 10.0} == {LEVEL_DEG}
-    assert {tilt for second, tilt in tilts.items() if 10.5 <= second < 60.0} == {None}
+    assert {tilt for second, tilt in tilts.items() if 1.0 <= second < 15.0} == {LEVEL_DEG}
+    assert {tilt for second, tilt in tilts.items() if 15.5 <= second < 60.0} == {None}
     assert {tilt for second, tilt in tilts.items() if second >= 61.0} == {LEVEL_DEG}
+    assert air.told == [
+        "autopilots 1 and 2 are heard; 1, the first, is taken for our own: set system_id",
+        "autopilot 1 is silent; 2, heard, is held for another's: set system_id if it is not",
+    ]
+
+
+def test_another_that_is_heard_first_and_flies_by_does_not_keep_ours_out() -> None:
+    air = Airspace(ours=lambda s: s >= 0.5, other=lambda s: s < 3.0 or 60.0 <= s < 70.0)
+    tilts = air.fly(120)
+    assert {tilt for second, tilt in tilts.items() if second >= 10.0} == {LEVEL_DEG}
+    assert air.told[0] == "autopilot 2 is silent; 1, first heard since, is taken for our own: set system_id"
 
 
 def test_an_autopilot_that_takes_another_id_is_followed_and_that_is_told() -> None:
@@ -135,19 +146,19 @@ class Port:
 BEFORE, AFTER, OTHERS = ("10.0.0.1", 14550), ("10.0.0.1", 14999), ("10.0.0.2", 14550)
 
 
-@pytest.mark.parametrize("other_from_s", [0.5, 17.0], ids=["heard beside ours", "taken for ours"])
+@pytest.mark.parametrize("other_from_s", [0.5, 22.0], ids=["heard beside ours", "taken for ours"])
 def test_on_one_port_another_aircraft_does_not_keep_our_autopilot_out(other_from_s: float) -> None:
     """Both send to it, each from an address of its own, and ours comes back with another port."""
     with contextlib.closing(Port()) as port:
         for now_ns in range(BEGAN_NS, BEGAN_NS + 40 * S, 20 * MS):
             second = (now_ns - BEGAN_NS) / S
             port.tick(now_ns)
-            if second < 10.0 or second >= 30.0:
-                port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE if second < 10.0 else AFTER, now_ns)
+            if second < 15.0 or second >= 30.0:
+                port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE if second < 15.0 else AFTER, now_ns)
             if second >= other_from_s:
                 port.hear(said(OTHER, UPSIDE_DOWN_DEG, now_ns), OTHERS, now_ns)
-        assert port.heeded[9.0] == BEFORE
-        assert port.heeded[25.0] == (None if other_from_s < 10.0 else OTHERS)
+        assert port.heeded[14.0] == BEFORE
+        assert port.heeded[28.0] == (None if other_from_s < 15.0 else OTHERS)
         assert port.heeded[31.0] == port.heeded[39.0] == AFTER
         assert port.tilt_deg(now_ns) == LEVEL_DEG
 
@@ -161,9 +172,9 @@ def test_who_speaks_for_another_aircraft_alone_does_not_keep_the_port() -> None:
             if 20.0 <= second < 40.0:
                 for frame in said(OURS, LEVEL_DEG, now_ns):
                     port.station.take(FrameReader(datagram=True).feed(frame), 1, now_ns)
-            if second < 5.0 or second >= 40.0:
+            if second < 12.0 or second >= 40.0:
                 port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE, now_ns)
-            if second >= 12.0:
+            if second >= 18.0:
                 port.hear(said(OTHER, UPSIDE_DOWN_DEG, now_ns), OTHERS, now_ns)
         assert port.heeded[19.0] == OTHERS
         assert port.heeded[35.0] is None
@@ -184,14 +195,25 @@ def test_nothing_is_said_of_a_vehicle_that_is_not_known_but_what_is_wrong_when_i
             heard.extend(reader.feed(ground.receive()))
             return sum(m.get_type() == "HEARTBEAT" for m in heard) >= 4
 
-        link.event(3, "fault: no model")
-        link.event(4, "degraded: the camera's clock jumps")
-        link.event(6, "searching")
+        link.event(4, "model: runs on the CPU")
+        for state in ("fault: no frame for 3 s", "searching", "degraded: no own attitude"):
+            link.event(6 if state == "searching" else 4, state, of_state=True)
+        link.event(6, "target 1 found")
         until(beat, what="heartbeats of the daemon alone")
         assert {m.get_type() for m in heard} == {"HEARTBEAT"}
         heard.clear()
         meet(link, peer)
-        peer.settle(lambda: beat() and any(m.get_type() == "STATUSTEXT" for m in heard), "what was wrong")
+        peer.settle(lambda: beat() and sum(m.get_type() == "STATUSTEXT" for m in heard) == 2, "what was wrong")
     ground.close()
-    (text,) = (m for m in heard if m.get_type() == "STATUSTEXT")
-    assert (text.get_srcSystem(), text.severity, text.text) == (SYSTEM_ID, 4, "degraded: the camera's clock jumps")
+    told = [(m.get_srcSystem(), m.severity, m.text) for m in heard if m.get_type() == "STATUSTEXT"]
+    assert told == [(SYSTEM_ID, 4, "model: runs on the CPU"), (SYSTEM_ID, 4, "degraded: no own attitude")]
+
+
+def test_a_state_that_is_over_before_anybody_hears_of_it_is_not_told() -> None:
+    station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
+    station.event(4, "degraded: no frame for 3 s", BEGAN_NS, of_state=True)
+    station.event(6, "searching", BEGAN_NS + S, of_state=True)
+    for frame in said(OURS, LEVEL_DEG, BEGAN_NS + 600 * S):
+        station.take(FrameReader(datagram=True).feed(frame), 0, BEGAN_NS + 600 * S)
+    told = station.tick(BEGAN_NS + 600 * S).everywhere
+    assert not [letter for letter in told if letter.message.get_type() == "STATUSTEXT"]
