@@ -44,12 +44,14 @@ class Recognition:
         return believed
 
     def introduces(self, message: Any, now_ns: int) -> bool:
-        """Whether a stranger's message is the heartbeat of an autopilot that we would listen to. Another aircraft's is
+        """Whether an authentic message is the heartbeat of an autopilot that we would listen to. Another aircraft's is
         remembered."""
-        if is_autopilot_heartbeat(message) and self.is_stranger(message):
-            self._heard_other(message.get_srcSystem(), now_ns)
-        named = self._named in (None, message.get_srcSystem())
-        return is_autopilot_heartbeat(message) and named and not self.is_stranger(message)
+        if not is_autopilot_heartbeat(message):
+            return False
+        if not self._may_be_ours(message):
+            self._notice(message.get_srcSystem(), now_ns)
+            return False
+        return True
 
     def is_stranger(self, message: Any) -> bool:
         """Whether a message is of what is known to be another aircraft."""
@@ -64,7 +66,7 @@ class Recognition:
         system = message.get_srcSystem()
         if self._signing is None or self._signing.unproven(message) is None:
             self._notice(system, now_ns)
-        if not self.introduces(message, now_ns):
+        if not self._may_be_ours(message):
             return False
         return self._vehicle.was_own(system) if self._signing is None else self._signing.outruns(message, now_ns)
 
@@ -112,6 +114,9 @@ class Recognition:
             f"autopilots {ours} and {system} are heard; {ours}, the first, is taken for our own: set system_id"
             for system in self._rivals.news()
         ]
+
+    def _may_be_ours(self, message: Any) -> bool:
+        return self._named in (None, message.get_srcSystem()) and not self.is_stranger(message)
 
     def _notice(self, system_id: int, now_ns: int) -> None:
         if self._named is None and self._vehicle.system_id not in (None, system_id):

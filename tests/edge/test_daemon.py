@@ -34,16 +34,16 @@ from edge.health import (
     judge,
     percentiles_ms,
 )
-from edge.outlets import Outlets
 from edge.reload import Reloader
 from edge.requests import RequestQueue
 from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import CameraInfo, Frame, Report, Track, TrackState
+from edge.types import CameraInfo, Frame, Track, TrackState
 from msgs.client import connect, subscribe
 from msgs.ground.keys import init_authority, issue
 from msgs.session import QUIC_OPEN_TIMEOUT_MS
 
+from .looping import Ear
 from .toy_scene import center_of, true_t_cam_target_m
 
 FRAMES = 40
@@ -283,17 +283,6 @@ def test_the_line_of_each_second_is_short_and_the_last_one_holds_every_counter()
     assert all(f"{name}={count}" in snapshot.line().split() for name, count in counters.items())
 
 
-class Recorder(Outlets):
-    """Both links off; keeps what the loop publishes."""
-
-    def __init__(self) -> None:
-        super().__init__(None, None)
-        self.reports: list[Report] = []
-
-    def publish(self, report: Report) -> None:
-        self.reports.append(report)
-
-
 class FrozenStamp:
     """A camera whose driver's stamp stands still from the tenth frame on."""
 
@@ -320,7 +309,7 @@ def test_a_frame_that_is_not_later_than_the_last_is_counted_and_its_pose_not_sen
     config = Config.model_validate({
         "camera": {"type": "sequence", "path": scene}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
     })  # fmt: skip
-    capture, outlets, model = Capture(FrozenStamp(scene), False), Recorder(), load_model(toy_model, 1)
+    capture, outlets, model = Capture(FrozenStamp(scene), False), Ear(), load_model(toy_model, 1)
     board = StatusBoard(ConfigFile(Path("config.toml"), "", config), model, FrozenStamp(scene).open())
     requests = RequestQueue()
     pipeline = Pipeline(board, Estimator(model), OwnShipBuffer(), outlets, capture, requests, Reloader())

@@ -163,6 +163,21 @@ def test_on_one_port_another_aircraft_does_not_keep_our_autopilot_out(other_from
         assert port.tilt_deg(now_ns) == LEVEL_DEG
 
 
+def test_at_a_port_that_nobody_is_heeded_at_it_is_told_who_is_held_for_anothers() -> None:
+    """As it may be ours after all: first heard beside another aircraft that has gone."""
+    with contextlib.closing(Port()) as port:
+        told = []
+        for now_ns in range(BEGAN_NS, BEGAN_NS + 60 * S, 20 * MS):
+            second = (now_ns - BEGAN_NS) / S
+            port.tick(now_ns)
+            if second < 20.0:
+                port.hear(said(OTHER, UPSIDE_DOWN_DEG, now_ns), OTHERS, now_ns)
+            port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE, now_ns)
+            told += port.station.recognition.news()
+        assert port.heeded[50.0] is None
+        assert told[-1] == "autopilot 2 is silent; 1, heard, is held for another's: set system_id if it is not"
+
+
 def test_who_speaks_for_another_aircraft_alone_does_not_keep_the_port() -> None:
     """It was taken for ours there; ours shows on another link that it is not, and later comes by the port again."""
     with contextlib.closing(Port()) as port:
