@@ -245,7 +245,7 @@ class MavlinkLink:
             self._told = (vehicle.system_id, vehicle.autopilot)
             for sentence in self._station.withheld():
                 log.warning("mavlink: %s", sentence)
-        for sentence in self._station.recognition.news():
+        for sentence in self._station.news(now_ns):
             log.warning("mavlink: %s", sentence)
             self.event(dialect.MAV_SEVERITY_WARNING, sentence)
         self._send(out.everywhere)

@@ -87,8 +87,8 @@ class Station:
         self._settings = settings
         self._camera = camera
         self._requests = requests
-        self._telemetry = Telemetry(own_ship, self.timesync, settings.gimbal_component_id)
         self._utc = UtcClock()
+        self._telemetry = Telemetry(own_ship, self.timesync, self._utc, settings.gimbal_component_id)
         self._components = (settings.component_id, settings.camera_component_id)
         self._schedule = Schedule(sent_rates_hz(settings))
         self._computer = ComputerReader()
@@ -200,6 +200,10 @@ class Station:
         self._held_state = None
         return [letter for text in held for letter in self._texts(*text)]
 
+    def news(self, now_ns: int) -> list[str]:
+        """Sentences, each once: what a person has to set right."""
+        return self.recognition.news() + self._telemetry.daytime.news(now_ns)
+
     def withheld(self) -> list[str]:
         """Sentences: what the settings ask for and this vehicle does not get."""
         settings, found = self._settings, []
@@ -254,6 +258,8 @@ class Station:
             self.counters["position_jumps"] = self._telemetry.position_jumps
             self.counters["attitude_jumps"] = self._telemetry.attitude_jumps
             self.counters["gimbal_jumps"] = self._telemetry.gimbal_jumps
+            if (ahead_ns := self._telemetry.daytime.ahead_ns) is not None:
+                self.counters["utc_ahead_ms"] = ahead_ns // 1_000_000
             if reason is not None:
                 self.refused[reason] += 1
         return []

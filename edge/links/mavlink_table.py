@@ -76,7 +76,7 @@ READ = (
     Read(LOCAL_POSITION_NED, "LOCAL_POSITION_NED", "20 Hz asked", "own position and velocity"),
     Read(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "5 Hz asked", "where that lies on the globe"),
     Read(GIMBAL_ATTITUDE, "GIMBAL_DEVICE_ATTITUDE_STATUS", "50 Hz asked with a gimbal", "the camera's attitude"),
-    Read(SYSTEM_TIME, "SYSTEM_TIME", "1 Hz asked", "boot time: a fall is a reboot"),
+    Read(SYSTEM_TIME, "SYSTEM_TIME", "1 Hz asked", "boot time: a fall is a reboot; UTC, beside our own"),
     Read(TIMESYNC, "TIMESYNC", "answers ours", "the autopilot's clock"),
     Read(COMMAND_ACK, "COMMAND_ACK", "answers ours", "whether a rate was granted"),
     Read(COMMAND_LONG, "COMMAND_LONG", "as it comes", "commands for us"),

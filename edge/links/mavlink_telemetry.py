@@ -1,4 +1,4 @@
-"""The autopilot's and the gimbal's telemetry into the own ship, on the monotonic clock. Pure but for that buffer."""
+"""The telemetry of autopilot and gimbal into the own ship, on the monotonic clock. Pure but for that buffer and UTC."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from edge import clock
+from edge.clock import UtcClock
+from edge.links.mavlink_daytime import Daytime
 from edge.links.mavlink_jumps import Jumps
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
 from edge.links.mavlink_table import (
@@ -15,6 +18,7 @@ from edge.links.mavlink_table import (
     GIMBAL_ATTITUDE,
     GLOBAL_POSITION_INT,
     LOCAL_POSITION_NED,
+    SYSTEM_TIME,
 )
 from edge.tracking.clock import BootClock, RebootDetector, TimesyncEstimator
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
@@ -64,9 +68,12 @@ def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
 class Telemetry:
     """`gimbal_id`: a component, or 1 to 6 of one that the autopilot speaks for; None: the first heard, until silent."""
 
-    def __init__(self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, gimbal_id: int | None) -> None:
+    def __init__(
+        self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, utc: UtcClock, gimbal_id: int | None
+    ) -> None:
         self._own_ship = own_ship
         self._timesync = timesync
+        self._utc = utc
         self._gimbal_id = gimbal_id
         self.attitude_jumps = self.position_jumps = self.gimbal_jumps = 0
         self._forget()
@@ -80,6 +87,7 @@ class Telemetry:
     def _forget(self) -> None:
         self._own_ship.clear()
         self._jumps = Jumps()
+        self.daytime = Daytime()
         self._boot_clock = BootClock(self._timesync)
         self._forget_gimbal_clock()
         self._quaternion_ns: int | None = None
@@ -102,6 +110,8 @@ class Telemetry:
                 rising = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
         elif message_id == LOCAL_POSITION_NED:
             rising = self._add_position(time_ns, message, now_ns)
+        elif message_id == SYSTEM_TIME and not clock.stepped():  # else nothing here tells the day
+            self.daytime.compare(message.time_unix_usec, self._utc.utc_ns(time_ns))
         # 0, 0 is how an autopilot without a fix says so.
         elif message_id == GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
             place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.clock import UtcClock
 from edge.links.mavlink_telemetry import Telemetry, uptime_ms
 from edge.tracking.clock import TimesyncEstimator
 from edge.tracking.own_ship import OwnShipBuffer
@@ -26,7 +27,7 @@ def attitude(boot_ms: int) -> Any:
 def told(messages: list[Any], time_ms: int) -> OwnShip:
     """The own ship at a time, by messages that arrive as they are stamped."""
     own_ship = OwnShipBuffer()
-    telemetry = Telemetry(own_ship, TimesyncEstimator(), None)
+    telemetry = Telemetry(own_ship, TimesyncEstimator(), UtcClock(), None)
     for message in messages:
         assert telemetry.take(message, message.time_boot_ms * MS) is None
     now = own_ship.at(time_ms * MS)
