@@ -88,12 +88,12 @@ class Recognition:
         self._rivals.forget(system)
         self._left = Rivals()
         if before not in (None, system):
-            self.home.forget()
+            self.home = Home()  # where the last one was heard says nothing of this one
             since = f"autopilot {before} is silent; {system}, first heard since, is taken for our own: set system_id"
             again = f"autopilot {system} is heard again; it is our own, and {before} another's: set system_id"
             self._changes.append(again if back else since)
         if at_home and link != self.home.link:
-            self.home.link = link
+            self.home.move(link, now_ns)
             vehicle.ask_anew()
         self.home.heard(link, now_ns)
         return True

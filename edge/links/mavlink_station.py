@@ -249,6 +249,7 @@ class Station:
         elif message_id in COMMANDS:
             return self._obey(message, now_ns)
         elif message_id != HEARTBEAT:
+            self.recognition.home.carries()
             by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
             up_ms = uptime_ms(message.time_boot_ms, self.timesync.offset_ns, now_ns)
             if by_autopilot and self.vehicle.boot_time(up_ms):

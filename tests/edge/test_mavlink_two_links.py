@@ -120,6 +120,21 @@ def test_a_link_that_is_heard_now_and_then_does_not_take_the_place_of_one_that_i
         assert air.tilt_deg(began_ns + (second + 2) * 1_000 * MS - 20 * MS) == 180.0
 
 
+def test_a_link_that_brings_heartbeats_alone_gives_the_place_back_to_the_one_that_brought_telemetry() -> None:
+    """As where a ground station, listed first, passes on what its own radio hears and none of our questions."""
+    air, silent_s = Air(), 0
+    for now_ns in range(BEGAN_NS, BEGAN_NS + 90_000 * MS, 20 * MS):
+        air.station.tick(now_ns)
+        air.attitude(OTHER, now_ns, UPSIDE_DOWN)
+        if now_ns % (1_000 * MS) == 0:
+            silent_s += air.tilt_deg(now_ns) is None
+            air.beat(OTHER, now_ns)
+            if now_ns >= BEGAN_NS + 5_000 * MS:
+                air.beat(HOME, now_ns)
+    assert air.tilt_deg(BEGAN_NS + 89_980 * MS) == 180.0
+    assert silent_s < 20, "it is tried once and no more"
+
+
 def test_our_clock_is_told_on_any_link_and_the_autopilots_is_believed_on_one() -> None:
     air = Air()
     air.beat(HOME, BEGAN_NS)
