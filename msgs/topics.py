@@ -117,13 +117,18 @@ def check_uav_name(uav: str) -> str:
     return uav
 
 
+def _check_target_name(target: str) -> None:
+    if not _TARGET_NAME.fullmatch(target):
+        raise ValueError(f"target {target!r} must be t0, t1, …")
+
+
 def topic_name(topic: Topic, uav: str, target: str | None = None) -> str:
     """`<uav>/<topic>` without a leading slash. `target` is `t0`, `t1`, … and given exactly for per-target topics."""
     check_uav_name(uav)
     if topic.per_target != (target is not None):
         raise ValueError(f"topic {topic.name!r} {'needs a' if topic.per_target else 'takes no'} target")
-    if target is not None and not _TARGET_NAME.fullmatch(target):
-        raise ValueError(f"target {target!r} must be t0, t1, …")
+    if target is not None:
+        _check_target_name(target)
     return f"{uav}/{topic.name.format(target=target)}"
 
 
@@ -149,9 +154,14 @@ def publication_key(
 
 
 def subscription_key(topic: Topic, uav: str, target: str | None = None, *, domain: int = 0) -> str:
-    """A key expression for the topic under every distribution; `target` None takes every target, `uav` "*" all."""
+    """A key expression for the topic under every distribution; `target` None takes every target, `uav` "*" all.
+
+    Raises ValueError for an illegal name: on its key nothing would ever come.
+    """
     if uav != "*":
         check_uav_name(uav)
+    if target is not None:
+        _check_target_name(target)
     return f"{domain}/{uav}/{topic.name.format(target=target or '*')}/**"
 
 

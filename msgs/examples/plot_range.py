@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import suppress
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def bar(range_m: float, sigma_m: float) -> str:
 
 def main() -> None:
     options = parse("Plot the range of a vehicle's targets as text.")
-    with connect(options.endpoint) as session, subscribe(session, options.uav) as poses:
+    with suppress(KeyboardInterrupt), connect(options.endpoint) as session, subscribe(session, options.uav) as poses:
         for one in itertools.islice(poses, options.count):
             t_m = one.pose.t_cam_target_m
             range_m = float(np.linalg.norm(t_m))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import suppress
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from msgs.examples.arguments import parse
 
 def main() -> None:
     options = parse("Print each pose of a vehicle's targets.")
-    with connect(options.endpoint) as session, subscribe(session, options.uav) as poses:
+    with suppress(KeyboardInterrupt), connect(options.endpoint) as session, subscribe(session, options.uav) as poses:
         for one in itertools.islice(poses, options.count):
             x, y, z = one.pose.t_cam_target_m
             range_m = np.linalg.norm(one.pose.t_cam_target_m)

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import itertools
+import sys
+from contextlib import suppress
 
 import numpy as np
 
 from msgs.client import connect, subscribe
 from msgs.examples.arguments import parse
 from msgs.geometry import R_from_q_wxyz
+from msgs.receive import TargetPose
 
 OUT = "poses.npz"
 
 
 def main() -> None:
-    options = parse(f"Gather the poses of a vehicle's targets into {OUT}.")
-    with connect(options.endpoint) as session, subscribe(session, options.uav, depth=256) as poses:
-        taken = list(itertools.islice(poses, options.count or 100))
+    options, taken = parse(f"Gather the poses of a vehicle's targets into {OUT}.", count=100), list[TargetPose]()
+    # Who grows tired of waiting keeps what has come.
+    with (
+        suppress(KeyboardInterrupt),
+        connect(options.endpoint) as session,
+        subscribe(session, options.uav, depth=256) as poses,
+    ):
+        for one in itertools.islice(poses, options.count):
+            taken.append(one)
+    if not taken:
+        sys.exit("no poses came")
     np.savez(
         OUT,
         target=np.array([one.target for one in taken]),

@@ -14,6 +14,7 @@ from msgs.session import TlsFiles
 from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
 
+DOMAIN_MAX = 232  # of any daemon and router
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
@@ -158,6 +159,12 @@ def _not_negative(text: str) -> float:
     return value
 
 
+def _ros_domain(text: str) -> int:
+    if not text.isdecimal() or int(text) > DOMAIN_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is not a ROS domain, 0 to {DOMAIN_MAX}")
+    return int(text)
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
@@ -168,7 +175,7 @@ def _number(text: str) -> float:
 def _connection(command: argparse.ArgumentParser) -> None:
     _endpoint(command)
     command.add_argument("--uav", action="append", default=[], metavar="NAME", help="only this vehicle; repeatable")
-    command.add_argument("--domain", type=int, default=0, help="ROS domain (default 0)")
+    command.add_argument("--domain", type=_ros_domain, default=0, help="ROS domain (default 0)")
 
 
 def _endpoint(command: argparse.ArgumentParser) -> None:
@@ -254,7 +261,7 @@ def _record(options: argparse.Namespace) -> int:
 def _command(options: argparse.Namespace) -> int:
     from msgs.ground.command import command
 
-    uav, stop = _uav(options.uav), _stop_on_signal(10.0)
+    uav, stop = _uav(options.uav), _stop_on_signal()
     return command(options.connect, _tls(options), uav, options.name, options.words, stop, _say_aside)
 
 

@@ -15,6 +15,8 @@ from msgs.session import TlsFiles
 
 ANSWER_S = 5.0
 RELOAD_ANSWER_S = 60.0  # a model is loaded and warmed up first
+LINK_S = 10.0
+LOOK_EVERY_S = 0.02
 EXIT_REFUSED = 1
 
 
@@ -43,21 +45,42 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
 
 
 def ask(
-    opened: zenoh.Session, uav: str, name: str, asked: dict[str, Any], timeout_s: float = ANSWER_S
+    opened: zenoh.Session,
+    uav: str,
+    name: str,
+    asked: dict[str, Any],
+    timeout_s: float = ANSWER_S,
+    stop: threading.Event | None = None,
 ) -> dict[str, Any]:
-    """The vehicle's answer; `ok` is false, with an `error`, where it refuses or none comes."""
-    key = f"uavpose/@v1/{uav}/cmd/{name}"
-    for reply in opened.get(
-        key, payload=json.dumps(asked), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s
-    ):
-        said = reply.ok if reply.ok is not None else reply.err
+    """The vehicle's answer, waited for until `stop` is set; `ok` is false, with an `error`, where it refuses or none
+    comes."""
+    stop = stop or threading.Event()
+    key, why = f"uavpose/@v1/{uav}/cmd/{name}", f"{uav} does not answer: not there, or not for you to command"
+    replies = opened.get(key, payload=json.dumps(asked), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s)
+    # Waiting inside zenoh would hear no signal.
+    while not stop.is_set():
         try:
-            answer = json.loads(said.payload.to_bytes()) if said is not None else None
-        except ValueError:
-            answer = None
-        if isinstance(answer, dict) and "ok" in answer:
+            reply = replies.try_recv()
+        except zenoh.ZError:  # no more will come
+            return {"ok": False, "command": name, "error": why}
+        if reply is None:
+            stop.wait(LOOK_EVERY_S)
+            continue
+        answer = _answer(reply)
+        if answer is not None:
             return answer
-    return {"ok": False, "command": name, "error": f"{uav} does not answer: not there, or not for you to command"}
+        why = f"{uav} does not answer within {timeout_s:.0f} s: it may have done it, or it is not for you to command"
+    return {"ok": False, "command": name, "error": f"broken off before {uav} answered: it may have done it"}
+
+
+def _answer(reply: zenoh.Reply) -> dict[str, Any] | None:
+    """None for what zenoh says itself, as that the time is over."""
+    said = reply.ok if reply.ok is not None else reply.err
+    try:
+        answer = json.loads(said.payload.to_bytes()) if said is not None else None
+    except ValueError:
+        return None
+    return answer if isinstance(answer, dict) and "ok" in answer else None
 
 
 def command(
@@ -69,12 +92,16 @@ def command(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send one command and print the answer as JSON; 0, or 1 if it is refused. Raises InputError for words that are
-    no command."""
+    """Send one command and print the answer as JSON; 0, or 1 if it is refused or `stop` was set before it came. Raises
+    InputError for words that are no command."""
     asked = body(name, words)
+    giving_up = threading.Timer(LINK_S, stop.set)
+    giving_up.daemon = True
+    giving_up.start()
     with session(endpoint, tls, stop, say) as opened:
+        giving_up.cancel()
         answer = {"ok": False, "command": name, "error": f"no link to {endpoint}"}
         if opened is not None:
-            answer = ask(opened, uav, name, asked, RELOAD_ANSWER_S if name == "reload" else ANSWER_S)
+            answer = ask(opened, uav, name, asked, RELOAD_ANSWER_S if name == "reload" else ANSWER_S, stop)
     print(json.dumps(answer))
     return 0 if answer["ok"] is True else EXIT_REFUSED

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 
 import zenoh
 from zenoh import ext, handlers
@@ -13,10 +14,11 @@ from zenoh import ext, handlers
 from msgs import topics
 from msgs.client import connect, sender_of
 from msgs.ground.errors import InputError
-from msgs.session import TlsFiles, check_endpoint
+from msgs.session import SECURE, TlsFiles, check_endpoint
 from msgs.topics import Topic
 
 RETRY_S = 0.5
+LOOK_EVERY_S = 0.1
 ALIVE = "uavpose/@v1/*/alive"
 
 
@@ -53,18 +55,38 @@ def session(
         say(f"there may be no link: {doubt}")
     waiting = False
     while not stop.is_set():
-        try:
-            opened = connect(endpoint, tls=tls)
-        except ConnectionError:
-            if not waiting:
-                say(f"waiting for {endpoint}")
-                waiting = True
-            stop.wait(RETRY_S)
-            continue
-        with opened:
-            yield opened
-        return
+        opened = _connected(endpoint, tls, stop)
+        if opened is not None:
+            with opened:
+                yield opened
+            return
+        if not waiting and not stop.is_set():
+            # zenoh does not say why there is no link.
+            why = ": not there, or one end refuses the other's certificate" if endpoint.startswith(SECURE) else ""
+            say(f"waiting for {endpoint}{why}")
+            waiting = True
+        stop.wait(RETRY_S)
     yield None
+
+
+def _connected(endpoint: str, tls: TlsFiles | None, stop: threading.Event) -> zenoh.Session | None:
+    """None where nobody answers, and at once when `stop` is set: a call, of ten seconds over QUIC, hears of nothing."""
+    answer: SimpleQueue[zenoh.Session | None] = SimpleQueue()
+
+    def call() -> None:
+        opened: zenoh.Session | None = None
+        with suppress(ConnectionError):
+            opened = connect(endpoint, tls=tls)
+        if opened is not None and stop.is_set():
+            opened.close()
+        else:
+            answer.put(opened)
+
+    threading.Thread(target=call, name="calling", daemon=True).start()
+    while not stop.is_set():
+        with suppress(Empty):
+            return answer.get(timeout=LOOK_EVERY_S)
+    return None
 
 
 def linked(opened: zenoh.Session) -> bool:

@@ -87,7 +87,11 @@ def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 82
 def listing(folder: Path) -> list[str]:
     """A line for each certificate in `folder`: identity, last day, hosts. Raises InputError if there are none."""
     lines = []
-    for path in sorted(folder.glob("*.pem")):
+    try:
+        paths = sorted(folder.glob("*.pem"))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
+    for path in paths:
         try:
             certificate = x509.load_pem_x509_certificate(path.read_bytes())
         except (OSError, ValueError) as error:
@@ -155,7 +159,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _require_new(*paths: Path) -> None:
     for path in paths:
-        if path.exists():
+        if os.path.lexists(path):  # what cannot be looked at is told when it is written
             raise InputError(f"{path}: is there already; move it away first, so that no key is lost")
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from msgs import topics
+from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, linked, listening, session
 from msgs.recording import Recorder, RecordingLimits
 from msgs.session import TlsFiles
@@ -28,8 +31,9 @@ def record(
 ) -> int:
     """Record these vehicles, all if none is named, until `stop` is set; 0. Samples are kept as they came, sound or not.
 
-    Raises InputError for a bad endpoint.
+    Raises InputError for a bad endpoint, and for a folder that cannot be written.
     """
+    _check_writable(folder)
     recorder = Recorder(folder, STEM, limits, lambda _, text: say(text))
 
     def take(one: Incoming) -> None:
@@ -54,3 +58,15 @@ def record(
         recorder.stop()
     say(", ".join(f"{name} {count}" for name, count in recorder.counters().items()))
     return 0
+
+
+def _check_writable(folder: Path) -> None:
+    """The recorder writes nothing until a vehicle is heard: who starts it before a flight is to know then."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        # A disk that is full may have room when it is needed; the recorder makes some, or says so.
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise InputError(f"--dir {folder}: cannot be written: {error.strerror}") from error

@@ -121,11 +121,14 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) 
     A bearing with a `c` is to the right of the optical axis, for want of the vehicle's attitude.
     """
     link = Text(f"{endpoint}: up" if up else f"{endpoint}: no link", style="green" if up else "bold red")
-    fleet = Table("vehicle", "link", "health", "poses/s", "refused", "last event", box=box.SIMPLE_HEAD, pad_edge=False)
-    # Eighty columns are enough; one that is narrower still wraps rather than cuts.
-    found = Table("target", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    fleet = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    found = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    # Eighty columns are enough for short names; else what is too long goes on below: cut, 1218.2 m would read 12….
+    for name in ("vehicle", "link", "health", "poses/s", "refused", "last event"):
+        fleet.add_column(name, overflow="fold")
+    found.add_column("target", overflow="fold")
     for name in ("range m", "±", "close m/s", "brg °", "el °", "hdg/pit/rol °", "±°", "score", "age s"):
-        found.add_column(name, justify="right")
+        found.add_column(name, justify="right", overflow="fold")
     for one in vehicles:
         here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
         event = Text(_printable(one.event) or "–")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import msgs.examples
 from msgs import topics
@@ -81,6 +83,26 @@ def test_poses_are_gathered_as_arrays(network: Network, tmp_path: Path) -> None:
         np.testing.assert_allclose(arrays["R_cam_target"], [np.eye(3)] * 5, atol=1e-12)
         assert (np.diff(arrays["stamp_ns"]) > 0).all()
         assert arrays["covariance"].shape == (5, 6, 6)
+
+
+@pytest.mark.parametrize("example", ["print_poses", "plot_range", "to_numpy"])
+def test_on_ctrl_c_an_example_ends_quietly_and_keeps_what_came(network: Network, tmp_path: Path, example: str) -> None:
+    command = [sys.executable, "-c", RUN, example, "-e", network.endpoint, "-n", "100000"]
+    with Node(network.daemon, "uav1") as node:
+        publisher = node.publisher(topics.POSE, "t3")
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            until(publisher.matching)
+            until(lambda: publisher.sequence >= 100, lambda: publisher.put(ahead().encode()))
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60.0)
+        finally:
+            process.kill()
+    assert (process.returncode, err) == (0, "")
+    if example == "to_numpy":
+        with np.load(tmp_path / "poses.npz") as arrays:
+            assert out == f"{len(arrays['stamp_ns'])} poses in poses.npz\n"
+            assert len(arrays["stamp_ns"]) > 0
 
 
 def test_every_example_is_run_here() -> None:

@@ -79,6 +79,12 @@ def test_a_target_is_named_exactly_where_there_is_one(topic: Topic, target: str 
         topics.publication_key(topic, "uav1", target)
 
 
+@pytest.mark.parametrize("target", ["", "0", "T0", "t1000", "*", "t0/pose", "target0"])
+def test_nobody_waits_for_a_target_that_cannot_be(target: str) -> None:
+    with pytest.raises(ValueError, match="must be t0"):
+        topics.subscription_key(POSE, "uav1", target)
+
+
 @pytest.mark.parametrize(
     "key",
     [

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
 import rerun as rr
 
@@ -25,15 +20,12 @@ from msgs.ground.view.layout import blueprint
 from msgs.ground.view.recorded import check_opens, samples
 from msgs.ground.view.saving import saved
 from msgs.ground.view.scene import Scene
+from msgs.ground.view.viewer import page, window
 from msgs.session import TlsFiles
 
 APPLICATION = "uavpose"
 DRAWN = (*TAKEN, topics.CAMERA_INFO, topics.IMAGE)
 TICK_S = 0.2
-_LOOPBACK = "127.0.0.1"
-_START_S = 60.0
-_LOOK_EVERY_S = 0.05
-_SERVER_MEMORY = "1GiB"  # older data goes first when a browser joins a long flight
 
 
 @dataclass(frozen=True)
@@ -63,7 +55,12 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
         rec.send_blueprint(blueprint(uavs, live=not options.recordings))
 
     scene = Scene(rec, fleet, options.size_m, arrange)
-    with _opened(rec, options, stop, say):
+
+    def complete() -> bool:
+        # A live view is whole whenever it is ended.
+        return not scene.empty() and not (options.recordings and stop.is_set())
+
+    with _opened(rec, options, complete, stop, say):
         if options.recordings:
             _play(options, scene, stop, say)
         else:
@@ -79,73 +76,28 @@ def _check_recordings(options: ViewOptions) -> None:
     """Raise InputError for a recording that does not open, or that --save would overwrite."""
     for path in options.recordings:
         check_opens(path)
-        if options.save is not None and options.save.exists() and options.save.samefile(path):
+        if options.save is not None and os.path.exists(options.save) and options.save.samefile(path):
             raise InputError(f"--save {options.save}: is the recording {path} itself")
 
 
 @contextmanager
 def _opened(
-    rec: rr.RecordingStream, options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
+    rec: rr.RecordingStream,
+    options: ViewOptions,
+    complete: Callable[[], bool],
+    stop: threading.Event,
+    say: Callable[[str], None],
 ) -> Iterator[None]:
     """Where the recording goes: a file, a server for browsers on this machine, or a window that stays."""
     if options.save is not None:
-        # A live view is whole whenever it is ended.
-        with saved(rec, options.save, stop, lambda: not (options.recordings and stop.is_set())):
+        with saved(rec, options.save, stop, complete):
             yield
     elif options.web_port is not None:
-        with _server(options.web_port) as address:
-            rec.connect_grpc(address)
-            say(f"open http://{_LOOPBACK}:{options.web_port}/?url={quote(address, safe=':/')}")
+        with page(rec, options.web_port, bool(options.recordings), stop, say):
             yield
-            rec.flush()
-            if options.recordings:
-                stop.wait()
-            rec.disconnect()
     else:
-        rec.spawn()
-        yield
-        rec.flush()
-        rec.disconnect()
-
-
-@contextmanager
-def _server(web_port: int) -> Iterator[str]:
-    """Rerun's server as a process, bound to this machine alone (the one in its library is open to every network); its
-    address for data. Raises InputError if the ports are not to be had."""
-    ports = (web_port, web_port + 1)
-    command = [sys.executable, "-m", "rerun", "--serve-web", "--bind", _LOOPBACK, "--web-viewer-port", str(ports[0])]
-    for port in ports:
-        if _answers(port):
-            raise InputError(f"--web {web_port}: port {port} is taken")
-    server = subprocess.Popen(
-        [*command, "--port", str(ports[1]), "--server-memory-limit", _SERVER_MEMORY],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,  # the command starts the server as a child of its own: both have to be ended
-    )
-    try:
-        deadline_s = time.monotonic() + _START_S
-        while not all(_answers(port) for port in ports):
-            if _ended(server, _LOOK_EVERY_S) or time.monotonic() > deadline_s:
-                raise InputError(f"--web {web_port}: Rerun's server does not start there")
-        yield f"rerun+http://{_LOOPBACK}:{ports[1]}/proxy"
-    finally:
-        with suppress(ProcessLookupError):  # both have ended by themselves
-            os.killpg(server.pid, signal.SIGTERM)
-        server.wait()
-
-
-def _ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
-    try:
-        process.wait(within_s)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
-
-
-def _answers(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex((_LOOPBACK, port)) == 0
+        with window(rec, stop, say):
+            yield
 
 
 def _play(options: ViewOptions, scene: Scene, stop: threading.Event, say: Callable[[str], None]) -> None:

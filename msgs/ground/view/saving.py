@@ -44,9 +44,9 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: 
     no more can be written. Raises InputError, and leaves nothing behind then.
     """
     whole = Path(os.path.realpath(path))  # a link stays one
-    if whole.exists() and not whole.is_file():
+    if os.path.exists(whole) and not whole.is_file():
         raise InputError(f"--save {path}: is there and is no file")
-    unfinished, replaces = whole.with_name(f".{whole.name}.part"), whole.exists()
+    unfinished, replaces = whole.with_name(f".{whole.name}.part"), os.path.exists(whole)
     try:
         unfinished.touch()
     except OSError as error:
@@ -75,7 +75,9 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: 
         if broken is not None:
             raise broken
         if kept:
-            raise InputError(f"--save {path}: ended before all was drawn; the file that was there stays")
+            raise InputError(
+                f"--save {path}: ended before all was drawn, or nothing was; the file that was there stays"
+            )
     finally:
         rec.disconnect()
         writer.join()

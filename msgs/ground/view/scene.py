@@ -87,6 +87,11 @@ class Scene:
                 self._at(now_ns)
                 entities.log_event(self._rec, uav, 20 if here else 30, "here" if here else "gone")
 
+    def empty(self) -> bool:
+        """Whether nothing is drawn, as nothing came."""
+        with self._lock:
+            return not self._vehicles
+
     def tick(self, now_ns: int) -> None:
         """Take away the targets that were not told again, say where health was not; call it now and then."""
         with self._lock:

@@ -114,3 +114,10 @@ def test_the_list_says_until_when(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert listing(tmp_path)[1] == f"uav1             valid until {last:%Y-%m-%d}  uav1, 10.0.0.7"
     assert cli.main(["keys", "list", "--dir", str(tmp_path)]) == 0
     assert "no certificates there" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / ("k" * 300)
+    for action in (["init"], ["issue", "uav1"], ["list"]):
+        assert cli.main(["keys", *action, "--dir", str(folder)]) == 2
+        assert "File name too long" in capsys.readouterr().err

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -17,8 +19,8 @@ import pytest
 from playwright.sync_api import sync_playwright
 
 from msgs.ground.errors import InputError
-from msgs.ground.view.command import _server
 from msgs.ground.view.entities import TARGET_RGB
+from msgs.ground.view.viewer import server
 from tests.waiting import until
 
 from .flight import record
@@ -79,8 +81,21 @@ def test_a_server_that_ends_at_once_is_told_and_no_traceback(monkeypatch: pytest
     unwilling = shutil.which("false")
     assert unwilling is not None
     monkeypatch.setattr(sys, "executable", unwilling)
-    with pytest.raises(InputError, match="Rerun's server does not start there"), _server(two_free_ports()):
+    with pytest.raises(InputError, match="Rerun's server does not start there"), server(two_free_ports()):
         pass
+
+
+def test_a_server_that_ends_in_the_middle_is_told_and_no_traceback(tmp_path: Path) -> None:
+    record(tmp_path / "flight.mcap", 5)
+    with served(tmp_path / "flight.mcap") as (_, _, server):
+        assert server.stderr is not None
+        assert server.stderr.readline().endswith("flight.mcap: read\n")
+        (child,) = Path(f"/proc/{server.pid}/task/{server.pid}/children").read_text().split()
+        os.killpg(int(child), signal.SIGKILL)
+        said = server.stderr.read()
+    assert said.endswith("Rerun's server ended by itself\n")
+    assert "Traceback" not in said
+    assert server.returncode == 2
 
 
 @pytest.mark.timeout(500)

@@ -17,6 +17,7 @@ from msgs.ground.cli import main
 from msgs.ground.errors import InputError
 from msgs.ground.view.saving import saved
 
+from ..conftest import free_endpoint
 from .flight import record
 
 OLD = b"an older file"
@@ -95,6 +96,16 @@ def test_a_recording_broken_off_replaces_no_old_file_and_a_live_view_does(flight
     assert out.read_bytes() != OLD
 
 
+def test_a_view_of_nothing_replaces_no_old_file(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = flight.with_name("out.rrd")
+    nobody = ["-e", free_endpoint(), "--seconds", "0.2"]
+    for heard in (nobody, [str(flight), "--uav", "uav9"]):
+        assert main(["view", *heard, "--save", str(out)]) == 2
+        assert "nothing was; the file that was there stays" in capsys.readouterr().err
+        assert out.read_bytes() == OLD
+    assert main(["view", *nobody, "--save", str(flight.with_name("new.rrd"))]) == 0
+
+
 def test_what_an_unforeseen_end_leaves_is_kept_where_there_was_nothing(flight: Path) -> None:
     new = flight.with_name("new.rrd")
 
@@ -118,6 +129,11 @@ def test_what_is_no_file_is_not_replaced(flight: Path, capsys: pytest.CaptureFix
     assert f"--save {folder}: is there and is no file" in capsys.readouterr().err
     assert main(["view", str(flight), "--save", str(folder / "no" / "out.rrd")]) == 2
     assert "cannot be written: No such file or directory" in capsys.readouterr().err
+
+
+def test_a_name_that_cannot_be_is_a_sentence(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", str(flight), "--save", str(flight.with_name("n" * 300))]) == 2
+    assert "cannot be written: File name too long" in capsys.readouterr().err
 
 
 def test_on_a_full_disk_a_sentence_ends_it_and_no_half_file_is_left(flight: Path) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -117,13 +118,17 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
             uav2.tell()
             uav1.tell_health()
 
+        def full() -> list[dict[str, object]]:
+            """Poses of which all is told: what else a frame brings may come after its pose, or be lost."""
+            known = ("closing_mps", "attitude_deg", "score")
+            return [one for one in lines.objects("pose") if None not in (one[key] for key in known)]
+
         def complete() -> bool:
-            poses = lines.objects("pose")
-            full = {one["uav"] for one in poses if None not in (one["closing_mps"], one["attitude_deg"], one["score"])}
-            return full == {"uav1", "uav2"} and bool(lines.objects("health")) and bool(lines.objects("event"))
+            heard = {one["uav"] for one in full()}
+            return heard == {"uav1", "uav2"} and bool(lines.objects("health")) and bool(lines.objects("event"))
 
         until(complete, tell)
-        last = lines.objects("pose")[-1]
+        last = full()[-1]
         x, y, z = last["t_cam_target_m"]  # type: ignore[misc]
         direction = (R_NED_BODY * R_BODY_CAM).apply([x, y, z])
         assert last["range_m"] == pytest.approx(np.linalg.norm([x, y, z]))
@@ -208,6 +213,15 @@ def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_
     assert all(0 <= m.log_time - m.publish_time < 10**10 for _, m in came)
 
 
+@pytest.mark.parametrize("name", ["file", "file/within"])
+def test_a_folder_that_cannot_be_recorded_into_is_told_before_anything_flies(
+    name: str, network: Network, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert main(["record", "-e", network.endpoint, "--dir", str(tmp_path / name), "--seconds", "0.5"]) == 2
+    assert f"--dir {tmp_path / name}: cannot be written: " in capsys.readouterr().err
+
+
 NOW_NS, S = 1_700_000_000_000_000_000, 1_000_000_000
 DIM = "\x1b[2m"
 
@@ -267,6 +281,26 @@ def test_a_target_is_dim_by_when_it_was_heard_whatever_the_vehicle_s_clock_says(
     assert DIM in line(fleet, NOW_NS + 2 * S, "uav1/t0")
 
 
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_a_narrow_terminal_cuts_neither_names_nor_numbers(columns: int) -> None:
+    fleet = Fleet()
+    tell(fleet, topics.DIAGNOSTICS, told_health(1, "degraded, tracking; no own attitude"), NOW_NS)
+    for target in ("t0", "t12"):
+        key = topics.publication_key(topics.POSE, "reconnaissance_12", target)
+        pose = dataclasses.replace(pose_now(), stamp_ns=NOW_NS, t_cam_target_m=np.array([-1218.2, -310.5, 804.1]))
+        attachment = topics.attachment(1, NOW_NS, bytes(16))
+        incoming = Incoming("reconnaissance_12", topics.POSE, target, key, pose.encode(), attachment)
+        assert fleet.take(incoming, NOW_NS) is not None
+
+    def shown(width: int) -> Counter[str]:
+        console = Console(file=io.StringIO(), width=width)
+        console.print(table(fleet.rows(NOW_NS), True, "tcp/127.0.0.1:7447", NOW_NS))
+        assert isinstance(console.file, io.StringIO)
+        return Counter(one for one in console.file.getvalue() if not one.isspace() and one != "─")
+
+    assert shown(columns) == shown(200)
+
+
 def test_a_link_that_is_down_is_told_so_from_the_first() -> None:
     endpoint = free_endpoint()
     with ExitStack() as stack:
@@ -300,3 +334,10 @@ def test_what_is_no_number_from_nought_on_is_a_sentence(
     with pytest.raises(SystemExit, match="2"):
         main([*option.split(), number, "--seconds", "0.1"])
     assert f"argument {option.split()[1]}: {number} is not a number from 0 on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("domain", ["-1", "233", "0.5", "uav1", ""])
+def test_what_is_no_ros_domain_is_a_sentence(domain: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["watch", "-e", free_endpoint(), "--domain", domain, "--seconds", "0.1"])
+    assert f"{domain} is not a ROS domain, 0 to 232" in capsys.readouterr().err

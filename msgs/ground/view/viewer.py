@@ -1,0 +1,170 @@
+"""Rerun's viewer as a process of its own, a window or a page for browsers: when it ends, what is drawn into it does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from urllib.parse import quote
+
+import rerun as rr
+
+from msgs.ground.errors import InputError
+
+WINDOW_PORT = 9876  # Rerun's own; a window that is open already is drawn into
+_LOOPBACK = "127.0.0.1"
+_START_S = 60.0
+_LOOK_EVERY_S = 0.05
+_LOOK_AGAIN_S = 0.5
+_SETTLE_S = 1.0  # a viewer without a display takes calls for a moment before it ends
+_SERVER_MEMORY = "1GiB"  # older data goes first when a browser joins a long flight
+_NO_WINDOW = "Rerun's viewer has no window here: view with --web for a browser, or with --save for another machine"
+
+
+@contextmanager
+def window(rec: rr.RecordingStream, stop: threading.Event, say: Callable[[str], None]) -> Iterator[None]:
+    """A window, which stays afterwards; sets `stop` when it is closed. Raises InputError if none opens, or it fails."""
+    viewer: subprocess.Popen[bytes] | None = None
+    if not answers(WINDOW_PORT):
+        viewer = subprocess.Popen(
+            _command(WINDOW_PORT, "--expect-data-soon"), stdout=subprocess.DEVNULL, start_new_session=True
+        )
+        if not _started(viewer, [WINDOW_PORT]) or _ended(viewer, _SETTLE_S):
+            raise InputError(_NO_WINDOW)
+
+    def here() -> bool:
+        return answers(WINDOW_PORT) if viewer is None else viewer.poll() is None
+
+    with _fed(rec, WINDOW_PORT, here, stop, _NO_WINDOW) as gone:
+        yield
+    if gone.is_set():
+        if viewer is not None and viewer.poll():
+            raise InputError(_NO_WINDOW)
+        say("the viewer was closed")
+
+
+@contextmanager
+def page(
+    rec: rr.RecordingStream, web_port: int, stays: bool, stop: threading.Event, say: Callable[[str], None]
+) -> Iterator[None]:
+    """A page for browsers on this machine; `stays`: until `stop` is set, though all is drawn. Raises InputError if the
+    ports are not to be had, or its server ends."""
+    ended = f"--web {web_port}: Rerun's server ended by itself"
+    with (
+        server(web_port) as process,
+        _fed(rec, web_port + 1, lambda: process.poll() is None, stop, ended, stays=stays) as gone,
+    ):
+        say(f"open http://{_LOOPBACK}:{web_port}/?url={quote(_address(web_port + 1), safe=':/')}")
+        yield
+    if gone.is_set():
+        raise InputError(ended)
+
+
+@contextmanager
+def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Rerun's server; it takes data at the port after `web_port`. Raises InputError if the ports are not to be had."""
+    ports = (web_port, web_port + 1)
+    for port in ports:
+        if answers(port):
+            raise InputError(f"--web {web_port}: port {port} is taken")
+    process = subprocess.Popen(
+        _command(ports[1], "--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # the command starts the server as a child of its own: both have to be ended
+    )
+    try:
+        if not _started(process, ports):
+            raise InputError(f"--web {web_port}: Rerun's server does not start there")
+        yield process
+    finally:
+        with suppress(ProcessLookupError):  # both have ended by themselves
+            os.killpg(process.pid, signal.SIGTERM)
+        process.wait()
+
+
+def answers(port: int) -> bool:
+    """Whether somebody on this machine takes calls there."""
+    with socket.socket() as probe:
+        return probe.connect_ex((_LOOPBACK, port)) == 0
+
+
+@contextmanager
+def _fed(
+    rec: rr.RecordingStream,
+    port: int,
+    here: Callable[[], bool],
+    stop: threading.Event,
+    refused: str,
+    *,
+    stays: bool = False,
+) -> Iterator[threading.Event]:
+    """What is logged inside goes to the viewer at `port`. Once that is not `here` any more, sets `stop` and the event
+    that is given. Raises InputError, `refused`, if it takes nothing from the first."""
+    gone, over = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_LOOK_AGAIN_S):
+            if not here():
+                gone.set()
+                stop.set()
+                return
+
+    rec.connect_grpc(_address(port))
+    watcher = threading.Thread(target=watch, name="viewer", daemon=True)
+    try:
+        # Rerun holds up whoever logs to a viewer that it never reached, without end.
+        if not _reached(rec, here):
+            raise InputError(refused)
+        watcher.start()
+        yield gone
+        try:
+            rec.flush()
+        except RuntimeError:  # nobody takes it any more
+            gone.set()
+        if stays:
+            stop.wait()
+    finally:
+        over.set()
+        rec.disconnect()
+
+
+def _reached(rec: rr.RecordingStream, here: Callable[[], bool]) -> bool:
+    deadline_s = time.monotonic() + _START_S
+    while here() and time.monotonic() < deadline_s:
+        with suppress(RuntimeError):
+            rec.flush(timeout_sec=_LOOK_AGAIN_S)
+            return True
+    return False
+
+
+def _started(process: subprocess.Popen[bytes], ports: Sequence[int]) -> bool:
+    """Wait until all ports answer; False if the process ends before, or takes too long."""
+    deadline_s = time.monotonic() + _START_S
+    while not all(map(answers, ports)):
+        if _ended(process, _LOOK_EVERY_S) or time.monotonic() > deadline_s:
+            return False
+    return True
+
+
+def _ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
+    try:
+        process.wait(within_s)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
+
+
+def _command(port: int, *options: str) -> list[str]:
+    """Bound to this machine: whoever reaches a viewer sees what it shows, and can draw into it."""
+    return [sys.executable, "-m", "rerun", "--bind", _LOOPBACK, "--port", str(port), *options]
+
+
+def _address(port: int) -> str:
+    return f"rerun+http://{_LOOPBACK}:{port}/proxy"

@@ -1,0 +1,52 @@
+"""`uavpose-ground command` where the vehicle takes a command and does not answer."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh import handlers
+
+from msgs.client import connect
+from msgs.ground.command import RELOAD_ANSWER_S, ask
+from tests.waiting import until
+
+from ..conftest import Network
+
+
+@pytest.fixture
+def held(network: Network) -> Iterator[list[zenoh.Query]]:
+    """The commands that uav1 took, and answers none of."""
+    queries: list[zenoh.Query] = []
+    handler = handlers.Callback(queries.append, indirect=False)
+    with network.daemon.declare_queryable("uavpose/@v1/uav1/cmd/*", handler):
+        yield queries
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_who_waits_for_an_answer_can_break_off(
+    network: Network, held: list[zenoh.Query], number: signal.Signals
+) -> None:
+    command = [sys.executable, "-m", "msgs.ground.cli", "command", "uav1", "reload", "-e", network.endpoint]
+    asking = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    until(lambda: held, what="the command")
+    asking.send_signal(number)
+    said, _ = asking.communicate(timeout=0.8 * RELOAD_ANSWER_S)
+    answer = json.loads(said)
+    assert asking.returncode == 1
+    assert (answer["ok"], answer["command"]) == (False, "reload")
+    assert "it may have done it" in answer["error"]
+
+
+def test_a_command_without_an_answer_in_time_may_have_been_done(network: Network, held: list[zenoh.Query]) -> None:
+    with connect(network.endpoint) as session:
+        said = dict[str, Any]()
+        until(lambda: held, lambda: said.update(ask(session, "uav1", "stop", {}, timeout_s=0.5)), what="the command")
+    assert said["error"].startswith("uav1 does not answer within ")
+    assert "it may have done it" in said["error"]
