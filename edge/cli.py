@@ -77,6 +77,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
+    # Not to be ended by it until it can be obeyed: the configuration is yet to be read.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     from edge.config import load_config
     from edge.daemon import run
     from edge.reload import Reloader

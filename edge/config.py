@@ -5,10 +5,12 @@ Paths are taken from the folder the file lies in. `uavpose-edge check --config F
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +20,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from edge.config_camera import CameraSettings
 from edge.config_camera import SequenceCamera as SequenceCamera
 from edge.config_camera import camera_key as camera_key
-from edge.config_ground import RecorderSettings, ZenohSettings
+from edge.config_ground import RecorderSettings, ZenohSettings, ZenohTlsSettings
 from edge.config_path import ConfigPath
 from edge.errors import InputError
 from edge.estimator.providers import Provider
@@ -44,7 +46,7 @@ def _signing_key(path: Path) -> Path:
 
 
 def _no_folder(path: Path) -> Path:
-    if path.is_dir():
+    if os.path.isdir(path):  # Path's own raises where a folder above may not be entered
         raise ValueError(f"{path} is a folder; give a file in it")
     return path
 
@@ -179,9 +181,7 @@ class MavlinkSettings(Section):
     position_rate_hz: float = Field(
         default=20.0, ge=3, le=100, description="asked of the autopilot; of fewer no frame has any use"
     )
-    max_age_ms: float = Field(
-        default=200.0, gt=0, allow_inf_nan=False, description="an older measurement is never sent"
-    )
+    max_age_ms: float = Field(default=200.0, gt=0, le=10_000, description="an older measurement is never sent")
 
     @model_validator(mode="after")
     def _fits_together(self) -> MavlinkSettings:
@@ -242,7 +242,7 @@ class ConfigFile:
     path: Path
     text: str
     config: Config
-    calibration: bytes | None = None  # of the camera's calibration file, as it was then
+    contents: Mapping[str, str] = field(default_factory=dict)  # by `[section] key`, a hash of the files named there
 
     @contextmanager
     def blame(self, *key: str) -> Iterator[None]:
@@ -262,18 +262,28 @@ def load_config(path: Path) -> ConfigFile:
     except ValidationError as error:
         lines = [_sentence(path, text, _key(fault), _reason(fault)) for fault in faults_of(error)]
         raise InputError("\n".join(lines)) from error
-    return ConfigFile(path, text, config, _calibration(config))
+    return ConfigFile(path, text, config, _contents(config))
 
 
-def _calibration(config: Config) -> bytes | None:
-    """What the camera's calibration file holds; None: it has none, or the camera will say that it cannot be read."""
-    intrinsics = getattr(config.camera, "intrinsics", None)
-    if intrinsics is None or intrinsics.file is None:
-        return None
-    try:
-        return bytes(intrinsics.file.read_bytes())
-    except OSError:
-        return None
+def _contents(config: Config) -> dict[str, str]:
+    """What the files hold that are read once, at the start; one that cannot be read is told by who needs it."""
+    intrinsics, camera_tls = getattr(config.camera, "intrinsics", None), getattr(config.camera, "tls", None)
+    files = {
+        "[camera] intrinsics": (intrinsics.file,) if intrinsics is not None else (),
+        "[camera] tls": _paths(camera_tls),
+        "[zenoh] tls": _paths(config.zenoh.tls),
+        "[mavlink] signing_key": (config.mavlink.signing_key,),
+    }
+    hashes: dict[str, str] = {}
+    for key, paths in files.items():
+        with suppress(OSError):
+            held = [hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path is not None]
+            hashes[key] = " ".join(held)
+    return hashes
+
+
+def _paths(tls: ZenohTlsSettings | None) -> tuple[Path, ...]:
+    return () if tls is None else (tls.root_ca, tls.certificate, tls.private_key)
 
 
 def _key(fault: Fault) -> tuple[str, ...]:
@@ -303,17 +313,22 @@ def _sentence(path: Path, text: str, key: tuple[str, ...], reason: str) -> str:
 
 
 def _line_of(text: str, key: tuple[str, ...]) -> int | None:
-    """Line of the key's assignment, else of its table's header, else None (a key that is not in the file)."""
+    """Line of the key's assignment, else of its table's, inline or by header, else None (a key that is not there)."""
     section: tuple[str, ...] = ()
-    header_line = None
+    table_line = None
     words = tuple(word for word in key if not word.isdigit())
     for number, line in enumerate(text.splitlines(), start=1):
-        header = re.match(r"\s*\[([^\[\]]+)\]", line)
+        header = re.match(r"\s*\[\s*([A-Za-z][^\[\]]*)\]", line)  # a row of numbers is of a matrix
         if header:
             section = tuple(part.strip() for part in header[1].split("."))
             if section == words[: len(section)]:
-                header_line = number
+                table_line = number
         assignment = re.match(r"\s*([\w.-]+)\s*=", line)
-        if assignment and section + tuple(assignment[1].split(".")) == words:
+        if assignment is None:
+            continue
+        assigned = section + tuple(assignment[1].split("."))
+        if assigned == words:
             return number
-    return header_line
+        if assigned == words[: len(assigned)]:
+            table_line = number
+    return table_line

@@ -12,8 +12,12 @@ from edge.config_path import ConfigPath
 from msgs.session import check_endpoint
 from msgs.settings import Section
 
+SIDE_MAX_PX = 65_535  # JPEG's own bound; beyond it memory is asked for that no machine has
+MONOTONIC_MAX_NS = 10**18  # 31 years since the start of the machine: a greater one is UTC
+
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Side = Annotated[int, Field(gt=0, le=SIDE_MAX_PX)]
 
 
 def _network_address(text: str) -> str:
@@ -50,8 +54,8 @@ class IntrinsicsSettings(Section):
     fy: PositivePx | None = Field(default=None, description="focal length along y, pixels")
     cx: Finite | None = Field(default=None, description="principal point x, pixels; pixel centres at integers")
     cy: Finite | None = Field(default=None, description="principal point y, pixels; pixel centres at integers")
-    width: int | None = Field(default=None, gt=0, description="width of the calibrated picture, pixels")
-    height: int | None = Field(default=None, gt=0, description="height of the calibrated picture, pixels")
+    width: Side | None = Field(default=None, description="width of the calibrated picture, pixels")
+    height: Side | None = Field(default=None, description="height of the calibrated picture, pixels")
     distortion: list[Finite] = Field(
         default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: the picture has none"
     )
@@ -79,7 +83,9 @@ class SequenceCamera(Camera):
     path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
     fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
     start_at_ns: int | None = Field(
-        default=None, description="monotonic ns of frame 0's exposure; default: when all is ready"
+        default=None,
+        le=MONOTONIC_MAX_NS,
+        description="monotonic ns of frame 0's exposure; default: when all is ready",
     )
     loop: bool = Field(default=False, description="begin again after the last frame")
     lockstep: Annotated[str, AfterValidator(_own_machine)] | None = Field(
@@ -94,7 +100,9 @@ class FolderCamera(Camera):
     path: ConfigPath = Field(description="folder of pictures, played in the order of their names")
     fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
     start_at_ns: int | None = Field(
-        default=None, description="monotonic ns of the first picture's exposure; default: when all is ready"
+        default=None,
+        le=MONOTONIC_MAX_NS,
+        description="monotonic ns of the first picture's exposure; default: when all is ready",
     )
     loop: bool = Field(default=False, description="begin again after the last picture")
     intrinsics: IntrinsicsSettings
@@ -102,15 +110,15 @@ class FolderCamera(Camera):
 
 class FileCamera(Camera):
     type: Literal["file"]
-    path: ConfigPath = Field(description="video file, played at its own rate")
+    path: ConfigPath = Field(description="video file, played by its own times")
     intrinsics: IntrinsicsSettings
 
 
 class DeviceCamera(Camera):
     type: Literal["device"]
     device: Annotated[str, AfterValidator(_device)] = Field(default="/dev/video0", description="V4L2 device")
-    width: int = Field(default=1920, gt=0, description="pixels asked of the device")
-    height: int = Field(default=1080, gt=0, description="pixels asked of the device")
+    width: Side = Field(default=1920, description="pixels asked of the device")
+    height: Side = Field(default=1080, description="pixels asked of the device")
     fps: float = Field(default=30.0, ge=0.01, le=1000, description="rate asked of the device")
     fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
     exposure_ms: float | None = Field(

@@ -13,6 +13,7 @@ from msgs.session import TlsFiles, check_endpoint
 from msgs.settings import Section
 
 _MB = 1_000_000
+DISK_MAX_MB = 1e9  # a petabyte
 SELDOM_HZ = 0.001
 
 
@@ -65,7 +66,7 @@ class ZenohSettings(Section):
         default="jazzy", description="whose keys and type hashes"
     )
     max_age_ms: float = Field(
-        default=500.0, gt=0, allow_inf_nan=False, description="an older measurement is not published as a pose"
+        default=500.0, gt=0, le=10_000, description="an older measurement is not published as a pose"
     )
 
     @model_validator(mode="after")
@@ -93,9 +94,9 @@ class RecorderSettings(Section):
     file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="then the next file begins")
     file_max_minutes: float = Field(default=10.0, gt=0, le=1440, description="then the next file begins")
     total_max_mb: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="of all of this vehicle's files; default: the disk's end"
+        default=None, gt=0, le=DISK_MAX_MB, description="of all of this vehicle's files; default: the disk's end"
     )
-    free_min_mb: float = Field(default=1000.0, ge=0, allow_inf_nan=False, description="left on the disk for others")
+    free_min_mb: float = Field(default=1000.0, ge=0, le=DISK_MAX_MB, description="left on the disk for others")
     when_full: Literal["oldest", "stop"] = Field(default="oldest", description="remove the oldest files, or stop")
 
     @model_validator(mode="after")

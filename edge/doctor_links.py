@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import tempfile
 import threading
@@ -131,7 +132,7 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
 def signing_finding(state: Path) -> Finding:
     """Whether the daemon can keep the last timestamp that it signed with, and what is kept is of no time to come."""
     advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
-    if state.is_dir():
+    if os.path.isdir(state):  # Path's own raises where a folder above may not be entered
         return wrong("signing", f"{state} is a folder: after a restart old messages would pass as new", advice)
     with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
         ahead = ahead_of_clock(state, clock.utc_ns())

@@ -77,6 +77,11 @@ def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Find
     # Paths' own `exists` and `is_dir` raise where a folder above may not be searched. A link that leads there is there.
     there = next((parent for parent in (folder, *folder.parents) if os.path.lexists(parent)), Path("/"))
     needed = os.W_OK | os.X_OK | (os.R_OK if there == folder else 0)  # the recorder looks for its files of before
+    if os.path.isdir(there) and os.statvfs(there).f_flag & os.ST_RDONLY:
+        advice = (
+            "mount it to be written (`findmnt -T` shows what it is; a failing card is made read-only), or name another"
+        )
+        return bad("disk", f"{of_what}{folder} is on a disk that is mounted read-only", advice)
     if not os.path.isdir(there) or not os.access(there, needed):
         advice = f"sudo install -d -o $USER {folder}, or name another in [recorder] folder"
         return bad("disk", f"{of_what}{folder} cannot be written by this user", advice)

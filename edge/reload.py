@@ -1,11 +1,11 @@
 """SIGHUP or a command: the configuration read again, a new model put in between two frames; what is wrong is refused.
 
-| key                                  | when it is changed         |
-|--------------------------------------|----------------------------|
-| [model], the file's content too      | from the next frame on     |
-| [estimator] acquire_every_n          | from the next frame on     |
-| [health] no_frame_s, latency_max_ms  | from the next frame on     |
-| all others, a calibration's content  | named; they need a restart |
+| key                                                       | when it is changed         |
+|-----------------------------------------------------------|----------------------------|
+| [model], the file's content too                           | from the next frame on     |
+| [estimator] acquire_every_n                               | from the next frame on     |
+| [health] no_frame_s, latency_max_ms                       | from the next frame on     |
+| all others, the content of calibration, certificates, key | named; they need a restart |
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ log = logging.getLogger(__name__)
 
 LIVE_KEYS = frozenset({("estimator", "acquire_every_n"), ("health", "no_frame_s"), ("health", "latency_max_ms")})
 LIVE_SECTIONS = frozenset({"model"})
-CALIBRATION_KEY = "[camera] intrinsics"
 
 
 @dataclass(frozen=True)
@@ -94,15 +93,15 @@ def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Relo
     """Read the configuration again and make ready what it asks for. Raises InputError; `flying` then goes on."""
     new = load_config(flying.path)
     config = with_live_keys(flying.config, new.config)
-    file = replace(new, config=config, calibration=flying.calibration)
+    file = replace(new, config=config, contents=flying.contents)
     said = []
     if config.model != flying.config.model or _sha256(file) != estimator.model.sha256:
         old = estimator.model
         estimator = warm_estimator(load_configured(file), config.estimator.max_targets, camera)
         said.append(f"model {old.sha256[:12]} replaced by {_name(estimator.model)}")
     changed = needs_restart(config, new.config)
-    if new.calibration != flying.calibration and CALIBRATION_KEY not in changed:
-        changed.append(CALIBRATION_KEY)
+    keys = dict.fromkeys((*flying.contents, *new.contents))
+    changed += [key for key in keys if key not in changed and flying.contents.get(key) != new.contents.get(key)]
     live = [f"[{s}] {k}" for s, k in sorted(LIVE_KEYS) if _key(config, s, k) != _key(flying.config, s, k)]
     if live:
         said.append(f"taken over: {', '.join(live)}")

@@ -118,6 +118,16 @@ def test_the_unit_starts_reloads_and_watches_the_daemon() -> None:
         assert f"\nm {service['User']} {group}\n" in users
 
 
+def test_the_drivers_of_what_may_be_plugged_in_later_are_there_when_the_unit_starts() -> None:
+    """systemd resolves a group of DeviceAllow= once, at the start, by /proc/devices (systemd.resource-control(5))."""
+    unit = UNIT.read_text()
+    modules = {"video4linux": "videodev", "ttyUSB": "usbserial", "ttyACM": "cdc_acm"}  # others are built in
+    wanted = {f"modprobe@{modules[group]}.service" for group in re.findall(r"=char-(\w+)", unit) if group in modules}
+    assert len(wanted) == len(modules)
+    for key in ("Wants", "After"):
+        assert wanted <= set(" ".join(re.findall(rf"^{key}=(.*)", unit, re.MULTILINE)).split())
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_the_unit_is_as_little_exposed_as_the_guide_says() -> None:
     told = re.search(r"exposure\nis ([\d.]+) by `(systemd-analyze .*)`\n?\s?\(systemd (\d+)\)", INSTALL)

@@ -12,6 +12,7 @@ from edge.errors import InputError
 
 PIPELINE = "uavpose-replay"
 THREADS, RUNS = "1,2", 50
+THREADS_MAX = 64  # as [model] threads has it
 
 
 def register(commands: argparse._SubParsersAction) -> None:
@@ -63,8 +64,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _threads(text: str) -> list[int]:
     numbers = text.split(",")
-    if not all(number.isdecimal() and int(number) >= 1 for number in numbers):
-        raise InputError(f"--threads {text}: give whole numbers from 1 on, such as 1,2")
+    if not all(number.isdecimal() and 1 <= int(number) <= THREADS_MAX for number in numbers):
+        raise InputError(f"--threads {text}: give whole numbers from 1 to {THREADS_MAX}, such as 1,2")
     return sorted({int(number) for number in numbers})
 
 

@@ -175,6 +175,7 @@ def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
     [
         (["--threads", "two"], "--threads two"),
         (["--threads", "0"], "--threads 0"),
+        (["--threads", "1,99999999999999999999"], "whole numbers from 1 to 64"),
         (["--runs", "0"], "--runs 0"),
         (["none.onnx"], "none.onnx"),
         (["--minutes", "1"], "--minutes needs --pipeline"),

@@ -14,6 +14,7 @@ from msgs.ground.keys import init_authority, issue
 from tests.certificates import redate
 
 from .conftest import Cli
+from .flying import flying
 from .toy_model import ONE_PICTURE_GRAPH, write_toy_model
 
 OFF = "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
@@ -216,6 +217,40 @@ def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: P
     done = subprocess.run(arguments, cwd=tmp_path, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_nobody_is_told_of_a_flight_by_the_library_that_runs_the_network(
+    cli: Cli, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ONNX Runtime's telemetry begins with a number for the machine and a store of what is to be sent."""
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    for variable in ("XDG_CACHE_HOME", "ORT_DISABLE_TELEMETRY", "CI"):
+        monkeypatch.delenv(variable, raising=False)
+    (tmp_path / "config.toml").write_text(text + OFF)
+    assert cli("check", "--config", "config.toml").returncode == 0
+    assert list(home.rglob("*")) == []
+
+
+HANG_UP_WHILE_IMPORTING = """
+import importlib.abc, os, signal, sys
+
+class HangUp(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "edge.daemon":
+            os.kill(os.getpid(), signal.SIGHUP)
+
+sys.meta_path.insert(0, HangUp())
+from edge.cli import main
+sys.exit(main())
+"""
+
+
+def test_a_reload_asked_of_a_daemon_that_is_still_starting_does_not_end_it(tmp_path: Path, text: str) -> None:
+    with flying(tmp_path, text + OFF, program=("-c", HANG_UP_WHILE_IMPORTING)) as flight:
+        flight.until("stopped: ")
+        assert flight.process.wait(60) == 0
 
 
 def test_the_daemon_needs_no_torch_and_nothing_of_the_trainer_or_the_replay() -> None:

@@ -47,7 +47,29 @@ def write(tmp_path: Path, text: str) -> Path:
         ),
         (CAMERA + "[mavlink]\ncomponent_id = 1", "config.toml:5: [mavlink] component_id: Input should be greater"),
         (CAMERA + "[mavlink]\ncomponent_id = 100", "config.toml:4: [mavlink]: component_id and camera_component_id"),
-        (CAMERA + "[zenoh]\nmax_age_ms = inf", "config.toml:5: [zenoh] max_age_ms: Input should be a finite number"),
+        (CAMERA + "[zenoh]\nmax_age_ms = inf", "config.toml:5: [zenoh] max_age_ms: Input should be less than or equal"),
+        (
+            CAMERA + "[zenoh]\nmax_age_ms = 1e308",
+            "config.toml:5: [zenoh] max_age_ms: Input should be less than or equal",
+        ),
+        (CAMERA + "[mavlink]\nmax_age_ms = 1e308", "config.toml:5: [mavlink] max_age_ms: Input should be less than or"),
+        (CAMERA + "[recorder]\nfree_min_mb = 1e308", "config.toml:5: [recorder] free_min_mb: Input should be less"),
+        (CAMERA + "[recorder]\ntotal_max_mb = 1e308", "config.toml:5: [recorder] total_max_mb: Input should be less"),
+        # 1.8e18 ns are of UTC, and would be waited for for decades.
+        (
+            CAMERA + "start_at_ns = 1_800_000_000_000_000_000",
+            "config.toml:4: [camera] start_at_ns: Input should be less",
+        ),
+        (LIVE + "type = 'device'\nwidth = 600000", "config.toml:4: [camera] width: Input should be less than or equal"),
+        (
+            LIVE.replace("6,", "600000,") + "type = 'stream'\nurl = 'udp://:5'",
+            "config.toml:2: [camera.intrinsics] width: Input should be less than or equal to 65535",
+        ),
+        ("mount = { roll_deg = nan }\n" + CAMERA, "config.toml:1: [mount] roll_deg: Input should be a finite number"),
+        (
+            CAMERA + "[mount]\nR_body_cam = [\n  [0.0, 0.0, 1.0],\n  [1.0, 0.0, 0.0],\n  [0.0, 1.0, 0.0]\n]\nroll = 3",
+            "config.toml:10: [mount] roll: unknown key",
+        ),
         (CAMERA + "[vehicle]\nname = 'uav 1'", "config.toml:5: [vehicle] name: uav name 'uav 1' must be a letter"),
         (
             LIVE + "type = 'zenoh'\ntopic = '/camera'",
@@ -177,7 +199,8 @@ def test_calibrations_of_ros_and_opencv_are_read(tmp_path: Path, text: str) -> N
         ("640.25, 0.0", "640.25, 7.5", "camera_matrix is not, row by row, fx 0 cx, 0 fy cy, 0 0 1"),
         (", 1.0]", ", 0.0]", "camera_matrix is not, row by row"),
         (", 1.0]", ", 2.0]", "camera_matrix is not, row by row"),
-        ("width: 1280", "width: .Inf", "image_width is missing or no positive whole number"),
+        ("width: 1280", "width: .Inf", "image_width is missing or no whole number from 1"),
+        ("width: 1280", "width: 4000000000", "image_width is missing or no whole number from 1 to 65535"),
         ("width: 1280", "width: 1280.7", "image_width is missing"),
         ("width: 1280", "width: [1280]", "image_width holds a list"),
         ("height: 720", "height: ~", "image_height holds '~'"),

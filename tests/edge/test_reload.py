@@ -19,12 +19,15 @@ from hypothesis import strategies as st
 from zenoh import handlers
 
 from edge.config import SHIPPED_MODEL, Config
+from edge.links.signing_key import write_new_key
 from edge.reload import Reloader, needs_restart, with_live_keys
 from edge.requests import ReloadOutcome
 from edge.status import ask
 from msgs.cdr import Log
 from msgs.client import connect, subscribe
 from msgs.contract import ModelContract
+from msgs.ground.keys import init_authority, issue
+from tests.certificates import redate
 
 from .flying import Flight, flying, free_port, toml, write_swaying_scene
 from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
@@ -146,6 +149,24 @@ def test_a_calibration_made_anew_in_the_same_file_is_named(tmp_path: Path, swayi
             calibration.write_text(numbers.format(w=width, h=height, f=focal_px))
             flight.process.send_signal(signal.SIGHUP)
             assert words in flight.until("reloaded: ")
+
+
+def test_a_certificate_or_a_key_made_anew_in_the_same_file_is_named(tmp_path: Path, swaying: Path, port: int) -> None:
+    model, key = tmp_path / "flown.onnx", tmp_path / "mavlink.key"
+    write_toy_model(model)
+    write_new_key(key)
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    tls = '{ root_ca = "ca.pem", certificate = "uav1.pem", private_key = "uav1.key" }'
+    text = toml(swaying, model, port, 'signing_key = "mavlink.key"\n')
+    with flying(tmp_path, text.replace("[mavlink]\n", f"tls = {tls}\n[mavlink]\n")) as flight:
+        redate(tmp_path, "uav1", begins_days=-1, ends_days=90)
+        flight.process.send_signal(signal.SIGHUP)
+        assert flight.until("reloaded: ").endswith("reloaded: needs a restart: [zenoh] tls\n")
+        key.unlink()
+        write_new_key(key)
+        flight.process.send_signal(signal.SIGHUP)
+        assert flight.until("reloaded: ").endswith("reloaded: needs a restart: [zenoh] tls, [mavlink] signing_key\n")
 
 
 def commanded(port: int, *words: str) -> dict[str, Any]:
