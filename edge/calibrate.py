@@ -15,6 +15,7 @@ import numpy as np
 from edge.calibrate_board import BoardSettings, Gray, Size, View, detector_of
 from edge.calibrate_fit import VIEWS_MIN, Calibration, Coefficients, calibration_of
 from edge.cameras.folder import list_pictures
+from edge.cameras.video import open_video
 from edge.errors import InputError
 from edge.types import Array
 
@@ -35,7 +36,7 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
         return
     if not source.is_file():
         raise InputError(f"{source} does not exist")
-    video = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
+    video = open_video(str(source))
     if not video.isOpened():
         raise InputError(f"{source} is neither a folder of pictures nor a readable video")
     every = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // PICTURES_MAX, 1)

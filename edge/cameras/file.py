@@ -1,27 +1,33 @@
-"""A video file, played at its own rate on the monotonic clock."""
+"""A video file, played by its own times on the monotonic clock."""
 
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
+from edge.cameras.video import is_bare_jpeg, open_video
 from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
 # What is skipped is decoded all the same: a video that decodes slower than its rate never catches up.
 SKIPPING_MAX_NS = 250_000_000
+ROUNDING_NS = 1_000_000  # files round times, Matroska to the millisecond
+GAP_MAX_NS = 60_000_000_000  # between two frames of one film
 
 
 class FileSource:
-    """Frame k is taken as exposed at start + k / fps; frames a late reader missed are skipped, as with a camera.
+    """A frame is taken as exposed at start + its time in the video; those a late reader missed are skipped, as with a
+    camera.
 
     Where skipping takes too long, the frame is an old one and says so by its stamp.
     """
@@ -32,48 +38,53 @@ class FileSource:
         self._settings = settings
         self._capture: cv2.VideoCapture | None = None
         self._start_ns: int | None = None
-        self._next = 0
+        self._times = VideoTimes(1.0)
         self.counts: Counter[str] = Counter()
 
     def open(self) -> CameraInfo:
-        """Raises InputError: no video, no frame rate, or intrinsics that do not fit."""
+        """Raises InputError: no video, no times, or intrinsics that do not fit."""
         path = self._settings.path
-        if not path.is_file():
+        if not os.path.isfile(path):  # Path's own raises where a folder above may not be entered
             raise InputError(f"{path} does not exist")
-        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        self._capture = open_video(str(path))
         if not self._capture.isOpened():
             raise InputError(f"{path} is not a readable video")
-        self._fps = self._capture.get(cv2.CAP_PROP_FPS)
-        if not math.isfinite(self._fps) or not 0 < self._fps <= 1000:
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
+        if not math.isfinite(fps) or not 0 < fps <= 1000:
             raise InputError(f"{path} does not say its frame rate")
+        if not _tells_times(path):
+            raise InputError(
+                f"{path} does not say when its frames were taken; put it into a file that does, "
+                f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -c copy {path.stem}.mp4"
+            )
         self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # not above 0: not known
         size_wh = (
             int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
         )
         self._intrinsics = load_intrinsics(self._settings.intrinsics).scaled_to(size_wh)
-        self._start_ns, self._next = None, 0
-        return CameraInfo(path.name, size_wh, self._intrinsics.K, self._fps, self._intrinsics.distortion)
+        self._start_ns, self._times = None, VideoTimes(fps)
+        return CameraInfo(path.name, size_wh, self._intrinsics.K, fps, self._intrinsics.distortion)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame, not before its time. Raises EndOfStream after the last, InputError if none can be read."""
         assert self._capture is not None
+        if stop.is_set():
+            raise EndOfStream
+        skipping_until_ns = time.monotonic_ns() + SKIPPING_MAX_NS
+        self._grab(self._capture)
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
-        skipping_until_ns = time.monotonic_ns() + SKIPPING_MAX_NS
-        while self._follows(self._next) and self._exposure_ns(self._next + 1) <= (now_ns := time.monotonic_ns()):
-            if stop.is_set() or now_ns >= skipping_until_ns or not self._capture.grab():
+        while self._follows() and self._start_ns + self._times.next_ns <= (now_ns := time.monotonic_ns()):
+            if stop.is_set() or now_ns >= skipping_until_ns:
                 break
-            self._next += 1
-        capture_ns = self._exposure_ns(self._next)
+            self._grab(self._capture)
+        index, capture_ns = self._times.index, self._start_ns + self._times.last_ns
         wait_until(capture_ns, stop)
-        read, image_bgr = self._capture.read()
+        read, image_bgr = self._capture.retrieve()
         if not read:
-            if self._next == 0:
-                raise InputError(f"{self._settings.path} has no readable frame")
             raise EndOfStream
-        meta = FrameMeta(self._next, capture_ns, time.monotonic_ns())
-        self._next += 1
+        meta = FrameMeta(index, capture_ns, time.monotonic_ns())
         image = np.asarray(image_bgr, dtype=np.uint8)
         return Frame(meta, image, self._intrinsics.K, self._intrinsics.distortion)
 
@@ -82,10 +93,55 @@ class FileSource:
             self._capture.release()
             self._capture = None
 
-    def _follows(self, index: int) -> bool:
-        """Whether another frame comes after this one: the last is not skipped, however late the reader."""
-        return self._frames <= 0 or index + 1 < self._frames
+    def _grab(self, capture: cv2.VideoCapture) -> None:
+        """Go on to the next frame. Raises EndOfStream if there is none, InputError if there never was one."""
+        if not capture.grab():
+            if self._times.index < 0:
+                raise InputError(f"{self._settings.path} has no readable frame")
+            raise EndOfStream
+        self._times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
 
-    def _exposure_ns(self, index: int) -> int:
-        assert self._start_ns is not None
-        return self._start_ns + round(index * 1e9 / self._fps)
+    def _follows(self) -> bool:
+        """Whether another frame comes after this one: the last is not skipped, however late the reader."""
+        return self._frames <= 0 or self._times.index + 1 < self._frames
+
+
+class VideoTimes:
+    """When the frames of a video were taken, from the first on.
+
+    Where the file's times are those of its rate but for their rounding, they are exact. A frame that has none, as the
+    last ones of some files, or one of another clock, as where two videos were joined, follows at that rate.
+    """
+
+    def __init__(self, fps: float) -> None:
+        self._fps = fps
+        self._period_ns = self._step_ns = round(1e9 / fps)
+        self._stamp_ns = self._told_ns = 0  # of the last frame: as it stands in the file, and from the first on
+        self.index = -1  # of the last frame
+        self.last_ns = 0
+
+    @property
+    def next_ns(self) -> int:
+        """When the frame to come was taken, if it follows as the last did: what it says itself is not known before."""
+        return self.last_ns + self._step_ns
+
+    def take(self, stamp_ns: int) -> None:
+        """The next frame, by its time in the file."""
+        self.index += 1
+        since_ns, self._stamp_ns = stamp_ns - self._stamp_ns, stamp_ns
+        if self.index == 0:
+            return
+        self._told_ns += since_ns if 0 < since_ns <= GAP_MAX_NS else self._period_ns
+        by_rate_ns = round(self.index * 1e9 / self._fps)
+        time_ns = by_rate_ns if abs(self._told_ns - by_rate_ns) <= ROUNDING_NS else self._told_ns
+        time_ns = max(time_ns, self.last_ns + 1)
+        self._step_ns, self.last_ns = time_ns - self.last_ns, time_ns
+
+
+def _tells_times(path: Path) -> bool:
+    """Whether a video's frames have times, or it has one frame alone. H.264 and JPEG without a container have none."""
+    capture = open_video(str(path))
+    stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if capture.grab()]
+    told = len(stamps_ms) < 2 or (stamps_ms[0] < stamps_ms[1] and not is_bare_jpeg(capture))
+    capture.release()
+    return told

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge.config_camera import IntrinsicsSettings
+from edge.config_camera import SIDE_MAX_PX, IntrinsicsSettings
 from edge.errors import InputError
 from edge.estimator.lens import Lens
 from edge.types import Array
@@ -154,8 +154,8 @@ def _side_px(storage: cv2.FileStorage, path: Path, name: str) -> int:
     """Raises InputError."""
     node, named = storage.getNode(name), f"calibration {path}: {name}"
     side_px = 0.0 if node.empty() else _number(node, named)
-    if side_px <= 0 or not side_px.is_integer():
-        raise InputError(f"{named} is missing or no positive whole number", INTRINSICS_KEY)
+    if not (0 < side_px <= SIDE_MAX_PX and side_px.is_integer()):
+        raise InputError(f"{named} is missing or no whole number from 1 to {SIDE_MAX_PX}", INTRINSICS_KEY)
     return int(side_px)
 
 

@@ -90,13 +90,9 @@ class SequenceSource:
         capture_ns = self._exposure_ns(index)
         wait_until(capture_ns, stop)
         image_bgr = self._ahead.popleft()[1].result()
-        if (image_bgr.shape[1], image_bgr.shape[0]) != self._image_size_wh:
-            raise InputError(f"{self._at(index).path} differs in size from the first picture of the scene")
         self._next = index + 1
         self._decode_ahead(self._next)
-        meta = FrameMeta(self._frame(index), capture_ns, time.monotonic_ns())
-        picture = self._at(index)
-        return Frame(meta, image_bgr, picture.K, picture.distortion)
+        return self._shown(self._at(index), image_bgr, FrameMeta(self._frame(index), capture_ns, time.monotonic_ns()))
 
     def exposed_now(self, index: int, sequence: int) -> Frame:
         """Frame `index` as if exposed this instant, the camera's frame `sequence`. Raises InputError."""
@@ -105,7 +101,7 @@ class SequenceSource:
         if wanted not in self._frames:
             raise InputError(f"{self._settings.path} has no picture {index} among its {frames} frames")
         picture, now_ns = self._pictures[self._frames.index(wanted)], clock.monotonic_ns()
-        return Frame(FrameMeta(sequence, now_ns, now_ns), _decode(picture.path), picture.K, picture.distortion)
+        return self._shown(picture, _decode(picture.path), FrameMeta(sequence, now_ns, now_ns))
 
     def close(self) -> None:
         if self._decoder is not None:
@@ -115,6 +111,12 @@ class SequenceSource:
     def _list(self, folder: Path) -> list[ScenePicture]:
         """Raises InputError if the folder holds none."""
         return read_scene(folder)
+
+    def _shown(self, picture: ScenePicture, image_bgr: NDArray[np.uint8], meta: FrameMeta) -> Frame:
+        """Raises InputError for a picture that the intrinsics are not of."""
+        if (image_bgr.shape[1], image_bgr.shape[0]) != self._image_size_wh:
+            raise InputError(f"{picture.path} differs in size from the first picture of the scene")
+        return Frame(meta, image_bgr, picture.K, picture.distortion)
 
     def _exists(self, index: int) -> bool:
         return self._settings.loop or index < len(self._pictures)

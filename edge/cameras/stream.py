@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,8 +14,10 @@ from edge.addresses import no_password
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
 from edge.cameras.source import SourceLost
-from edge.cameras.stamps import StreamClock
+from edge.cameras.stamps import CAUGHT_UP_NS, StreamClock
+from edge.cameras.video import is_bare_jpeg, open_video
 from edge.config_camera import StreamCamera
+from edge.errors import InputError
 from edge.types import Frame
 
 TIMEOUT_MS = 3000
@@ -32,10 +35,15 @@ class StreamSource(LiveSource):
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
+        self._timeless = False
+        self._unread_since_ns: int | None = None  # opened, and nothing was read
         self.counts["catching_up"] = 0
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame; what waited while nobody read, or in the server, is passed over, as nobody knows its age."""
+        if self._waited_unnoticed():
+            self._call_again()
+        self._unread_since_ns = None
         while True:
             frame = super().read(stop)
             if self._clock.caught_up:
@@ -47,10 +55,28 @@ class StreamSource(LiveSource):
         self._clock = StreamClock()
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
         with _ffmpeg_options(transport + LOW_DELAY):
-            return cv2.VideoCapture(self._settings.url, cv2.CAP_FFMPEG, limits)
+            capture = open_video(self._settings.url, limits)
+        self._timeless = not transport and is_bare_jpeg(capture)
+        self._unread_since_ns = time.monotonic_ns()
+        return capture
+
+    def _call_again(self) -> None:
+        """Raises SourceLost."""
+        self.close()
+        try:
+            self.open()
+        except InputError as error:
+            raise SourceLost(str(error)) from error
+
+    def _waited_unnoticed(self) -> bool:
+        """Whether pictures without times wait here, of which nobody could tell how old they are. A web camera sends who
+        calls again what is now; who serves a bare TCP connection may end with it."""
+        asked_anew = self._timeless and self._settings.url.startswith("http")
+        since_ns = self._unread_since_ns
+        return asked_anew and since_ns is not None and time.monotonic_ns() - since_ns >= CAUGHT_UP_NS
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
-        stamp_ns = self._clock.monotonic_ns(round(position_ms * 1e6), arrival_ns)
+        stamp_ns = self._clock.monotonic_ns(0 if self._timeless else round(position_ms * 1e6), arrival_ns)
         if (behind_ns := self._clock.behind_ns(arrival_ns)) > BEHIND_MAX_NS:
             raise SourceLost(f"the stream runs {behind_ns / 1e9:.1f} s behind itself")
         if stamp_ns is None:

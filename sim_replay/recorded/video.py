@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
+from edge.cameras.file import VideoTimes
 from edge.cameras.intrinsics import load_intrinsics
+from edge.cameras.video import open_video
 from edge.config import MountSettings
 from edge.config_camera import IntrinsicsSettings
 from edge.config_path import ConfigPath
@@ -23,6 +25,7 @@ from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_seq
 from sim_replay.telemetry import TelemetryError, read_telemetry
 
 FPS_MAX = 240.0  # of the daemon's camera
+STEADY_FRAMES = 0.5  # by which a picture of a constant rate may be off it
 ROWS_HZ_MIN = 9.5  # of telemetry said to be of 10: between its rows the own ship is taken to turn evenly
 
 
@@ -58,7 +61,7 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         raise InputError(f"{flight.telemetry}: has {rows_hz:.1f} rows a second; 10 are needed")
     if not flight.video.is_file():
         raise InputError(f"{path}: video: {flight.video} does not exist")
-    capture = cv2.VideoCapture(str(flight.video), cv2.CAP_FFMPEG)
+    capture = open_video(str(flight.video))
     try:
         if not capture.isOpened():
             raise InputError(f"{path}: video: {flight.video} is not a readable video")
@@ -67,7 +70,7 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
         frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: it does not say
         check_spans(telemetry, flight.telemetry, flight.t0_ns, frames, fps)
-        _unpack(capture, path, flight, folder, on_picture)
+        _unpack(capture, path, flight, fps, folder, on_picture)
     finally:
         capture.release()
     shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
@@ -75,19 +78,31 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
 
 
 def _unpack(
-    capture: cv2.VideoCapture, path: Path, flight: FilmedFlight, folder: Path, on_picture: Callable[[], None]
+    capture: cv2.VideoCapture,
+    path: Path,
+    flight: FilmedFlight,
+    fps: float,
+    folder: Path,
+    on_picture: Callable[[], None],
 ) -> None:
     size_wh = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     try:
         lens = load_intrinsics(flight.intrinsics).scaled_to(size_wh)
     except InputError as error:
         raise InputError(f"{path}: intrinsics: {error}") from error
-    count = 0
+    count, times = 0, VideoTimes(fps)
     with SceneWriter(folder, JPEG_QUALITY) as writer:
         while True:
             read, image_bgr = capture.read()
             if not read:
                 break
+            times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+            off_ns = abs(times.last_ns - count * 1e9 / fps)
+            if flight.fps is None and off_ns > STEADY_FRAMES * 1e9 / fps:
+                raise InputError(
+                    f"{path}: video: {flight.video} is of a rate that varies: picture {count} was taken "
+                    f"{off_ns / 1e9:.2f} s off {fps:g} a second; make one of a constant rate of it"
+                )
             add_picture(writer, count, np.asarray(image_bgr, dtype=np.uint8), lens.K, lens.distortion)
             count += 1
             on_picture()

@@ -10,17 +10,19 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from fractions import Fraction
-from itertools import pairwise
+from itertools import count, pairwise
 from typing import BinaryIO, Literal
 
 import av
+import cv2
 import numpy as np
 import pytest
 
 from edge.cameras.stream import StreamSource
 from edge.config_camera import StreamCamera
+from tests.waiting import until
 
 from .pictures import INTRINSICS, SIZE_WH, number_of, picture
 
@@ -93,6 +95,34 @@ class HttpCamera(Server):
         self.heard(lines)
         caller.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: video/mp2t\r\nConnection: close\r\n\r\n")
         film(caller.sendall)
+
+
+class WebCamera(Server):
+    """JPEG after JPEG over HTTP (multipart/x-mixed-replace) to one caller after the other: nothing tells when one was
+    taken. `sent` of them were, and each tells in its halves which it is."""
+
+    def __init__(self, fps: int) -> None:
+        super().__init__()
+        self._fps, self.sent = fps, 0
+
+    def run(self) -> None:
+        with self._listening:
+            while True:
+                with self._listening.accept()[0] as caller, caller.makefile("rb") as lines, suppress(OSError):
+                    self.serve(caller, lines)
+
+    def serve(self, caller: socket.socket, lines: BinaryIO) -> None:
+        self.heard(lines)
+        caller.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=next\r\n\r\n")
+        began_s = time.monotonic()
+        for index in count():
+            time.sleep(max(began_s + index / self._fps - time.monotonic(), 0))
+            halves = np.hstack([picture(self.sent, (2, 4)), picture(self.sent // 25, (2, 4))])
+            image = cv2.resize(halves, SIZE_WH, interpolation=cv2.INTER_NEAREST)
+            jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+            head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+            caller.sendall(head.encode() + jpeg + b"\r\n")
+            self.sent += 1
 
 
 class RtspCamera(Server):
@@ -168,3 +198,32 @@ def test_an_http_camera_is_looked_through() -> None:
     camera.start()
     assert is_real_time(*seen(f"http://127.0.0.1:{camera.port}/video.ts"))
     assert camera.requests[0].startswith("GET /video.ts")
+
+
+@pytest.mark.parametrize("fps", [10, 60])
+def test_a_web_camera_s_pictures_are_of_when_they_came_whatever_their_rate(fps: int) -> None:
+    """ffmpeg counts them as 25 a second: of fewer each would seem later than the one before."""
+    camera = WebCamera(fps)
+    camera.start()
+    url = f"http://127.0.0.1:{camera.port}/video.mjpg"
+    with closing(StreamSource(StreamCamera(type="stream", url=url, latency_ms=30, intrinsics=INTRINSICS))) as source:
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(20)]
+    assert {frame.meta.arrival_ns - frame.meta.capture_ns for frame in frames} == {30_000_000}
+    assert frames[0].meta.sequence < 2 * fps  # what waited is passed over for half a second, not for five
+    assert source.counts["unstamped"] >= len(frames)
+
+
+def test_a_web_camera_s_pictures_that_waited_to_be_read_are_not_told_as_of_now() -> None:
+    """As while a model is loaded. A slow machine would be long in catching up, and tell each as of when it was decoded:
+    the camera is called again."""
+    camera = WebCamera(fps=20)
+    camera.start()
+    url = f"http://127.0.0.1:{camera.port}/video.mjpg"
+    with closing(StreamSource(StreamCamera(type="stream", url=url, intrinsics=INTRINSICS))) as source:
+        source.open()
+        until(lambda: camera.sent >= 40, what="pictures that wait")
+        waiting = camera.sent
+        left, right = np.array_split(source.read(threading.Event()).image_bgr, 2, axis=1)
+    assert round(float(left.mean()) / 10) + 25 * round(float(right.mean()) / 10) >= waiting
+    assert len(camera.requests) == 2

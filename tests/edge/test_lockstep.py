@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import pytest
 
 from edge import clock
@@ -20,6 +21,8 @@ from edge.cameras.source import EndOfStream
 from edge.config_camera import SequenceCamera
 from edge.errors import InputError
 from tests.waiting import WITHIN_S
+
+from .toy_scene import draw, write_scene
 
 
 class Player:
@@ -71,6 +74,24 @@ def test_time_and_frames_come_by_the_word_and_the_answer_after_the_links_have_se
     assert player.capture.newest(0.0) is None
     assert (player.heard(), settled) == ("ok", [1000, 2500, 2500])
     assert player.capture.counters() == {"captured": 1, "dropped": 0}
+
+
+def test_a_picture_of_another_size_than_the_scene_s_first_ends_lock_step_too(tmp_path: Path) -> None:
+    """Its pixels are not those that the scene's intrinsics are of."""
+    scene = write_scene(tmp_path / "000001", frames=2)
+    cv2.imwrite(str(scene / "rgb" / "000001.png"), draw((100.5, 100.5), (640, 360)))
+    player = Player(scene)
+    try:
+        for line in ("time 1", "frame 0", "frame 1"):
+            player.say(line)
+        player.capture.start(lambda: None)
+        assert player.capture.newest(5.0) is not None
+        with pytest.raises(InputError, match=r"000001.png differs in size"):
+            player.capture.newest(5.0)
+    finally:
+        player.hang_up()
+        player.capture.stop()
+        clock.run_freely()
 
 
 def test_when_the_player_hangs_up_the_recording_is_over(player: Player) -> None:

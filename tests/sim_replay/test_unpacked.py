@@ -1,4 +1,4 @@
-"""What `play` removes to make room for a video's pictures: what it made itself, and nothing else."""
+"""What `play` makes of a video, and what it removes to make room for that: what it made itself, and nothing else."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rich.console import Console
 from edge.errors import InputError
 from sim_replay.recorded.opened import open_sequence
 from sim_replay.telemetry import Telemetry, write_telemetry
+from tests.edge.test_cameras_video import turned, write_film
 
 LENS = "{ fx = 300.0, fy = 300.0, cx = 31.5, cy = 23.5, width = 64, height = 48 }"
 
@@ -49,3 +50,25 @@ def test_a_scene_that_was_not_unpacked_here_is_in_the_way_and_stays(film: Path, 
     with pytest.raises(InputError, match="is in the way"):
         open_sequence(film, tmp_path / "out", Console(quiet=True))
     assert sorted(path.name for path in scene.rglob("*")) == before
+
+
+def test_a_video_of_a_rate_that_varies_is_refused_unless_its_rate_is_told(film: Path, tmp_path: Path) -> None:
+    """Its pictures would be laid beside the own ship of other times."""
+    write_film(tmp_path / "film.mp4", [0, 40, 80, 120, 400, 440])
+    film.write_text(film.read_text().replace("width = 64, height = 48", "width = 320, height = 180"))
+    with pytest.raises(InputError, match="rate that varies"):
+        open_sequence(film, tmp_path / "out", Console(quiet=True))
+    assert not any((tmp_path / "out").glob("*"))
+    film.write_text("fps = 20.0\n" + film.read_text())
+    assert len(open_sequence(film, tmp_path / "out", Console(quiet=True)).scene.images) == 6
+
+
+def test_a_video_is_unpacked_as_its_sensor_read_it_out(film: Path, tmp_path: Path) -> None:
+    """Lens and mount are the sensor's, however the video says it is to be shown."""
+    turned(write_film(tmp_path / "film.mp4", [0, 40, 80], bright=np.s_[:60]))
+    film.write_text(film.read_text().replace("width = 64, height = 48", "width = 320, height = 180"))
+    scene = open_sequence(film, tmp_path / "out", Console(quiet=True)).scene
+    image = cv2.imread(str(next((scene.folder / "rgb").iterdir())))
+    assert image is not None
+    assert image[:60].mean() > 150
+    assert image[60:].mean() < 50

@@ -1,0 +1,123 @@
+"""Video files as they are made: of a rate that varies, turned, joined, or without any times."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from contextlib import closing
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from edge.calibrate import pictures_of
+from edge.cameras.file import FileSource, VideoTimes
+from edge.cameras.source import EndOfStream
+from edge.config_camera import FileCamera
+from edge.errors import InputError
+from edge.types import Frame
+
+from .pictures import INTRINSICS, SIZE_WH, picture
+
+FPS = 25
+UPRIGHT, TURNED = ((1, 0, 0, 1), (-1, 0, 0, -1))  # of a track header's matrix: a, b, c, d
+
+
+def write_film(path: Path, times_ms: list[int], codec: str = "mpeg4", bright: slice = np.s_[:]) -> Path:
+    """A picture for each time, bright in a part of its rows."""
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream(codec, rate=FPS)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
+        stream.time_base, stream.codec_context.max_b_frames = Fraction(1, 1000), 0
+        for time_ms in times_ms:
+            image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+            image[bright] = 200
+            frame = av.VideoFrame.from_ndarray(image, format="bgr24")
+            frame.pts, frame.time_base = time_ms, Fraction(1, 1000)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return path
+
+
+def matrix(a: int, b: int, c: int, d: int) -> bytes:
+    return struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+
+
+def bare_jpeg(path: Path) -> Path:
+    jpegs = [cv2.imencode(".jpg", picture(index))[1].tobytes() for index in range(3)]
+    path.write_bytes(b"".join(jpegs))
+    return path
+
+
+def turned(path: Path) -> Path:
+    """The same file, which says that it is to be shown upside down, as a camera that hangs writes it."""
+    before, name, header = path.read_bytes().rpartition(b"tkhd")  # of the track, as the film has one alone
+    assert matrix(*UPRIGHT) in header
+    path.write_bytes(before + name + header.replace(matrix(*UPRIGHT), matrix(*TURNED), 1))
+    return path
+
+
+def source_of(path: Path) -> FileSource:
+    return FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS))
+
+
+def play(path: Path) -> list[Frame]:
+    frames = []
+    with closing(source_of(path)) as source:
+        source.open()
+        try:
+            while True:
+                frames.append(source.read(threading.Event()))
+        except EndOfStream:
+            return frames
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_video_of_a_rate_that_varies_is_played_by_its_own_times(tmp_path: Path, suffix: str) -> None:
+    """As a camera films that exposes longer in the dark, or a radio link that lost some of it is recorded."""
+    times_ms = [0, 40, 80, 120, 640, 680, 720, 840, 960]
+    frames = play(write_film(tmp_path / f"flight.{suffix}", times_ms))
+    began_ns = frames[0].meta.capture_ns - times_ms[frames[0].meta.sequence] * 1_000_000
+    told_ms = {frame.meta.sequence: (frame.meta.capture_ns - began_ns) / 1e6 for frame in frames}
+    assert len(told_ms) >= 3  # a busy machine passes some over
+    for index, time_ms in told_ms.items():
+        assert time_ms == pytest.approx(times_ms[index], abs=1.0)
+    assert all(frame.meta.arrival_ns >= frame.meta.capture_ns for frame in frames)
+
+
+def test_the_times_of_a_steady_video_are_those_of_its_rate_however_its_file_rounds_them() -> None:
+    times = VideoTimes(30.0)
+    for index in range(300):
+        times.take(5_000_000_000 + round(index * 1000 / 30) * 1_000_000)
+        assert times.last_ns == round(index * 1e9 / 30)
+
+
+def test_where_a_video_has_no_times_or_those_of_another_clock_frames_follow_at_its_rate() -> None:
+    joined, none_at_the_end = [0, 40, 80, 9_000_000, 9_000_040, 20, 60], [80, 120, 160, 0, 0]
+    for stamps_ms in (joined, none_at_the_end):
+        times, told_ms = VideoTimes(FPS), []
+        for stamp_ms in stamps_ms:
+            times.take(stamp_ms * 1_000_000)
+            told_ms.append(times.last_ns / 1e6)
+        assert told_ms == [40.0 * k for k in range(len(stamps_ms))]
+
+
+def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_shown(tmp_path: Path) -> None:
+    path = turned(write_film(tmp_path / "flight.mp4", [0, 40, 80], bright=np.s_[:60]))
+    seen = [frame.image_bgr[..., 0] for frame in play(path)]
+    calibrated = [gray for _, gray in pictures_of(path)]
+    assert len(calibrated) == 3
+    for image in (*seen, *calibrated):
+        assert image[:60].mean() > 150
+        assert image[60:].mean() < 50
+
+
+def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    """As a camera's encoder writes it where nothing packs it into a file with times."""
+    for path in (write_film(tmp_path / "flight.h264", [0, 40, 80], "libx264"), bare_jpeg(tmp_path / "flight.mjpeg")):
+        with closing(source_of(path)) as source, pytest.raises(InputError, match=f"when its frames.*{path.name}"):
+            source.open()
