@@ -85,8 +85,9 @@ def _parser() -> argparse.ArgumentParser:
         "train",
         help="train a network on rendered windows",
         description="Train a network on rendered windows. Stops with a checkpoint when the planned samples are done, "
-        "the budget is used up, or on SIGTERM or Ctrl-C; --resume goes on at the next step. The run folder holds "
-        "weights.pt, resume.pt, config.toml, run.json (how each start was asked for), log.jsonl and TensorBoard "
+        "the budget is used up, or on SIGTERM or Ctrl-C; --resume goes on at the next step. Where the loss has no "
+        "finite gradient it stops too, and the last checkpoint stays. The run folder holds weights.pt, "
+        "resume.pt, config.toml, run.json (how each start was asked for), log.jsonl and TensorBoard "
         "scalars and pictures.",
     )
     train.add_argument("--config", type=Path, required=True, help="TOML, such as trainer/configs/edge.toml")

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from msgs.contract import Span
 from msgs.settings import Section, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
@@ -201,7 +202,9 @@ class ContractConfig(Section):
     acquire_fit: Literal["letterbox", "squash"]
     track_size_wh: tuple[Side, Side] | None = None
     track_window_scale: float = Field(gt=1.0)
-    trained_range_m: tuple[float, float] = (100.0, 500.0)
+    trained_range_m: Span | None = Field(
+        None, description="depths; absent: 100 to 500 m of rendered windows, and those that the datasets' targets have"
+    )
 
     @model_validator(mode="after")
     def _windows_are_square(self) -> ContractConfig:

@@ -56,6 +56,11 @@ class DatasetSampler:
             raise ConfigError(f"{root}: holds no frames to train on")
         _judge_range(root, self._frames)
 
+    @property
+    def shows_targets(self) -> bool:
+        """Whether any picture does."""
+        return any(target.box_visible_xyxy_px is not None for frame in self._frames for target in frame.targets)
+
     def batch(self, first_index: int, count: int) -> TrainingBatch:
         """Windows first_index .. first_index + count - 1."""
         return joined([self._window(i) for i in range(first_index, first_index + count)])

@@ -79,12 +79,27 @@ def _judged(batches: Sequence[TrainingBatch]) -> NDArray[np.bool_]:
     return np.concatenate([~batch.others.any(axis=(1, 2)) for batch in batches])
 
 
+def tell_of_poses(batches: Sequence[TrainingBatch]) -> bool:
+    """Whether any window shows a target whose pose `measure` can judge."""
+    return bool((_judged(batches) & np.concatenate([batch.present for batch in batches])).any())
+
+
+def _mean(values: NDArray) -> float:
+    """NaN of none."""
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _median(values: NDArray) -> float:
+    """NaN of none."""
+    return float(np.median(values)) if len(values) else math.nan
+
+
 def measure(
     predicted: Predictions, batches: list[TrainingBatch], threshold: float = SCORE_THRESHOLD
 ) -> dict[str, float]:
     """Metrics of one set of windows. Pose metrics are over every window with a target, found or not.
 
-    Windows with a second aircraft are left out: the highest peak may be its own.
+    Windows with a second aircraft are left out: the highest peak may be its own. What none is left for is NaN.
     """
     judged = _judged(batches)
     labels = TrainingBatch(*(np.concatenate(values)[judged] for values in zip(*batches, strict=True)))
@@ -102,22 +117,22 @@ def measure(
     empty = predicted.score[~on]
     return {
         "windows": float(len(on)),
-        "E_r_mean_deg": float(E_r.mean()),
-        "E_r_median_deg": float(np.median(E_r)),
-        "rot_lt_10deg": float(np.mean(E_r < 10.0)),
-        "E_t_mean_m": float(E_t.mean()),
-        "E_t_median_m": float(np.median(E_t)),
-        "E_z_mean_m": float(metrics.depth_error_m(est.t_cam_target_m, t).mean()),
-        "depth_rel_mean": float(depth.mean()),
-        "depth_rel_median": float(np.median(depth)),
-        "depth_lt_5pct": float(np.mean(depth < 0.05)),
-        "pose_10deg_5pct": float(pose.mean()),
-        "bearing_median_deg": float(np.median(metrics.bearing_error_deg(est.t_cam_target_m, t))),
-        "box_iou_mean": float(box_iou(est.center_px, est.size_px, center, size).mean()),
-        "recall": float(found.mean()),
-        "false_alarms": float(np.mean(empty >= threshold)) if len(empty) else float("nan"),
+        "E_r_mean_deg": _mean(E_r),
+        "E_r_median_deg": _median(E_r),
+        "rot_lt_10deg": _mean(E_r < 10.0),
+        "E_t_mean_m": _mean(E_t),
+        "E_t_median_m": _median(E_t),
+        "E_z_mean_m": _mean(metrics.depth_error_m(est.t_cam_target_m, t)),
+        "depth_rel_mean": _mean(depth),
+        "depth_rel_median": _median(depth),
+        "depth_lt_5pct": _mean(depth < 0.05),
+        "pose_10deg_5pct": _mean(pose),
+        "bearing_median_deg": _median(metrics.bearing_error_deg(est.t_cam_target_m, t)),
+        "box_iou_mean": _mean(box_iou(est.center_px, est.size_px, center, size)),
+        "recall": _mean(found),
+        "false_alarms": _mean(empty >= threshold),
         "score_auc": ranking_auc(est.score, empty),
-        "score_median": float(np.median(est.score)),
+        "score_median": _median(est.score),
     }
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from trainer.evaluate import (
     measure,
     predict_all,
     sigma_shortfall,
+    tell_of_poses,
     torch_predictor,
 )
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
@@ -33,6 +34,7 @@ from trainer.sources import window_sampler
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
+RENDERED_RANGE_M = (100.0, 500.0)  # what rendered windows show well
 ANY_SIZE_PX = (1e-3, 1e6)  # of what nobody has measured: nothing is untrained
 UNREACHABLE_SCORE = 1.0
 EMPTY_SHARE = 0.12
@@ -113,12 +115,26 @@ def make_contract(
     views: Views,
     thresholds: tuple[float, float],
 ) -> ModelContract:
-    """The contract of the FP32 file, without metrics; what the windows show (focal length, box) is read from them."""
+    """The contract of the FP32 file, without metrics; what was trained on (focal length, box, depths of datasets) is
+    read from `views`, windows of such. Raises ConfigError if they show no target."""
     batches = [*views.track, *views.acquire]
     on = np.concatenate([batch.present for batch in batches])
     focal_px = np.concatenate([batch.K[:, 0, 0] for batch in batches])
     box_px = np.concatenate([batch.size_px.max(axis=1) for batch in batches])[on]
-    return _contract(config, training, sha256, thresholds, _span(focal_px), _span(box_px))
+    if not len(box_px):
+        raise ConfigError("what the network was trained on shows no target")
+    range_m = config.contract.trained_range_m or _trained_range_m(config.data, batches)
+    return _contract(config, training, sha256, thresholds, range_m, _span(focal_px), _span(box_px))
+
+
+def _trained_range_m(data: DataConfig, batches: Sequence[TrainingBatch]) -> tuple[float, float]:
+    """Depths, whole metres, between which targets were seen in training."""
+    of_datasets = [batch.t_cam_target_m[batch.present & (batch.airframe_id < 0), 2] for batch in batches]
+    Z_m = np.clip(np.concatenate(of_datasets), *Z_RANGE_M)
+    spans = [] if data.rendered_share == 0.0 else [RENDERED_RANGE_M]
+    spans += [(math.floor(Z_m.min()), math.floor(Z_m.max()) + 1.0)] if len(Z_m) else []
+    low_m, high_m = zip(*spans, strict=True)
+    return min(low_m), max(high_m)
 
 
 def _contract(
@@ -126,6 +142,7 @@ def _contract(
     training: dict[str, str | int | float],
     sha256: str,
     thresholds: tuple[float, float],
+    trained_range_m: tuple[float, float],
     trained_focal_px: tuple[float, float],
     trained_box_px: tuple[float, float],
 ) -> ModelContract:
@@ -146,7 +163,7 @@ def _contract(
         pixel_mean_bgr=IMAGENET_MEAN_BGR,
         pixel_std_bgr=IMAGENET_STD_BGR,
         depth_limits_m=Z_RANGE_M,
-        trained_range_m=contract.trained_range_m,
+        trained_range_m=trained_range_m,
         trained_focal_px=trained_focal_px,
         trained_box_px=trained_box_px,
         airframes=airframe_names(config.data.airframe_ids) if config.data.rendered_share > 0.0 else [],
@@ -207,8 +224,9 @@ def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tupl
         present = np.concatenate([batch.present for batch in batches])
         d = difference(one, other, present)
         pose = [100 * measure(predicted, batches)["pose_10deg_5pct"] for predicted in (one, other)]
+        lost = pose[1] - pose[0] if tell_of_poses(batches) else 0.0
         smaller = 100 * sigma_shortfall(one, other, present)
-        strayed = Strayed(d["rotation_deg_median"], 100 * d["depth_rel_median"], pose[1] - pose[0], smaller)
+        strayed = Strayed(d["rotation_deg_median"], 100 * d["depth_rel_median"], lost, smaller)
         worst = Strayed(*(np.maximum(x, y) for x, y in zip(worst, strayed, strict=True)))  # keeps NaN
         scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "sigma_rel": 100, "score": 1}
         cells = (f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items())
@@ -254,7 +272,7 @@ def export_models(
         acquire_min = choose_threshold(floats.acquire, comparison.acquire)
         track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
         thresholds = (acquire_min, track_min)
-        promise = make_contract(config, training, sha256, comparison, thresholds)
+        promise = make_contract(config, training, sha256, calibration, thresholds)
         write_contract(unmeasured, promise.model_copy(update={"metrics": _metrics(floats, comparison, thresholds)}))
         unmeasured.replace(float_path)
     finally:
@@ -294,7 +312,9 @@ def export_unmeasured(
     made_folder(out)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
     write_graph(model, path)
-    write_contract(path, _contract(config, training, sha256, (score_min, score_min), ANY_SIZE_PX, ANY_SIZE_PX))
+    range_m = config.contract.trained_range_m or (Z_RANGE_M if config.data.datasets else RENDERED_RANGE_M)
+    spans = (range_m, ANY_SIZE_PX, ANY_SIZE_PX)
+    write_contract(path, _contract(config, training, sha256, (score_min, score_min), *spans))
     return path
 
 

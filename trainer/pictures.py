@@ -20,7 +20,7 @@ def _draw_sticks(
     picture: NDArray[np.uint8], K: NDArray, R: NDArray, t_m: NDArray, radius_m: float, colour: tuple[int, int, int]
 ) -> None:
     points = STICKS * radius_m @ np.asarray(R, np.float64).T + np.asarray(t_m, np.float64)
-    if points[..., 2].min() <= 0:
+    if not (np.isfinite(points).all() and points[..., 2].min() > 0):
         return
     pixels = points @ np.asarray(K, np.float64).T
     pixels = pixels[..., :2] / pixels[..., 2:]

@@ -34,14 +34,21 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
 
 
 def refuse_unreadable(config: DataConfig) -> None:
-    """Raises ConfigError where a dataset to train or to validate on cannot be used: before hours of training."""
+    """Raises ConfigError where datasets to train or to validate on cannot be used: before hours of training."""
     size_px = 32  # whatever the windows' size, the labels are the same
+    show_targets: dict[str, list[bool]] = {"train": [], "validate": []}
     for source in config.datasets:
         if source.split == source.validation_split:
             raise ConfigError(f"{source.path}: validation_split {source.split!r} is what is trained on: give another")
-        for split in (source.split, source.validation_split):
+        for purpose, split in zip(show_targets, (source.split, source.validation_split), strict=True):
             if split is not None:
-                DatasetSampler(source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view)
+                opened = DatasetSampler(
+                    source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view
+                )
+                show_targets[purpose].append(opened.shows_targets)
+    for purpose, shown in show_targets.items():
+        if config.rendered_share == 0.0 and shown and not any(shown):
+            raise ConfigError(f"data.datasets: no picture to {purpose} on shows a target, and nothing is rendered")
 
 
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:

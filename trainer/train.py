@@ -52,6 +52,10 @@ def size_at(schedule: ScheduleConfig, progress: float) -> int:
     return [stage.size_px for stage in schedule.sizes if stage.from_progress <= progress][-1]
 
 
+class Diverged(ArithmeticError):
+    """A step whose loss has no finite gradient; it was not taken, but norm statistics may be spoilt."""
+
+
 class StepResult(NamedTuple):
     loss: float
     terms: dict[str, float]
@@ -94,7 +98,8 @@ class Trainer:
     def step(self, batch: TrainingBatch, progress: float) -> StepResult:
         """One optimiser step over the group's batches. Its only randomness is drawn from (seed, step, rank).
 
-        So a resumed run repeats it. Gradients and norm statistics are means over the group.
+        So a resumed run repeats it. Gradients and norm statistics are means over the group. Raises Diverged, in all
+        processes of the group.
         """
         schedule = self.config.schedule
         image, labels = to_tensors(batch, self.device)
@@ -123,7 +128,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.group.average(p.grad for p in self.model.parameters() if p.grad is not None)
-        nn.utils.clip_grad_norm_(self.model.parameters(), schedule.gradient_clip)
+        if not nn.utils.clip_grad_norm_(self.model.parameters(), schedule.gradient_clip).isfinite():
+            raise Diverged
         self.optimizer.step()
         self.group.average(b for b in self.model.buffers() if b.dtype.is_floating_point)
         self.steps += 1
@@ -298,6 +304,7 @@ class _Loop:
     def run(self, stopped: list[int], max_steps: int | None) -> None:
         last_step = None if max_steps is None else self.trainer.steps + max_steps
         reason = "the planned samples are done"
+        worth_saving = True
         try:
             self.size_px = size_at(self.config.schedule, self.progress())  # a run may be resumed at its end
             while (progress := self.progress()) < 1.0:
@@ -307,13 +314,26 @@ class _Loop:
                     break
             if self.budget.total_s and self.used_s() >= self.budget.total_s:
                 reason = "the time budget is used up"
+        except Diverged:
+            worth_saving = False
+            raise ConfigError(self._divergence()) from None
         finally:
-            if self.trainer.steps > 0:  # what failed before it began is no run to go on with
+            if self.trainer.steps > 0 and worth_saving:  # what failed before it began is no run to go on with
                 self.save()
         self.validate(self.size_px)
         self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
         if self.log is not None:
             self.log.close()
+
+    def _divergence(self) -> str:
+        """What became of the run, and how to get by it: the same steps would end it again."""
+        told = (
+            f"{self.out}: after {self.trainer.samples} samples the loss has no finite gradient: training stopped; "
+            "most often [schedule] lr is too high"
+        )
+        if not (self.out / WEIGHTS_NAME).exists():
+            return told
+        return f"{told}. {WEIGHTS_NAME} is of before: begin another run with --start-from {self.out / WEIGHTS_NAME}"
 
     def _train_at(self, size_px: int, stopped: list[int], last_step: int | None) -> bool:
         """Train with windows of one size until the schedule changes it or ends. True: told to stop."""

@@ -97,11 +97,13 @@ def _scene(folder: Path) -> BopScene:
 
 def _root_and_split(folder: Path, holder: Path) -> tuple[Path | None, str | None]:
     """The dataset of `folder`, and its split's name if `holder`, which holds the scenes, is one or lies in one."""
-    root = find_root(folder)
-    if root is not None:
-        return root, holder.relative_to(root).parts[0] if root in holder.parents else None
-    named = re.match(r"train|val|test", holder.name)
-    return (holder.parent, holder.name) if named else (None, None)
+    root, named = find_root(folder), re.match(r"train|val|test", holder.name)
+    if root is None:
+        return (holder.parent, holder.name) if named else (None, None)
+    if root in holder.parents:
+        return root, holder.relative_to(root).parts[0]
+    # A camera.json of the scene's own makes it no dataset of its own.
+    return root, holder.name if named and root != holder else None
 
 
 def _numbered(scenes: list[BopScene]) -> tuple[BopScene, ...]:

@@ -198,7 +198,21 @@ def _tell_once_of_dark_pictures(folder: Path) -> None:
 
 
 def _pixels(path: Path, flags: int) -> NDArray[Any]:
-    pixels = cv2.imread(str(path), flags | cv2.IMREAD_IGNORE_ORIENTATION)  # labels are of the pixels as they lie
+    coded = path.read_bytes() if path.is_file() else b""
+    if _is_torn_jpeg(coded):
+        raise BopError(f"{path} is cut short: what is missing would be read as gray")
+    as_they_lie = flags | cv2.IMREAD_IGNORE_ORIENTATION  # labels are of the pixels as they lie
+    pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), as_they_lie) if coded else None
     if pixels is None:
         raise BopError(f"{path} is not a readable picture")
     return pixels
+
+
+def _is_torn_jpeg(coded: bytes) -> bool:
+    """Whether a JPEG ends before its end is marked: OpenCV fills up the rest. Behind the mark may lie anything."""
+    if not coded.startswith(b"\xff\xd8"):
+        return False
+    at = 2
+    while at + 4 <= len(coded) and coded[at] == 0xFF and coded[at + 1] != 0xDA:  # to the scan; a thumbnail has its own
+        at += 1 if coded[at + 1] == 0xFF else 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
+    return coded.find(b"\xff\xd9", at) < 0

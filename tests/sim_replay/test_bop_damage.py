@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_replay.bop import DISTORTION_KEY, BopError
+from sim_replay.bop.scene import read_picture_bgr
 from sim_replay.datasets import open_dataset
 
 UNIT = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
@@ -80,3 +81,22 @@ def test_one_value_that_is_anything_gives_frames_or_a_sentence(root: Path, name:
         assert all(model.diameter_m > 0 for model in models.values())
         return
     assert Path(name).name in said or "rgb" in said
+
+
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_that_is_cut_short_is_named_and_not_filled_up_with_gray(tmp_path: Path, progressive: int) -> None:
+    """A copy that broke off would be a picture without its target; what lies behind a whole one does no harm."""
+    image = np.random.default_rng(1).integers(0, 255, (90, 160, 3), np.uint8)
+    path, options = tmp_path / "000003.jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive]
+    small = cv2.imencode(".jpg", image[:16, :16])[1].tobytes()
+    whole = cv2.imencode(".jpg", image, options)[1].tobytes()
+    thumbnail = b"\xff\xe1" + (len(small) + 2).to_bytes(2, "big") + small
+    with_thumbnail = whole[:2] + thumbnail + whole[2:]
+    for coded in (whole, with_thumbnail, whole + b"\xff\xda and a film"):
+        path.write_bytes(coded)
+        np.testing.assert_array_equal(read_picture_bgr(path), cv2.imdecode(np.frombuffer(whole, np.uint8), 1))
+    for length in (len(whole) - 2, len(whole) // 2, 300):
+        for torn in (whole[:length], with_thumbnail[: len(thumbnail) + length]):
+            path.write_bytes(torn)
+            with pytest.raises(BopError, match=r"000003\.jpg is cut short"):
+                read_picture_bgr(path)

@@ -73,3 +73,13 @@ def test_scenes_with_a_camera_each_and_no_models_are_one_dataset(tmp_path: Path)
         scene = write_scene(tmp_path / "flown" / name)
         (scene / "camera.json").write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1}))
     assert numbers(open_dataset(tmp_path / "flown")) == {"pass_a": 0, "pass_b": 1}
+
+
+def test_scenes_with_a_camera_each_and_no_models_have_the_splits_that_their_folders_say(tmp_path: Path) -> None:
+    """As `uavpose-replay generate` writes them, where only the scenes were copied."""
+    for name in ("train/000001", "val/000001", "val/000002"):
+        scene = write_scene(tmp_path / "skies" / name)
+        (scene / "camera.json").write_text(json.dumps({"fx": 1, "fy": 1, "cx": 1, "cy": 1}))
+    assert numbers(open_dataset(tmp_path / "skies", "train")) == {"000001": 1}
+    assert numbers(open_dataset(tmp_path / "skies", "val")) == {"000001": 1, "000002": 2}
+    assert open_dataset(tmp_path / "skies" / "val" / "000002").split == "val"
