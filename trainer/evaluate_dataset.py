@@ -19,6 +19,7 @@ from sim_replay.evaluation.consistency import consistency
 from sim_replay.evaluation.files import write_files
 from sim_replay.evaluation.filtering import filtering
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
+from sim_replay.evaluation.spread import intervals_95
 from sim_replay.evaluation.tracked import OwnShipTold, tracker_answers
 from sim_replay.offline import (
     DEFAULT_THREADS,
@@ -96,6 +97,7 @@ def evaluate_dataset(
         "own_ship": request.own_ship if request.mode == "track" else None,
         "every": request.every,
         **score_of(dataset, method, judged),
+        "intervals_95": intervals_95(judged),
         "consistency": consistency(judged),
         "filtering": filtering(judged),
     }

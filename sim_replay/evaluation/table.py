@@ -50,6 +50,8 @@ def score_table(score: dict[str, Any]) -> Group:
     caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
     if overall["rotations_not_known"]:
         caption += f"\nposes whose rotation is not known, in no E_r and no hit: {overall['rotations_not_known']}"
+    if score.get("intervals_95") is not None:
+        caption += f"\n{_intervals(score['intervals_95'])}"
     if score.get("consistency") is not None:
         caption += f"\n{consistency_line(score['consistency'])}"
     if score.get("filtering") is not None:
@@ -88,6 +90,13 @@ def consistency_line(found: dict[str, Any]) -> str:
         f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
         f"{left_out}"
     )
+
+
+def _intervals(intervals: dict[str, tuple[float, float]]) -> str:
+    found, pose = (
+        "{:.0f} to {:.0f} %".format(*(100 * end for end in intervals[name])) for name in ("recall", "pose_10deg_5pct")
+    )
+    return f"in 95 of 100 sets of as many flights, drawn from these: found {found}, Pose@10°/5 % {pose}"
 
 
 def _filtering(found: dict[str, Any]) -> str:

@@ -144,6 +144,16 @@ def test_a_model_beside_is_told_by_its_name_and_how_long_it_learnt() -> None:
     assert "| d | mf-uavpose6d-edge, int8, after 24,000 windows | 1 |" in text
 
 
+def test_a_rate_is_told_with_how_far_other_flights_may_put_it() -> None:
+    method = {"file": "m.onnx", "precision": "int8", "sha256": "0" * 64}
+    score = {"dataset": "d", "mode": "frames", "overall": {"frames": 9}, "by_range": {}, "by_airframe": {}}
+    score |= {"method": method, "recipe": ""}
+    told = {**score, "dataset": "e", "intervals_95": {"pose_10deg_5pct": (0.7012, 0.8049)}}
+    text = page([score, told], "the command", "")
+    assert "| d | int8 | 9 | – |" in text
+    assert "| e | int8 | 9 | 70–80 |" in text
+
+
 def test_two_models_of_one_name_and_precision_are_told_apart() -> None:
     from sim_replay.offline import load_model, method_of
 

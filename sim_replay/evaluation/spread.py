@@ -1,0 +1,44 @@
+"""How far a rate may be from what many more flights would give. Pure.
+
+Frames of one flight show one aircraft against one sky and are right or wrong together, so flights are drawn anew, not
+frames (the percentile bootstrap over clusters, Efron and Tibshirani, An Introduction to the Bootstrap, chapter 13).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from msgs.geometry import Array
+from sim_replay.evaluation.judge import JudgedFrame
+from sim_replay.score import Match, pose_statistics
+
+RATES = ("recall", "rot_10deg", "depth_5pct", "pose_10deg_5pct")
+DRAWS = 4000
+TAILS_PERCENT = (2.5, 97.5)
+
+
+def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]] | None:
+    """Of each rate over all targets the interval that holds it in 95 of 100 such draws; None of fewer than two flights.
+
+    The draws are the same each time.
+    """
+    by_flight: dict[tuple[str, int], list[Match]] = {}
+    for frame in judged:
+        if frame.matches:
+            scene = frame.picture.scene
+            by_flight.setdefault((str(scene.folder), scene.scene_id), []).extend(frame.matches)
+    if len(by_flight) < 2:
+        return None
+    groups = [pose_statistics(0, matches, None) for matches in by_flight.values()]
+    targets = np.array([float(group["targets"]) for group in groups])
+    return {name: _interval(np.array([group[name] for group in groups]), targets) for name in RATES}
+
+
+def _interval(rates: Array, targets: Array) -> tuple[float, float]:
+    """Of the rate over all targets, by the rates of N flights and how many targets each has."""
+    drawn = np.random.default_rng(0).integers(len(rates), size=(DRAWS, len(rates)))
+    overall = (rates * targets)[drawn].sum(axis=1) / targets[drawn].sum(axis=1)
+    low, high = np.percentile(overall, TAILS_PERCENT)
+    return round(float(low), 4), round(float(high), 4)

@@ -1,0 +1,71 @@
+"""How far a rate may be from the truth, by flights and not by frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from sim_replay.bop import BopScene
+from sim_replay.datasets import DatasetFrame
+from sim_replay.evaluation.judge import JudgedFrame
+from sim_replay.evaluation.spread import intervals_95
+from sim_replay.score import Match, TargetPose, Truth
+
+T_CAM_TARGET_M = np.array([4.0, -3.0, 300.0])
+
+
+def flights(turned_deg: Sequence[Sequence[float | None]]) -> list[JudgedFrame]:
+    """Frames of flights, each with one target that is found turned by so much, or not at all."""
+    judged: list[JudgedFrame] = []
+    for number, of_flight in enumerate(turned_deg):
+        scene = BopScene(Path("all"), number)
+        for angle_deg in of_flight:
+            truth = Truth(len(judged), np.eye(3), T_CAM_TARGET_M, 4, 10.0)
+            estimate = None
+            if angle_deg is not None:
+                R = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
+                estimate = TargetPose(len(judged), R, T_CAM_TARGET_M)
+            picture = DatasetFrame(number, len(judged), np.eye(3), None, Path("none.jpg"), (), scene, ())
+            judged.append(JudgedFrame(picture, (Match(truth, estimate),), (), None))
+    return judged
+
+
+def test_flights_that_are_right_or_wrong_throughout_vary_as_so_many_draws_and_not_as_their_frames() -> None:
+    found = intervals_95(flights([[0.0] * 25] * 30 + [[90.0] * 25] * 10))
+    assert found is not None
+    by_flights = stats.binom.ppf([0.025, 0.975], 40, 0.75) / 40
+    assert found["pose_10deg_5pct"] == pytest.approx(tuple(by_flights), abs=1.01 / 40)
+    assert found["recall"] == found["depth_5pct"] == (1.0, 1.0)
+
+
+def test_flights_of_unequal_length_agree_with_scipys_bootstrap() -> None:
+    rng = np.random.default_rng(5)
+    lengths = rng.integers(2, 40, 30)
+    shares = rng.uniform(0.3, 1.0, 30)
+    wrong: tuple[float | None, float] = (None, 170.0)
+    drawn = [
+        [0.0 if rng.random() < share else wrong[rng.integers(2)] for _ in range(length)]
+        for share, length in zip(shares, lengths, strict=True)
+    ]
+    found = intervals_95(flights(drawn))
+    assert found is not None
+    right = np.array([sum(angle == 0.0 for angle in one) for one in drawn])
+    oracle = stats.bootstrap(
+        (right, lengths),
+        lambda r, n, axis: r.sum(axis=axis) / n.sum(axis=axis),
+        paired=True,
+        n_resamples=4000,
+        method="percentile",
+        rng=1,
+    ).confidence_interval
+    assert found["pose_10deg_5pct"] == pytest.approx((oracle.low, oracle.high), abs=0.01)
+
+
+def test_one_flight_tells_nothing_of_others() -> None:
+    assert intervals_95(flights([[0.0] * 50])) is None
+    assert intervals_95([]) is None
