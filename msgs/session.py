@@ -31,6 +31,7 @@ RETRY_PERIOD_MAX_MS = 500
 TF_RATE_MAX_HZ = 5.0
 DETECTIONS_RATE_MAX_HZ = 2.0
 SECURE = ("tls", "quic")
+CALLING = "calling"  # name of the thread that opens a session which its caller may not wait for
 _NO_CHECK_TIME = 0x200000  # OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which ssl has no name for
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5}))([?#].*)?")
 

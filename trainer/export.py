@@ -132,7 +132,9 @@ def _trained_range_m(data: DataConfig, batches: Sequence[TrainingBatch]) -> tupl
     of_datasets = [batch.t_cam_target_m[batch.present & (batch.airframe_id < 0), 2] for batch in batches]
     Z_m = np.clip(np.concatenate(of_datasets), *Z_RANGE_M)
     spans = [] if data.rendered_share == 0.0 else [RENDERED_RANGE_M]
-    spans += [(math.floor(Z_m.min()), math.floor(Z_m.max()) + 1.0)] if len(Z_m) else []
+    if len(Z_m):
+        low_m = min(math.floor(Z_m.min()), Z_RANGE_M[1] - 1.0)  # all may be of one depth
+        spans.append((low_m, max(math.ceil(Z_m.max()), low_m + 1.0)))
     low_m, high_m = zip(*spans, strict=True)
     return min(low_m), max(high_m)
 

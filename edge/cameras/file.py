@@ -14,7 +14,7 @@ import numpy as np
 
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
-from edge.cameras.video import is_bare_jpeg, open_video
+from edge.cameras.video import open_video
 from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
@@ -142,6 +142,11 @@ def _tells_times(path: Path) -> bool:
     """Whether a video's frames have times, or it has one frame alone. H.264 and JPEG without a container have none."""
     capture = open_video(str(path))
     stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if capture.grab()]
-    told = len(stamps_ms) < 2 or (stamps_ms[0] < stamps_ms[1] and not is_bare_jpeg(capture))
     capture.release()
-    return told
+    return len(stamps_ms) < 2 or (stamps_ms[0] < stamps_ms[1] and not _is_bare_jpeg(path))
+
+
+def _is_bare_jpeg(path: Path) -> bool:
+    """Whether JPEG follows JPEG, as they are or parted as a web camera sends them: ffmpeg makes up their times."""
+    with path.open("rb") as file:
+        return file.read(16).lstrip().startswith((b"\xff\xd8", b"--"))

@@ -15,7 +15,7 @@ from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
 from edge.cameras.source import SourceLost
 from edge.cameras.stamps import CAUGHT_UP_NS, StreamClock
-from edge.cameras.video import is_bare_jpeg, open_video
+from edge.cameras.video import is_counted, may_be_bare_jpeg, open_video
 from edge.config_camera import StreamCamera
 from edge.errors import InputError
 from edge.types import Frame
@@ -56,7 +56,7 @@ class StreamSource(LiveSource):
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
         with _ffmpeg_options(transport + LOW_DELAY):
             capture = open_video(self._settings.url, limits)
-        self._timeless = not transport and is_bare_jpeg(capture)
+        self._timeless = not transport and may_be_bare_jpeg(capture)
         self._unread_since_ns = time.monotonic_ns()
         return capture
 
@@ -76,6 +76,7 @@ class StreamSource(LiveSource):
         return asked_anew and since_ns is not None and time.monotonic_ns() - since_ns >= CAUGHT_UP_NS
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
+        self._timeless = self._timeless and is_counted(position_ms)
         stamp_ns = self._clock.monotonic_ns(0 if self._timeless else round(position_ms * 1e6), arrival_ns)
         if (behind_ns := self._clock.behind_ns(arrival_ns)) > BEHIND_MAX_NS:
             raise SourceLost(f"the stream runs {behind_ns / 1e9:.1f} s behind itself")

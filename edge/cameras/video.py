@@ -21,8 +21,14 @@ def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:
     return capture
 
 
-def is_bare_jpeg(capture: cv2.VideoCapture) -> bool:
-    """Whether JPEG follows JPEG with nothing between that tells the time, as web cameras send them: the times that
-    ffmpeg tells then are made up, whatever the pictures' rate is."""
+def may_be_bare_jpeg(capture: cv2.VideoCapture) -> bool:
+    """Whether JPEG may follow JPEG with nothing between that tells the time, as web cameras send them: the times that
+    ffmpeg tells then are made up, whatever the pictures' rate is. A container may look alike until it tells one that
+    `is_counted` is not."""
     jpeg = capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*"MJPG")
     return jpeg and capture.get(cv2.CAP_PROP_FPS) == COUNTED_FPS and capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0
+
+
+def is_counted(position_ms: float) -> bool:
+    """Whether a time may be a count of pictures: no camera's own clock keeps to it for long."""
+    return round(position_ms * COUNTED_FPS) % 1000 == 0

@@ -43,11 +43,14 @@ class Home:
 
     def move(self, link: int, now_ns: int) -> None:
         """Home is another link from now on: one that may be."""
-        left = self.link
-        if left is not None and self._missed(link, now_ns):
+        left, returns = self.link, self._missed(link, now_ns)
+        if left is not None and returns:
             self._barren.add(left)
-        self._left = (left, now_ns) if left is not None and link < left and self._carries else None
-        self.link, self._carries = link, False
+        if left is not None and link < left and self._carries:
+            self._left = (left, now_ns)
+        elif self._left is not None:  # several are tried before it goes back
+            self._left = (self._left[0], now_ns) if link < self._left[0] else None
+        self.link, self._carries = link, returns
 
     def _missed(self, link: int, now_ns: int) -> bool:
         """Whether telemetry came by a link until home was tried elsewhere, and none has come since."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import threading
 from pathlib import Path
@@ -10,18 +11,30 @@ from typing import TypeAlias
 
 from msgs.command_line import exit_code
 from msgs.ground.errors import InputError
-from msgs.session import TlsFiles
+from msgs.session import CALLING, TlsFiles
 from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
 
 DOMAIN_MAX = 232  # of any daemon and router
+HANGING_UP_S = 0.5  # within which a call ends where nobody listens
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
     options = _parser().parse_args(arguments)
-    return exit_code(lambda: int(options.act(options)), InputError, ["ground"])
+    code = exit_code(lambda: int(options.act(options)), InputError, ["ground"])
+    if _still_calls():
+        # It would come back from zenoh while the interpreter is taken down, and abort the process.
+        os._exit(code)
+    return code
+
+
+def _still_calls() -> bool:
+    calling = [thread for thread in threading.enumerate() if thread.name == CALLING]
+    for thread in calling:
+        thread.join(HANGING_UP_S)
+    return any(thread.is_alive() for thread in calling)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -14,7 +14,7 @@ from zenoh import ext, handlers
 from msgs import topics
 from msgs.client import connect, sender_of
 from msgs.ground.errors import InputError
-from msgs.session import SECURE, TlsFiles, check_endpoint
+from msgs.session import CALLING, SECURE, TlsFiles, check_endpoint
 from msgs.topics import Topic
 
 RETRY_S = 0.5
@@ -82,7 +82,7 @@ def _connected(endpoint: str, tls: TlsFiles | None, stop: threading.Event) -> ze
         else:
             answer.put(opened)
 
-    threading.Thread(target=call, name="calling", daemon=True).start()
+    threading.Thread(target=call, name=CALLING, daemon=True).start()
     while not stop.is_set():
         with suppress(Empty):
             return answer.get(timeout=LOOK_EVERY_S)

@@ -198,7 +198,10 @@ def _tell_once_of_dark_pictures(folder: Path) -> None:
 
 
 def _pixels(path: Path, flags: int) -> NDArray[Any]:
-    coded = path.read_bytes() if path.is_file() else b""
+    try:
+        coded = path.read_bytes()
+    except OSError as error:
+        raise BopError(f"{path} cannot be read: {error.strerror}") from error
     if _is_torn_jpeg(coded):
         raise BopError(f"{path} is cut short: what is missing would be read as gray")
     as_they_lie = flags | cv2.IMREAD_IGNORE_ORIENTATION  # labels are of the pixels as they lie

@@ -125,6 +125,29 @@ class WebCamera(Server):
             self.sent += 1
 
 
+class ContainerCamera(Server):
+    """JPEG at the rate that ffmpeg takes pictures without times for, in a container that tells the camera's own; the
+    link holds up every tenth."""
+
+    def serve(self, caller: socket.socket, lines: BinaryIO) -> None:
+        self.heard(lines)
+        caller.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: video/x-matroska\r\n\r\n")
+        sink = Sink(caller.sendall, None)
+        with av.open(sink, "w", format="matroska", options={"cluster_time_limit": "1"}) as out:
+            stream = out.add_stream("mjpeg", rate=25)
+            stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuvj420p"
+            stream.codec_context.time_base = Fraction(1, 1000)
+            began_s, index = time.monotonic(), 0
+            while sink.there:
+                filmed_ms = index * 40 + index % 3
+                held_ms = 60 if index % 10 == 9 else 0
+                time.sleep(max(began_s + (filmed_ms + held_ms) / 1000 - time.monotonic(), 0))
+                frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
+                frame.pts, frame.time_base = filmed_ms, Fraction(1, 1000)
+                out.mux(stream.encode(frame))
+                index += 1
+
+
 class RtspCamera(Server):
     """RFC 2326 as far as a player asks it: pictures by RTP in the connection itself, or in datagrams."""
 
@@ -227,3 +250,16 @@ def test_a_web_camera_s_pictures_that_waited_to_be_read_are_not_told_as_of_now()
         left, right = np.array_split(source.read(threading.Event()).image_bgr, 2, axis=1)
     assert round(float(left.mean()) / 10) + 25 * round(float(right.mean()) / 10) >= waiting
     assert len(camera.requests) == 2
+
+
+def test_jpeg_in_a_container_is_of_the_times_that_this_tells() -> None:
+    """At 25 a second too, where it looks like JPEG without any: what the link held up would be told as new."""
+    camera = ContainerCamera()
+    camera.start()
+    url = f"http://127.0.0.1:{camera.port}/video.mkv"
+    with closing(StreamSource(StreamCamera(type="stream", url=url, intrinsics=INTRINSICS))) as source:
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(40)]
+    between_ms = [(b.meta.capture_ns - a.meta.capture_ns) / 1e6 for a, b in pairwise(frames)]
+    assert max(between_ms) < 50  # 80 and more between the arrivals
+    assert source.counts["unstamped"] < 10

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
 import threading
 from contextlib import closing
 from fractions import Fraction
@@ -31,7 +33,7 @@ def write_film(path: Path, times_ms: list[int], codec: str = "mpeg4", bright: sl
     with av.open(str(path), "w") as out:
         stream = out.add_stream(codec, rate=FPS)
         assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.time_base, stream.codec_context.max_b_frames = Fraction(1, 1000), 0
         for time_ms in times_ms:
             image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
@@ -114,6 +116,19 @@ def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_s
     for image in (*seen, *calibrated):
         assert image[:60].mean() > 150
         assert image[60:].mean() < 50
+
+
+def test_a_video_of_jpeg_whose_recorder_never_ended_it_has_its_times_all_the_same(tmp_path: Path) -> None:
+    """As where the power goes in flight: Matroska then says neither how long it is nor of how many frames."""
+    pipe, path = tmp_path / "pipe.mkv", tmp_path / "flight.mkv"
+    os.mkfifo(pipe)
+    with path.open("wb") as file, subprocess.Popen(["cat", pipe], stdout=file):
+        write_film(pipe, [0, 40, 80, 120], "mjpeg")  # who cannot go back writes no end
+    with closing(source_of(path)) as source:
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(2)]
+    steps_ns = (frames[1].meta.sequence - frames[0].meta.sequence) * 40_000_000
+    assert frames[1].meta.capture_ns - frames[0].meta.capture_ns == steps_ns
 
 
 def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path: Path) -> None:

@@ -135,6 +135,21 @@ def test_a_link_that_brings_heartbeats_alone_gives_the_place_back_to_the_one_tha
     assert silent_s < 20, "it is tried once and no more"
 
 
+def test_of_several_links_that_bring_heartbeats_alone_none_keeps_the_place_of_the_one_that_brought_telemetry() -> None:
+    air, telling = Air(), 2
+    for now_ns in range(BEGAN_NS, BEGAN_NS + 60_000 * MS, 20 * MS):
+        air.station.tick(now_ns)
+        if air.station.home in (None, telling):  # asked elsewhere, it streams no more
+            air.attitude(telling, now_ns, UPSIDE_DOWN)
+        if now_ns % (1_000 * MS) == 0:
+            air.beat(telling, now_ns)
+            for link in (0, 1):
+                if now_ns >= BEGAN_NS + (7_000 - 2_000 * link) * MS:
+                    air.beat(link, now_ns)
+    assert air.station.home == telling
+    assert air.tilt_deg(BEGAN_NS + 59_980 * MS) == 180.0
+
+
 def test_our_clock_is_told_on_any_link_and_the_autopilots_is_believed_on_one() -> None:
     air = Air()
     air.beat(HOME, BEGAN_NS)

@@ -100,3 +100,11 @@ def test_a_jpeg_that_is_cut_short_is_named_and_not_filled_up_with_gray(tmp_path:
             path.write_bytes(torn)
             with pytest.raises(BopError, match=r"000003\.jpg is cut short"):
                 read_picture_bgr(path)
+
+
+def test_a_picture_that_cannot_be_read_is_named_like_one_that_is_none(tmp_path: Path) -> None:
+    """As on a disk that fails, or of another user: what reads it knows BopError alone."""
+    (tmp_path / "000003.png").mkdir()
+    for name in ("000003.png", "0" * 300):
+        with pytest.raises(BopError, match=f"{name} cannot be read"):
+            read_picture_bgr(tmp_path / name)

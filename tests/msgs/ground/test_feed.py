@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -31,6 +33,37 @@ def test_who_calls_a_router_that_says_nothing_can_break_off() -> None:
             with pytest.raises(BlockingIOError):  # the call still waits for its answer
                 heard.recv(4096)
     assert none == [True]
+
+
+HANGS_UP_AT_THE_VERY_END = """
+import os, signal, socket, sys, threading, time
+from msgs.ground.cli import main
+
+class Mute:
+    def __init__(self):
+        self.listening, self.sleep = socket.create_server(("127.0.0.1", 0)), time.sleep
+        self.endpoint = f"tcp/127.0.0.1:{self.listening.getsockname()[1]}"
+
+    def interrupt(self):
+        self.heard, _ = self.listening.accept()
+        self.heard.recv(4096)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def __del__(self):  # while the interpreter is taken down
+        self.heard.close()
+        self.sleep(1.0)
+
+mute = Mute()
+threading.Thread(target=mute.interrupt, daemon=True).start()
+sys.exit(main([*sys.argv[1:], "-e", mute.endpoint]))
+"""
+
+
+@pytest.mark.parametrize(("words", "code"), [(["watch"], 0), (["command", "uav1", "stop"], 1)])
+def test_a_call_that_was_broken_off_and_ends_with_the_process_does_not_abort_it(words: list[str], code: int) -> None:
+    asked = [sys.executable, "-c", HANGS_UP_AT_THE_VERY_END, *words]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (code, "")
 
 
 def test_where_certificates_may_be_at_fault_who_waits_is_told_so(ground: Ground) -> None:
