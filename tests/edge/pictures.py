@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import socket
+import threading
+from contextlib import closing
 
 import numpy as np
 
+from edge.cameras.source import EndOfStream, Source
 from edge.config_camera import IntrinsicsSettings
 from edge.types import Frame
 
@@ -27,3 +30,15 @@ def picture(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
 
 def number_of(frame: Frame) -> int:
     return round(float(frame.image_bgr.mean()) / 10)
+
+
+def play(source: Source) -> list[Frame]:
+    """Every frame until the end, as a reader gets it that is always in time."""
+    frames = []
+    with closing(source):
+        source.open()
+        try:
+            while True:
+                frames.append(source.read(threading.Event()))
+        except EndOfStream:
+            return frames

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from edge.cameras.capture import Capture
 from edge.cameras.file import FileSource
 from edge.cameras.intrinsics import Intrinsics
-from edge.cameras.live import LiveSource
 from edge.cameras.reconnect import LONGEST_WAIT_NS, LinkState, Reconnect
 from edge.cameras.sequence import SequenceSource
 from edge.cameras.source import EndOfStream
@@ -26,22 +25,11 @@ from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 from tests.waiting import until
 
+from .pictures import play
 from .toy_scene import write_scene
 
 VIDEO_WH = (320, 180)
 INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=VIDEO_WH[0], height=VIDEO_WH[1])
-
-
-def play(source: SequenceSource | FileSource | LiveSource) -> list[Frame]:
-    """Every frame until the end, as a reader gets it that is always in time."""
-    frames = []
-    with closing(source):
-        source.open()
-        try:
-            while True:
-                frames.append(source.read(threading.Event()))
-        except EndOfStream:
-            return frames
 
 
 def write_video(path: Path, frames: int, fps: float) -> Path:

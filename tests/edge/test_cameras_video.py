@@ -17,12 +17,10 @@ import pytest
 
 from edge.calibrate import pictures_of
 from edge.cameras.file import FileSource, VideoTimes
-from edge.cameras.source import EndOfStream
 from edge.config_camera import FileCamera
 from edge.errors import InputError
-from edge.types import Frame
 
-from .pictures import INTRINSICS, SIZE_WH, picture
+from .pictures import INTRINSICS, SIZE_WH, picture, play
 
 FPS = 25
 UPRIGHT, TURNED = ((1, 0, 0, 1), (-1, 0, 0, -1))  # of a track header's matrix: a, b, c, d
@@ -67,22 +65,11 @@ def source_of(path: Path) -> FileSource:
     return FileSource(FileCamera(type="file", path=path, intrinsics=INTRINSICS))
 
 
-def play(path: Path) -> list[Frame]:
-    frames = []
-    with closing(source_of(path)) as source:
-        source.open()
-        try:
-            while True:
-                frames.append(source.read(threading.Event()))
-        except EndOfStream:
-            return frames
-
-
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_video_of_a_rate_that_varies_is_played_by_its_own_times(tmp_path: Path, suffix: str) -> None:
     """As a camera films that exposes longer in the dark, or a radio link that lost some of it is recorded."""
     times_ms = [0, 40, 80, 120, 640, 680, 720, 840, 960]
-    frames = play(write_film(tmp_path / f"flight.{suffix}", times_ms))
+    frames = play(source_of(write_film(tmp_path / f"flight.{suffix}", times_ms)))
     began_ns = frames[0].meta.capture_ns - times_ms[frames[0].meta.sequence] * 1_000_000
     told_ms = {frame.meta.sequence: (frame.meta.capture_ns - began_ns) / 1e6 for frame in frames}
     assert len(told_ms) >= 3  # a busy machine passes some over
@@ -110,7 +97,7 @@ def test_where_a_video_has_no_times_or_those_of_another_clock_frames_follow_at_i
 
 def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_shown(tmp_path: Path) -> None:
     path = turned(write_film(tmp_path / "flight.mp4", [0, 40, 80], bright=np.s_[:60]))
-    seen = [frame.image_bgr[..., 0] for frame in play(path)]
+    seen = [frame.image_bgr[..., 0] for frame in play(source_of(path))]
     calibrated = [gray for _, gray in pictures_of(path)]
     assert len(calibrated) == 3
     for image in (*seen, *calibrated):

@@ -13,11 +13,12 @@ import pytest
 
 from edge.cameras.capture import Capture
 from edge.cameras.sequence import DISTORTION_KEY, SequenceSource
-from edge.cameras.source import EndOfStream
 from edge.config_camera import IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
 from edge.types import Frame
 from tests.waiting import until
+
+from .pictures import play
 
 SIZE_WH = (320, 180)
 LENS = (-0.25, 0.08, 0.002, -0.001, -0.01)
@@ -44,16 +45,8 @@ def centroid(image_bgr: np.ndarray, near_px: np.ndarray) -> np.ndarray:
     return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum() + (left, top)
 
 
-def play(folder: Path, intrinsics: IntrinsicsSettings | None = None) -> list[Frame]:
-    frames = []
-    settings = SequenceCamera(type="sequence", path=folder, fps=4, intrinsics=intrinsics)
-    with closing(SequenceSource(settings)) as source:
-        source.open()
-        try:
-            while True:
-                frames.append(source.read(threading.Event()))
-        except EndOfStream:
-            return frames
+def frames_of(folder: Path, intrinsics: IntrinsicsSettings | None = None) -> list[Frame]:
+    return play(SequenceSource(SequenceCamera(type="sequence", path=folder, fps=4, intrinsics=intrinsics)))
 
 
 @pytest.fixture
@@ -72,7 +65,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_every_frame_is_as_on_disk_and_says_what_its_lens_does(scene: Path) -> None:
-    frames = play(scene)
+    frames = frames_of(scene)
     assert [frame.K[0, 0] for frame in frames] == [300.0, 300.0, 320.0]
     for frame in frames:
         lens = np.array(frame.distortion or (0.0,) * 5)
@@ -83,7 +76,7 @@ def test_every_frame_is_as_on_disk_and_says_what_its_lens_does(scene: Path) -> N
 
 def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) -> None:
     plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
-    frames = play(scene, plain)
+    frames = frames_of(scene, plain)
     assert [frame.K[0, 0] for frame in frames] == [310.0] * 3
     # Its lens has no distortion, so the pixels stay what they are on disk.
     np.testing.assert_array_equal(frames[0].image_bgr[:, :, 0], dots(camera(300.0), LENS))
@@ -132,7 +125,7 @@ def test_a_number_left_out_of_what_was_recorded_is_a_frame_that_was_dropped(scen
         with pytest.raises(InputError, match="no picture 12 among its 15 frames"):
             source.exposed_now(12, 2)
     (scene / "sequence.toml").write_text("fps = 100.0\n")  # not recorded: any numbers, one after the other
-    assert [frame.meta.sequence for frame in play(scene)] == [0, 1, 2]
+    assert [frame.meta.sequence for frame in frames_of(scene)] == [0, 1, 2]
 
 
 def test_a_gap_counts_as_dropped_frames_and_not_as_a_frozen_camera(scene: Path) -> None:
