@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import socket
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.links.signing import timestamp_of
 from edge.status import ask
+from sim_replay.faults.rig import can_mount
 from tests.waiting import until
 
 from . import pictures
@@ -275,9 +275,9 @@ print(disk_finding(Path(sys.argv[1]) / "rec", 0, from_start=True).line())
 
 
 def test_a_disk_that_is_mounted_read_only_is_not_taken_for_one_that_others_own(tmp_path: Path) -> None:
-    mounting = ["unshare", "--map-root-user", "--mount", "sh", "-c", ON_A_READ_ONLY_DISK, "sh", str(tmp_path)]
-    if shutil.which("unshare") is None or subprocess.run([*mounting, "true"], capture_output=True).returncode:
+    if not can_mount(tmp_path):
         pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
+    mounting = ["unshare", "--map-root-user", "--mount", "sh", "-c", ON_A_READ_ONLY_DISK, "sh", str(tmp_path)]
     said = subprocess.run([*mounting, sys.executable, LOOK_AT_DISK], capture_output=True, text=True, check=True).stdout
     assert f"WRONG  disk         {tmp_path}/rec is on a disk that is mounted read-only" in said
     assert "$USER" not in said
