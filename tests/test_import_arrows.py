@@ -15,7 +15,7 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
 def test_the_arrows_hold() -> None:
     result = lint_imports(ROOT)
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "4 kept, 0 broken" in result.stdout
+    assert "5 kept, 0 broken" in result.stdout
 
 
 def test_an_arrow_against_the_grain_is_found(tmp_path: Path) -> None:
@@ -24,6 +24,8 @@ def test_an_arrow_against_the_grain_is_found(tmp_path: Path) -> None:
     for package in ("edge", "msgs", "trainer", "sim_replay"):
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").write_text("import edge\n" if package == "msgs" else "")
+    for module in ("data", "sources"):
+        (tmp_path / "trainer" / f"{module}.py").touch()
     result = subprocess.run(
         [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"],
         cwd=tmp_path,

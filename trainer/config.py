@@ -13,6 +13,7 @@ from msgs.settings import Section, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
 Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a picture that the network sees, pixels
+Z_RANGE_M = (50.0, 600.0)  # what depth a network can tell at all
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
 

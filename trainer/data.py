@@ -1,7 +1,8 @@
 """The data feed: rendering processes make sampler batches ahead of training and deliver them in index order.
 
 Sample i is a pure function of (seed, i, size), so the place in the stream is one integer and a resumed run sees
-exactly the samples that an unbroken one would have.
+exactly the samples that an unbroken one would have. Neither this nor `sources.py` imports torch: each rendering process
+would spend seconds on it and hold it in memory.
 """
 
 from __future__ import annotations
@@ -21,12 +22,10 @@ from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sim_replay.sample import SampleBatch
 from trainer.config import ConfigError, RenderingError
-from trainer.losses import Labels
 
 DENSE_STRIDE = 4
 STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -83,24 +82,6 @@ def _pooled(dense: NDArray[np.float32]) -> NDArray[np.float32]:
     rows, columns = dense.shape[:2]
     tiles_wh = (columns // DENSE_STRIDE, rows // DENSE_STRIDE)
     return np.asarray(cv2.resize(dense, tiles_wh, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[torch.Tensor, Labels]:
-    """The images [N, H, W, 3] uint8 and the labels on `device`."""
-    put = lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device)  # noqa: E731
-    labels = Labels(
-        K=put(batch.K),
-        present=put(batch.present.astype(np.float32)),
-        R_cam_target=put(batch.R_cam_target),
-        t_cam_target_m=put(batch.t_cam_target_m),
-        center_px=put(batch.center_px),
-        size_px=put(batch.size_px),
-        coverage=put(batch.coverage),
-        noc=put(batch.noc),
-        others=put(batch.others),
-        airframe_id=put(batch.airframe_id),
-    )
-    return put(batch.image_bgr), labels
 
 
 def _serve(

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.sample import AcquireView, SampleBatch
-from trainer.config import ConfigError
+from trainer.config import Z_RANGE_M, ConfigError
 from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
-from trainer.model import Z_RANGE_M
 
 TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
@@ -77,8 +76,10 @@ class DatasetSampler:
         seen = [k for k, box in enumerate(boxes) if box is not None]
         chosen = int(rng.choice(seen)) if seen else None
         box = None if chosen is None else boxes[chosen]
-        low, sides = self._cut(rng, box, frame_wh)
-        scale = self.size_px / sides
+        # Where pixels are not square, windows are: an aircraft must not look longer or higher than it is.
+        aspect = np.array([1.0, frame.K[0, 0] / frame.K[1, 1]])
+        low, sides = self._cut(rng, None if box is None else box * np.tile(aspect, 2), np.array(frame_wh) * aspect)
+        low, scale = low / aspect, self.size_px * aspect / sides
         to_window = np.column_stack([np.diag(scale), (0.5 - low) * scale - 0.5])
         image = _resampled(picture, to_window, self.size_px)
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
@@ -89,14 +90,12 @@ class DatasetSampler:
                 _mark(out.others[0], other, to_window)
         return out
 
-    def _cut(
-        self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: tuple[int, int]
-    ) -> tuple[Array, Array]:
-        """First pixel's place [2] and sides [2], frame pixels, of what the window shows."""
+    def _cut(self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array) -> tuple[Array, Array]:
+        """First pixel's place [2] and sides [2], in the unit of the box and of the frame, of what the window shows."""
         if box_xyxy_px is not None and rng.random() >= self.acquire_share:
             low, side = _track_square(rng, box_xyxy_px)
         elif self.acquire_view == "frame":
-            return np.zeros(2), np.array(frame_wh, dtype=np.float64)
+            return np.zeros(2), frame_wh
         else:
             low, side = _acquire_square(rng, box_xyxy_px, frame_wh, self.size_px)
         return low, np.full(2, side)
@@ -141,13 +140,13 @@ def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, 
 
 
 def _acquire_square(
-    rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: tuple[int, int], size_px: int
+    rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array, size_px: int
 ) -> tuple[Array, float]:
     """The same of a window of the reduced frame, anywhere around the box, or anywhere at all."""
     side = size_px * frame_wh[0] / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
     around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
     low = around - rng.uniform(0.0, 1.0, 2) * side
-    return np.where(np.array(frame_wh) > side, np.clip(low, 0.0, np.maximum(np.array(frame_wh) - side, 0.0)), low), side
+    return np.where(frame_wh > side, np.clip(low, 0.0, np.maximum(frame_wh - side, 0.0)), low), side
 
 
 def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int) -> NDArray[np.uint8]:

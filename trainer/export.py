@@ -14,7 +14,7 @@ import numpy as np
 
 from msgs.contract import CONTRACT_VERSION, ModelContract
 from trainer.checkpoint import load_model, weights_sha256
-from trainer.config import ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
+from trainer.config import Z_RANGE_M, ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
 from trainer.data import Sampler, TrainingBatch, render_once
 from trainer.evaluate import (
     Predictions,
@@ -28,7 +28,7 @@ from trainer.evaluate import (
     torch_predictor,
 )
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
-from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, Z_RANGE_M, PoseNet
+from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, PoseNet
 from trainer.sources import window_sampler
 
 CALIBRATION_SEED = 910_001

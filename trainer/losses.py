@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from trainer import equations as eq
 from trainer.config import LossConfig
+from trainer.data import TrainingBatch
 from trainer.model import Decoded
 from trainer.refinement import RANGE
 
@@ -37,6 +39,24 @@ class Labels(NamedTuple):
     noc: Tensor  # [N, 3, H/4, W/4]
     others: Tensor  # [N, H/4, W/4], bool: other aircraft, of which nothing is asked
     airframe_id: Tensor  # [N], -1 where not known
+
+
+def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[Tensor, Labels]:
+    """A batch's images [N, H, W, 3] uint8 and its labels on `device`."""
+    put = lambda array: torch.from_numpy(np.ascontiguousarray(array)).to(device)  # noqa: E731
+    labels = Labels(
+        K=put(batch.K),
+        present=put(batch.present.astype(np.float32)),
+        R_cam_target=put(batch.R_cam_target),
+        t_cam_target_m=put(batch.t_cam_target_m),
+        center_px=put(batch.center_px),
+        size_px=put(batch.size_px),
+        coverage=put(batch.coverage),
+        noc=put(batch.noc),
+        others=put(batch.others),
+        airframe_id=put(batch.airframe_id),
+    )
+    return put(batch.image_bgr), labels
 
 
 def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:

@@ -15,12 +15,11 @@ from torch.nn import functional as F
 
 from trainer import equations as eq
 from trainer.backbones import build_backbone
-from trainer.config import ModelConfig
+from trainer.config import Z_RANGE_M, ModelConfig
 from trainer.layers import conv_bn_relu, mlp
 from trainer.neck import AlignFuseNeck
 from trainer.refinement import SIGMAS, Evidence, Refined, RefinementHead, answers_of
 
-Z_RANGE_M = (50.0, 600.0)
 OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 REGION = 7
 IMAGENET_MEAN_BGR = (103.53, 116.28, 123.675)

@@ -15,8 +15,8 @@ from torch import Tensor
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, TRAINING_ONLY_PREFIX, WEIGHTS_NAME, load_file, save_weights, weights_sha256
 from trainer.config import ConfigError, DataConfig, TrainerConfig, made_folder, parse_config, refuse_no_folder
-from trainer.data import Feed, Sampler, TrainingBatch, to_tensors
-from trainer.losses import pose_residual, refinement_nll
+from trainer.data import Feed, Sampler, TrainingBatch
+from trainer.losses import pose_residual, refinement_nll, to_tensors
 from trainer.model import Perception, PoseNet
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance

@@ -18,12 +18,12 @@ from msgs.contract import samples_behind
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
-from trainer.data import Feed, Sampler, TrainingBatch, render_once, to_tensors
+from trainer.data import Feed, Sampler, TrainingBatch, render_once
 from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.fixed_norms import folded_norms
 from trainer.guidance import guided_peaks
-from trainer.losses import Labels, joint_loss
+from trainer.losses import Labels, joint_loss, to_tensors
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.rounding import rounded

@@ -21,10 +21,10 @@ from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from sim_replay.datasets import box_of_mask, open_dataset
 from sim_replay.sample import AcquireView
 from trainer.config import ConfigError, parse_config
-from trainer.data import TrainingBatch, to_tensors, training_batch
+from trainer.data import TrainingBatch, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 from trainer.export import stage_sampler
-from trainer.losses import dense_terms, heatmap_loss, heatmap_target
+from trainer.losses import dense_terms, heatmap_loss, heatmap_target, to_tensors
 from trainer.train import run_training
 
 K = np.array([[1500.0, 0, 320], [0, 1480, 180], [0, 0, 1]])
@@ -105,6 +105,31 @@ def test_behind_a_lens_labels_are_where_the_straightened_picture_shows_the_targe
             np.testing.assert_allclose(batch.center_px[k], (box[:2] + box[2:]) / 2, atol=0.05 * sides.max() + 0.5)
             np.testing.assert_allclose(batch.size_px[k], sides, rtol=0.2)  # the box that its sides' middles bound
     assert judged > 10
+
+
+@pytest.mark.parametrize("acquire_share", [0.0, 1.0])
+def test_of_a_camera_whose_pixels_are_not_square_the_windows_are(tmp_path: Path, acquire_share: float) -> None:
+    """A disc that faces the camera is one in every window, though the picture shows an ellipse half as high."""
+    squeezed_K = np.array([[1500.0, 0, 320], [0, 750.0, 180], [0, 0, 1]])
+    with SceneWriter(tmp_path / "train" / "000000", jpeg_quality=98) as writer:
+        for image_id, centre in enumerate([(320, 180), (200, 120), (450, 240)]):
+            image, mask = np.full((HEIGHT, WIDTH, 3), 128, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+            cv2.ellipse(image, centre, (20, 10), 0, 0, 360, DOT_BGR, -1)
+            cv2.ellipse(mask, centre, (20, 10), 0, 0, 360, 255, -1)
+            t = 260.0 * np.linalg.solve(squeezed_K, [*centre, 1.0])
+            target = BopTarget(1, np.eye(3), t, box_of_mask(mask > 0), None, int((mask > 0).sum()))
+            writer.add(BopFrame(image_id, squeezed_K, (target,)), image)
+    batch = DatasetSampler(tmp_path, "train", 5, 128, acquire_share).batch(0, 80)
+    np.testing.assert_allclose(batch.K[:, 0, 0], batch.K[:, 1, 1], rtol=1e-6)
+    judged = 0
+    for k in np.flatnonzero(batch.present):
+        box = box_of_mask(batch.image_bgr[k, ..., 2].astype(float) - batch.image_bgr[k, ..., 1] > 64)
+        assert box is not None
+        if box.min() > 0 and box.max() < 126:
+            judged += 1
+            assert box[2] - box[0] == pytest.approx(box[3] - box[1], rel=0.1, abs=2.0)
+            np.testing.assert_allclose(batch.size_px[k], box[2:] - box[:2], rtol=0.1, atol=2.0)
+    assert judged > 4
 
 
 def test_of_a_second_aircraft_in_the_window_nothing_is_asked(pairs: Path) -> None:

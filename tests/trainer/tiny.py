@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from trainer.config import TrainerConfig, parse_config
-from trainer.data import to_tensors, training_batch
-from trainer.losses import Labels
+from trainer.data import training_batch
+from trainer.losses import Labels, to_tensors
 from trainer.model import PoseNet
 
 TOML = """
