@@ -17,7 +17,7 @@ from edge.cameras.source import EndOfStream
 from edge.clock import monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
-from edge.estimator.estimator import Estimator
+from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.health import HealthSnapshot
 from edge.outlets import Outlets, start_outlets
@@ -176,7 +176,8 @@ class Pipeline:
         searches = self._by_hand.searches(capture_ns)
         held = [track.box_xyxy_px for track in expected]
         twice = [looked_at_twice(track.state, unhurried) for track in expected]
-        places = self.search.places(capture_ns, held, self._max_targets - len(held) if searches else 0)
+        room = searches and len(held) < self._max_targets
+        places = self.search.places(capture_ns, held, PLACES_MOST - len(held) if room else 0)
         found = self._look_into(held, twice, places, frame, pointed_at, clock)
         self._since_acquire += 1
         if not searches:

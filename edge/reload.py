@@ -60,7 +60,8 @@ def warm_estimator(model: Model, max_targets: int, camera: CameraInfo) -> Estima
     cost a frame."""
     estimator = Estimator(model, max_targets)
     width, height = camera.image_size_wh
-    estimator.warm_up(Frame(FrameMeta(0, 0, 0), np.zeros((height, width, 3), dtype=np.uint8), camera.K))
+    black = np.zeros((height, width, 3), dtype=np.uint8)
+    estimator.warm_up(Frame(FrameMeta(0, 0, 0), black, camera.K, camera.distortion))
     model.take_runs_ns()
     return estimator
 

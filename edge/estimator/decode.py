@@ -31,8 +31,9 @@ CUT_SIGMA_ROTATION_RAD = 0.8
 # What scores low is often not what it is taken for: 1-sigma of those that are not, as above. Times 1 - score it is the
 # variance of the doubt. Chosen on the validation split and the first flights of strangers.
 DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
-# A depth at the farthest that a graph tells is a least depth: 1-sigma of log Z then, and how near counts as at it.
-FARTHEST_SIGMA_LOG_Z, FARTHEST_TOLERANCE = 1.0, 1e-3
+# A depth at the farthest that a graph tells is a least depth, one at the nearest a greatest: 1-sigma of log Z then, and
+# how near counts as at it.
+LIMIT_SIGMA_LOG_Z, LIMIT_TOLERANCE = 1.0, 1e-3
 
 
 class Shown(NamedTuple):
@@ -96,8 +97,9 @@ def decode(
             continue
         longer_px = float(peaks.size_px[image, peak].max())
         sigma = _widened(sigma, score, longer_px, cut, contract.trained_box_px)
-        if t_m[2] >= contract.depth_limits_m[1] * (1.0 - FARTHEST_TOLERANCE):
-            sigma[2] = np.hypot(sigma[2], FARTHEST_SIGMA_LOG_Z)
+        nearest_m, farthest_m = contract.depth_limits_m
+        if not nearest_m * (1.0 + LIMIT_TOLERANCE) < t_m[2] < farthest_m * (1.0 - LIMIT_TOLERANCE):
+            sigma[2] = np.hypot(sigma[2], LIMIT_SIGMA_LOG_Z)
         covariance = pose_covariance(t_m, sigma, shown.K, contract.trained_range_m)
         found.append(Estimate(score, on_frame, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))

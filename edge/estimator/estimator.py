@@ -12,11 +12,14 @@ from edge.estimator.decode import Shown, decode, distinct, grown, nearest_expect
 from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
-from edge.estimator.window import cut, fit_frame, window_around
+from edge.estimator.window import cut, fit_frame, pixel_aspect, window_around
 from edge.types import Array, Estimate, Frame
 
 WORTH_A_LOOK = 0.1  # where the whole frame has a target less probably, no window is spent on it
 FAINTEST = 0.02  # the least that a window says of a place that the whole frame has named
+# So many places and targets are looked at in one frame, of however few there is room for: the likeliest place may show
+# none, frame after frame.
+PLACES_MOST = 4
 LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
 
 
@@ -52,8 +55,10 @@ class Estimator:
         if `thrice`, twice more in a window that lies as the first has it, plain and mirrored. What the windows do not
         show, or all together do not confirm, is no target.
         """
+        room = max(self._max_targets - len(known_boxes), 0)
         if not self.has_track_stage:
-            return self._whole(frame, known_boxes, self.model.contract.acquire_score_min, self.model.run, self.refused)
+            least = self.model.contract.acquire_score_min
+            return self._whole(frame, known_boxes, least, self.model.run, self.refused)[:room]
         places = self._whole(frame, known_boxes, self._worth_a_look, self.model.run, self.refused)
         faintest = min(FAINTEST, self.model.contract.track_score_min)
         firsts = _each_once(self._look(frame, [place.box_xyxy_px for place in places], faintest))
@@ -71,7 +76,7 @@ class Estimator:
         found = [look for look in looks if look is not None]
         likely = sum(place.score >= self.model.contract.acquire_score_min for place in places)
         self.refused["unconfirmed"] += max(likely - len(found), 0)
-        return distinct(sorted(found, key=lambda estimate: -estimate.score), known_boxes)
+        return distinct(sorted(found, key=lambda estimate: -estimate.score), known_boxes)[:room]
 
     def _together(self, seen: tuple[Estimate, Estimate], *finer: Estimate | None) -> Estimate | None:
         """What a place of the whole frame, the first look at it and two finer ones say; None: that there is nothing."""
@@ -109,10 +114,11 @@ class Estimator:
         contract = self.model.contract
         lens = lens_of(frame.K, frame.distortion)
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
-        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens)
+        aspect = pixel_aspect(frame.K)
+        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens, aspect)
         shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh)
         found = decode(run(image[None], shown.K[None]), 0, shown, contract, "acquire", score_min, refused)
-        return distinct(found, known_boxes)[: max(self._max_targets - len(known_boxes), 0)]
+        return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 0)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows.
@@ -160,7 +166,8 @@ class Estimator:
         size_wh = contract.track_size_wh
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         lens = lens_of(frame.K, frame.distortion)
-        windows = [window_around(box, contract.track_window_scale, size_wh, frame_wh, lens) for box in boxes_xyxy_px]
+        scale, aspect = contract.track_window_scale, pixel_aspect(frame.K)
+        windows = [window_around(box, scale, size_wh, frame_wh, lens, aspect) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
         shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
         pixels = {window: cut(frame.image_bgr, window, size_wh, lens) for window in dict.fromkeys(windows)}

@@ -1,7 +1,7 @@
 """Between the frame's pixels and the network's: whole frames fitted, windows cut, K following exactly. Pure.
 
-The network always sees a pinhole camera. A lens's distortion is taken out of the pixels that it is shown and of no
-others, and put back into the boxes it finds.
+The network always sees a pinhole camera of square pixels. A lens's distortion is taken out of the pixels that it is
+shown and of no others, and put back into the boxes it finds.
 """
 
 from __future__ import annotations
@@ -17,6 +17,10 @@ from edge.estimator.lens import Lens
 from edge.types import Array
 
 Image = NDArray[np.uint8]
+
+# Pixels whose sides differ by less are as good as square: training has such, and a calibration is no more exact.
+SQUARE_WITHIN = 0.03
+ASPECT_MOST = 4.0  # no camera's pixels are longer; without a bound a slip in fx or fy would ask for any memory
 
 _GRID_POINTS = 9  # each way, to find what part of the frame a window sees through a lens
 _MARGIN_PX = 4.0  # and how much that may miss between them, with what bilinear sampling takes beside a point
@@ -77,6 +81,17 @@ class Window:
         return PixelMap((sx, sy), (-self.left * sx, -self.top * sy), lens)
 
 
+def pixel_aspect(K: ArrayLike) -> float:
+    """How many times as high as wide a pixel is, by the angles that it spans; 1 where that makes no difference.
+
+    Of a picture of other pixels, as capture cards make of analogue and of squeezed ones, the network has seen none: it
+    would take the aircraft for a longer or a higher one, and be sure of it.
+    """
+    f = np.asarray(K, dtype=np.float64)
+    aspect = float(np.clip(f[0, 0] / f[1, 1], 1.0 / ASPECT_MOST, ASPECT_MOST))
+    return 1.0 if abs(np.log(aspect)) <= SQUARE_WITHIN else aspect
+
+
 def whole_frame(frame_wh: tuple[int, int], lens: Lens | None = None) -> Window:
     """The window that holds all that the frame shows."""
     if lens is None:
@@ -87,14 +102,22 @@ def whole_frame(frame_wh: tuple[int, int], lens: Lens | None = None) -> Window:
 
 
 def fit_frame(
-    image_bgr: Image, size_wh: tuple[int, int], fit: Literal["letterbox", "squash"], lens: Lens | None = None
+    image_bgr: Image,
+    size_wh: tuple[int, int],
+    fit: Literal["letterbox", "squash"],
+    lens: Lens | None = None,
+    aspect: float = 1.0,
 ) -> tuple[Image, PixelMap]:
-    """The whole frame [H, W, 3] on the network's [h, w, 3]: aspect kept and centred on black, or squashed."""
+    """The whole frame [H, W, 3] on the network's [h, w, 3]: on square pixels and centred on black, or squashed.
+
+    `aspect`: of the frame's pixels (pixel_aspect).
+    """
     seen = whole_frame((image_bgr.shape[1], image_bgr.shape[0]), lens)
     inner_wh = size_wh
     if fit == "letterbox":
-        scale = min(size_wh[0] / seen.width, size_wh[1] / seen.height)
-        inner_wh = (max(round(seen.width * scale), 1), max(round(seen.height * scale), 1))
+        height = seen.height * aspect
+        scale = min(size_wh[0] / seen.width, size_wh[1] / height)
+        inner_wh = (max(round(seen.width * scale), 1), max(round(height * scale), 1))
     inner_map = seen.pixel_map(inner_wh, lens)
     if lens is None:
         inner = _resize(image_bgr, inner_wh)
@@ -113,8 +136,11 @@ def window_around(
     size_wh: tuple[int, int],
     image_size_wh: tuple[int, int],
     lens: Lens | None = None,
+    aspect: float = 1.0,
 ) -> Window:
     """The window of the network's aspect around a box on the frame, its shorter side window_scale times the longer.
+
+    Sides are compared as the pixels' `aspect` (pixel_aspect) has them, so that the network sees square ones.
 
     It is moved into the frame where it fits there: real pixels say more than a border. It never outgrows the frame's
     longer side: the box of a target predicted at arm's length has no bounds, and the memory for its window has.
@@ -122,9 +148,12 @@ def window_around(
     seen = whole_frame(image_size_wh, lens)
     box = np.asarray(box_xyxy_px, dtype=np.float64)
     x0, y0, x1, y1 = box if lens is None else _straight(lens, _clipped(box, image_size_wh))
-    side = min(window_scale * max(x1 - x0, y1 - y0, 1.0), float(max(seen.width, seen.height)))
+    side = min(window_scale * max(x1 - x0, (y1 - y0) * aspect, 1.0), float(max(seen.width, seen.height * aspect)))
     shorter = min(size_wh)
-    width, height = (_halvable(max(round(side * size / shorter), 2), size) for size in size_wh)
+    width, height = (
+        _halvable(max(round(side * size / shorter / high), 2), size)
+        for size, high in zip(size_wh, (1.0, aspect), strict=True)
+    )
     # Outermost pixel centres lie half a pixel inside the box's edges.
     left = round(0.5 * (x0 + x1) - 0.5 * (width - 1))
     top = round(0.5 * (y0 + y1) - 0.5 * (height - 1))
@@ -161,18 +190,14 @@ def _straightened(image_bgr: Image, lens: Lens, pixel_map: PixelMap, size_wh: tu
     pinhole = pixel_map.to_pinhole(grid).reshape(-1, 2)
     folded = np.linalg.norm(lens.rays(pinhole)[:, :2], axis=1) > lens.radius_max
     points = lens.to_frame(pinhole[~folded] if not folded.all() else pinhole[:1])
-    shrink = min(*pixel_map.scale_xy, 1.0)
-    margin_px = _MARGIN_PX / shrink
-    step = 2 ** int(-np.log2(shrink))
-    left, right = _span(points[:, 0], margin_px, image_bgr.shape[1], step)
-    top, bottom = _span(points[:, 1], margin_px, image_bgr.shape[0], step)
+    shrink_x, shrink_y = (min(scale, 1.0) for scale in pixel_map.scale_xy)
+    left, right = _span(points[:, 0], shrink_x, image_bgr.shape[1])
+    top, bottom = _span(points[:, 1], shrink_y, image_bgr.shape[0])
     part = Window(left, top, right - left, bottom - top)
     pixels: Image = image_bgr[top:bottom, left:right]
-    part_wh = (max(round(part.width * shrink), 1), max(round(part.height * shrink), 1))
-    if shrink < 1.0:
+    part_wh = (max(round(part.width * shrink_x), 1), max(round(part.height * shrink_y), 1))
+    if part_wh != (part.width, part.height):
         pixels = _resize(pixels, part_wh)
-    else:
-        part_wh = (part.width, part.height)
     K_part, K_network = part.pixel_map(part_wh).intrinsics(lens.K), pixel_map.intrinsics(lens.K)
     maps = cv2.initUndistortRectifyMap(K_part, np.array(lens.distortion), None, K_network, size_wh, cv2.CV_32FC1)
     if folded.any():
@@ -188,11 +213,12 @@ def _folded(lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int]) -> NDArra
     return np.asarray(np.hypot(rays[..., 0], rays[..., 1]) > lens.radius_max)
 
 
-def _span(coordinates: Array, margin_px: float, limit: int, step: int) -> tuple[int, int]:
+def _span(coordinates: Array, shrink: float, limit: int) -> tuple[int, int]:
     """First and one past the last pixel, inside 0 .. limit and never empty, that hold the coordinates.
 
-    So many that `step` divides them, where the limit has room for them.
+    So many that they can be halved on the way to `shrink` of them, where the limit has room for that.
     """
+    margin_px, step = _MARGIN_PX / shrink, 2 ** int(-np.log2(shrink))
     first = int(np.clip(np.floor(coordinates.min() - margin_px), 0, limit - 1))
     last = int(np.clip(np.ceil(coordinates.max() + margin_px) + 1, first + 1, limit))
     length = -(-(last - first) // step) * step
@@ -227,6 +253,7 @@ def _resize(image_bgr: Image, size_wh: tuple[int, int]) -> Image:
     while pixels.shape[1] >= 2 * size_wh[0] and pixels.shape[0] >= 2 * size_wh[1]:
         half_wh = (pixels.shape[1] // 2, pixels.shape[0] // 2)
         pixels = np.asarray(cv2.resize(pixels, half_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    shrinks = size_wh[0] < pixels.shape[1]
-    resized = cv2.resize(pixels, size_wh, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    return np.asarray(resized, dtype=np.uint8)
+    # First the sides that shrink: where one shrinks and the other grows, OpenCV has no averages.
+    less_wh = (min(size_wh[0], pixels.shape[1]), min(size_wh[1], pixels.shape[0]))
+    averaged = cv2.resize(pixels, less_wh, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(averaged, size_wh, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)

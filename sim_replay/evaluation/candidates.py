@@ -11,7 +11,7 @@ import numpy as np
 from edge.estimator.decode import shown_size_px
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
-from edge.estimator.window import PixelMap, fit_frame, window_around
+from edge.estimator.window import PixelMap, fit_frame, pixel_aspect, window_around
 from edge.tracking.boxes import iou
 from edge.types import Array, Estimate, Frame, FrameMeta
 from msgs.contract import ScoreCalibration
@@ -58,15 +58,17 @@ def _bare(model: Model) -> Model:
 def _in_frame(estimator: Estimator, frame: Frame, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:
     contract = estimator.model.contract
     frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
-    whole_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit)[1]
+    aspect = pixel_aspect(frame.K)
+    whole_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, aspect=aspect)[1]
     for found in estimator.anywhere(frame, (), Counter()):
         yield from _labelled(found, whole_map, truth_boxes)
         if contract.track_size_wh is None:
             continue
-        window = window_around(found.box_xyxy_px, contract.track_window_scale, contract.track_size_wh, frame_wh)
+        scale, size_wh = contract.track_window_scale, contract.track_size_wh
+        window = window_around(found.box_xyxy_px, scale, size_wh, frame_wh, aspect=aspect)
         for seen in estimator.track(frame, [found.box_xyxy_px]):
             if seen is not None:
-                yield from _labelled(seen, window.pixel_map(contract.track_size_wh), truth_boxes)
+                yield from _labelled(seen, window.pixel_map(size_wh), truth_boxes)
 
 
 def _labelled(found: Estimate, pixel_map: PixelMap, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:

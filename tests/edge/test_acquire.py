@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge.estimator.estimator import Estimator
-from edge.estimator.model import Peaks
+from edge.estimator.model import Peaks, load_model
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.types import Frame, FrameMeta, TrackState
 from msgs.contract import ModelContract
 
 from .toy_model import CONTRACT
-from .toy_scene import SIZE_WH, K
+from .toy_scene import SIZE_WH, K, draw
 
 RANGE_M = 250.0
 TARGET_PX = np.array([700.0, 500.0])
 OTHER_PX = np.array([760.0, 500.0])
+CLOUD_PX = np.array([1400.0, 300.0])
 SIZE_PX = np.array([50.0, 20.0])
 # Brighter to the right, so that an image tells whether it is mirrored.
 SLOPE = np.broadcast_to(np.linspace(0, 255, SIZE_WH[0])[None, :, None], (SIZE_WH[1], SIZE_WH[0], 3)).astype(np.uint8)
@@ -155,6 +157,34 @@ def test_what_the_finer_windows_do_not_show_is_no_target_however_sure_the_first_
     estimator, _, frame = scripted([answer(0.99)], [answer(0.99), answer(0.0)], [answer(0.0)])
     assert estimator.acquire(frame) == []
     assert estimator.refused["unconfirmed"] == 1
+
+
+@pytest.mark.parametrize("max_targets", [1, 2])
+def test_where_there_is_room_for_few_a_false_place_hides_no_target(max_targets: int) -> None:
+    """A speck of cloud that the whole frame takes for likelier than the aircraft, frame after frame."""
+
+    class TwoPlaces(Scripted):
+        def run(self, images: np.ndarray, K_images: np.ndarray) -> Peaks:
+            self.script["whole"] = [answer(0.8, CLOUD_PX), answer(0.6)]
+            peaks = super().run(images, K_images)
+            if self.asked[-1] != "whole":
+                return peaks
+            both = zip(vars(peaks).values(), vars(super().run(images, K_images)).values(), strict=True)
+            return Peaks(*(np.concatenate(of_both, axis=1) for of_both in both))
+
+    contract = ModelContract(**(CONTRACT | {"acquire_score_min": 0.7, "track_score_min": 0.3}))
+    # Nothing where the cloud is, in its window and in the next.
+    model = TwoPlaces({"whole": [], "plain": [answer(0.0), answer(0.9)], "mirrored": [answer(0.9)]}, contract)
+    estimator = Estimator(model, max_targets)  # type: ignore[arg-type]
+    (found,) = estimator.acquire(Frame(FrameMeta(0, 0, 0), SLOPE, K))
+    np.testing.assert_allclose(found.box_xyxy_px[0], TARGET_PX[0] - SIZE_PX[0] / 2, atol=0.01)
+
+
+def test_no_more_targets_are_found_than_there_is_room_for(toy_model: Path) -> None:
+    frame = Frame(FrameMeta(0, 0, 0), draw((500.5, 500.5)), K)
+    estimator = Estimator(load_model(toy_model, 1), 1)
+    assert len(estimator.acquire(frame)) == 1
+    assert estimator.acquire(frame, [np.array([1500.0, 200.0, 1620.0, 260.0])]) == [], "the one is held"
 
 
 def test_a_first_look_that_shows_nothing_is_the_last() -> None:

@@ -4,6 +4,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -13,7 +14,7 @@ from edge.errors import InputError
 from edge.estimator.decode import Shown, decode, nearest_expected, overlap, pose_covariance
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Peaks, load_model
-from edge.estimator.window import PixelMap, cut, fit_frame, window_around
+from edge.estimator.window import PixelMap, cut, fit_frame, pixel_aspect, window_around
 from edge.types import Estimate, Frame, FrameMeta
 from msgs.contract import ModelContract
 
@@ -77,6 +78,45 @@ def test_a_fitted_frame_shows_a_target_where_its_map_says(fit: str, size_wh: tup
     np.testing.assert_allclose(seen, pixel_map.to_network(center), atol=0.02)
     if fit == "letterbox":
         assert pixel_map.scale_xy[0] == pytest.approx(pixel_map.scale_xy[1], rel=0.01)
+
+
+@pytest.mark.parametrize(("wide", "high"), [(1, 2), (2, 1), (1, 1.42), (1.33, 1)])
+@pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 0.0, 0.0)])
+def test_the_network_is_shown_square_pixels_whatever_the_camera_s_are(
+    toy_model: Path, wide: float, high: float, distortion: tuple[float, ...]
+) -> None:
+    """As of a picture that a capture card has squeezed; the toy's truth holds for it, as its depth knows both f."""
+    model = load_model(toy_model, 1)
+    shown: list[np.ndarray] = []
+
+    def run(images: np.ndarray, K_images: np.ndarray) -> Peaks:
+        shown.extend(K_images)
+        return model.infer(images, K_images)
+
+    model.run = run  # type: ignore[method-assign]
+    squeezed_wh = round(SIZE_WH[0] / wide), round(SIZE_WH[1] / high)
+    by = np.array(squeezed_wh) / SIZE_WH
+    squeezed_K = PixelMap(tuple(by), (0, 0)).intrinsics(K)  # type: ignore[arg-type]
+    center, half = np.array([960.5, 540.5]), np.array(TARGET_WH) / 2  # in the middle, where the lens bends nothing
+    image = np.asarray(cv2.resize(draw((960.5, 540.5)), squeezed_wh, interpolation=cv2.INTER_AREA), np.uint8)
+    box = (np.concatenate([center - half, center + half]) + 0.5) * np.tile(by, 2) - 0.5
+    frame = Frame(FrameMeta(0, 0, 0), image, squeezed_K, distortion)
+
+    estimator = Estimator(model)
+    (found,) = estimator.acquire(frame)
+    (tracked,) = estimator.track(frame, [box])
+    assert tracked is not None
+    for K_shown in shown:
+        assert K_shown[0, 0] == pytest.approx(K_shown[1, 1], rel=0.03)
+    for estimate in (found, tracked):
+        np.testing.assert_allclose(estimate.t_cam_target_m, true_t_cam_target_m((960.5, 540.5)), rtol=0.03, atol=0.3)
+        np.testing.assert_allclose(estimate.box_xyxy_px, box, atol=1.5)
+
+
+def test_a_slip_in_a_focal_length_asks_for_no_more_memory_than_there_is() -> None:
+    mistyped = K * [[1, 1, 1], [1, 1000, 1], [1, 1, 1]]
+    window = window_around([900, 500, 1000, 560], 2.0, TRACK_WH, SIZE_WH, None, pixel_aspect(mistyped))
+    assert window.width * window.height <= 8 * SIZE_WH[0] * SIZE_WH[1]
 
 
 @pytest.mark.parametrize("center", [(900.5, 500.5), (70.5, 40.5), (1850.5, 1040.5)])
@@ -146,15 +186,15 @@ def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
     assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
 
 
-def test_a_depth_at_the_end_of_what_a_graph_can_tell_is_a_least_depth() -> None:
-    contract = ModelContract(**(CONTRACT | {"depth_limits_m": (50.0, 600.0)}))
+def test_a_depth_at_either_end_of_what_a_graph_can_tell_is_a_bound() -> None:
+    contract = ModelContract(**(CONTRACT | {"depth_limits_m": (50.0, 600.0), "trained_range_m": (50.0, 600.0)}))
     sigma = {}
-    for z_m in (590.0, 599.99):
+    for z_m in (50.01, 51.0, 590.0, 599.99):
         certain = peaks_of(score=1.0, z_m=z_m)
         (e,) = decode(certain, 0, WHOLE, contract, "track", contract.track_score_min, Counter())
         sigma[z_m] = e.covariance[2, 2] ** 0.5 / z_m
-    assert sigma[590.0] == pytest.approx(0.05, rel=1e-3)
-    assert sigma[599.99] > 0.9
+    assert (sigma[51.0], sigma[590.0]) == pytest.approx((0.05, 0.05), rel=1e-3)
+    assert min(sigma[50.01], sigma[599.99]) > 0.9
 
 
 def test_what_may_not_be_what_it_is_taken_for_is_less_sure_in_all_it_tells() -> None:

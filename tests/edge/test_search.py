@@ -329,6 +329,20 @@ def test_a_false_place_beside_a_target_that_is_held_takes_no_sight_of_it_away(ga
         assert [track.measured_ns for track in report.tracks] == [report.meta.capture_ns] * 2
 
 
+def test_where_there_is_room_for_one_more_a_likelier_false_place_hides_no_target(gated: Gated) -> None:
+    with looping(gated, max_targets=2) as (loop, ear, _):
+        (real,) = (e for e in gated.track(frame(0, OTHER), [box_around(OTHER)]) if e)
+        cloud = replace(real, score=0.99, box_xyxy_px=box_around((1100.5, 200.5)))
+        gated.sees = [cloud, replace(real, score=0.9)]
+        gated.gate.set()
+        for index in range(6):
+            loop._process(frame(index, HELD))
+        until(lambda: loop.search.counters()["searches"] == 1)
+        for index in range(6, 10):
+            loop._process(frame(index, HELD, OTHER))
+    assert [track.state for track in ear.reports[-1].tracks] == [TrackState.CONFIRMED] * 2
+
+
 def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated) -> None:
     loop, _, _ = pipeline
     gated.gate.set()

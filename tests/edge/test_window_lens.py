@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from edge.estimator.decode import Shown, grown
 from edge.estimator.estimator import Estimator
-from edge.estimator.lens import Lens, lens_of
+from edge.estimator.lens import Lens, _extent, lens_of
 from edge.estimator.model import load_model
 from edge.estimator.window import cut, fit_frame, whole_frame, window_around
-from edge.types import Frame, FrameMeta
+from edge.reload import warm_estimator
+from edge.types import CameraInfo, Frame, FrameMeta
 
 from .toy_scene import SIZE_WH, TARGET_WH, K, true_t_cam_target_m
 
@@ -245,6 +246,17 @@ def test_only_a_window_cuts_a_target_in_the_middle_of_the_frame(distortion: tupl
         assert (larger is None) == (moved_px == 0.0)
         if larger is not None:
             assert larger[2] - larger[0] == pytest.approx(320.0)
+
+
+def test_the_first_frame_through_a_lens_finds_it_worked_out(toy_model: Path) -> None:
+    """What of the pinhole's picture the frame holds takes milliseconds, and on a small board a frame."""
+    camera_K = np.array([[1990.0, 0.0, 959.5], [0.0, 1990.0, 539.5], [0.0, 0.0, 1.0]])  # of no other test
+    camera = CameraInfo("toy", SIZE_WH, camera_K, 30.0, BARREL)
+    estimator = warm_estimator(load_model(toy_model, 1), 4, camera)
+    worked_out = _extent.cache_info().misses
+    image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+    estimator.acquire(Frame(FrameMeta(1, 1, 1), image, camera_K, BARREL))
+    assert _extent.cache_info().misses == worked_out
 
 
 def test_a_corner_where_the_lens_cannot_be_inverted_has_a_window_all_the_same() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -44,6 +45,15 @@ def scene_at(seed: int, range_m: float, longer_px: float, at: tuple[float, float
     ray = np.linalg.solve(camera.K, [*(np.array(at) * FRAME_WH), 1.0])
     away_m = camera.R_ned_cam @ ray / np.linalg.norm(ray) * range_m
     return replace(scene, camera=camera, targets=(replace(target, t_ned_body_m=camera.t_ned_cam_m + away_m),))
+
+
+def squeezed(frame: Frame, wide: float, high: float) -> Frame:
+    """The same view on pixels so many times as wide and as high, as a capture card makes them."""
+    height, width = frame.image_bgr.shape[:2]
+    size_wh = round(width / wide), round(height / high)
+    by = np.array(size_wh) / (width, height)
+    K = np.array([[by[0], 0.0, 0.5 * by[0] - 0.5], [0.0, by[1], 0.5 * by[1] - 0.5], [0.0, 0.0, 1.0]]) @ frame.K
+    return replace(frame, image_bgr=cv2.resize(frame.image_bgr, size_wh, interpolation=cv2.INTER_AREA), K=K)
 
 
 def frame_of(scene: Scene) -> Frame:
@@ -95,6 +105,19 @@ def test_a_target_cut_by_the_edge_is_told_with_the_doubt_it_deserves_or_not_at_a
     assert position.max() < NEES_MAX
     # Half of them take nose for tail: as far as a turn can be, and told so.
     assert np.mean(rotation < NEES_MAX) > 0.9
+
+
+def test_a_picture_of_other_than_square_pixels_tells_the_same_pose(estimator: Estimator) -> None:
+    """Taken as it is, a picture squeezed to half its width or height turns the aircraft by 20 degrees."""
+    scenes = [scene_at(seed, 220.0, 110.0) for seed in range(100, 108)]
+    frames = [frame_of(scene) for scene in scenes]
+    for wide, high in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0)):
+        errors_deg = []
+        for scene, frame in zip(scenes, frames, strict=True):
+            (found, *_) = [*estimator.acquire(squeezed(frame, wide, high)), None]
+            R, _ = scene.targets[0].pose_in(scene.camera)
+            errors_deg.append(180.0 if found is None else float(metrics.rotation_error_deg(found.R_cam_target, R)))
+        assert np.median(errors_deg) < 8.0, f"pixels {wide:g} wide, {high:g} high: {np.round(errors_deg, 1)}"
 
 
 @pytest.mark.parametrize(("range_m", "least", "mistaken"), [(30.0, 0, 0.2), (800.0, 6, 0.2), (1200.0, 6, 0.3)])
