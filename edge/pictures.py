@@ -18,6 +18,8 @@ from edge.types import Frame
 
 LIVE_BYTES_MAX = 150_000
 LIVE_QUALITIES = (80, 60, 40, 20)  # the first that fits
+# Then these, in codes of the picture's own, which take longer: in JPEG's usual ones 4K is 130 kB at its very worst.
+LIVE_TIGHT_QUALITIES = (20, 10, 5)
 RECORDED_QUALITY = 90
 WAITING_MAX = 4  # frames
 STOP_TIMEOUT_S = 5.0
@@ -121,10 +123,12 @@ class Pictures:
         self._link.publish_picture(Picture(frame.meta.capture_ns, data, live, recorded))
 
 
-def jpeg(image_bgr: NDArray[np.uint8], quality: int) -> bytes | None:
-    """[H, W, 3] as JPEG; None if it cannot be encoded (JPEG ends at 65,535 pixels a side)."""
+def jpeg(image_bgr: NDArray[np.uint8], quality: int, tight: bool = False) -> bytes | None:
+    """[H, W, 3] as JPEG, if `tight` in codes of its own; None if it cannot be encoded (JPEG ends at 65,535 pixels a
+    side)."""
     try:
-        done, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        settings = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, int(tight)]
+        done, data = cv2.imencode(".jpg", image_bgr, settings)
     except cv2.error:
         return None
     return data.tobytes() if done else None
@@ -132,8 +136,8 @@ def jpeg(image_bgr: NDArray[np.uint8], quality: int) -> bytes | None:
 
 def small_jpeg(image_bgr: NDArray[np.uint8]) -> bytes | None:
     """As good as LIVE_BYTES_MAX lets it be, all its pixels kept so that what is drawn on it fits; None: none does."""
-    for quality in LIVE_QUALITIES:
-        data = jpeg(image_bgr, quality)
+    for quality, tight in (*((q, False) for q in LIVE_QUALITIES), *((q, True) for q in LIVE_TIGHT_QUALITIES)):
+        data = jpeg(image_bgr, quality, tight)
         if data is not None and len(data) <= LIVE_BYTES_MAX:
             return data
     return None

@@ -1,7 +1,8 @@
 """What a person asked of the tracker. Pure: every time comes in as an argument.
 
 A box to look into is looked into for LOOK_NS, frame by frame, until a target is found there; it is then the chosen one
-for as long as its track lives. Stopping drops all targets and lets the search rest for REST_NS or until the next box.
+for as long as its track lives, and if that ends before it was sure the look goes on. Stopping drops all targets and
+lets the search rest for REST_NS or until the next box.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from edge.requests import Request, SelectTarget, TrackBox
 from edge.tracking.boxes import SAME_BOX_IOU, iou
-from edge.types import Array, Estimate, Track
+from edge.types import Array, Estimate, Track, TrackState
 
 LOOK_NS = 1_000_000_000
 REST_NS = 10_000_000_000
@@ -45,18 +46,18 @@ class ByHand:
 
     def box_xyxy_px(self, now_ns: int, image_size_wh: tuple[int, int], expected: Iterable[Track]) -> Array | None:
         """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
-        if self._box_share is not None and now_ns > self._look_until_ns:
+        if self._box_share is None or self._chosen is not None:
+            return None
+        if now_ns > self._look_until_ns:
             self._box_share = None
             self._news.append("no target found where pointed")
-        if self._box_share is None:
             return None
-        box = self._box_share * np.tile(image_size_wh, 2) - 0.5
-        for track in expected:
-            if _holds(box, _center(track.box_xyxy_px)) or _holds(track.box_xyxy_px, _center(box)):
-                self._box_share = None
-                self._choose(track)
-                return None
-        return box
+        box: Array = self._box_share * np.tile(image_size_wh, 2) - 0.5
+        there = [t for t in expected if _holds(box, _center(t.box_xyxy_px)) or _holds(t.box_xyxy_px, _center(box))]
+        if not there:
+            return box
+        self._choose(max(there, key=lambda track: _fit(track.box_xyxy_px, box)))
+        return None
 
     def searches(self, now_ns: int) -> bool:
         """Whether to look for targets that nobody pointed at."""
@@ -75,8 +76,11 @@ class ByHand:
         if self._found is not None:
             self._choose_where(tracks, self._found)
             self._found = None
-        if self._chosen not in [(track.track_id, track.born_ns) for track in tracks]:
+        chosen = next((track for track in tracks if (track.track_id, track.born_ns) == self._chosen), None)
+        if chosen is None:
             self._chosen = None
+        elif chosen.state is not TrackState.TENTATIVE:
+            self._box_share = None
 
     def news(self) -> list[str]:
         """What the person should hear of it since the last call."""
@@ -95,7 +99,6 @@ class ByHand:
         seen = [track for track in tracks if track.measured_ns == track.time_ns]
         best = max(seen, key=lambda track: iou(track.box_xyxy_px, found_xyxy_px), default=None)
         if best is not None and iou(best.box_xyxy_px, found_xyxy_px) > SAME_BOX_IOU:
-            self._box_share = None
             self._choose(best)
 
     def _choose(self, track: Track) -> None:
@@ -105,6 +108,14 @@ class ByHand:
 
 def _holds(box_xyxy_px: Array, point_px: Array) -> bool:
     return bool(np.all(point_px >= box_xyxy_px[:2]) and np.all(point_px <= box_xyxy_px[2:]))
+
+
+def _fit(box_xyxy_px: Array, pointed_xyxy_px: Array) -> tuple[float, float]:
+    """Which of several targets was meant, the greatest: the one that the box is drawn round, else the one whose middle
+    is the nearest; a near target's box may hold a far one's."""
+    drawn = iou(box_xyxy_px, pointed_xyxy_px)
+    away_px = float(np.linalg.norm(_center(box_xyxy_px) - _center(pointed_xyxy_px)))
+    return drawn if drawn > SAME_BOX_IOU else 0.0, -away_px
 
 
 def _center(box_xyxy_px: Array) -> Array:

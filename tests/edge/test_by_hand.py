@@ -12,15 +12,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from edge import clock
+from edge.estimator.model import load_model
 from edge.requests import POINTED_AGE_MAX_NS, RequestQueue, SelectTarget, StopTracking, TrackBox
 from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
-from edge.types import Estimate, Mount
+from edge.types import Estimate, Mount, TrackState
 from msgs.mavlink import dialect
 
 from . import toy_scene
+from .looping import OTHER, Gated, box_around, looping
+from .looping import frame as loop_frame
 from .mavlink_peer import Peer
 from .reports import SIZE_WH
 from .reports import make_track as track
@@ -104,6 +108,57 @@ def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends()
     by_hand.settle([elsewhere])
     by_hand.settle([elsewhere, there])
     assert by_hand.chosen_id is None, "its number may be another target's by now"
+
+
+NEAR_PX, FAR_PX = np.array([400.0, 300.0, 700.0, 500.0]), np.array([620.0, 340.0, 650.0, 352.0])
+
+
+@pytest.mark.parametrize(
+    ("pointed_px", "meant"),
+    [
+        ((615, 335, 655, 357), 1),  # drawn round the far one
+        ((596, 307, 674, 385), 1),  # what a point in its middle becomes
+        ((390, 290, 705, 510), 0),  # drawn round the near one, the far one in it too
+        ((430, 380, 508, 458), 0),
+    ],
+)
+def test_of_two_targets_there_the_one_pointed_at_is_chosen_though_the_other_s_box_holds_it(
+    pointed_px: tuple[int, ...], meant: int
+) -> None:
+    both = [track(0, track_id=0, box_xyxy_px=NEAR_PX), track(0, track_id=1, box_xyxy_px=FAR_PX)]
+    for expected in (both, both[::-1]):
+        by_hand = ByHand()
+        left, top, right, bottom = ((np.array(pointed_px) + 0.5) / np.tile(SIZE_WH, 2)).tolist()
+        by_hand.take(TrackBox((left, top, right, bottom)), 0)
+        assert by_hand.box_xyxy_px(1, SIZE_WH, expected) is None
+        by_hand.settle(expected)
+        assert by_hand.chosen_id == meant
+
+
+def test_a_target_that_shows_itself_once_and_again_within_the_second_is_the_chosen_one(toy_model: Path) -> None:
+    """Gone before it was sure: the look goes on, as nobody else would say that what was chosen is no more."""
+    empty = replace(loop_frame(0, OTHER), image_bgr=np.zeros_like(loop_frame(0, OTHER).image_bgr))
+    with looping(Gated(load_model(toy_model, 1))) as (loop, ear, requests):
+        left, top, right, bottom = ((box_around(OTHER) + 0.5) / np.tile(SIZE_WH, 2)).tolist()
+        requests.put(TrackBox((left, top, right, bottom)))
+        for index in range(12):
+            seen = loop_frame(index, OTHER)
+            loop._process(seen if index == 0 or index > 4 else replace(seen, image_bgr=empty.image_bgr))
+    assert [len(report.tracks) for report in ear.reports[3:5]] == [0, 0], "it was gone"
+    (held,) = ear.reports[-1].tracks
+    assert (held.state, ear.reports[-1].chosen_id) == (TrackState.CONFIRMED, held.track_id)
+
+
+def test_a_target_found_once_and_gone_for_good_is_told_as_not_found() -> None:
+    by_hand, unsure = ByHand(), track(0, state=TrackState.TENTATIVE)
+    by_hand.take(TrackBox((0.5, 0.4, 0.6, 0.5)), 0)
+    assert by_hand.box_xyxy_px(1, SIZE_WH, [unsure]) is None
+    by_hand.settle([unsure])
+    assert by_hand.box_xyxy_px(LOOK_NS + 1, SIZE_WH, [unsure]) is None
+    assert (by_hand.chosen_id, by_hand.news()) == (0, ["target 0 chosen"])
+    by_hand.settle([])
+    assert by_hand.box_xyxy_px(LOOK_NS + 2, SIZE_WH, []) is None
+    assert (by_hand.chosen_id, by_hand.news()) == (None, ["no target found where pointed"])
 
 
 def test_a_target_selected_by_its_name_is_chosen_unless_it_is_gone() -> None:

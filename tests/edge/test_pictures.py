@@ -32,11 +32,11 @@ from .test_zenoh_link import MOUNT, free_endpoint
 
 
 def frame(sequence: int, capture_ns: int, seed: int | None = None) -> Frame:
-    """A smooth picture whose brightness tells its number; with a seed, noise that no JPEG makes small."""
+    """A smooth picture whose brightness tells its number; with a seed, 4K of noise that no JPEG makes small."""
     if seed is None:
         image = np.full((270, 480, 3), 20 * sequence % 240, dtype=np.uint8)
     else:
-        image = np.random.default_rng(seed).integers(0, 256, (1080, 1920, 3), dtype=np.uint8)
+        image = np.random.default_rng(seed).integers(0, 256, (2160, 3840, 3), dtype=np.uint8)
     return Frame(FrameMeta(sequence, capture_ns, capture_ns), image, K)
 
 
@@ -107,6 +107,26 @@ def test_a_picture_that_is_too_large_for_the_wire_is_sent_worse_or_counted() -> 
         until(lambda: pictures.counters().get("not_encoded"), lambda: pictures.show(frame(1, now(), seed=1)))
         until(lambda: bool(sizes), lambda: pictures.show(frame(1, now())), what="one that fits")
     assert max(sizes) < LIVE_BYTES_MAX + 200
+
+
+def test_a_4k_picture_full_of_detail_is_seen_with_all_its_pixels() -> None:
+    """In JPEG's usual codes alone it is too large at any quality: who looks would wait in vain."""
+    grain = np.random.default_rng(0).normal(120.0, 15.0, (540, 960)).clip(0, 255).astype(np.uint8)
+    image = np.asarray(cv2.cvtColor(cv2.resize(grain, (3840, 2160)), cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    endpoint = free_endpoint()
+    received: list[bytes] = []
+    with (
+        shown(ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT), 10.0) as pictures,
+        connect(endpoint) as session,
+    ):
+        take = zenoh.handlers.Callback(lambda s: received.append(s.payload.to_bytes()), indirect=False)
+        session.declare_subscriber("0/uav1/image/**", take)
+        until(lambda: bool(received), lambda: pictures.show(Frame(FrameMeta(1, now(), now()), image, K)))
+        assert "not_encoded" not in pictures.counters()
+    assert len(received[0]) < LIVE_BYTES_MAX + 200
+    _, seen = decoded(received[0])
+    assert seen.shape == image.shape
+    assert np.abs(seen.astype(float) - image).mean() < 8.0, "it is that picture"
 
 
 def now() -> int:
