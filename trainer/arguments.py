@@ -1,37 +1,55 @@
-"""Numbers on the command line, for argparse: what is out of bounds is a ValueError, which it tells."""
+"""Numbers on the command line, for argparse: what is out of bounds is told with the bounds."""
 
 from __future__ import annotations
 
+import argparse
 import math
+
+SEED_MAX = 2**31 - 1
 
 
 def positive(text: str) -> float:
     """A finite number above zero."""
-    number = float(text)
+    number = _number(text)
     if not (math.isfinite(number) and number > 0):
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number above 0")
     return number
 
 
 def count(text: str) -> int:
     """A whole number from 1 on."""
-    number = int(text)
-    if number < 1:
-        raise ValueError(text)
+    number = _whole_number(text)
+    if number is None or number < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 on")
     return number
 
 
 def whole(text: str) -> int:
     """A whole number from 0 on that a generator takes as its seed."""
-    number = int(text)
-    if not 0 <= number < 2**31:
-        raise ValueError(text)
+    number = _whole_number(text)
+    if number is None or not 0 <= number <= SEED_MAX:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
     return number
 
 
 def share(text: str) -> float:
     """A number from 0 to 1."""
-    number = float(text)
+    number = _number(text)
     if not 0.0 <= number <= 1.0:
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number from 0 to 1")
     return number
+
+
+def _number(text: str) -> float:
+    """Not a number where it is none, which lies within no bounds."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _whole_number(text: str) -> int | None:
+    try:
+        return int(text)
+    except ValueError:
+        return None

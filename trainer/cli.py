@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import sys
@@ -59,7 +60,9 @@ def _ablate(arguments: argparse.Namespace) -> None:
     config = load_config(arguments.config)
     variants = chosen(arguments.variants.split(",") if arguments.variants else None)
     scale = Scale(arguments.samples, arguments.size, arguments.windows)
-    result = ablate(config, variants, scale, arguments.out, lambda text: print(text, flush=True))
+    # What training tells on its way is for a person, and standard output for whoever reads JSON.
+    with contextlib.redirect_stdout(sys.stderr if arguments.json else sys.stdout):
+        result = ablate(config, variants, scale, arguments.out, lambda text: print(text, flush=True))
     print(json.dumps(result, indent=2) if arguments.json else table(result))
 
 

@@ -15,6 +15,7 @@ import torch
 
 from trainer.ablate import FULL, VARIANTS, Scale, ablate, chosen, table, varied
 from trainer.checkpoint import load_file, write_atomic
+from trainer.cli import main
 from trainer.config import ConfigError, DataConfig, load_config, parse_config
 from trainer.model import PoseNet
 
@@ -122,3 +123,14 @@ def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(tmp_path: Path) -
 def test_an_unknown_variant_is_named_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match="'no-such'; there are full, no-ray"):
         chosen(["no-such"])
+
+
+def test_as_json_standard_output_holds_the_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tiny.toml").write_text(tiny.TOML)
+    ablate(tiny.config(), [FULL], SCALE, tmp_path / "runs", lambda _: None, open_view)  # the command measures it alone
+    capsys.readouterr()
+    options = ["--samples", "8", "--size", "64", "--windows", "16", "--variants", "full", "--json"]
+    assert main(["ablate", "--config", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "runs"), *options]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == json.loads((tmp_path / "runs" / "ablation.json").read_text())
+    assert "full: all of it" in err

@@ -67,3 +67,22 @@ def test_commands_end_with_2_and_a_sentence(
     assert message.startswith("uavpose-trainer: ")
     assert f"{tmp_path}/none" in message
     assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("train --samples 0", "--samples: '0' is not a whole number from 1 on"),
+        ("train --budget-minutes nan", "--budget-minutes: 'nan' is not a number above 0"),
+        ("refine --seed 2147483648", "--seed: '2147483648' is not a whole number from 0 to 2147483647"),
+        ("refine --strangers 35", "--strangers: '35' is not a number from 0 to 1"),
+        ("export --samples many", "--samples: 'many' is not a whole number from 1 on"),
+    ],
+)
+def test_a_number_out_of_bounds_is_told_with_the_bounds(
+    words: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"argument {told}\n")

@@ -187,9 +187,7 @@ def test_a_number_that_means_nothing_is_refused(arguments: list[str], capsys: py
     with pytest.raises(SystemExit) as ended:
         main([*arguments, "--out", "x"])
     assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert f"argument {arguments[-2]}: invalid" in said
-    assert repr(arguments[-1]) in said
+    assert f"argument {arguments[-2]}: {arguments[-1]!r} is not a " in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_is_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
