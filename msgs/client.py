@@ -36,7 +36,8 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
     try:
         return zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
-        raise ConnectionError(f"no zenoh session with {endpoint}: {error}") from error
+        reason = str(error).partition(" at /")[0].strip()  # what follows is a line of zenoh's source
+        raise ConnectionError(f"no zenoh session with {endpoint}: {reason}") from error
 
 
 class PoseSubscription:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import dataclasses
 import re
 import shlex
 import shutil
@@ -18,6 +19,7 @@ from edge.daemon import TICK_S
 from edge.systemd import FEEDS_PER_LIMIT
 from edge.watchdog import LAST_WORDS_S, LOOKS_PER_LIMIT
 from msgs import topics
+from msgs.ground.fleet import TargetRow
 
 ROOT = Path(__file__).parents[1]
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
@@ -66,6 +68,13 @@ def test_files_that_the_architecture_names_are_there() -> None:
     for folder, text in rows:
         for name in re.findall(r"`([\w*]+(?:\.py|/))`", text):
             assert list((ROOT / folder).glob(name.rstrip("/"))), f"{folder}{name}"
+
+
+def test_the_keys_of_a_watched_pose_are_told() -> None:
+    row = re.search(r"^\| `pose` \| (.*) \|$", (ROOT / "docs" / "ground.md").read_text(), re.MULTILINE)
+    assert row is not None
+    told = set(re.findall(r"`(\w+)`", row[1])) - {"ned", "cam"}
+    assert told | {"uav"} == {"age_s", *(field.name for field in dataclasses.fields(TargetRow))}
 
 
 @pytest.mark.parametrize("document", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from msgs.client import connect, subscribe
-from msgs.examples.arguments import parse
+from msgs.examples.arguments import parse, run
 
 NEAR_M, FAR_M, COLUMNS = 0.0, 600.0, 60
 
@@ -32,4 +32,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from msgs.client import connect, subscribe
-from msgs.examples.arguments import parse
+from msgs.examples.arguments import parse, run
 
 
 def main() -> None:
@@ -27,4 +27,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

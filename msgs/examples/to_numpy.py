@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from msgs.client import connect, subscribe
-from msgs.examples.arguments import parse
+from msgs.examples.arguments import parse, run
 from msgs.geometry import R_from_q_wxyz
 from msgs.receive import TargetPose
 
@@ -40,4 +40,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

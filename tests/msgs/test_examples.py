@@ -18,7 +18,7 @@ from msgs.cdr import PoseWithCovarianceStamped
 from msgs.publish import Node
 from tests.waiting import until
 
-from .conftest import Network, pose_now
+from .conftest import Network, free_endpoint, pose_now
 
 EXAMPLES = sorted(path.stem for path in Path(msgs.examples.__file__).parent.glob("*.py"))
 RUN = """
@@ -103,6 +103,41 @@ def test_on_ctrl_c_an_example_ends_quietly_and_keeps_what_came(network: Network,
         with np.load(tmp_path / "poses.npz") as arrays:
             assert out == f"{len(arrays['stamp_ns'])} poses in poses.npz\n"
             assert len(arrays["stamp_ns"]) > 0
+
+
+@pytest.mark.parametrize("example", ["print_poses", "plot_range", "to_numpy"])
+def test_where_nobody_answers_an_example_says_so_in_a_sentence(tmp_path: Path, example: str) -> None:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-c", RUN, example, "-e", endpoint]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"no zenoh session with {endpoint}: ")
+    assert done.stderr.count("\n") == 1
+    assert ".rs" not in done.stderr
+
+
+def test_behind_a_reader_that_has_enough_an_example_ends_quietly(network: Network, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RUN, "print_poses", "-e", network.endpoint]
+    with Node(network.daemon, "uav1") as node:
+        publisher = node.publisher(topics.POSE, "t3")
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            process.stdout.close()
+            until(lambda: process.poll() is not None, lambda: publisher.put(ahead().encode()))
+            assert (process.returncode, process.stderr.read()) == (141, "")
+        finally:
+            process.kill()
+            process.stderr.close()
+
+
+@pytest.mark.parametrize("words", [["-u", "uav*"], ["-n", "-3"], ["-n", "0"]])
+def test_words_that_make_no_sense_are_told_before_anybody_is_called(words: list[str], tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RUN, "print_poses", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"error: argument {words[0]}/" in done.stderr
 
 
 def test_every_example_is_run_here() -> None:
