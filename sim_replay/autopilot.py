@@ -2,8 +2,9 @@
 
 It reports a sequence's telemetry as an ArduPilot plane would, or one that PX4 flies, on a boot clock of its own:
 HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS
-of a gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. PX4 denies a command with parameters that
-it does not know, and asks for TIMESYNC itself, ten times a second, believing answers of at most 10 ms.
+of a gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. Where rows of the telemetry are missing
+it tells nothing of the own ship. PX4 denies a command with parameters that it does not know, and asks for TIMESYNC
+itself, ten times a second, believing answers of at most 10 ms.
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
@@ -64,6 +65,12 @@ GIMBAL_UNKNOWN = ("angular_velocity_x", "angular_velocity_y", "angular_velocity_
 # Up for an odd while before the first frame: no test may pass by taking boot time for the host's.
 BOOT_BEFORE_START_NS = 734_567_891_234
 INTERVAL_MIN_NS = 1_000_000
+OWN_SHIP_IDS = (
+    dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+)
+SPEED_MAX_CMPS = 32767  # that GLOBAL_POSITION_INT can tell
 _POLL_S = 0.2
 _DATAGRAM_BYTES = 65535
 
@@ -115,7 +122,8 @@ class Autopilot:
         packed = []
         for message_id, next_ns in self._next_ns.items():
             if next_ns <= now_ns:
-                packed.append(self._packed(self._telemetry_message(message_id, now_ns)))
+                if message_id not in OWN_SHIP_IDS or self._telemetry.tells_of(now_ns - self._start_at_ns):
+                    packed.append(self._packed(self._telemetry_message(message_id, now_ns)))
                 interval_ns = self._interval_ns[message_id]
                 self._next_ns[message_id] = max(next_ns + interval_ns, now_ns + interval_ns // 2)
         return packed
@@ -182,7 +190,7 @@ class Autopilot:
             round(state.lon_deg * 1e7),
             round(state.alt_m * 1e3),
             round(-state.t_ned_body_m[2] * 1e3),
-            *(round(v * 100.0) for v in state.v_ned_body_mps.tolist()),
+            *(max(-SPEED_MAX_CMPS, min(SPEED_MAX_CMPS, round(v * 100.0))) for v in state.v_ned_body_mps.tolist()),
             round(math.degrees(float(yaw_rad)) * 100.0) % 36000,
         )
 

@@ -21,6 +21,11 @@ class LinkFaults:
     loss: float = 0.0  # share that never arrives
     reorder: float = 0.0  # share that the next one overtakes
 
+    @property
+    def late_ms_max(self) -> float:
+        """What may pass until the last datagram is there."""
+        return self.delay_ms + self.jitter_ms
+
     def arguments(self) -> list[str]:
         """For the command line that `add_options` reads."""
         given = {name: value for name, value in asdict(self).items() if value}

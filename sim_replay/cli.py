@@ -175,6 +175,8 @@ def main(argv: list[str] | None = None) -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        raise  # who read the output has had enough: no failure, and `launch` ends as such a command does
     except (PlayError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

@@ -139,7 +139,7 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
             _pass_on(records, recording, on_record, timeout_s=0.05)
             _check_peers_run(peers)
         recording.daemon_exit = daemon.poll()
-        settled_ns = time.monotonic_ns() + round(_SETTLE_S * 1e9)
+        settled_ns = time.monotonic_ns() + round((_SETTLE_S + settings.link.late_ms_max * 1e-3) * 1e9)
         while time.monotonic_ns() < settled_ns:
             _pass_on(records, recording, on_record, timeout_s=0.05)
         _check_exit(recording.daemon_exit, settings.out / "daemon.log")
@@ -266,8 +266,9 @@ def _peer(
     lines = process.stdout
 
     def read() -> None:
-        for line in lines:
-            records.put((name, json.loads(line)))
+        with lines:
+            for line in lines:
+                records.put((name, json.loads(line)))
 
     reader = threading.Thread(target=read, name=f"read {name}", daemon=True)
     reader.start()

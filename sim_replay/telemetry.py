@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,10 @@ COLUMNS = (
     *("t_ns", "q_ned_body_w", "q_ned_body_x", "q_ned_body_y", "q_ned_body_z", "p_radps", "q_radps", "r_radps"),
     *("north_m", "east_m", "down_m", "v_north_mps", "v_east_mps", "v_down_mps", "lat_deg", "lon_deg", "alt_m"),
 )
+
+
+GAP_NS = 500_000_000  # for which own attitude is not known where rows are missing, as the daemon has it
+GAP_ROWS = 5  # or so many, where they are further apart
 
 
 class TelemetryError(ValueError):
@@ -39,6 +44,17 @@ class Telemetry:
 
     t_ns: np.ndarray  # [N] int64
     values: Array  # [N, 16], COLUMNS[1:]
+
+    @cached_property
+    def _gap_ns(self) -> float:
+        return max(GAP_NS, GAP_ROWS * float(np.median(np.diff(self.t_ns))))
+
+    def tells_of(self, t_ns: int) -> bool:
+        """False between two rows with so many missing that nobody knows how the own ship was then."""
+        i = int(np.searchsorted(self.t_ns, t_ns, side="left"))
+        if i == 0 or i == len(self.t_ns) or self.t_ns[i] == t_ns:
+            return True
+        return bool(self.t_ns[i] - self.t_ns[i - 1] <= self._gap_ns)
 
     def at(self, t_ns: int) -> OwnShipState:
         """State at `t_ns`: slerp and linear between neighbours; at rest in the first or last row outside them."""
@@ -77,7 +93,9 @@ def read_telemetry(path: Path) -> Telemetry:
             t_ns[k] = int(row[order[0]])
             values[k] = [float(row[column]) for column in order[1:]]
         except (ValueError, IndexError) as error:
-            raise TelemetryError(f"{path}: line {line} does not hold {len(COLUMNS)} numbers") from error
+            raise TelemetryError(
+                f"{path}: line {line} does not hold {len(COLUMNS)} numbers, t_ns a whole one"
+            ) from error
         except OverflowError as error:
             raise TelemetryError(f"{path}: line {line}: t_ns is beyond 64 bits") from error
     if len(lines) < 2 or not (np.diff(t_ns) > 0).all():

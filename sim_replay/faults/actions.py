@@ -47,8 +47,10 @@ PACED_S = 30.0  # on a busy machine; what is left then comes as fast as it can
 
 @singledispatch
 def act(step: object, rig: Rig) -> str | None:
-    """Carry out a step that is an act; what there is to tell of it. Raises PlayError when the host does not let it,
-    naming why."""
+    """Carry out a step that is an act; what there is to tell of it.
+
+    Raises PlayError when the host does not let it, naming why, InputError when what it acts upon does not run.
+    """
     raise TypeError(f"{type(step).__name__} is no act")
 
 
@@ -64,7 +66,7 @@ def _start(step: Start, rig: Rig) -> None:
 
 @act.register
 def _signal(step: Signal, rig: Rig) -> None:
-    process = rig.processes[step.who]
+    process = rig.running(step.who)
     if step.name == "KILL" or (step.name == "TERM" and step.who != "daemon"):
         process.end(signal.Signals[f"SIG{step.name}"])
     else:
@@ -73,7 +75,7 @@ def _signal(step: Signal, rig: Rig) -> None:
 
 @act.register
 def _camera(step: Camera, rig: Rig) -> None:
-    rig.processes["camera"].tell(json.dumps(step.model_dump(exclude={"do"})))
+    rig.running("camera").tell(json.dumps(step.model_dump(exclude={"do"})))
 
 
 @act.register
@@ -125,7 +127,7 @@ def _slow_subscriber(step: SlowSubscriber, rig: Rig) -> None:
 
 @act.register
 def _disk(step: Disk, rig: Rig) -> None:
-    pid = rig.daemon.pid
+    pid = rig.running("daemon").pid
     _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard if step.file_max_bytes is None else step.file_max_bytes, hard))
     if not rig.settings.volume:

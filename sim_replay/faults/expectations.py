@@ -77,7 +77,8 @@ def _silence(step: ExpectSilence, rig: Rig, since: Since) -> Seen:
         return time.time_ns() - max(last_ns(), since.began_ns) >= step.for_s * NS
 
     if not rig.witness.wait_for(silent, step.within_s):
-        raise Unmet(f"poses went on: no silence of {step.for_s:g} s within {step.within_s:g} s")
+        lasted_s = (time.time_ns() - max(last_ns(), since.began_ns)) / NS
+        raise Unmet(f"no silence of {step.for_s:g} s within {step.within_s:g} s, but of {lasted_s:.1f} s")
     took_s = max(last_ns() - since.acted_ns, 0) / NS
     return Seen(f"silence at {' and '.join(peers)} for {step.for_s:g} s, the last pose after {took_s:.2f} s", took_s)
 
@@ -115,7 +116,8 @@ def _counter(step: ExpectCounter, rig: Rig, since: Since) -> Seen:
         return witness.counters.get(step.name, 0) - since.counters.get(step.name, 0)
 
     if not witness.wait_for(lambda: witness.counted_ns >= since.began_ns and growth() >= step.by, step.within_s):
-        raise Unmet(f"{step.name} did not grow by {step.by} within {step.within_s:g} s, but by {growth()}")
+        told = f"{step.name}{_unheard(step.name, rig)} did not grow by {step.by} within {step.within_s:g} s"
+        raise Unmet(f"{told}, but by {growth()}")
     took_s = max(witness.counted_ns - since.acted_ns, 0) / NS
     return Seen(f"{step.name} grew by {growth()}", took_s)
 
@@ -133,9 +135,16 @@ def _still(step: ExpectStill, rig: Rig, since: Since) -> Seen:
         return witness.counted_ns - grown_ns >= step.for_s * NS
 
     if not witness.wait_for(still, step.within_s):
-        raise Unmet(f"{step.name} went on growing: not still for {step.for_s:g} s within {step.within_s:g} s")
+        lasted_s = (witness.counted_ns - grown_ns) / NS
+        raise Unmet(f"{step.name} was not still for {step.for_s:g} s within {step.within_s:g} s, but {lasted_s:.1f} s")
     took_s = max(grown_ns - since.acted_ns, 0) / NS
-    return Seen(f"{step.name} stood still for {step.for_s:g} s, from {took_s:.2f} s on", took_s)
+    told = f"{step.name}{_unheard(step.name, rig)} stood still for {step.for_s:g} s, from {took_s:.2f} s on"
+    return Seen(told, took_s)
+
+
+def _unheard(name: str, rig: Rig) -> str:
+    """Of a counter that the diagnostics do not tell of: it never counted, or is written wrongly."""
+    return "" if name in rig.witness.counters else " (which the daemon has not told of)"
 
 
 @expect.register

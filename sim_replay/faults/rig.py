@@ -43,6 +43,7 @@ UAV = "uav1"
 PATIENT = ("--wait-s", str(START_S), "--all", "--max-age-s", "3600")
 KEY = "mavlink.key"
 ICAO_ADDRESS = 0xF00000
+SERVING: tuple[Who, ...] = ("camera", "router", "daemon")  # each listens at a port that is its own throughout
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,13 @@ class Rig:
     def daemon(self) -> Process:
         return self.processes["daemon"]
 
+    def running(self, who: Who) -> Process:
+        """Raises InputError if it has ended: then there is nothing to act upon."""
+        process = self.processes[who]
+        if process.exit_code is not None:
+            raise InputError(f"the {who} does not run any more: the timeline must `start` it before it acts upon it")
+        return process
+
     @property
     def own_endpoint(self) -> str:
         """Where the daemon serves tools on board."""
@@ -119,18 +127,21 @@ class Rig:
         return self.settings.out.resolve() / "recordings"
 
     def start(self, step: Start) -> None:
-        """Start a process and wait until it is ready; one of that name that still runs is then killed.
+        """Start a process and wait until it is ready; one of that name that still runs is killed.
 
-        An autopilot that comes back with another clock is killed first: of two that speak in turn, each would seem to
-        start again when the other has spoken.
+        Of those that serve, the port must first be free again. An autopilot is killed when the next one speaks, but
+        first if that comes with another clock: of two that speak in turn, each would seem to start again when the
+        other has spoken.
 
         Raises InputError if the daemon refuses its configuration, PlayError if anything else does not start.
         """
         who = step.who
         before = self.processes.get(who)
-        if before is not None and (step.rebooted or step.clock_ahead_s):
+        if before is not None and (who in SERVING or step.rebooted or step.clock_ahead_s):
             before.end(signal.SIGKILL)
         self.witness.forget_ready(who)
+        if who == "daemon":
+            self.witness.forget_counters()
         said_before = len(self.witness.said)
         if who == "daemon":
             process = Process(self._daemon_command(), self.witness.hear_daemon)

@@ -22,6 +22,7 @@ from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 TIMELINES = Path(__file__).parent / "timelines"
 EXIT_UNMET = 1
+REPORT = "faults.json"
 
 Say = Callable[[str], None]
 
@@ -71,6 +72,7 @@ def _take(step: Step, rig: Rig, since: Since, outcome: Outcome, say: Say) -> Sin
         return since
     acted_ns = time.time_ns()
     if step.do == "start":
+        counters = {} if step.who == "daemon" else counters
         took_s = (acted_ns - began_ns) / 1e9
         outcome.seen.append(
             {"step": what, "seen": f"the {step.who} up after {took_s:.2f} s", "took_s": round(took_s, 3)}
@@ -112,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name}: signed differs from that of {args.timeline[0]}: they need a run each")
     on_volume = [name for name, timeline in zip(args.timeline, timelines, strict=True) if timeline.volume]
     args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / REPORT).unlink(missing_ok=True)  # of an earlier run: this one may end without
     if on_volume and not can_mount(args.out):
         raise InputError(f"{on_volume[0]}: volume = true needs a host that lets a user mount (unshare --mount)")
     rig = Rig(RigSettings(args.out, args.scene, args.model, volume=bool(on_volume), signed=timelines[0].signed))
@@ -125,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
         "poses": {peer: len(ages_ms(rig.witness, peer)) for peer in (AUTOPILOT, SUBSCRIBER)},
         "wrong": wrong,
     }
-    (args.out / "faults.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    (args.out / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     for text in wrong:
         print(f"WRONG: {text}")
     print(f"{len(rig.witness.poses)} poses received, oldest on receipt {oldest_ms} ms; {len(wrong)} wrong")
@@ -133,5 +136,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def timeline_path(name: str) -> Path:
-    """The file of a timeline: one that comes with the package, or a path."""
-    return TIMELINES / f"{name}.toml" if name in bundled() else Path(name)
+    """The file of a timeline: one that comes with the package, or a path. Raises InputError where it is neither."""
+    if name in bundled():
+        return TIMELINES / f"{name}.toml"
+    if not Path(name).is_file():
+        raise InputError(f"{name}: is no file, nor a timeline that comes with this: {', '.join(bundled())}")
+    return Path(name)

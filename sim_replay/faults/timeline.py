@@ -21,10 +21,11 @@ do = "expect_poses"
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from edge.errors import InputError
 from msgs.mavlink import dialect
@@ -33,6 +34,17 @@ from msgs.settings import Section, load_settings
 Who = Literal["camera", "daemon", "autopilot", "router", "subscriber"]
 Peer = Literal["autopilot", "subscriber", "both"]
 Seconds = Annotated[float, Field(gt=0, le=600)]
+
+
+def _expression(pattern: str) -> str:
+    try:
+        re.compile(pattern)
+    except re.error as error:
+        raise ValueError(f"is no regular expression: {error}") from error
+    return pattern
+
+
+Pattern = Annotated[str, AfterValidator(_expression)]
 WITHIN_S = 60.0  # a loaded machine takes its time; what was taken is reported
 
 
@@ -49,6 +61,13 @@ class Start(Section):
     system_id: int = Field(default=1, ge=1, le=255, description="autopilot: its MAVLink system")
     rebooted: bool = Field(default=False, description="autopilot: its boot clock begins now")
     clock_ahead_s: float = Field(default=0.0, ge=-60, le=60, description="autopilot: boot clock against the last one's")
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Start:
+        of_autopilot = self.model_fields_set & {"system_id", "rebooted", "clock_ahead_s"}
+        if self.who != "autopilot" and of_autopilot:
+            raise ValueError(f"{min(of_autopilot)} is an autopilot's, not the {self.who}'s")
+        return self
 
 
 class Signal(Section):
@@ -85,6 +104,12 @@ class Link(Section):
             if not hasattr(dialect, f"MAVLINK_MSG_ID_{name}"):
                 raise ValueError(f"{name} is no MAVLink message")
         return names
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Link:
+        if self.which == "zenoh" and self.drop:
+            raise ValueError("drop names MAVLink messages: none passes the zenoh link")
+        return self
 
 
 class Flood(Section):
@@ -150,7 +175,9 @@ class ExpectState(Section):
     """The daemon's state and its reasons, as its diagnostics tell them to a subscriber."""
 
     do: Literal["expect_state"]
-    pattern: str = Field(description="regular expression, of the state as diagnostics have it, e.g. 'fault; no frame'")
+    pattern: Pattern = Field(
+        description="regular expression, of the state as diagnostics have it, e.g. 'fault; no frame'"
+    )
     within_s: Seconds = WITHIN_S
 
 
@@ -158,7 +185,7 @@ class ExpectSaid(Section):
     """A line of the daemon's log since the last act; the log counts repetitions within a minute, and keeps one."""
 
     do: Literal["expect_said"]
-    pattern: str = Field(description="regular expression")
+    pattern: Pattern = Field(description="regular expression")
     within_s: Seconds = WITHIN_S
 
 
@@ -215,6 +242,13 @@ class Timeline(Section):
     signed: bool = Field(default=False, description="daemon and autopilot sign all that they say")
     volume: bool = Field(default=False, description="recordings go to a small volume of their own (needs unshare)")
     step: list[Step] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _has_its_volume(self) -> Timeline:
+        for number, step in enumerate(self.step, 1):
+            if isinstance(step, Disk) and (step.full or step.read_only) and not self.volume:
+                raise ValueError(f"step {number}: full and read_only need `volume = true` at the top")
+        return self
 
 
 def load_timeline(path: Path) -> Timeline:

@@ -85,6 +85,11 @@ class Witness:
         with self._changed:
             self.ready.discard(name)
 
+    def forget_counters(self) -> None:
+        """The daemon's count from 0 again."""
+        with self._changed:
+            self.counters = {}
+
     def zenoh_cut(self, cut: bool, now_ns: int) -> None:
         """The link to the ground keeps what it is given from now on, or gives it out."""
         with self._changed:

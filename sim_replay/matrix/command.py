@@ -17,6 +17,7 @@ from edge.errors import InputError
 from edge.estimator.model import Model, load_model
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation.table import table_console
+from sim_replay.faults.rig import can_mount
 from sim_replay.faults.run import timeline_path
 from sim_replay.faults.timeline import Timeline, load_timeline
 from sim_replay.ground_truth import PlayedSequence, read_sequence
@@ -74,22 +75,30 @@ def run(args: argparse.Namespace) -> int:
     if NO_FAULT not in faults and all(sequence.scene.target_free for sequence, _ in sequences):
         raise InputError(f"--fault: no sequence shows a target, which faults are judged by; say --fault {NO_FAULT}")
     args.out.mkdir(parents=True, exist_ok=True)
+    for name, timeline in timelines.items():
+        if timeline.volume and not can_mount(args.out):
+            raise InputError(f"--fault {name}: needs a host that lets a user mount (unshare --mount)")
     console = table_console(stderr=args.json)
     for sequence, name in sequences:
         if timelines and sequence.scene.target_free:
             console.print(f"{name}: shows no target, which faults are judged by: flown without them", highlight=False)
-    cells = []
+    cells: list[Cell] = []
+    _write(args.out, cells)  # of an earlier run nothing is left
     for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
         cells.append(cell)
+        _write(args.out, cells)  # after each: what was flown for hours is kept if the next cannot be
         told = "; ".join(cell.wrong) or "as it should be"
         console.print(f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False)
-    records = [asdict(cell) for cell in cells]
-    (args.out / "matrix.json").write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
     if args.json:
-        print(json.dumps(records))
+        print(json.dumps([asdict(cell) for cell in cells]))
     else:
         console.print(table(cells))
     return EXIT_WRONG if any(cell.wrong for cell in cells) else 0
+
+
+def _write(out: Path, cells: Sequence[Cell]) -> None:
+    text = json.dumps([asdict(cell) for cell in cells], indent=2)
+    (out / "matrix.json").write_text(text + "\n", encoding="utf-8")
 
 
 def _cells(

@@ -3,6 +3,7 @@
 Pictures are played at a constant rate, each in the slot nearest its exposure, and the telemetry is bent so that the
 attitude at every picture's exposure is the one that was recorded. Pictures from before the first and after the last
 attitude are left out. A picture's number is its slot: one that is left out was not recorded, and is a dropped frame.
+Recorded on the ground, a file may tell of other vehicles too; they are passed over.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ ORIGIN_DEG_M = (0.0, 0.0, 0.0)  # of ned: recordings do not tell where on Earth 
 GAP_S_MAX = 10.0  # between two pictures of one flight
 FPS_MAX = 240.0
 _FIXED_RAD = 1e-4  # a mount that moves no more is a fixed one
+_NEIGHBOURS = 5  # velocities whose middle one is taken: where the autopilot sets its place anew, nobody flew so fast
+
+Stamped = dict[int, dict[str, TransformStamped]]  # transforms by child frame, by stamp
 
 
 @dataclass(eq=False)
@@ -42,7 +46,12 @@ class Recorded:
     uav: str | None = None
     picture_ns: list[int] = field(default_factory=list)
     lens: list[CameraInfo] = field(default_factory=list)  # of each picture
-    own: dict[int, dict[str, TransformStamped]] = field(default_factory=dict)  # by stamp, transforms by child frame
+    own_of: dict[str, Stamped] = field(default_factory=dict)  # by vehicle
+
+    @property
+    def own(self) -> Stamped:
+        """Of the vehicle whose pictures they are."""
+        return self.own_of.get(self.uav or "", {})
 
 
 def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[[], None]) -> None:
@@ -52,6 +61,7 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
     picture_ns = np.array(recorded.picture_ns)
     fps = _rate_hz(picture_ns)
     own_ns, mounts = _own_ship(recorded)
+    places_m = _places_m(recorded, own_ns)
     within_ns = UNCOVERED_NS_MAX // 2  # bending moves times by half a picture or so
     covered = np.flatnonzero((picture_ns >= own_ns[0] - within_ns) & (picture_ns <= own_ns[-1] + within_ns))
     if len(covered) < 2:
@@ -65,13 +75,13 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
 
         def write(index: int, image: CompressedImage) -> None:
             if index in of_picture:
-                R_ned_cam, t_ned_cam_m = _camera_at(recorded, own_ns, recorded.picture_ns[index])
+                R_ned_cam, t_ned_cam_m = _camera_at(recorded, own_ns, places_m, recorded.picture_ns[index])
                 _add(writer, of_picture[index], image, recorded.lens[index], R_ned_cam, t_ned_cam_m)
                 on_picture()
 
         _read(paths, write)
     bent_ns = _bend(own_ns, picture_ns[kept], slots, fps)
-    write_telemetry(folder / "telemetry.csv", _telemetry(recorded, own_ns, bent_ns))
+    write_telemetry(folder / "telemetry.csv", _telemetry(recorded, own_ns, places_m, bent_ns))
     write_sequence_toml(folder, paths[0], fps, 0, mounts[0], gimballed)
 
 
@@ -95,7 +105,7 @@ def _read(paths: Sequence[Path], on_picture: Callable[[int, CompressedImage], No
                 elif one.topic is topics.TF:
                     links = {link.child_frame_id: link for link in TFMessage.decode(one.payload).transforms}
                     if topics.FRAME_BODY in links and topics.FRAME_CAMERA in links:
-                        recorded.own[links[topics.FRAME_BODY].stamp_ns] = links
+                        recorded.own_of.setdefault(one.uav, {})[links[topics.FRAME_BODY].stamp_ns] = links
         except (RecordingError, PayloadError) as error:
             raise InputError(str(error) if isinstance(error, RecordingError) else f"{path}: {error}") from error
     return recorded
@@ -145,17 +155,26 @@ def _R(link: TransformStamped) -> Array:
     return R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1))
 
 
-def _place_m(links: dict[str, TransformStamped]) -> Array:
-    """Of the own ship in ned; the origin where its position was not known."""
-    place = links.get(topics.FRAME_BODY_NED)
-    return np.zeros(3) if place is None else np.asarray(place.t_frame_child_m)
+def _places_m(recorded: Recorded, own_ns: Array) -> Array:
+    """[N, 3] of the own ship in ned; evenly from one to the next where the position was not known.
+
+    Before the first and after the last it stays there: from the origin it would leap, faster than anything flies.
+    """
+    told = [recorded.own[int(stamp)].get(topics.FRAME_BODY_NED) for stamp in own_ns]
+    known = [k for k, place in enumerate(told) if place is not None]
+    if not known:
+        return np.zeros((len(told), 3))
+    places_m = np.array([place.t_frame_child_m for place in told if place is not None])
+    since_ns = own_ns - own_ns[0]
+    return np.column_stack([np.interp(since_ns, since_ns[known], column) for column in places_m.T])
 
 
-def _camera_at(recorded: Recorded, own_ns: Array, at_ns: int) -> tuple[Array, Array]:
+def _camera_at(recorded: Recorded, own_ns: Array, places_m: Array, at_ns: int) -> tuple[Array, Array]:
     """R_ned_cam [3, 3] and t_ned_cam_m [3] by the transforms nearest in time."""
-    links = recorded.own[int(own_ns[np.argmin(np.abs(own_ns - at_ns))])]
+    nearest = int(np.argmin(np.abs(own_ns - at_ns)))
+    links = recorded.own[int(own_ns[nearest])]
     R_ned_body, camera = _R(links[topics.FRAME_BODY]), links[topics.FRAME_CAMERA]
-    return R_ned_body @ _R(camera), _place_m(links) + R_ned_body @ np.asarray(camera.t_frame_child_m)
+    return R_ned_body @ _R(camera), places_m[nearest] + R_ned_body @ np.asarray(camera.t_frame_child_m)
 
 
 def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
@@ -166,15 +185,22 @@ def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
     return np.round(inside).astype(np.int64)
 
 
-def _telemetry(recorded: Recorded, own_ns: Array, t_ns: Array) -> Telemetry:
+def _telemetry(recorded: Recorded, own_ns: Array, places_m: Array, t_ns: Array) -> Telemetry:
     """Of the attitudes and places told; rates and velocities are their differences."""
     t_ns, kept = np.unique(t_ns, return_index=True)
     links = [recorded.own[int(stamp)] for stamp in own_ns[kept]]
     R_ned_body = np.array([_R(one[topics.FRAME_BODY]) for one in links])
-    t_ned_m = np.array([_place_m(one) for one in links])
+    t_ned_m = places_m[kept]
     t_s = t_ns * 1e-9
-    velocity = np.gradient(t_ned_m, t_s, axis=0)
+    velocity = _middle_ones(np.gradient(t_ned_m, t_s, axis=0))
     rates = so3_log(np.swapaxes(R_ned_body[:-1], -1, -2) @ R_ned_body[1:]) / np.diff(t_s)[:, None]
     rates = np.vstack([rates, rates[-1]])
     place = np.array([lat_lon_alt_from_ned(ORIGIN_DEG_M, p) for p in t_ned_m])
     return Telemetry(t_ns, np.hstack([q_wxyz_from_R(R_ned_body), rates, t_ned_m, velocity, place]))
+
+
+def _middle_ones(values: Array) -> Array:
+    """[N, 3]: each the median of the _NEIGHBOURS around it."""
+    half = _NEIGHBOURS // 2
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, ((half, half), (0, 0)), "edge"), _NEIGHBOURS, 0)
+    return np.asarray(np.median(around, axis=-1))

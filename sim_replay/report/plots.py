@@ -145,7 +145,8 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
         above.set(xlabel=f"{across}, m", ylabel=f"{along}, m")
         above.set_title("from above  ·  ○ where it begins")
         above.set_aspect("equal", adjustable="datalim")
-        above.legend(loc="best")
+        if curves:
+            above.legend(loc="best")
         return _svg(figure, "trajectory")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import signal
 import socket
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,8 @@ from msgs.mavlink import FrameReader, MAVLink, dialect
 from sim_replay.faults import hostile, run
 from sim_replay.faults.judge import pose_faults
 from sim_replay.faults.relay import LOOPBACK, LinkState, TcpRelay, UdpRelay, message_id
-from sim_replay.faults.timeline import load_timeline
+from sim_replay.faults.rig import SERVING, Rig, RigSettings
+from sim_replay.faults.timeline import Start, load_timeline
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose
 
 MS = 1_000_000
@@ -65,6 +67,10 @@ def test_a_camera_whose_clock_is_slow_does_not_make_an_old_pose_young() -> None:
         ('title = "x"\n[[step]]\ndo = "hold"\nfor_s = 1\nsoftly = true\n', "softly: unknown key"),
         ('title = "x"\n[[step]]\ndo = "link"\nwhich = "mavlink"\ndrop = ["NONE"]\n', "NONE is no MAVLink message"),
         ("title = \n", "not valid TOML"),
+        ('title = "x"\n[[step]]\ndo = "expect_said"\npattern = "no frame ("\n', "pattern: is no regular expression"),
+        ('title = "x"\n[[step]]\ndo = "disk"\nfull = true\n', "step 1: full and read_only need `volume = true`"),
+        ('title = "x"\n[[step]]\ndo = "start"\nwho = "camera"\nrebooted = true\n', "rebooted is an autopilot's"),
+        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "zenoh"\ndrop = ["HEARTBEAT"]\n', "drop names MAVLink messages"),
     ],
 )
 def test_a_bad_timeline_is_told_by_file_and_key(tmp_path: Path, text: str, words: str) -> None:
@@ -76,13 +82,59 @@ def test_a_bad_timeline_is_told_by_file_and_key(tmp_path: Path, text: str, words
     assert words in str(told.value)
 
 
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory, small_scene: Path, toy_model: Path) -> Iterator[Rig]:
+    with Rig(RigSettings(tmp_path_factory.mktemp("rig"), small_scene, toy_model, fps=30.0)) as rig:
+        yield rig
+
+
+def play_steps(rig: Rig, folder: Path, steps: str) -> run.Outcome:
+    path = folder / "own.toml"
+    path.write_text(f'title = "x"\n{steps}')
+    return run.play_timeline(rig, load_timeline(path), print)
+
+
+def test_counters_of_a_daemon_that_was_started_again_count_from_nothing(rig: Rig, tmp_path: Path) -> None:
+    assert rig.witness.wait_for(lambda: rig.witness.counters.get("captured", 0) > 300, 60.0)
+    steps = '[[step]]\ndo = "signal"\nwho = "daemon"\nname = "KILL"\n[[step]]\ndo = "start"\nwho = "daemon"\n'
+    steps += '[[step]]\ndo = "expect_counter"\nname = "captured"\nwithin_s = 8.0\n'  # at 30 a second: 240 at most
+    assert play_steps(rig, tmp_path, steps).wrong == []
+
+
+def test_what_still_runs_and_holds_a_port_is_replaced(rig: Rig, tmp_path: Path) -> None:
+    before = {who: rig.processes[who] for who in SERVING}
+    for who in SERVING:
+        steps = f'[[step]]\ndo = "start"\nwho = "{who}"\n[[step]]\ndo = "expect_poses"\n'
+        assert play_steps(rig, tmp_path, steps).wrong == []
+        assert before[who].exit_code is not None
+        assert rig.processes[who].exit_code is None
+
+
+def test_what_was_not_seen_is_told_as_it_was(rig: Rig, tmp_path: Path) -> None:
+    steps = '[[step]]\ndo = "signal"\nwho = "camera"\nname = "STOP"\n'
+    steps += '[[step]]\ndo = "expect_still"\nname = "captured_"\nfor_s = 1.0\n'
+    steps += '[[step]]\ndo = "expect_silence"\nfor_s = 90.0\nwithin_s = 3.0\n'
+    outcome = play_steps(rig, tmp_path, steps)
+    rig.processes["camera"].send_signal(signal.SIGCONT)
+    assert "captured_ (which the daemon has not told of) stood still" in outcome.seen[0]["seen"]
+    assert outcome.wrong[0].startswith("no silence of 90 s within 3 s, but of ")
+
+
+def test_to_act_upon_what_does_not_run_any_more_is_refused_by_name(rig: Rig, tmp_path: Path) -> None:
+    killed = '[[step]]\ndo = "signal"\nwho = "camera"\nname = "KILL"\n'
+    for step in ('do = "camera"\nfrozen = true\n', 'do = "signal"\nwho = "camera"\nname = "STOP"\n'):
+        with pytest.raises(InputError, match=r"^the camera does not run any more"):
+            play_steps(rig, tmp_path, f"{killed}[[step]]\n{step}")
+        rig.start(Start(do="start", who="camera"))
+
+
 def test_the_command_takes_bundled_timelines_by_name_and_refuses_a_missing_one(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     run.register(parser.add_subparsers())
     for name in run.bundled():
         load_timeline(run.TIMELINES / f"{name}.toml")
     args = parser.parse_args(["faults", "--timeline", str(tmp_path / "none.toml"), "--out", str(tmp_path)])
-    with pytest.raises(InputError, match=r"none\.toml: cannot be read"):
+    with pytest.raises(InputError, match=r"none\.toml: is no file, nor .*: all-at-once, .*, zenoh-cut"):
         args.run(args)
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from sim_replay.cli import main
 from sim_replay.faults.relay import free_port
+from sim_replay.golden import run as golden
 from sim_replay.golden.run import CASES
 
 BIN = Path(sys.executable).parent
@@ -57,6 +58,18 @@ def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
     played = replay("golden", case, "--out", tmp_path)
     assert played.returncode == 0, f"{played.stdout}\n{played.stderr}\naccept it: uavpose-replay golden --accept"
     assert played.stdout.strip().endswith(f"{case}: as accepted")
+
+
+def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(golden, "FOLDER", tmp_path)
+    golden.golden_file("two_targets").write_text("<<<<<<< HEAD\n")  # as a merge leaves it
+    play = ["golden", "two_targets", "--out", str(tmp_path / "out")]
+    assert main(play) == 2
+    assert "two_targets.jsonl: is no golden file" in capsys.readouterr().err
+    assert main([*play, "--accept"]) == 0
+    assert {"pose", "TARGET_RELATIVE"} <= {record["kind"] for record in golden.read_golden("two_targets")[1]}
 
 
 @pytest.mark.parametrize(

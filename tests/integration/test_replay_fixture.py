@@ -11,12 +11,19 @@ import pytest
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.pytest_plugin import Replay, ReplayedFlight
 from sim_replay.report.flight_files import is_flight, read_flight
+from tests.sim_replay.toy_flight import write_toy_flight
 
 OWN_TEST = """
 def test_the_target_is_held(uavpose_replay):
     flight = uavpose_replay({sequence!r})
     assert flight.peer("subscriber")["continuity"]["identity_switches"] == 0
     assert flight.score["overall"]["frames"] == 1  # the sequence has more
+"""
+
+STRICT_TEST = """
+def test_the_sky_is_empty(uavpose_replay):
+    flight = uavpose_replay({sequence!r}, model={model!r}, report=True)
+    assert (flight.folder / "report.html").is_file()
 """
 
 
@@ -52,3 +59,11 @@ def test_a_test_of_five_lines_flies_and_its_last_line_can_fail(tmp_path: Path) -
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "assert 150 == 1" in done.stdout, done.stdout + done.stderr
     assert "1 failed" in done.stdout
+
+
+def test_a_project_that_takes_warnings_for_errors_can_fly_too(tmp_path: Path, toy_model: Path) -> None:
+    sequence = write_toy_flight(tmp_path / "sky", target=False, labelled=True)
+    (tmp_path / "test_own.py").write_text(STRICT_TEST.format(sequence=str(sequence), model=str(toy_model)))
+    command = [sys.executable, "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", "--rootdir", "."]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,13 @@ def turning_flight() -> Telemetry:
 class Daemon:
     """The other end of the link: a socket and the parser, nothing of the daemon's code."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, flight: Telemetry | None = None) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.settimeout(5.0)
         self.mav = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=191)
         self.start_at_ns = time.monotonic_ns() + 1_500_000_000
-        write_telemetry(folder / "telemetry.csv", turning_flight())
+        write_telemetry(folder / "telemetry.csv", flight or turning_flight())
         endpoint = f"127.0.0.1:{self.socket.getsockname()[1]}"
         arguments = ["--telemetry", str(folder / "telemetry.csv"), "--endpoint", endpoint]
         self.process = subprocess.Popen(
@@ -76,14 +77,16 @@ class Daemon:
         out, _ = self.process.communicate(timeout=5)
         return [json.loads(line) for line in out.splitlines()]
 
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self.socket.close()
+
 
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
-    peer = Daemon(tmp_path)
-    yield peer
-    peer.process.kill()
-    peer.process.communicate()
-    peer.socket.close()
+    with closing(Daemon(tmp_path)) as peer:
+        yield peer
 
 
 def boot_offset_ns(daemon: Daemon) -> int:
@@ -124,6 +127,18 @@ def test_attitude_and_position_are_the_telemetrys_at_their_own_boot_time(daemon:
         if attitudes >= 50:
             break
     assert positions >= 10
+
+
+def test_a_speed_that_a_message_has_no_room_for_is_told_as_the_largest(tmp_path: Path) -> None:
+    flight = turning_flight()
+    flight.values[:, 10:13] = (400.0, -400.0, 3.0)  # as a fast own ship has it at several times its speed
+    with closing(Daemon(tmp_path, flight)) as daemon:
+        for _, message in daemon.messages():
+            if message.get_type() == "GLOBAL_POSITION_INT" and message.vz == 300:
+                break
+        assert (message.vx, message.vy) == (32767, -32767)
+        local = next(one for _, one in daemon.messages() if one.get_type() == "LOCAL_POSITION_NED" and one.vz == 3.0)
+        assert (local.vx, local.vy) == (400.0, -400.0)
 
 
 def test_it_sets_intervals_with_an_acknowledgement_and_denies_what_it_lacks(daemon: Daemon) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +60,16 @@ def dataset(tmp_path: Path) -> Path:
     names = {1: "male_v_tail", 4: "light_aircraft"}
     (root / "models" / "models_info.json").write_text(json.dumps({i: {"name": name} for i, name in names.items()}))
     return root
+
+
+def test_json_that_nobody_reads_ends_as_a_command_does_whose_reader_had_enough(dataset: Path) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)  # as `| head` does
+    command = [sys.executable, "-u", "-c", "import sys; from sim_replay.launch import main; sys.exit(main())"]
+    arguments = ["stats", "--dataset", str(dataset), "--json"]
+    done = subprocess.run([*command, *arguments], stdout=write_end, stderr=subprocess.PIPE, text=True, timeout=200)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_every_figure_is_that_of_the_files(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

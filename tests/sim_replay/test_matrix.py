@@ -124,3 +124,31 @@ def test_faults_alone_of_an_empty_sky_are_refused(tmp_path: Path, capsys: pytest
     sky = write_toy_flight(tmp_path / "sky", target=False, labelled=True)
     assert main(["matrix", "--sequence", str(sky), "--fault", "mavlink-cut", "--out", str(tmp_path / "out")]) == 2
     assert "no sequence shows a target" in capsys.readouterr().err
+
+
+def test_a_fault_that_the_host_does_not_allow_is_refused_before_anything_is_flown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequence = write_toy_flight(tmp_path / "toy")
+    model, out = write_toy_model(tmp_path / "toy.onnx"), tmp_path / "out"
+    monkeypatch.setenv("PATH", str(tmp_path))  # no unshare, as on a host that lets nobody mount
+    faults = ["--fault", "none", "--fault", "disk-full"]
+    assert main(["matrix", "--sequence", str(sequence), "--model", str(model), *faults, "--out", str(out)]) == 2
+    told = capsys.readouterr()
+    assert "--fault disk-full: needs a host that lets a user mount" in told.err
+    assert told.out == ""
+    assert list(out.iterdir()) == []
+
+
+def test_what_was_flown_is_kept_when_a_later_sequence_cannot_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sound, torn = write_toy_flight(tmp_path / "sound"), write_toy_flight(tmp_path / "torn")
+    (torn / "rgb/000000.png").write_bytes(b"no picture")
+    model, out = write_toy_model(tmp_path / "toy.onnx"), tmp_path / "out"
+    sequences = ["--sequence", str(sound), "--sequence", str(torn)]
+    assert main(["matrix", *sequences, "--model", str(model), "--out", str(out)]) == 2
+    assert "000000.png" in capsys.readouterr().err
+    (flown,) = json.loads((out / "matrix.json").read_text())
+    assert (flown["sequence"], flown["wrong"]) == ("sound", [])
+    assert flown["poses"] > 0

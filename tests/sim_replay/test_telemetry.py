@@ -37,6 +37,7 @@ def test_a_mark_before_the_header_and_a_blank_line_at_the_end_are_passed_over(tm
         ("9" * 25, "line 3: t_ns is beyond 64 bits"),
         ('"' + "9" * 200_000 + '"', "line 3 is not CSV: field larger than"),
         ("soon", "line 3 does not hold 17 numbers"),
+        ("20000000.0", "line 3 does not hold 17 numbers, t_ns a whole one"),
     ],
 )
 def test_a_number_that_is_none_is_told_with_its_line(tmp_path: Path, t_ns: str, words: str) -> None:
