@@ -115,11 +115,12 @@ class Node:
 
 def declare(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher | ext.AdvancedPublisher:
     """A zenoh publisher on `key` with the row's quality of service; with a cache for late joiners if the row says."""
+    # Never "express": each sample would be a batch of its own, and the queue has room for few. With eight targets it
+    # waited for room and lost some even on loopback, and arrived no sooner.
     quality = {
         "encoding": topics.encoding(topic),
         "congestion_control": topic.congestion,
         "priority": topic.priority,
-        "express": topic.express,
         "reliability": topic.reliability,
     }
     if not topic.cache:

@@ -27,6 +27,8 @@ OPEN_TIMEOUT_MS = 4000
 QUIC_OPEN_TIMEOUT_MS = 10_000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
+# zenoh's own 2 are not enough: while a busy machine sends those, poses of the same frame find no room and are lost.
+POSE_BATCHES = 4
 # On a link whose poses are capped: what a person needs beside them, and no more.
 TF_RATE_MAX_HZ = 5.0
 DETECTIONS_RATE_MAX_HZ = 2.0
@@ -230,6 +232,7 @@ def _config(
     _insert(config, "scouting/gossip/enabled", discovery)
     _insert(config, "timestamping/enabled", True)
     _insert(config, "transport/link/tx/lease", LEASE_MS)
+    _insert(config, "transport/link/tx/queue/size/real_time", POSE_BATCHES)
     by_quic = any(endpoint.startswith("quic/") for endpoint in connect)
     _insert(config, "transport/unicast/open_timeout", QUIC_OPEN_TIMEOUT_MS if by_quic else OPEN_TIMEOUT_MS)
     _insert(config, "transport/shared_memory/enabled", False)

@@ -46,7 +46,6 @@ class Topic:
     reliability: Reliability
     congestion: CongestionControl
     priority: Priority
-    express: bool
     rate: str
     cache: int  # samples kept for who joins late; 0: none
     recorded: bool
@@ -62,49 +61,49 @@ POSE = Topic(
     "target/{target}/pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
-    _BEST_EFFORT, _DROP, Priority.REAL_TIME, True, "frame rate, capped per link", 0, True,
+    _BEST_EFFORT, _DROP, Priority.REAL_TIME, "frame rate, capped per link", 0, True,
 )  # fmt: skip
 ODOM = Topic(
     "target/{target}/odom",
     "nav_msgs/msg/Odometry",
     "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
-    _BEST_EFFORT, _DROP, Priority.REAL_TIME, True, "frame rate, capped per link", 0, True,
+    _BEST_EFFORT, _DROP, Priority.REAL_TIME, "frame rate, capped per link", 0, True,
 )  # fmt: skip
 DETECTIONS = Topic(
     "target/detections",
     "vision_msgs/msg/Detection3DArray",
     "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018",
-    _BEST_EFFORT, _DROP, Priority.DATA, False, "frame rate; 2 Hz where poses are capped", 0, True,
+    _BEST_EFFORT, _DROP, Priority.DATA, "frame rate; 2 Hz where poses are capped", 0, True,
 )  # fmt: skip
 TF = Topic(
     "tf",
     "tf2_msgs/msg/TFMessage",
     "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    _BEST_EFFORT, _DROP, Priority.DATA, False, "frame rate; 5 Hz where poses are capped", 0, True,
+    _BEST_EFFORT, _DROP, Priority.DATA, "frame rate; 5 Hz where poses are capped", 0, True,
 )  # fmt: skip
 CAMERA_INFO = Topic(
     "camera_info",
     "sensor_msgs/msg/CameraInfo",
     "RIHS01_b3dfd68ff46c9d56c80fd3bd4ed22c7a4ddce8c8348f2f59c299e73118e7e275",
-    _RELIABLE, _DROP, Priority.DATA_HIGH, False, "on change", 1, True,
+    _RELIABLE, _DROP, Priority.DATA_HIGH, "on change", 1, True,
 )  # fmt: skip
 IMAGE = Topic(
     "image/compressed",
     "sensor_msgs/msg/CompressedImage",
     "RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a",
-    _BEST_EFFORT, _DROP, Priority.BACKGROUND, False, "at most 1 Hz, off on radio", 0, False,
+    _BEST_EFFORT, _DROP, Priority.BACKGROUND, "at most 1 Hz, off on radio", 0, False,
 )  # fmt: skip
 DIAGNOSTICS = Topic(
     "diagnostics",
     "diagnostic_msgs/msg/DiagnosticArray",
     "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
-    _RELIABLE, _DROP, Priority.DATA_HIGH, False, "1 Hz", 0, True,
+    _RELIABLE, _DROP, Priority.DATA_HIGH, "1 Hz", 0, True,
 )  # fmt: skip
 EVENTS = Topic(
     "events",
     "rcl_interfaces/msg/Log",
     "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
-    _RELIABLE, _DROP, Priority.DATA_HIGH, False, "on change", 50, True,
+    _RELIABLE, _DROP, Priority.DATA_HIGH, "on change", 50, True,
 )  # fmt: skip
 
 TOPICS = (POSE, ODOM, DETECTIONS, TF, CAMERA_INFO, IMAGE, DIAGNOSTICS, EVENTS)
@@ -209,7 +208,7 @@ def table_markdown() -> str:
     for one in TOPICS:
         name = f"`<uav>/{one.name}`".replace("{target}", "<tN>")
         reliability = "best effort" if one.reliability == Reliability.BEST_EFFORT else "reliable"
-        priority = str(one.priority).rpartition(".")[2].lower().replace("_", " ") + (", express" if one.express else "")
+        priority = str(one.priority).rpartition(".")[2].lower().replace("_", " ")
         kept, recorded = str(one.cache or "–"), "yes" if one.recorded else "no"
         lines.append(f"| {name} | {one.ros_type} | {reliability} | {priority} | {one.rate} | {kept} | {recorded} |")
     return "\n".join(lines) + "\n"

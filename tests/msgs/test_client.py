@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from itertools import pairwise
 
 import pytest
@@ -34,7 +35,7 @@ def test_a_sample_is_what_a_ros_2_publisher_sends(network: Network) -> None:
     first, second = samples[:2]
     assert str(first.key_expr) == topics.publication_key(POSE, "uav1", "t2")
     assert str(first.encoding) == "application/cdr;geometry_msgs/msg/PoseWithCovarianceStamped"
-    assert (first.priority, first.express) == (zenoh.Priority.REAL_TIME, True)
+    assert first.priority == zenoh.Priority.REAL_TIME
     assert first.congestion_control == zenoh.CongestionControl.DROP
     attachments = [topics.parse_attachment(sample.attachment.to_bytes()) for sample in (first, second)]
     assert [a[2] for a in attachments if a] == [topics.gid(token)] * 2
@@ -58,6 +59,24 @@ def test_poses_arrive_typed_with_their_age(network: Network, distribution: topic
         until(lambda: bool(taken), step)
     assert (taken[0].uav, taken[0].target, taken[0].pose.t_cam_target_m[2]) == ("uav1", "t0", 321.0)
     assert 0.1 <= taken[0].age_s < 1.0
+
+
+def test_of_a_frame_with_many_targets_none_is_lost(network: Network) -> None:
+    with client.connect(network.endpoint) as tool, client.subscribe(tool, "uav1", depth=2000, max_age_s=60.0) as poses:
+        publishers = [Node(network.daemon, "uav1").publisher(POSE, f"t{i}") for i in range(16)]
+        until(lambda: poses.poll() is not None, lambda: publishers[-1].put(pose_now().encode()))
+        last = {f"t{i}": publisher.sequence + 50 for i, publisher in enumerate(publishers)}
+        for _ in range(50):
+            for publisher in publishers:
+                publisher.put(pose_now().encode())
+            time.sleep(0.01)  # the frame's period
+        taken: list[TargetPose] = []
+        until(
+            lambda: {one.target: one.sequence for one in taken} == last,
+            lambda: taken.extend(iter(poses.poll, None)),
+            what="the last pose of each target",
+        )
+    assert Counter(one.target for one in taken if one.sequence > last[one.target] - 50) == dict.fromkeys(last, 50)
 
 
 def test_bad_samples_are_counted_by_reason_and_good_ones_still_come(network: Network) -> None:
