@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,9 @@ from edge.reload import load_configured
 FRAME_S = 8.0
 TIMED_RUNS = 10
 LIVE_FRAMES = 20
+STAMPS = "camera_stamps"
 ADVICE = {  # by the kind of edge.health.Reason
-    "camera_stamps": "docs/cameras.md says what a timestamp means; so do pictures that come in bursts",
+    STAMPS: "docs/cameras.md says what a timestamp means; so do pictures that come in bursts",
     "camera_frozen": "does it look at anything that moves? else plug it in again",
 }
 ADVICE_CAMERA = "is it on, plugged in, and reachable from here?"
@@ -64,9 +65,8 @@ def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float 
     """A camera serves one program at a time: where the daemon has it, its word is taken."""
     of_camera = [(kind, text) for kind, text in told_reasons(running) if kind.startswith(CAMERA_REASONS)]
     if of_camera:
-        advice = next((ADVICE[kind] for kind, _ in of_camera if kind in ADVICE), ADVICE_CAMERA)
         said = "; ".join(text for _, text in of_camera)
-        yield wrong("camera", f"the daemon, which has it, says: {said}", advice), None
+        yield wrong("camera", f"the daemon, which has it, says: {said}", _advice(of_camera)), None
         return
     rate_hz = running.get("frame_rate_hz")
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
@@ -89,24 +89,38 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
     capture = Capture(source, opened)
     capture.start()
     try:
-        seen_ns = _see_frames(capture)
+        seen_ns, size_wh = _see_frames(capture)
+        reasons = [(one.kind, one.text) for one in capture.reasons(time.monotonic_ns())]
     except InputError as error:
         yield wrong("camera", str(error), "mend what is named in [camera]"), None
         return
     finally:
         capture.stop()
-    if not seen_ns:
+    said = "; ".join(text for _, text in reasons)
+    if size_wh is None:
         advice = "is it on, plugged in, in no other program's hands, and reachable from here?"
-        yield wrong("camera", f"{name}: no picture within {FRAME_S:.0f} s", advice), None
+        why = f": {said}" if said else ""
+        yield wrong("camera", f"{name}: no picture within {FRAME_S:.0f} s{why}", advice), None
         return
     rate_hz = (len(seen_ns) - 1) / ((seen_ns[-1] - seen_ns[0]) / 1e9) if len(seen_ns) > 2 else None
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
-    yield good("camera", f"{name}: {info.image_size_wh[0]}x{info.image_size_wh[1]}{rate}"), rate_hz
+    text = f"{name}: {size_wh[0]}x{size_wh[1]}{rate}"
+    if not reasons:
+        yield good("camera", text), rate_hz
+        return
+    # Stamps that jump may be a busy machine's; of a camera that is frozen or lost again nothing is seen.
+    bad = poor if all(kind == STAMPS for kind, _ in reasons) else wrong
+    yield bad("camera", f"{text}; {said}", _advice(reasons)), rate_hz
 
 
-def _see_frames(capture: Capture) -> list[int]:
-    """Exposure times of the first frames that come. Raises InputError."""
-    until_s, seen_ns = time.monotonic() + FRAME_S, list[int]()
+def _advice(reasons: Iterable[tuple[str, str]]) -> str:
+    """What to do about the first of these kinds that has its own."""
+    return next((ADVICE[kind] for kind, _ in reasons if kind in ADVICE), ADVICE_CAMERA)
+
+
+def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
+    """Exposure times of the first frames that come, and the size of the last; None: none came. Raises InputError."""
+    until_s, seen_ns, size_wh = time.monotonic() + FRAME_S, list[int](), None
     while time.monotonic() < until_s and len(seen_ns) < LIVE_FRAMES:
         try:
             frame = capture.newest(0.2)
@@ -114,7 +128,8 @@ def _see_frames(capture: Capture) -> list[int]:
             break
         if frame is not None:
             seen_ns.append(frame.meta.capture_ns)
-    return seen_ns
+            size_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+    return seen_ns, size_wh
 
 
 def _model(file: ConfigFile, frame_ms: float | None) -> Iterator[Finding]:

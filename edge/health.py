@@ -241,9 +241,9 @@ class Health:
         condition = self.assess(now_ns)
         latency_ms = {stage: percentiles_ms(values) for stage, values in self._stages_ns.items()}
         sure = sum(track.state is not TrackState.TENTATIVE for track in self._tracks)
-        held = 0 if condition.activity is Activity.WAITING else sure  # those of a camera that is gone are history
+        # Of a camera that is gone, targets and rate are history.
+        held, rate_hz = (0, 0.0) if condition.activity is Activity.WAITING else (sure, self._frame_rate_hz())
         counted = {"poses": self._poses, **counters}
-        rate_hz = self._frame_rate_hz()
         return HealthSnapshot(now_ns, condition, held, rate_hz, counted, latency_ms, facts or {})
 
     def recent_total_ms(self, now_ns: int) -> Percentiles | None:

@@ -120,7 +120,7 @@ class Reloader:
         self._asked = False
         self._ready: Reloaded | None = None
         self._taken = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: threading.Thread | None = None  # of the reload under way
         self._lock = threading.Lock()
         self._answer: Callable[[ReloadOutcome], None] | None = None  # of what is asked for, or under way
 
@@ -131,7 +131,7 @@ class Reloader:
     def ask_for(self, answer: Callable[[ReloadOutcome], None]) -> bool:
         """The same, and `answer` hears the outcome on the reload's thread; False if another one waits for its own."""
         with self._lock:
-            if self._answer is not None or (self._thread is not None and self._thread.is_alive()):
+            if self._answer is not None or self._thread is not None:
                 return False
             self._answer = answer
         self._asked = True
@@ -145,7 +145,7 @@ class Reloader:
         if ready is not None:
             self._taken.set()
             return ready
-        if self._asked and (self._thread is None or not self._thread.is_alive()):
+        if self._asked and self._thread is None:
             self._asked = False
             self._taken.clear()
             arguments = (flying, estimator, camera, event)
@@ -172,6 +172,7 @@ class Reloader:
             self._taken.wait()
         with self._lock:
             answer, self._answer = self._answer, None
+            self._thread = None  # before the answer: who has it may ask again at once
         if answer is not None:
             answer(outcome)
 

@@ -34,6 +34,7 @@ class StatusBoard:
         self.file = file
         self.model = model
         self.camera = camera
+        self.image_size_wh = camera.image_size_wh  # of the newest frame: until one came, as the camera was opened
         self.snapshot: HealthSnapshot | None = None
         self._start_ns = clock.monotonic_ns()
         self._version = importlib.metadata.version(DISTRIBUTION)
@@ -44,7 +45,7 @@ class StatusBoard:
 
     def info(self) -> dict[str, Any]:
         snapshot, now_ns = self.snapshot, clock.monotonic_ns()
-        width, height = self.camera.image_size_wh
+        width, height = self.image_size_wh
         told: dict[str, Any] = {
             "vehicle": self.file.config.vehicle.name,
             "pid": os.getpid(),

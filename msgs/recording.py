@@ -90,7 +90,9 @@ class Recorder:
         self._opened_s = 0.0
         self._clock_ns = 0  # of the file's first sample
         self._retry_s = 0.0
-        self._failure: str | None = None
+        self._failure: str | None = None  # while it is there what comes is lost
+        self._stopped = False  # as it was told: from a failure until something is on the disk again
+        self._holds_samples = False  # the file, on the disk
         self._thread: threading.Thread | None = None
 
     @property
@@ -184,6 +186,9 @@ class Recorder:
         for sample in samples:
             self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         self._file.flush()
+        if samples:
+            self._holds_samples = True
+            self._tell_going()
         aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
         if not go_on or aged or self._file.size >= self._limits.file_bytes_max:
             self._end_file()
@@ -202,7 +207,7 @@ class Recorder:
         self._store.finish_unfinished()
         self._store.make_room()
         self._file = self._store.new_file()
-        self._opened_s = now_s
+        self._opened_s, self._holds_samples = now_s, False
         self._clock_ns = samples[0].clock_ns if samples else _utc_ahead_ns()
         with self._changed:
             standing = list(self._standing.values())
@@ -213,16 +218,25 @@ class Recorder:
                 self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns)
         if self._failure is not None:
             self._set_failure(None)
-            log.info("recording again")
-            self._tell(logging.INFO, "recording again")
+
+    def _tell_going(self) -> None:
+        """A file that could be begun is not enough: a disk may have room for its first bytes and no more."""
+        if not self._stopped:
+            return
+        self._stopped = False
+        log.info("recording again")
+        self._tell(logging.INFO, "recording again")
 
     def _fail(self, error: Exception, lost: int) -> None:
         """Leave what is whole on the disk, say so once, and try again later."""
         if self._file is not None:
             file, self._file = self._file, None
             file.abandon()
+            if not self._holds_samples:
+                with suppress(OSError):
+                    file.path.unlink()
         self._retry_s = time.monotonic() + RETRY_S
-        first = self._failure is None
+        first, self._stopped = not self._stopped, True
         reason = error.strerror if isinstance(error, OSError) else repr(error)
         self._set_failure(reason or str(error), lost)
         if first:

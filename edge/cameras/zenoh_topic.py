@@ -18,6 +18,7 @@ from edge.cameras.source import EndOfStream, SourceLost
 from edge.cameras.stamps import StampCheck
 from edge.clock import UtcClock
 from edge.config_camera import ZenohCamera
+from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 from msgs.cdr import CompressedImage
 from msgs.session import client_config
@@ -32,6 +33,14 @@ STAMP_AGE_MAX_NS = 2_000_000_000
 PUBLISHER_SILENT_NS = 1_000_000_000  # then another may take its place
 # A picture turned by what its EXIF says would be of another camera than was calibrated.
 DECODING = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+
+
+class _UnusableError(Exception):
+    """A picture that is not one for the daemon; the text says what it is instead."""
+
+    def __init__(self, counted_as: str, text: str) -> None:
+        super().__init__(text)
+        self.counted_as = counted_as
 
 
 class ZenohSource:
@@ -70,22 +79,32 @@ class ZenohSource:
             self._session.declare_subscriber(key, handlers.Callback(self._take, indirect=False))
         except zenoh.ZError as error:
             self.close()
-            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+            reason = str(error).partition(" at /")[0].rstrip("! ")  # what follows is a line of zenoh's source
             raise SourceLost(f"no zenoh session with {self._settings.connect}: {reason}") from error
         return self.nominal()
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next picture. Raises SourceLost when none came for three seconds."""
+        """The next picture. Raises SourceLost when none came for three seconds, or none that can be used."""
         silent_ns = time.monotonic_ns() + round(SILENCE_S * 1e9)
+        unusable, why = 0, ""
         while time.monotonic_ns() < silent_ns:
             if stop.is_set():
                 raise EndOfStream
             with self._arrived:
                 self._arrived.wait_for(lambda: self._sample is not None, LOOK_S)
                 sample, self._sample = self._sample, None
-            if sample is not None and (frame := self._frame(*sample)) is not None:
-                return frame
-        raise SourceLost(f"no picture on {self._settings.topic} for {SILENCE_S:.0f} s")
+            if sample is None:
+                continue
+            try:
+                return self._frame(*sample)
+            except _UnusableError as error:
+                self.counts[error.counted_as] += 1
+                unusable, why = unusable + 1, str(error)
+        topic, seconds = self._settings.topic, f"{SILENCE_S:.0f} s"
+        if unusable:
+            # Who is told that none came looks for a cable, not for the calibration.
+            raise SourceLost(f"of {unusable} pictures on {topic} in {seconds} none can be used: the last {why}")
+        raise SourceLost(f"no picture on {topic} for {seconds}")
 
     def close(self) -> None:
         if self._session is not None:
@@ -107,20 +126,16 @@ class ZenohSource:
             self._sample = (now_ns, sample.payload.to_bytes(), attachment)
             self._arrived.notify()
 
-    def _frame(self, arrival_ns: int, payload: bytes, attachment: bytes) -> Frame | None:
+    def _frame(self, arrival_ns: int, payload: bytes, attachment: bytes) -> Frame:
+        """Raises _UnusableError."""
         try:
             message = CompressedImage.decode(payload)
-        except PayloadError:
-            self.counts["undecodable"] += 1
-            return None
+        except PayloadError as error:
+            raise _UnusableError("undecodable", "is no sensor_msgs/CompressedImage") from error
         image_bgr = decode_picture(message.data)
         if image_bgr is None:
-            self.counts["undecodable"] += 1
-            return None
+            raise _UnusableError("undecodable", "cannot be decoded, or has more than 8 bits a channel")
         fitted = self._fit((image_bgr.shape[1], image_bgr.shape[0]))
-        if fitted is None:
-            self.counts["misfit"] += 1
-            return None
         stamp_ns = self._clock.monotonic_ns(message.stamp_ns)
         if not self._stamps.believes(stamp_ns, arrival_ns):
             self.counts["unstamped"] += 1
@@ -128,9 +143,12 @@ class ZenohSource:
         meta = FrameMeta(self._number(attachment), stamp_ns - self._latency_ns, arrival_ns)
         return Frame(meta, image_bgr, fitted.K, fitted.distortion)
 
-    def _fit(self, size_wh: tuple[int, int]) -> Intrinsics | None:
-        (w, h), (new_w, new_h) = self._intrinsics.image_size_wh, size_wh
-        return self._intrinsics.scaled_to(size_wh) if w * new_h == h * new_w else None
+    def _fit(self, size_wh: tuple[int, int]) -> Intrinsics:
+        """Raises _UnusableError."""
+        try:
+            return self._intrinsics.scaled_to(size_wh)
+        except InputError as error:
+            raise _UnusableError("misfit", f"is of another shape: {error}") from error
 
     def _number(self, attachment: bytes) -> int:
         """Counts up with the publisher's own numbers while one publisher sends, so that what is lost shows as a gap."""

@@ -117,9 +117,13 @@ class MavlinkLink:
         """Send what waits, end the thread and close the sockets. May be called twice, or without start."""
         self._stopping.set()
         self._poke()
+        ended = True
         if self._thread is not None:
             self._thread.join(STOP_TIMEOUT_S)
+            ended = not self._thread.is_alive()
             self._thread = None
+        if self._signing is not None and ended:
+            self._signing.rest()
         for endpoint in self._endpoints:
             endpoint.transport.close()
         self._endpoints.clear()

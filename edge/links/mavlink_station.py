@@ -18,6 +18,7 @@ from edge.links import mavlink_messages as words
 from edge.links.allowance import Allowance
 from edge.links.computer_status import ComputerReader, onboard_computer_status
 from edge.links.mavlink_commands import answer
+from edge.links.mavlink_namesakes import Namesakes
 from edge.links.mavlink_packing import Letter
 from edge.links.mavlink_primary import Primary
 from edge.links.mavlink_rates import sent_rates_hz, wanted_rates_hz
@@ -90,6 +91,7 @@ class Station:
         self._utc = UtcClock()
         self._telemetry = Telemetry(own_ship, self.timesync, self._utc, settings.gimbal_component_id)
         self._components = (settings.component_id, settings.camera_component_id)
+        self._namesakes = Namesakes(dict(zip(self._components, ("component_id", "camera_component_id"), strict=True)))
         self._schedule = Schedule(sent_rates_hz(settings))
         self._computer = ComputerReader()
         self._heartbeat_due_ns = self._timesync_due_ns = 0
@@ -115,6 +117,7 @@ class Station:
             if is_autopilot_heartbeat(message):
                 self._count(message, None if self._meet(message, link, now_ns) else "not_our_autopilot")
                 continue
+            self._namesakes.heard(message, self.vehicle.system_id)
             reason = self._misdirected(message, link)
             self._count(message, reason)
             if reason is None:
@@ -133,6 +136,7 @@ class Station:
             self._heartbeat_due_ns = now_ns + HEARTBEAT_NS
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
+            self._namesakes.sent(out.everywhere)
         if self.vehicle.system_id is not None:
             out.everywhere += self._held()
         frameless = self._sight is not None and not self._in_sight(now_ns)
@@ -202,7 +206,7 @@ class Station:
 
     def news(self, now_ns: int) -> list[str]:
         """Sentences, each once: what a person has to set right."""
-        return self.recognition.news() + self._telemetry.daytime.news(now_ns)
+        return self.recognition.news() + self._telemetry.news(now_ns) + self._namesakes.news()
 
     def withheld(self) -> list[str]:
         """Sentences: what the settings ask for and this vehicle does not get."""
@@ -255,7 +259,7 @@ class Station:
             if by_autopilot and self.vehicle.boot_time(up_ms):
                 self._telemetry.forget(now_ns)
                 self.timesync.clear()
-            reason = self._telemetry.take(message, now_ns)
+            reason = self._telemetry.take(message, now_ns, self.vehicle.autopilot)
             self.counters["position_jumps"] = self._telemetry.position_jumps
             self.counters["attitude_jumps"] = self._telemetry.attitude_jumps
             self.counters["gimbal_jumps"] = self._telemetry.gimbal_jumps

@@ -38,6 +38,7 @@ GIMBAL_FAILURES = (
     | dialect.GIMBAL_DEVICE_ERROR_FLAGS_COMMS_ERROR
     | dialect.GIMBAL_DEVICE_ERROR_FLAGS_CALIBRATION_RUNNING
 )
+SERVO_GIMBAL = "PX4 tells what it steers the gimbal's servos by, not where the camera looks: it is not used"
 
 
 def gimbal_frame(flags: int) -> GimbalFrame | None:
@@ -52,6 +53,14 @@ def gimbal_frame(flags: int) -> GimbalFrame | None:
     if not earth and not heading:
         earth = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK
     return GimbalFrame.EARTH if earth else GimbalFrame.HEADING
+
+
+def steers_servos(message: Any, autopilot: int | None) -> bool:
+    """Whether a gimbal's attitude is what PX4 steers its servos by. That measures nothing, is told in the body's axes,
+    level or not, and its yaw lock says how it was asked for; of gimbals that measure, PX4 says the frame."""
+    framed = dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME | dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+    by_px4 = autopilot == dialect.MAV_AUTOPILOT_PX4 and message.get_srcComponent() == AUTOPILOT_COMPONENT
+    return by_px4 and not message.flags & framed
 
 
 def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
@@ -76,6 +85,7 @@ class Telemetry:
         self._utc = utc
         self._gimbal_id = gimbal_id
         self.attitude_jumps = self.position_jumps = self.gimbal_jumps = 0
+        self._servos_heard = self._servos_told = False
         self._forget()
         self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
 
@@ -93,11 +103,16 @@ class Telemetry:
         self._quaternion_ns: int | None = None
         self._gimbal: tuple[int, int] | None = None  # its id, heard ns
 
-    def take(self, message: Any, now_ns: int) -> str | None:
-        """Take in a message that was found sound; why it was not, or None."""
+    def news(self, now_ns: int) -> list[str]:
+        """Sentences, each once: what a person has to set right."""
+        untold, self._servos_told = self._servos_heard and not self._servos_told, self._servos_heard
+        return self.daytime.news(now_ns) + ([SERVO_GIMBAL] if untold else [])
+
+    def take(self, message: Any, now_ns: int, autopilot: int | None = None) -> str | None:
+        """Take in a message that was found sound, of a MAV_AUTOPILOT or its gimbal; why it was not, or None."""
         message_id = message.get_msgId()
         if message_id == GIMBAL_ATTITUDE:
-            return self._take_gimbal(message, now_ns)
+            return self._take_gimbal(message, now_ns, autopilot)
         time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
         rising = True
         if message_id == ATTITUDE_QUATERNION:
@@ -137,12 +152,15 @@ class Telemetry:
             self._positions_from_ns = now_ns + JUMP_REST_NS
         return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
 
-    def _take_gimbal(self, message: Any, now_ns: int) -> str | None:
+    def _take_gimbal(self, message: Any, now_ns: int, autopilot: int | None) -> str | None:
         # One that an autopilot speaks for has a number from 1 to 6, by which it is told from the others there.
         component = message.get_srcComponent()
         gimbal_id = message.gimbal_device_id or component if component == AUTOPILOT_COMPONENT else component
         if not self._heeds(gimbal_id, now_ns):
             return "other_gimbal"
+        if steers_servos(message, autopilot):
+            self._servos_heard = self._own_ship.gimballed
+            return "servo_gimbal"
         if message.failure_flags & GIMBAL_FAILURES:
             return "gimbal_failure"
         frame = gimbal_frame(message.flags)

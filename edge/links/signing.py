@@ -52,7 +52,7 @@ class Signing:
     """One key, the timestamps used with it, and those seen. Used by one thread.
 
     `saved` is what `save` was last given, or 0: no timestamp up to it is used again. `save` is called before a
-    timestamp beyond it is used, so that a restart without a clock that knows the time repeats none.
+    timestamp beyond it is used, so that a restart without a clock that knows the time repeats none; `rest` at the end.
     """
 
     def __init__(self, key: bytes, saved: int, save: Callable[[int], None], utc_ns: Callable[[], int]) -> None:
@@ -73,6 +73,13 @@ class Signing:
             self._reserved = min(self._last + RESERVED_AHEAD, TIMESTAMP_MAX)
             self._save(self._reserved)
         return self._last
+
+    def rest(self) -> None:
+        """Nothing more is signed: what was put aside and not used is free again. Else each start would run a minute
+        ahead of the one before, and soon refuse an autopilot that knows the time."""
+        if self._last < self._reserved:
+            self._reserved = self._last
+            self._save(self._reserved)
 
     def prepare(self, mav: Any, link_id: int = 0) -> None:
         """Let a pymavlink packer sign its next message, as one of a link (0..255)."""

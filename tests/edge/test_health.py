@@ -178,6 +178,16 @@ def test_a_link_whose_thread_has_ended_is_told(toy_model: Path) -> None:
     assert "the mavlink thread has ended" in supervisor.snapshot().condition.texts
 
 
+def test_a_camera_that_is_gone_has_no_frame_rate() -> None:
+    health, period_ns = Health(wants_attitude=False), 100_000_000
+    for sequence in range(20):
+        health.frame_done(sequence, {"total": 1}, (), has_attitude=False, now_ns=sequence * period_ns)
+    last_ns = 19 * period_ns
+    assert health.snapshot(last_ns, {}).frame_rate_hz == pytest.approx(10.0)
+    gone = health.snapshot(last_ns + health.no_frame_ns + 1, {})
+    assert (gone.condition.state, gone.frame_rate_hz) == (HealthState.FAULT, 0.0)
+
+
 def test_what_else_is_wrong_degrades_a_daemon_that_tracks() -> None:
     slow = Reason("slow", "slow: p95 90 ms from exposure to the links")
     searching = Condition(HealthState.DEGRADED, Activity.SEARCHING, (slow,))

@@ -27,7 +27,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, alone, hear, linked, meet, on_the_wire
-from .reports import TRACKING
+from .reports import SEARCHING, TRACKING
 from .reports import make_report as report
 from .reports import make_track as track
 
@@ -238,6 +238,42 @@ def test_a_second_autopilot_on_the_network_is_told_once(
         station.tick(now_ns)
         sentences += station.recognition.news()
     assert [sentence.partition(";")[0] for sentence in sentences] == told
+
+
+@pytest.mark.parametrize(("component", "key"), [(191, "component_id"), (100, "camera_component_id")])
+def test_another_component_with_an_id_of_ours_is_told_and_our_own_words_that_come_back_are_not(
+    component: int, key: str
+) -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        back = 0
+
+        def bring_back() -> None:
+            """As a router with two ways to us does, while what we say changes."""
+            nonlocal back
+            link.set_health(TRACKING if back % 2 else SEARCHING)
+            for message in peer.received:
+                if message.get_type() == "HEARTBEAT":
+                    peer.wire.send(bytes(message.get_msgbuf()))
+                    back += 1
+            peer.received.clear()
+
+        peer.settle(lambda: back >= 6, "our heartbeats", bring_back)
+        peer.settle(lambda: link.counters().get("refused_not_our_autopilot", 0) >= 6, "their return", bring_back)
+        texts: list[str] = []
+
+        def told(words: str) -> bool:
+            texts.extend(m.text for m in peer.received if m.get_type() == "STATUSTEXT")
+            peer.received.clear()
+            return words in "".join(texts)
+
+        link.event(dialect.MAV_SEVERITY_INFO, "all came back")
+        peer.settle(lambda: told("all came back"), "news")
+        assert not told("another component")
+        other = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=component)
+        beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_CAMERA, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+        sentence = f"another component {component} of this vehicle is heard: set another {key}"
+        peer.settle(lambda: told(sentence), "sentence", lambda: peer.wire.send(bytes(beat.pack(other))))
 
 
 def test_who_draws_the_box_hears_on_while_the_autopilot_is_silent() -> None:

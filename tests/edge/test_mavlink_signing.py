@@ -253,6 +253,19 @@ def test_a_restart_repeats_no_timestamp_even_without_a_clock(tmp_path: Path) -> 
     assert open_signing(key, state, lambda: NOW_NS).next_timestamp() == timestamp_of(NOW_NS)
 
 
+def test_an_autopilot_that_knows_the_time_is_believed_however_often_the_link_begins_anew(tmp_path: Path) -> None:
+    key, state = tmp_path / "key", tmp_path / "state"
+    write_new_key(key)
+    used = 0
+    for _ in range(6):
+        one = open_signing(key, state, time.time_ns)
+        with linked(signing=one) as (link, _), Peer(link.ports[0], key=load_key(key)) as peer:
+            meet(link, peer)
+            stamps = [int.from_bytes(bytes(m.get_msgbuf())[-12:-6], "little") for m in peer.received]
+        assert used < min(stamps)
+        used = max(stamps)
+
+
 def test_a_state_from_a_time_to_come_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     key, state = tmp_path / "key", tmp_path / "state"
     write_new_key(key)

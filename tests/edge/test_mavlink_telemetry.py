@@ -270,6 +270,57 @@ def test_a_gimbal_that_cannot_be_right_is_not_believed(
         assert own_ship.at(time.monotonic_ns()) is None
 
 
+PX4, ARDUPILOT = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+LOCKS = 4 + 8 + 16  # roll, pitch and yaw
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "component", "flags", "measured"),
+    [
+        (PX4, 1, 2 + LOCKS, False),
+        (PX4, 1, 0, False),
+        (PX4, 1, 64, True),
+        (PX4, 154, LOCKS, True),
+        (ARDUPILOT, 1, 12, True),
+    ],
+)
+def test_what_px4_steers_a_gimbals_servos_by_is_not_where_the_camera_looks(
+    autopilot: int, component: int, flags: int, measured: bool
+) -> None:
+    own_ship = OwnShipBuffer(gimballed=True)
+    with linked(own_ship=own_ship) as (link, _), Peer(link.ports[0], autopilot=autopilot) as peer:
+        meet(link, peer)
+        gimbal = MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=component)
+
+        def both() -> None:
+            peer.attitude(BODY)
+            nan = math.nan
+            status = (
+                0,
+                0,
+                peer.boot_ms(),
+                flags,
+                [1.0, 0.0, 0.0, 0.0],
+                nan,
+                nan,
+                nan,
+                0,
+                nan,
+                nan,
+                int(component == 1),
+            )
+            peer.wire.send(dialect.MAVLink_gimbal_device_attitude_status_message(*status).pack(gimbal))
+
+        if measured:
+            peer.settle(lambda: own_ship.at(now_ns()) is not None, "own attitude", both)
+            assert "refused_servo_gimbal" not in link.counters()
+        else:
+            told = peer.until(lambda m: m.get_type() == "STATUSTEXT", "sentence", both)
+            assert told.text.startswith("PX4 tells what it steers the gimbal's servos by")
+            assert link.counters()["refused_servo_gimbal"] > 0
+            assert own_ship.at(now_ns()) is None
+
+
 @given(share=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
 def test_a_gimbals_attitude_between_samples_is_their_slerp(share: float, seed: int) -> None:
     rotations = Rotation.random(2, rng=np.random.default_rng(seed))

@@ -13,21 +13,26 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from zenoh import handlers
 
-from edge.config import SHIPPED_MODEL, Config
+from edge.config import SHIPPED_MODEL, Config, ConfigFile
+from edge.estimator.estimator import Estimator
+from edge.estimator.model import load_model
 from edge.links.signing_key import write_new_key
 from edge.reload import Reloader, needs_restart, with_live_keys
 from edge.requests import ReloadOutcome
 from edge.status import ask
+from edge.types import CameraInfo
 from msgs.cdr import Log
 from msgs.client import connect, subscribe
 from msgs.contract import ModelContract
 from msgs.ground.keys import init_authority, issue
 from tests.certificates import redate
+from tests.waiting import until
 
 from .flying import Flight, flying, free_port, toml, write_swaying_scene
 from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
@@ -214,6 +219,21 @@ def test_one_reload_at_a_time() -> None:
     assert reloader.ask_for(told.append)
     assert not reloader.ask_for(told.append)
     assert told == []
+
+
+def test_who_is_told_how_a_reload_went_may_ask_for_the_next_at_once(tmp_path: Path, toy_model: Path) -> None:
+    estimator, camera = Estimator(load_model(toy_model, 1), 1), CameraInfo("", (640, 480), np.eye(3), None)
+    gone = ConfigFile(tmp_path / "gone.toml", "", config_of())
+    reloader, taken, told = Reloader(), list[bool](), list[ReloadOutcome]()
+
+    def ask_again(outcome: ReloadOutcome) -> None:
+        told.append(outcome)
+        taken.append(reloader.ask_for(told.append))
+
+    assert reloader.ask_for(ask_again)
+    until(lambda: len(told) == 2 or taken == [False], lambda: reloader.take(gone, estimator, camera, lambda *_: None))
+    assert taken == [True]
+    assert [outcome.flies for outcome in told] == [False, False]
 
 
 def config_of(**sections: dict[str, object]) -> Config:

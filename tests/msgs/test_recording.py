@@ -330,9 +330,8 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     assert told == [(40, "recording stopped: No space left on device")]
     monkeypatch.setattr(os, "write", real_write)
     os.close(full)
-    until(lambda: len(told) == 2)
+    until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
     assert told[1] == (20, "recording again")
-    record_some(recorder, [b"after"])
     recorder.stop()
     kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
     assert (kept[0], kept[-1]) == (b"before", b"after")

@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
+from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
 from msgs.recording import RecordingLimits, Store
 
 FILE_BYTES = 25_000
+
+# No file may grow beyond what a recording begins with, until four tries have failed.
+NO_ROOM_FOR_MORE = """
+import json, resource, sys, time
+from pathlib import Path
+from msgs import recording, topics
+
+recording.FLUSH_S, recording.RETRY_S = 0.02, 0.05
+told = []
+recorder = recording.Recorder(
+    Path(sys.argv[1]), "uav1", recording.RecordingLimits(free_bytes_min=0), lambda _, text: told.append(text)
+)
+recorder.start()
+
+def feed_until(done):
+    deadline_s = time.monotonic() + 60
+    while not done() and time.monotonic() < deadline_s:
+        recorder.record(topics.CAMERA_INFO, "uav1", None, b"standing", time.time_ns())
+        recorder.record(topics.POSE, "uav1", "t0", bytes(5000), time.time_ns())
+        time.sleep(0.01)
+
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4000, most))
+feed_until(lambda: recorder.counters().get("failures", 0) >= 4)
+while_full = list(told)
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+feed_until(lambda: "recording again" in told[len(while_full):])
+recorder.stop()
+print(json.dumps([while_full, told]))
+"""
 
 
 def test_the_newest_recording_counts_towards_what_all_may_take(tmp_path: Path) -> None:
@@ -20,3 +54,17 @@ def test_the_newest_recording_counts_towards_what_all_may_take(tmp_path: Path) -
     Store(tmp_path, "uav1", limits, lambda _, text: told.append(text)).make_room()
     assert sorted(tmp_path.iterdir()) == files[1:]
     assert told == [f"old recordings removed to make room: 1, up to {files[0].name}"]
+
+
+def test_a_disk_with_room_for_the_first_bytes_alone_is_told_once_and_leaves_no_empty_files(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", NO_ROOM_FOR_MORE, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    while_full, told = json.loads(done.stdout)
+    assert while_full == ["recording stopped: File too large"]
+    assert told == [*while_full, "recording again"]
+    (path,) = tmp_path.iterdir()
+    with path.open("rb") as file:
+        kept = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert "/uav1/target/t0/pose" in kept
+    assert "/uav1/camera_info" in kept, "a file can be read without those before it"

@@ -1,0 +1,129 @@
+"""What a person is told of a camera is true of the pictures that come, not of those that were expected."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.cameras.capture import Capture
+from edge.cameras.zenoh_topic import ZenohSource
+from edge.status import ask
+from msgs.cdr import CompressedImage
+from tests.waiting import until
+
+from .conftest import Cli
+from .flying import flying, free_port
+from .test_cameras_live import deep_png, message, router, zenoh_camera
+
+HALF_WH = (160, 90)  # of what the calibration is for
+NONE: dict[str, Any] = {"info": {}}
+
+
+@contextmanager
+def filming(port: int, payload: Callable[[int], bytes], period_s: float = 0.05) -> Iterator[None]:
+    """A router and a camera behind it, which sends `payload` of 0, 1, … until the context ends."""
+    over = threading.Event()
+    with router(port) as publisher:
+
+        def film() -> None:
+            for index in count():
+                publisher.put(payload(index))
+                if over.wait(period_s):
+                    return
+
+        camera = threading.Thread(target=film)
+        camera.start()
+        try:
+            yield
+        finally:
+            over.set()
+            camera.join()
+
+
+def text_of(camera_port: int, zenoh_port: int, model: Path) -> str:
+    """A configuration that looks through `filming`'s camera, 320x180 by its calibration."""
+    return (
+        f'[camera]\ntype = "zenoh"\ntopic = "nose/image/compressed"\nconnect = "tcp/127.0.0.1:{camera_port}"\n'
+        "intrinsics = { fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }\n"
+        f'[model]\npath = "{model}"\nthreads = 1\n'
+        f'[zenoh]\nlisten = ["tcp/127.0.0.1:{zenoh_port}"]\n[mavlink]\nenabled = false\n'
+    )
+
+
+def camera_finding(cli: Cli, tmp_path: Path, text: str) -> dict[str, Any]:
+    (tmp_path / "config.toml").write_text(text)
+    done = cli("doctor", "--config", "config.toml", "--json")
+    found = json.loads(done.stdout)["findings"]
+    assert (done.returncode == 0) == all(finding["verdict"] != "wrong" for finding in found)
+    return next(finding for finding in found if finding["what"] == "camera")
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (
+            message(1, (300, 200)),
+            "the last is of another shape: these intrinsics are for 320x180 pixels, but the camera",
+        ),
+        (CompressedImage(1, "", "png", deep_png()).encode(), "the last cannot be decoded, or has more than 8 bits"),
+        (b"no message", "the last is no sensor_msgs/CompressedImage"),
+    ],
+)
+def test_a_camera_none_of_whose_pictures_can_be_used_is_not_told_as_one_that_sends_none(
+    payload: bytes, why: str
+) -> None:
+    port = free_port()
+    with filming(port, lambda _: payload):
+        capture = Capture(ZenohSource(zenoh_camera(port)), opened=False)
+        capture.start()
+
+        def told() -> str:
+            return "; ".join(reason.text for reason in capture.reasons(0))
+
+        try:
+            until(lambda: why in told(), what=why)
+            assert "none can be used" in told()
+        finally:
+            capture.stop()
+
+
+def test_status_and_doctor_tell_the_size_of_the_pictures_that_come(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    camera_port, asked_at = free_port(), free_port()
+    text = text_of(camera_port, asked_at, toy_model)
+
+    def told() -> str:
+        return str((ask(f"tcp/127.0.0.1:{asked_at}", "uav1") or NONE)["info"].get("camera"))
+
+    size_wh = [HALF_WH]
+    with filming(camera_port, lambda index: message(index, size_wh[0])):
+        found = camera_finding(cli, tmp_path, text)
+        assert "160x90" in found["says"], found
+        with flying(tmp_path, text):
+            assert told() == "nose/image/compressed 160x90"
+            assert "160x90" in camera_finding(cli, tmp_path, text)["says"]
+            size_wh[0] = (320, 180)  # switched in flight
+            until(lambda: told() == "nose/image/compressed 320x180", what="the new size")
+
+
+def test_doctor_does_not_take_a_frozen_camera_for_a_good_one(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    camera_port = free_port()
+    with filming(camera_port, lambda _: message(1)):
+        found = camera_finding(cli, tmp_path, text_of(camera_port, free_port(), toy_model))
+    assert found["verdict"] == "wrong", found
+    assert "camera frozen" in found["says"]
+    assert "plug it in again" in found["advice"]
+
+
+def test_doctor_says_why_no_picture_came(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
+    camera_port = free_port()
+    with filming(camera_port, lambda _: message(1, (300, 200))):
+        found = camera_finding(cli, tmp_path, text_of(camera_port, free_port(), toy_model))
+    assert found["verdict"] == "wrong", found
+    assert "300x200" in found["says"], found
