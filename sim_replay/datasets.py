@@ -25,7 +25,7 @@ from edge.estimator.lens import Lens, lens_of
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.fields import integer, load_json
 from sim_replay.bop.layout import TARGETS_FILE, dataset_of
-from sim_replay.bop.scene import Image, Mask, read_picture_bgr
+from sim_replay.bop.scene import Image, Mask, picture_size_wh, read_picture_bgr
 
 Array = NDArray[np.float64]
 Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
@@ -104,7 +104,6 @@ class Dataset:
         wanted = self._wanted
         passed_over, listed = 0, False
         for scene in self.scenes:
-            sizes: dict[str, tuple[int, int]] = {}
             frames = scene.pictured
             if len(frames) < len(scene.frames):
                 _log.warning("%s: %d listed pictures are missing", scene.folder, len(scene.frames) - len(frames))
@@ -116,16 +115,15 @@ class Dataset:
                         continue
                     listed = True
                     indices = _chosen(frame.targets, wanted[scene.scene_id, frame.image_id])
-                yield self._frame(scene, frame, indices, sizes)
+                yield self._frame(scene, frame, indices)
         if passed_over and not listed:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
 
     def pictured_frames(self) -> Iterator[DatasetFrame]:
         """Every frame that has a picture, whatever test_targets_bop19.json lists. Raises BopError."""
         for scene in self.scenes:
-            sizes: dict[str, tuple[int, int]] = {}
             for frame in scene.pictured:
-                yield self._frame(scene, frame, range(len(frame.targets)), sizes)
+                yield self._frame(scene, frame, range(len(frame.targets)))
 
     def labelled_frames(self) -> list[DatasetFrame]:
         """Those of frames() whose truth is known: some datasets keep that of their test splits to themselves.
@@ -159,17 +157,12 @@ class Dataset:
     def _wanted(self) -> Wanted | None:
         return _read_targets(self.root / TARGETS_FILE)
 
-    def _frame(
-        self, scene: BopScene, frame: BopFrame, indices: Sequence[int], sizes: dict[str, tuple[int, int]]
-    ) -> DatasetFrame:
+    def _frame(self, scene: BopScene, frame: BopFrame, indices: Sequence[int]) -> DatasetFrame:
         path = scene.image_path(frame)
         unlisted = [index for index in range(len(frame.targets)) if index not in indices]
         targets = [_with_box(scene, frame, index) for index in (*indices, *unlisted)]
-        if any(_unseen(target) for target in targets) and "wh" not in sizes:
-            height, width = read_picture_bgr(path).shape[:2]  # of the scene's first; they are alike
-            sizes["wh"] = (width, height)
         placed = tuple(
-            _with_projected_box(t, self.models.get(t.object_id), frame, sizes["wh"]) if _unseen(t) else t
+            _with_projected_box(t, self.models.get(t.object_id), frame, picture_size_wh(path)) if _unseen(t) else t
             for t in targets
         )
         return DatasetFrame(

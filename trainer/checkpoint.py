@@ -22,15 +22,21 @@ TRAINING_ONLY_PREFIX = "head_dense."
 
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
-    """torch.save to a neighbour, flush to disk, rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """torch.save to a neighbour, flush to disk, rename. Raises ConfigError, the file as it was, where that fails."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             torch.save(content, file)
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
+    except (OSError, RuntimeError) as error:
+        # What torch says at the end of a file that it could not write tells nothing of why.
+        why = error if isinstance(error, OSError) else error.__context__
+        if not isinstance(why, OSError):
+            raise
+        raise ConfigError(f"{path}: cannot be written: {why.strerror}") from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -200,7 +200,7 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 1 rendering failed, 2 bad input, told in a sentence, 130 interrupted, 141 unread."""
+    """Exit codes: 0 done, 1 rendering or a disk failed, 2 bad input, told so, 130 interrupted, 141 unread."""
     arguments = _parser().parse_args(argv)
     # OpenMP threads that spin while they wait cost a busy machine most of its speed. Read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -215,6 +215,11 @@ def _acted(arguments: argparse.Namespace) -> int:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except RenderingError as error:
+        print(f"uavpose-trainer: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        raise  # who read the output has had enough
+    except OSError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -313,10 +313,15 @@ def export_unmeasured(
         config = config.model_copy(update={"contract": contract})
     made_folder(out)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
-    write_graph(model, path)
+    part = path.with_suffix(".part")
     range_m = config.contract.trained_range_m or (Z_RANGE_M if config.data.datasets else RENDERED_RANGE_M)
     spans = (range_m, ANY_SIZE_PX, ANY_SIZE_PX)
-    write_contract(path, _contract(config, training, sha256, (score_min, score_min), *spans))
+    try:
+        write_graph(model, part)
+        write_contract(part, _contract(config, training, sha256, (score_min, score_min), *spans))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     return path
 
 

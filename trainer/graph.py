@@ -33,22 +33,25 @@ QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/",
 
 
 def write_graph(model: PoseNet, path: Path) -> None:
-    """The network as ONNX with msgs.contract's inputs and outputs; N, H and W are free."""
+    """The network as ONNX with msgs.contract's inputs and outputs; N, H and W are free. Raises ConfigError."""
     image = torch.randint(0, 255, (2, 128, 192, 3), dtype=torch.uint8)
     K = torch.tensor([[900.0, 0, 96], [0, 900, 64], [0, 0, 1]]).repeat(2, 1, 1)
     free = {"image": {0: "N", 1: "H", 2: "W"}, "K": {0: "N"}, **{name: {0: "N"} for name in OUTPUT_NAMES}}
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the tracer warns of shapes that it does trace
-        torch.onnx.export(
-            fuse_branches(model),
-            (image, K),
-            str(path),
-            input_names=list(INPUT_NAMES),
-            output_names=list(OUTPUT_NAMES),
-            dynamic_axes=free,
-            opset_version=OPSET,
-            dynamo=False,
-        )
+        try:
+            torch.onnx.export(
+                fuse_branches(model),
+                (image, K),
+                str(path),
+                input_names=list(INPUT_NAMES),
+                output_names=list(OUTPUT_NAMES),
+                dynamic_axes=free,
+                opset_version=OPSET,
+                dynamo=False,
+            )
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 class _Batches(CalibrationDataReader):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import platform
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,46 @@ from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
 from sim_replay.benchmark.manifest import PACKAGES, package_version
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME
 from trainer.config import ConfigError, TrainerConfig, made_folder
 from trainer.evaluate import null_where_unknown
 
 RUN_NAME = "run.json"
+LOCK_NAME = ".lock"
 # What makes the windows and what learns from them.
 SOURCES = ("trainer", "sim_replay", "msgs")
+
+
+@contextmanager
+def run_folder(out: Path, resume: bool, hold: bool = True) -> Iterator[None]:
+    """A run's folder, which `hold` keeps from a second run until this one ends, however that is.
+
+    Raises ConfigError where another run is at work there, or where a new one would take the place of what is there.
+    """
+    with _alone_in(out) if hold and (not resume or out.is_dir()) else nullcontext():
+        if not resume and (out / RESUME_NAME).exists():
+            raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+        if not resume and (out / WEIGHTS_NAME).exists():
+            raise ConfigError(f"{out}: holds weights already; give another --out")
+        yield
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    path = made_folder(out) / LOCK_NAME
+    try:
+        lock = path.open("w")
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{out}: another run is at work there; give another --out") from None
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def commit_of(tree: Path) -> str:

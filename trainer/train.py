@@ -27,7 +27,7 @@ from trainer.losses import Labels, joint_loss, to_tensors
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.rounding import rounded
-from trainer.runlog import RunLog, provenance
+from trainer.runlog import RunLog, provenance, run_folder
 from trainer.sources import refuse_unreadable, window_sampler
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
@@ -254,19 +254,16 @@ def run_training(
     opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
     with joined_group() as group:
         trainer = Trainer(config, group.device, group)
-        if not resume and (out / RESUME_NAME).exists():
-            raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
-        if not resume and (out / WEIGHTS_NAME).exists():
-            raise ConfigError(f"{out}: holds weights already; give another --out")
         if resume and start_from is not None:
             raise ConfigError(f"--start-from {start_from}: a resumed run goes on from its own weights")
         if start_from is not None:
             trainer.start_from(start_from)
-        plan = resume_run(out, trainer) if resume else Plan(config.schedule.samples)
-        budget = Budget(plan.used_s, None if budget_s is None else plan.used_s + budget_s)
-        loop = _Loop(trainer, config_text, out, budget, samples or plan.samples, opener)
-        with stop_on_signals() as stopped:
-            loop.run(stopped, max_steps)
+        with run_folder(out, resume, hold=group.first):
+            plan = resume_run(out, trainer) if resume else Plan(config.schedule.samples)
+            budget = Budget(plan.used_s, None if budget_s is None else plan.used_s + budget_s)
+            loop = _Loop(trainer, config_text, out, budget, samples or plan.samples, opener)
+            with stop_on_signals() as stopped:
+                loop.run(stopped, max_steps)
     return trainer
 
 

@@ -16,8 +16,9 @@ from rich.table import Table
 
 from edge.errors import InputError
 from msgs.settings import read_toml
-from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
+from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, find_scenes, object_names
 from sim_replay.bop.fields import integer, load_object
+from sim_replay.evaluation.judge import is_seen
 
 RANGE_EDGES_M = tuple(range(100, 501, 50))
 # FW-UAV6DPose as the paper's section on the dataset gives it. It prints 7,725 training images; its total needs 8,425.
@@ -52,9 +53,10 @@ class _Counts:
 def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Measure a BOP dataset, split or scene folder. Raises InputError, naming file and key.
 
-    Ranges are distances of target origins from the camera; box shares are those of the first target listed in each
-    frame that shows one, of its visible box in the picture's area. Sizes are of each scene's first picture, or of its
-    camera.json where there are labels alone. A value that the files do not hold is None.
+    Of targets that are said to be hidden nothing is counted. Ranges are distances of target origins from the camera;
+    box shares are those of the first target seen in each frame, of its visible box in the picture's area. Sizes are of
+    each scene's first picture, or of its camera.json where there are labels alone. A value that the files do not hold
+    is None.
     """
     counts = _Counts()
     try:
@@ -90,8 +92,9 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
 
 
 def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str]) -> None:
-    counts.targets_in_frame[len(frame.targets)] += 1
-    for k, target in enumerate(frame.targets):
+    seen = [target for target in frame.targets if is_seen(target) or _is_uncounted(target)]  # BOP lists hidden ones too
+    counts.targets_in_frame[len(seen)] += 1
+    for k, target in enumerate(seen):
         counts.range_m.append(float(np.linalg.norm(target.t_cam_target_m)))
         box = target.box_visible_xyxy_px
         if k == 0 and box is not None and area_px:
@@ -102,6 +105,11 @@ def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, name
             # World is local NED where this project wrote it: further down than the camera is before the ground.
             counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
         counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
+
+
+def _is_uncounted(target: BopTarget) -> bool:
+    """Whether it has a box, and nobody counted its pixels: labels alone say 0 of all."""
+    return target.box_visible_xyxy_px is not None and target.whole_px == 0
 
 
 def _picture_size(scene: BopScene) -> tuple[int, int]:

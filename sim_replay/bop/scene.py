@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from sim_replay.bop.fields import by_number, load_json, load_object, matrix
@@ -219,3 +220,13 @@ def _is_torn_jpeg(coded: bytes) -> bool:
     while at + 4 <= len(coded) and coded[at] == 0xFF and coded[at + 1] != 0xDA:  # to the scan; a thumbnail has its own
         at += 1 if coded[at + 1] == 0xFF else 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
     return coded.find(b"\xff\xd9", at) < 0
+
+
+def picture_size_wh(path: Path) -> tuple[int, int]:
+    """Width and height of a picture as its pixels lie, by its head where that tells. Raises BopError."""
+    try:
+        with PIL.Image.open(path) as picture:
+            return picture.size
+    except (OSError, PIL.Image.DecompressionBombError):  # of kinds and sizes that OpenCV reads none the less
+        height, width = read_picture_bgr(path).shape[:2]
+        return width, height

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from sim_replay.score import Match, stacked
 Array = NDArray[np.float64]
 
 SEQUENCES_MAX = 24  # of more scenes, as many evenly spread ones are drawn
+_OWN_NAMES = re.compile(r"sequence_(?:[\w.-]+_)?\d{6,}\.png|worst_frames\.jpg")
 TRUTH_COLOR, ESTIMATE_COLOR = "#0097a7", "#d500a0"
 _RATES = {
     "recall": "found",
@@ -35,8 +37,14 @@ _RATES = {
 def write_figures(
     out: Path, score: dict[str, Any], judged: Sequence[JudgedFrame], models: Mapping[int, Model]
 ) -> list[Path]:
-    """Draw everything into `out`; returns the files. Raises BopError if a picture can no longer be read."""
+    """Draw everything into `out`, where figures of another evaluation give way; returns the files.
+
+    Raises BopError if a picture can no longer be read.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    for path in list(out.iterdir()):
+        if _OWN_NAMES.fullmatch(path.name):  # of scenes that this one may not have
+            path.unlink()
     matches = [match for frame in judged for match in frame.matches]
     files = [out / "error_by_range.png", out / "cumulative_error.png"]
     _save(error_by_range(score), files[0])

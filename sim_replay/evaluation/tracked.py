@@ -2,7 +2,7 @@
 
 A scene with sequence.toml is of this project's making: its fps counts, and its world is local NED, so the tracker is
 told the camera's attitude and place from cam_R_w2c: exactly as the files have it, or with an autopilot's usual errors.
-Any other scene is taken at DEFAULT_FPS, with nothing known of the own ship.
+Any other scene is taken at DEFAULT_FPS, with nothing known of the own ship; time passes there as pictures' numbers do.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import time
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
+from statistics import median_low
 from typing import Literal
 
 import numpy as np
@@ -60,7 +62,7 @@ class _Sequence:
         errors = OwnShipErrors.of_flight(scene.folder.name) if own_ship == "usual" else None
         path = scene.folder / "sequence.toml"
         if not path.is_file():
-            return cls(scene, DEFAULT_FPS, False, places, list(range(len(places))), errors)
+            return cls(scene, DEFAULT_FPS, False, places, _by_number(list(places)), errors)
         try:
             fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
         except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
@@ -93,6 +95,16 @@ class _Sequence:
             return np.zeros(3), np.zeros(3)
         dt_s = (self.frames[last] - self.frames[first]) / self.fps
         return so3_log(after[0] @ before[0].T) / dt_s, (after[1] - before[1]) / dt_s
+
+
+def _by_number(image_ids: Sequence[int]) -> list[int]:
+    """Which frame each picture is, from 0, by their rising numbers: one left out is a frame that was not kept.
+
+    How far apart the numbers of two frames lie, what most often lies between two pictures tells.
+    """
+    apart = [after - before for before, after in pairwise(image_ids)]
+    frame = median_low(apart) if apart else 1
+    return list(accumulate((max(1, round(gap / frame)) for gap in apart), initial=0))
 
 
 def _place(frame: BopFrame) -> tuple[Array, Array] | None:

@@ -94,6 +94,52 @@ def test_every_figure_is_that_of_the_files(dataset: Path, capsys: pytest.Capture
     assert s["airframe_flights_in_two_splits"] == 1  # flight 11, on purpose
 
 
+def test_what_is_hidden_is_listed_and_not_shown(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """BOP lists a target that something hides, or that lies beyond the edge or behind the camera, in every picture."""
+
+    def statistics() -> Any:
+        assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    before = statistics()
+    for folder in sorted(dataset.glob("*/0*")):
+        for kind, entry in (
+            ("gt", {"obj_id": 3, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 4.1e5]}),
+            ("gt_info", {"bbox_obj": [0, 0, 9, 9], "bbox_visib": [-1] * 4, "px_count_all": 50, "px_count_visib": 0}),
+        ):
+            path = folder / f"scene_{kind}.json"
+            pictures = json.loads(path.read_text())
+            path.write_text(json.dumps({key: [entry, *targets] for key, targets in pictures.items()}))
+    assert statistics() == before
+    camera = json.loads((folder / "scene_camera.json").read_text())
+    path = folder / "scene_gt.json"
+    (folder / "scene_gt_info.json").unlink()  # then nobody says that it is hidden, but where it lies may
+    assert statistics()["range_histogram_m"]["400-450"] == len(camera)
+    hidden_behind = {"obj_id": 3, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, -4.1e5]}
+    pictures = json.loads(path.read_text())
+    path.write_text(json.dumps({key: [hidden_behind, *targets[1:]] for key, targets in pictures.items()}))
+    assert statistics()["targets_per_frame"] == before["targets_per_frame"]
+
+
+def test_labels_without_pixel_counts_tell_of_targets_that_are_seen(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As `generate --labels-only` writes them."""
+
+    def shown() -> list[Any]:
+        assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        return [told[name] for name in ("targets_per_frame", "range_m", "box_share", "airframes")]
+
+    before = shown()
+    for path in dataset.glob("*/0*/scene_gt_info.json"):
+        info = json.loads(path.read_text())
+        for entry in (entry for entries in info.values() for entry in entries):
+            entry.update(px_count_all=0, px_count_visib=0, visib_fract=0.0)
+        path.write_text(json.dumps(info))
+    assert shown() == before
+
+
 def test_the_table_stands_beside_the_papers(dataset: Path, capsys: pytest.CaptureFixture[str],
                                             monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     monkeypatch.setenv("COLUMNS", "200")

@@ -97,6 +97,34 @@ def test_a_picture_lies_as_its_pixels_do_whatever_its_exif_says(scene: Path) -> 
     assert read_scene(scene).image_bgr(read_scene(scene).frames[0]).shape == (120, 160, 3)
 
 
+def test_each_picture_of_a_scene_cuts_its_targets_at_its_own_edge(scene: Path) -> None:
+    """Sizes change in the middle of a scene; nothing but the model tells where the target is seen."""
+    half_mm = {f"{kind}_{axis}": value for axis in "xyz" for kind, value in (("min", -2e3), ("size", 4e3))}
+    write_models_info(scene.parents[1], **half_mm)
+    sizes_wh = {0: (160, 120), 1: (320, 240), 2: (320, 240), 3: (105, 83), 4: (320, 240), 5: (105, 240)}
+    (scene / "rgb" / "000000.jpg").unlink()
+    for image_id, (width, height) in sizes_wh.items():
+        suffix, options = {0: ".png", 2: ".bmp", 4: ".tif"}.get(image_id, ".jpg"), []
+        if suffix == ".jpg":
+            options = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(image_id == 5)]
+        pixels = np.full((height, width, 3), 90, np.uint8)
+        cv2.imwrite(str(scene / "rgb" / f"{image_id:06d}{suffix}"), pixels, options)
+    cameras = {str(i): {"cam_K": [2000.0, 0, 100.0, 0, 2000.0, 80.0, 0, 0, 1]} for i in sizes_wh}
+    write_json(scene / "scene_camera.json", cameras)
+    middle_mm = {i: [0.0, 0.0, 2e5] if i in (3, 5) else [12e3, 8e3, 2e5] for i in sizes_wh}  # at 100, 80 or 220, 160 px
+    poses = {str(i): [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": t_mm}] for i, t_mm in middle_mm.items()}
+    write_json(scene / "scene_gt.json", poses)
+    dataset = open_dataset(scene)
+    frames = dataset.labelled_frames()
+    boxes = [frame.targets[0].box_visible_xyxy_px for frame in frames]
+    assert [len(truths_of(0, frame, dataset.models)) for frame in frames] == [0, 1, 1, 1, 1, 1]
+    assert boxes[0] is None
+    for k in (1, 2, 4):
+        np.testing.assert_allclose(boxes[k], [198.8, 139.2, 241.4, 181.2], atol=1.5)
+    np.testing.assert_allclose(boxes[3], [79.8, 59.8, 104.5, 82.5], atol=0.3)
+    np.testing.assert_allclose(boxes[5], [79.8, 59.8, 104.5, 100.2], atol=0.3)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -126,3 +126,38 @@ def test_a_sequence_without_a_frame_rate_is_named(tmp_path: Path, dark_spot_mode
     (scene / "sequence.toml").write_text(text)
     with pytest.raises(InputError, match=r"sequence\.toml: 'fps'"):
         flown(tmp_path / "data", dark_spot_model)
+
+
+def write_gapped_scene(folder: Path, numbers: list[int], frames: list[int]) -> None:
+    """A spot that flies east by 4 m a frame, of another's making: the pictures of those frames, so numbered."""
+    write_scene(folder, [0.5] * (frames[-1] + 1), east_m=-10.0, step_m=4.0)
+    for path in sorted((folder / "rgb").iterdir()):
+        path.rename(path.with_stem(f"frame_{int(path.stem)}"))
+    for number, frame in zip(numbers, frames, strict=True):
+        (folder / "rgb" / f"frame_{frame}.png").rename(folder / "rgb" / f"{number:06d}.png")
+    for name in ("scene_camera.json", "scene_gt.json"):
+        entries = json.loads((folder / name).read_text())
+        kept = {str(number): entries[str(frame)] for number, frame in zip(numbers, frames, strict=True)}
+        (folder / name).write_text(json.dumps(kept))
+
+
+FRAMES_KEPT = [*range(8), *range(14, 20)]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        FRAMES_KEPT,
+        [12 * frame for frame in FRAMES_KEPT],
+        [1_700_000_000_000_000 + 33_333 * frame + 7 * (frame % 3) for frame in FRAMES_KEPT],  # microseconds
+    ],
+)
+def test_frames_left_out_of_a_scene_are_time_that_passed(
+    tmp_path: Path, dark_spot_model: Path, numbers: list[int]
+) -> None:
+    """Without it a target jumps where pictures are missing, and the tracker is blamed for it."""
+    write_gapped_scene(tmp_path / "data" / "test" / "000000", numbers, FRAMES_KEPT)
+    results = flown(tmp_path / "data", dark_spot_model)
+    errors_m = [frame.matches[0].translation_error_m for frame in results]
+    assert all(error_m is not None and error_m < 3.0 for error_m in errors_m[3:]), errors_m
+    assert told(results)[8:] == [True] * 6

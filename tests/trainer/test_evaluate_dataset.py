@@ -178,6 +178,22 @@ def test_a_results_file_that_lies_where_the_figures_go_stays_as_it_is(
     assert results.read_bytes() == content
 
 
+def test_figures_of_an_earlier_evaluation_do_not_stand_beside_the_new_metrics(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Other scenes then, all of them empty now: what is not drawn anew would be taken for the new method's."""
+    empty = tmp_path / "sky" / "test" / "000007"
+    shutil.copytree(dataset / "test" / "000002", empty)
+    (empty / "scene_gt.json").write_text("{}")
+    results, out = write_results(tmp_path / "none_plane-test.csv", []), tmp_path / "out"
+    evaluated(capsys, "--results", results, "--dataset", dataset, "--split", "test", "--out", out)
+    (out / "sequence_of_mine.png").write_bytes(b"kept")
+    assert (out / "worst_frames.jpg").is_file()
+    evaluated(capsys, "--results", results, "--dataset", tmp_path / "sky", "--split", "test", "--out", out)
+    figures = {"error_by_range.png", "cumulative_error.png", "sequence_000007.png"}
+    assert {path.name for path in out.iterdir()} == {"metrics.json", "frames.jsonl", "sequence_of_mine.png", *figures}
+
+
 def test_by_default_the_shipped_model_flies_over_the_bundled_scene(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

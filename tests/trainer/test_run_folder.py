@@ -8,6 +8,7 @@ import math
 import re
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -97,6 +98,27 @@ def test_a_record_of_starts_that_was_damaged_is_named(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text('{"starts": [')
     with pytest.raises(ConfigError, match=r"run\.json: not JSON"):
         RunLog(tmp_path, tiny.TOML, {"from_samples": 0})
+
+
+def test_a_second_run_in_the_folder_is_refused_while_the_first_is_at_work(tmp_path: Path) -> None:
+    """Their curves would be told as one, and the weights be of whichever saved last."""
+    out, other = tmp_path / "run", tmp_path / "other.toml"
+    other.write_text(tiny.TOML.replace("seed = 3", "seed = 7"))
+    refused: list[tuple[int, str]] = []
+
+    def opener(seed: int, size_px: int) -> object:
+        command = [sys.executable, "-m", "trainer.cli", "train", "--config", str(other), "--out", str(out)]
+        for more in ([], ["--resume"]) if not refused else ():
+            done = subprocess.run([*command, *more], capture_output=True, text=True, check=False, timeout=200)
+            refused.append((done.returncode, done.stderr))
+        return synthetic_sampler.opener(seed, size_px)
+
+    config = parse_config(tiny.TOML, "tiny.toml")
+    run_training(config, tiny.TOML, out, open_sampler=opener, max_steps=1)
+    assert refused == [(2, f"uavpose-trainer: {out}: another run is at work there; give another --out\n")] * 2
+    assert (out / "config.toml").read_text() == tiny.TOML
+    assert [start["seed"] for start in json.loads((out / "run.json").read_text())["starts"]] == [3]
+    assert train(out, resume=True).samples == 16
 
 
 def test_a_run_whose_end_is_a_time_to_validate_does_so_once(tmp_path: Path) -> None:
