@@ -9,9 +9,9 @@ Measurements are always compared in `cam`, where their covariance is given. The 
 
 A network misjudges the range of one target by much the same factor in all frames (`range_scale.py`), which no number of
 frames shrinks. The filter lives in ranges as they are seen, so P holds what the frames leave open; the common factor is
-added where a track is told (`covariance`). Range is compared by its logarithm: else frames that read short would pull
-more than frames that read far. The constants below are tuning choices for fixed-wing aircraft at 100-500 m, not
-measurements.
+added where a track is told (`covariance`). Range is compared, and corrected, by its logarithm: else frames that read
+short would pull more than frames that read far. The constants below are tuning choices for fixed-wing aircraft at
+100-500 m, not measurements.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.tracking import so3
-from edge.tracking.range_scale import RangeScale
+from edge.tracking.range_scale import RangeScale, corrected, in_metres
 from edge.tracking.view import NS_PER_S, FrameKind, View
 from edge.types import Array, Estimate
 
@@ -51,7 +51,6 @@ FIRST_SHARE = 0.2  # of the network's log-range variance, left open by a first f
 STALE_ATTITUDE_RADPS = 0.5
 
 SHORTEST_S = 1e-3  # between measurements
-
 SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is raised to meet it
 
 
@@ -72,10 +71,8 @@ class Motion:
 
 @dataclass(frozen=True)
 class Sight:
-    """Where the frame that saw a target has it in `cam`.
-
-    More exact than the state turned into that frame, as by how much its attitude is off is common to both.
-    """
+    """Where the frame that saw a target has it in `cam`, more exactly than the state turned into that frame has, as by
+    how much its attitude is off is common to both."""
 
     t_cam_m: Array  # [3]
     covariance: Array  # [3, 3], without the error of range that all frames share
@@ -230,10 +227,8 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
     log_residual = float(seen.residual_m @ seen.predicted_m) / range_m2
     log_variance = float(seen.predicted_m @ seen.predicted_covariance @ seen.predicted_m) / range_m2**2
     predicted = 0.5 * float(np.log(range_m2))
-    rate_per_s = _relative_velocity(motion, view) @ view.R_frame_cam @ seen.predicted_m / range_m2
-    scale = motion.scale.seen(
-        motion.time_ns, predicted + log_residual, seen.log_range_variance, predicted, float(rate_per_s)
-    )
+    rate_per_s = float(_relative_velocity(motion, view) @ view.R_frame_cam @ seen.predicted_m) / range_m2
+    scale = motion.scale.seen(motion.time_ns, predicted + log_residual, seen.log_range_variance, predicted, rate_per_s)
     away = scale.away(log_variance)
     if away:
         motion, seen = _rescaled(motion, away, view), _rescaled_innovation(seen, away)
@@ -254,14 +249,15 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
     P = symmetric(keep @ motion.P @ keep.T + gain @ (noise + seen.attitude) @ gain.T)
     if motion.kind == "cam":
         P = _follow_sight_line(P, motion.t_m, change)
+    relative_m, log_factor = corrected(motion.t_m - view.t_frame_cam_m, change[POSITION])
     turn_rate = float(np.clip(motion.turn_rate_radps + change[TURN_RATE], -TURN_RATE_MAX, TURN_RATE_MAX))
     return replace(
         motion,
         seen_ns=motion.time_ns,
-        t_m=motion.t_m + change[POSITION],
-        v_mps=motion.v_mps + change[VELOCITY],
+        t_m=view.t_frame_cam_m + relative_m,
+        v_mps=motion.v_mps + gain[VELOCITY] @ in_metres(seen.residual_m, ray, log_factor),
         turn_rate_radps=turn_rate,
-        P=P,
+        P=_farther(P, log_factor),
         scale=scale,
         sight=None if motion.kind == "cam" else _sight(seen, in_cam, noise),
     )
@@ -305,13 +301,17 @@ def _relative_velocity(motion: Motion, view: View) -> Array:
 
 def _rescaled(motion: Motion, log_factor: float, view: View) -> Motion:
     """The target at exp(log_factor) of its range. How fast it is there is less sure; that it jumped is no speed."""
-    factor = float(np.exp(log_factor))
     relative_m = motion.t_m - view.t_frame_cam_m
-    P = motion.P.copy()
-    P[POSITION] *= factor
-    P[:, POSITION] *= factor
+    P = _farther(motion.P, log_factor)
     P[VELOCITY, VELOCITY] += log_factor**2 * _first_velocity(motion.kind, float(np.linalg.norm(relative_m)))
-    return replace(motion, t_m=view.t_frame_cam_m + factor * relative_m, P=P)
+    return replace(motion, t_m=view.t_frame_cam_m + float(np.exp(log_factor)) * relative_m, P=P)
+
+
+def _farther(P: Array, log_factor: float) -> Array:
+    """P [7, 7] of a target at exp(log_factor) of its range, by angles and shares of it as sure as before."""
+    factors = np.ones(DIMENSION)
+    factors[POSITION] = np.exp(log_factor)
+    return P * np.outer(factors, factors)
 
 
 def _rescaled_innovation(seen: Innovation, log_factor: float) -> Innovation:
@@ -331,7 +331,9 @@ def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
     """The measurement and what was predicted of it, `in_cam` with the frame's attitude unknown, weighed in `cam`."""
     gain = np.linalg.solve(in_cam + noise, in_cam).T
     keep = so3.IDENTITY - gain
-    return Sight(seen.predicted_m + gain @ seen.residual_m, symmetric(keep @ in_cam @ keep.T + gain @ noise @ gain.T))
+    t_cam_m, log_factor = corrected(seen.predicted_m, gain @ seen.residual_m)
+    covariance = np.exp(2.0 * log_factor) * (keep @ in_cam @ keep.T + gain @ noise @ gain.T)
+    return Sight(t_cam_m, symmetric(covariance))
 
 
 def _by_attitude(t_cam_m: Array, view: View) -> Array:

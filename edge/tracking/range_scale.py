@@ -15,12 +15,16 @@ import math
 from dataclasses import dataclass
 from statistics import fmean, median
 
+import numpy as np
+
+from edge.types import Array
+
 FRAME_SHARE = 0.2  # of the network's log-range variance: what differs from frame to frame
 FRAME_STD_MIN = 0.01
 PRIOR_FRAMES = 4.0  # the network's word on the scatter counts as so many frames
 MAD_TO_STD = 1.4826  # of a normal distribution
 WINDOW_S = 1.5  # over which frames are compared
-RATE_MAX_PER_S = 0.3  # of log range; a track that runs faster is not believed
+CLOSING_MAX_PER_S, OPENING_MAX_PER_S = 1.0, 0.3  # of range, by the range; a track that runs faster is not believed
 RATE_STD_PER_S = 0.05
 SIGMA_MEMORY_S = 1.0
 TAIL_DOF = 3.0  # Student's t
@@ -61,8 +65,9 @@ class RangeScale:
         sigma2 = fade * self.sigma**2 + (1.0 - fade) * log_range_variance
         oldest_ns = time_ns - round(WINDOW_S * 1e9)
         recent = (*(one for one in self.recent if one[0] >= oldest_ns), (time_ns, log_range))
-        rate = min(max(rate_per_s, -RATE_MAX_PER_S), RATE_MAX_PER_S)
-        now = [value + rate * (time_ns - then_ns) * 1e-9 - track_log_range for then_ns, value in recent]
+        now = [
+            value + _gone_since((time_ns - then_ns) * 1e-9, rate_per_s) - track_log_range for then_ns, value in recent
+        ]
         center = median(now)
         scatter = (MAD_TO_STD * median(abs(one - center) for one in now)) ** 2
         told = PRIOR_FRAMES * FRAME_SHARE * sigma2
@@ -80,3 +85,31 @@ class RangeScale:
         drift = 0.5 * (self.recent[-1][0] - self.recent[0][0]) * 1e-9 * RATE_STD_PER_S
         spread = track_variance + self.frame_variance / len(self.recent) + drift**2
         return self.center if self.center**2 > OFF_STD**2 * spread else 0.0
+
+
+def _gone_since(ago_s: float, rate_per_s: float) -> float:
+    """How log range has changed in that time, by its rate now.
+
+    Of who closes at one speed its rate grows: farther off it was less. Who draws away came past, not from the camera.
+    """
+    if rate_per_s < 0.0:
+        return -math.log1p(min(-rate_per_s, CLOSING_MAX_PER_S) * ago_s)
+    return min(rate_per_s, OPENING_MAX_PER_S) * ago_s
+
+
+def corrected(relative_m: Array, change_m: Array) -> tuple[Array, float]:
+    """Where a correction [3] takes what lies at relative_m [3] from the camera, and by how much in log range.
+
+    It was weighed in log range: taken for metres, that of a wide prediction leads too near, or behind the camera.
+    """
+    log_factor = float(change_m @ relative_m) / float(relative_m @ relative_m)
+    return np.exp(log_factor) * (relative_m + change_m - log_factor * relative_m), log_factor
+
+
+def in_metres(residual_m: Array, ray_m: Array, log_factor: float) -> Array:
+    """A residual [3], which along ray_m [3] is a difference of log ranges, as the way flown, which speaks for a speed.
+
+    log_factor: by how much it changes the log range.
+    """
+    metres = math.expm1(log_factor) / log_factor if log_factor else 1.0
+    return residual_m + (metres - 1.0) * float(residual_m @ ray_m) / float(ray_m @ ray_m) * ray_m

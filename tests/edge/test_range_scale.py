@@ -22,16 +22,23 @@ def sight(t_cam_m: np.ndarray, log_range_error: float) -> Estimate:
     return Estimate(0.9, box, np.eye(3), t_cam_m * np.exp(log_range_error), covariance, "track")
 
 
-def follow(log_range_errors: np.ndarray, rate_hz: float, own_ship_known: bool) -> list[tuple[Track, np.ndarray]]:
-    """Tracks and truths of a target 200 m ahead that draws away and to the right."""
+def follow(
+    log_range_errors: np.ndarray,
+    rate_hz: float,
+    own_ship_known: bool,
+    range_m: float = 200.0,
+    opening_mps: float = 6.0,
+    missed: range = range(0),
+) -> list[tuple[Track, np.ndarray]]:
+    """Tracks and truths of a target ahead that draws away, or closes, and to the right; `missed` frames show none."""
     tracker = Tracker(1, LOOKING_NORTH)
     flown = []
     for i, error in enumerate(log_range_errors):
         t_s = i / rate_hz
-        t_cam = np.array([4.0 * t_s, 0.0, 200.0 + 6.0 * t_s])
+        t_cam = np.array([4.0 * t_s, 0.0, range_m + opening_mps * t_s])
         own_m = np.array([20.0 * t_s, 0.0, -100.0])
         own = OwnShip(1 + round(t_s * 1e9), np.eye(3), own_m, np.array([20.0, 0.0, 0.0]), None)
-        found = [sight(t_cam, float(error))]
+        found = [] if i in missed else [sight(t_cam, float(error))]
         (track,) = tracker.update(own.time_ns, found, own if own_ship_known else None, K, SIZE_WH)
         flown.append((track, t_cam))
     return flown
@@ -54,6 +61,34 @@ def test_frames_of_another_size_do_not_move_the_track(seed: int, own_ship_known:
     flown = follow(errors, 30.0, own_ship_known)
     off = [np.log(np.linalg.norm(track.t_cam_target_m) / np.linalg.norm(truth)) for track, truth in flown[30:]]
     assert np.mean(np.abs(off)) < 0.05
+
+
+@pytest.mark.parametrize("own_ship_known", [True, False], ids=["ned", "cam"])
+@pytest.mark.parametrize("closing_mps", [80.0, 100.0])
+def test_a_target_that_comes_head_on_is_not_told_farther_than_it_is(closing_mps: float, own_ship_known: bool) -> None:
+    """At 100 m its range shrinks by all of itself in a second; frames that are right must not be outvoted by those
+    of when it was farther away."""
+    for seed in range(3):
+        errors = np.random.default_rng(seed).normal(scale=0.02, size=121)
+        flown = follow(errors, 30.0, own_ship_known, 100.0 + 4.0 * closing_mps, -closing_mps)
+        last_m = [np.linalg.norm([track.t_cam_target_m, truth], axis=1) for track, truth in flown[-30:]]
+        assert max(abs(np.log(told_m / true_m)) for told_m, true_m in last_m) < 0.07
+
+
+@pytest.mark.parametrize("own_ship_known", [True, False], ids=["ned", "cam"])
+@pytest.mark.parametrize("closing_mps", [-60.0, 60.0, 100.0])
+def test_a_young_track_that_was_missed_is_taken_up_where_it_is_seen(closing_mps: float, own_ship_known: bool) -> None:
+    """After five sights its speed is hardly known; 1.7 s later it is at as little as 0.4 or as much as twice the range
+    that was predicted, which is far beyond where a difference of log ranges is one of ranges."""
+    missed = range(5, 56)
+    errors = np.random.default_rng(1).normal(scale=0.02, size=60)
+    flown = follow(errors, 30.0, own_ship_known, 120.0 if closing_mps < 0.0 else 290.0, -closing_mps, missed)
+    for (track, truth), error in zip(flown[missed.stop :], errors[missed.stop :], strict=True):
+        assert track.measured_ns == track.time_ns
+        assert track.t_cam_target_m == pytest.approx(np.exp(error) * truth, rel=0.1, abs=1.0)
+    if own_ship_known:
+        assert track.v_ned_target_mps is not None
+        assert track.v_ned_target_mps[0] == pytest.approx(20.0 - closing_mps, abs=12.0)
 
 
 @pytest.mark.parametrize("seed", range(3))
