@@ -76,7 +76,9 @@ class MountSettings(Section):
     R_body_cam: list[list[Finite]] | None = Field(
         default=None, description="3x3 rotation, cam (optical) into body (FRD)"
     )
-    t_body_cam_m: tuple[LeverM, LeverM, LeverM] = Field(default=(0.0, 0.0, 0.0), description="camera in body, metres")
+    t_body_cam_m: tuple[LeverM, LeverM, LeverM] = Field(
+        default=(0.0, 0.0, 0.0), strict=False, description="camera in body, metres"
+    )
 
     @model_validator(mode="after")
     def _rotation(self) -> MountSettings:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, ValidationInfo
 
+from msgs.settings import WrittenPath
+
 
 def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
     folder = (info.context or {}).get("folder", Path())
@@ -16,4 +18,4 @@ def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
         raise ValueError(f"'{path}' leads nowhere: {error}") from error
 
 
-ConfigPath = Annotated[Path, AfterValidator(_from_config_folder)]
+ConfigPath = Annotated[WrittenPath, AfterValidator(_from_config_folder)]

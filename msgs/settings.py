@@ -10,24 +10,30 @@ import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Strict, ValidationError
 
 _KNOWN = {
     "extra_forbidden": "unknown key",
     "missing": "is missing",
     **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must hold keys with values"),
+    **dict.fromkeys(("tuple_type", "list_type"), "must be a list"),
 }
 
 
 class Section(BaseModel):
-    """A table of settings: unknown keys are refused, and what was read stays as it is."""
+    """A table of settings: unknown keys are refused, `true` or "5" is no number, and what was read stays as it is."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 SomeSection = TypeVar("SomeSection", bound=BaseModel)
+Item = TypeVar("Item")
+
+# TOML has no paths and no tuples, so a section takes them of strings and of lists.
+WrittenPath = Annotated[Path, Strict(False)]
+Pair = Annotated[tuple[Item, Item], Strict(False)]
 
 
 class Fault(NamedTuple):

@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, Strict, field_validator, model_validator
 
 from msgs.contract import Span
-from msgs.settings import Section, load_settings, parse_settings
+from msgs.settings import Pair, Section, WrittenPath, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
 Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a picture that the network sees, pixels
@@ -101,7 +101,7 @@ class LossConfig(Section):
 class DatasetSource(Section):
     """A BOP dataset whose pictures are trained on beside rendered windows."""
 
-    path: Path
+    path: WrittenPath
     split: str = Field("train", description="folder of the dataset that is trained on")
     validation_split: str | None = Field(None, description="folder to validate on; absent: rendered windows only")
     share: float = Field(gt=0, le=1, description="of every batch")
@@ -199,11 +199,11 @@ class ContractConfig(Section):
     """What export writes into the model file and measurement cannot find out."""
 
     name: str
-    acquire_size_wh: tuple[Side, Side]
+    acquire_size_wh: Pair[Side]
     acquire_fit: Literal["letterbox", "squash"]
-    track_size_wh: tuple[Side, Side] | None = None
+    track_size_wh: Pair[Side] | None = None
     track_window_scale: float = Field(gt=1.0)
-    trained_range_m: Span | None = Field(
+    trained_range_m: Annotated[Span, Strict(False)] | None = Field(
         None, description="depths; absent: 100 to 500 m of rendered windows, and those that the datasets' targets have"
     )
 

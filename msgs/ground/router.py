@@ -29,16 +29,16 @@ from msgs.ground.access import Access, access_control
 from msgs.ground.errors import InputError
 from msgs.ground.feed import ALIVE, alive_uav
 from msgs.session import TlsFiles, check_endpoint, router_config
-from msgs.settings import Section, load_settings
+from msgs.settings import Section, WrittenPath, load_settings
 
 CommonName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,62}$")]
 VehicleName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
 class TlsSettings(Section):
-    root_ca: Path = Field(description="the authority that signed every certificate, PEM")
-    certificate: Path = Field(description="the router's, PEM")
-    private_key: Path = Field(description="the router's, PEM, mode 0600")
+    root_ca: WrittenPath = Field(description="the authority that signed every certificate, PEM")
+    certificate: WrittenPath = Field(description="the router's, PEM")
+    private_key: WrittenPath = Field(description="the router's, PEM, mode 0600")
 
 
 class AccessSettings(Section):

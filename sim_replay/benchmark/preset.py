@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from edge.errors import InputError
-from msgs.settings import Section, parse_settings, read_text
+from msgs.settings import Pair, Section, parse_settings, read_text
 from sim_replay.airframes import AIRFRAMES, airframe_id
 from sim_replay.airframes.invented import dataset_names
 
@@ -64,7 +64,7 @@ class Airframes(Section):
 
 
 class Lens(Section):
-    focal_px: tuple[Positive, Positive] = Field(default=(1200.0, 8000.0), description="shortest and longest there are")
+    focal_px: Pair[Positive] = Field(default=(1200.0, 8000.0), description="shortest and longest there are")
     box_share: float = Field(
         default=0.012, gt=0.0, le=0.1, description="mean share of the picture that the target's visible box covers"
     )
@@ -83,9 +83,7 @@ class Flight(Section):
     gimbal_share: Share = Field(
         default=0.6, description="share of sequences filmed from a gimbal; the rest is bolted on"
     )
-    jitter_mrad: tuple[Weight, Weight] = Field(
-        default=(0.02, 0.3), description="camera shake, rms, drawn between these"
-    )
+    jitter_mrad: Pair[Weight] = Field(default=(0.02, 0.3), description="camera shake, rms, drawn between these")
     gust: dict[Gust, Weight] = Field(
         default={"calm": 1.0, "light": 1.0, "moderate": 1.0}, description="weights of the air's states"
     )
@@ -113,8 +111,8 @@ class Targets(Section):
 class Picture(Section):
     weather: dict[Weather, Weight] = Field(min_length=1, description="weights of the kinds of weather")
     quality: dict[Quality, Weight] = Field(min_length=1, description="weights of the kinds of camera")
-    exposure_ms: tuple[Positive, Positive] = Field(default=(0.5, 5.0), description="shutter time, drawn between these")
-    distractors: tuple[int, int] = Field(default=(0, 2), description="birds and specks in a sequence, between these")
+    exposure_ms: Pair[Positive] = Field(default=(0.5, 5.0), description="shutter time, drawn between these")
+    distractors: Pair[int] = Field(default=(0, 2), description="birds and specks in a sequence, between these")
 
     @model_validator(mode="after")
     def _order(self) -> Picture:
@@ -129,8 +127,8 @@ class Picture(Section):
 
 class Compression(Section):
     weight: Positive = Field(default=1.0, description="how often it is drawn")
-    jpeg_quality: tuple[int, int] = Field(default=(85, 95), description="of the stored pictures, drawn between these")
-    h264_kbps: tuple[int, int] | None = Field(
+    jpeg_quality: Pair[int] = Field(default=(85, 95), description="of the stored pictures, drawn between these")
+    h264_kbps: Pair[int] | None = Field(
         default=None, description="pass the sequence through H.264 at a bitrate drawn between these before storing it"
     )
 
@@ -153,14 +151,12 @@ class Preset(Section):
     description: str = Field(default="", description="one sentence, copied into the dataset")
     splits: dict[Split, SplitSize] = Field(min_length=1, description="how many sequences and frames each split has")
     picture: Picture
-    size_wh_px: tuple[int, int] = Field(default=(1920, 1080), description="width and height of the pictures")
+    size_wh_px: Pair[int] = Field(default=(1920, 1080), description="width and height of the pictures")
     fps: list[Positive] = Field(
         default_factory=lambda: [10.0, 15.0, 30.0], min_length=1, description="rates drawn from"
     )
-    sequence_frames: tuple[int, int] = Field(default=(40, 160), description="shortest and longest sequence")
-    range_m: tuple[Positive, Positive] = Field(
-        default=(100.0, 500.0), description="distances, spread evenly over frames"
-    )
+    sequence_frames: Pair[int] = Field(default=(40, 160), description="shortest and longest sequence")
+    range_m: Pair[Positive] = Field(default=(100.0, 500.0), description="distances, spread evenly over frames")
     airframes: Airframes = Airframes()
     lens: Lens = Lens()
     flight: Flight = Flight()

@@ -58,3 +58,27 @@ def test_each_fault_has_a_line_with_its_key(tmp_path: Path) -> None:
     keys = {line.removeprefix(f"{path}: ").partition(":")[0] for line in lines}
     assert keys == {"listen", "domain", "access.vehicles.1", "access.reader"}
     assert f"{path}: access.reader: unknown key" in lines
+
+
+@pytest.mark.parametrize(
+    ("read", "error", "text", "key"),
+    [
+        (load_router, GroundError, "domain = true", "domain"),
+        (load_router, GroundError, 'domain = "0"', "domain"),
+        (lambda path: load_preset(str(path)), InputError, "fps = [true]", "fps.0"),
+        (lambda path: load_preset(str(path)), InputError, "size_wh_px = [640, false]", "size_wh_px.1"),
+        (lambda path: load_preset(str(path)), InputError, 'range_m = ["100", 500]', "range_m.0"),
+        (load_trainer, ConfigError, '[data]\nbatch_size = "24"', "data.batch_size"),
+        (load_trainer, ConfigError, "[contract]\ntrained_range_m = [true, 500.0]", "contract.trained_range_m.0"),
+        (load_trainer, ConfigError, "[contract]\nacquire_size_wh = [640, true]", "contract.acquire_size_wh.1"),
+    ],
+)
+def test_true_and_quoted_numbers_are_no_numbers(
+    tmp_path: Path, read: Callable[[Path], Any], error: type[Exception], text: str, key: str
+) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(text)
+    with pytest.raises(error) as told:
+        read(path)
+    lines = [line for line in str(told.value).splitlines() if line.startswith(f"{path}: {key}: ")]
+    assert [line.partition("Input should be ")[1] for line in lines] == ["Input should be "]
