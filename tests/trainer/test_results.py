@@ -58,7 +58,8 @@ def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
     assert [line["total_samples"] for line in history] == [100, 250, 290]
     assert told(history, {}).startswith("Trained on 290 rendered windows in 2 runs")
     refined = {"refined_windows": 1200, "refined_epochs": 3, "refined_seed": 7, "refined_strangers": 0.35}
-    assert told(history, refined).endswith("3 times from 1,200 more (seed 7, 35 % of the targets invented).")
+    ending = "3 epochs on 1,200 further windows (seed 7; 35 % of the targets are randomly generated aircraft)."
+    assert told(history, refined).endswith(ending)
     draw_history(history, tmp_path / "learning.png")
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="no validation"):
