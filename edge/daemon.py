@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 
 from edge.cameras import FrameSupply, open_capture
 from edge.cameras.source import EndOfStream
-from edge.clock import monotonic_ns
+from edge.clock import SleepWatch, monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import PLACES_MOST, Estimator
@@ -91,6 +91,7 @@ class Pipeline:
         self._by_hand = ByHand()
         self._acquire_every_n = config.estimator.acquire_every_n
         self._pace = Pace()
+        self._sleep = SleepWatch()
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
@@ -135,6 +136,8 @@ class Pipeline:
         }
 
     def _process(self, frame: Frame) -> None:
+        if self._slept():
+            return
         if frame.meta.time_jumps != self._time_jumps:
             self._time_jumps = frame.meta.time_jumps
             self._tracker.doubt_motion()
@@ -152,6 +155,8 @@ class Pipeline:
         estimates = self._estimate(frame, expected, pointed_at, clock)
         chosen_id = self._by_hand.chosen_id
         tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion, chosen_id)
+        if self._slept():
+            return
         self._by_hand.settle(tracks)
         for text in self._by_hand.news():
             self._outlets.event(logging.INFO, text)
@@ -159,6 +164,18 @@ class Pipeline:
         self._publish(frame, size_wh, tracks, own_ship)
         clock.lap("publish")
         self.supervisor.frame_done(frame.meta, clock.stages_ns(), tracks, own_ship is not None)
+
+    def _slept(self) -> bool:
+        """Whether the machine has slept since the last look: frame, targets and own ship are then of who knows when."""
+        slept_ns = self._sleep.slept_ns()
+        if slept_ns == 0:
+            return False
+        self._tracker.drop_all()
+        self._own_ship.clear(same_autopilot=True)
+        text = f"the computer has slept for {slept_ns / 1e9:.1f} s: all targets are forgotten"
+        log.warning("%s", text)
+        self._outlets.event(logging.WARNING, text)
+        return True
 
     def _take_requests(self, capture_ns: int) -> None:
         for request in self._requests.take():

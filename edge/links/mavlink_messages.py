@@ -9,11 +9,11 @@ import numpy as np
 
 from edge.health import Activity, Condition, HealthState
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
-from edge.links.outgoing import rotation_known
+from edge.links.outgoing import UNSURE_ROTATION_RAD, rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, CameraInfo, Report, Track, TrackState
 from msgs import mavlink
-from msgs.geometry import euler_from_R, q_wxyz_from_R
+from msgs.geometry import q_wxyz_from_R
 from msgs.mavlink import dialect
 
 NAN = math.nan
@@ -110,9 +110,7 @@ def geo_status(report: Report, track: Track) -> Any | None:
     # Without own position the velocity is relative to the own ship, which this message cannot say.
     if own_ship.t_ned_body_m is not None and track.v_ned_target_mps is not None:
         velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
-    heading_rad, heading_std_rad = NAN, NAN
-    if rotation_known(track):
-        heading_rad, heading_std_rad = float(euler_from_R(R)[2]) % (2.0 * math.pi), math.sqrt(P[8, 8])
+    heading_rad, heading_std_rad = _heading_rad(R, P[6:, 6:]) if rotation_known(track) else (NAN, NAN)
     return dialect.MAVLink_camera_tracking_geo_status_message(
         TRACKING_STATUS[track.state],
         round(lat * 1e7),
@@ -180,6 +178,19 @@ def _cut(data: bytes) -> list[bytes]:
         pieces.append(data[:end].ljust(STATUSTEXT_BYTES))
         data = data[end:]
     return [*pieces, data]
+
+
+def _heading_rad(R_ned_target: Array, P: Array) -> tuple[float, float]:
+    """Heading 0..2 pi and its standard deviation, by the rotation's covariance P [3, 3] in ned. The steeper the nose
+    points, the more a small tilt turns the heading: NaN where it is not known to UNSURE_ROTATION_RAD."""
+    north, east, down = R_ned_target[:, 0].tolist()
+    heading_rad = math.atan2(east, north)
+    slope = down / max(math.hypot(north, east), 1e-9)
+    per_turn = np.array([-slope * math.cos(heading_rad), -slope * math.sin(heading_rad), 1.0])
+    std_rad = math.sqrt(max(float(per_turn @ P @ per_turn), 0.0))
+    if std_rad > UNSURE_ROTATION_RAD:
+        return NAN, NAN
+    return heading_rad % (2.0 * math.pi), std_rad
 
 
 def _largest_std(P: Array) -> float:

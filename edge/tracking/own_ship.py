@@ -22,6 +22,9 @@ ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the
 ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
 USUAL_OF = 5  # so many samples tell how far they usually lie apart: one that is lost or late changes nothing
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
+# Of the nose's length, what must be level for it to have a heading: nearer to the vertical than 15 degrees what little
+# the attitude is off turns the heading, and all that is told against it, by many times as much.
+LEVEL_MIN = float(np.sin(np.deg2rad(15.0)))
 GIMBAL_STEP_MIN_NS = 5_000_000  # nearer, what lies between two is rounding, and no rate to go on by
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
@@ -267,7 +270,8 @@ def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
 
 
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
-    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 150 ms."""
+    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 150 ms; none
+    against the heading of a nose that points up or down."""
     after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples)
     if after == 0 or reach_ns is None or (after == len(samples) and time_ns - samples[-1].time_ns > reach_ns):
         return None
@@ -281,6 +285,8 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
         share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
     R = a.R_frame_gimbal @ so3_exp(share * so3_log(a.R_frame_gimbal.T @ b.R_frame_gimbal))
     if b.frame is GimbalFrame.HEADING:
+        if np.hypot(R_ned_body[0, 0], R_ned_body[1, 0]) < LEVEL_MIN:
+            return None
         _, _, yaw_rad = euler_from_R(R_ned_body)
         R = R_from_euler(0.0, 0.0, float(yaw_rad)) @ R
     return R_ned_body.T @ R

@@ -43,6 +43,37 @@ def test_being_held_up_between_two_readings_falsifies_no_stamp(
         assert utc_clock.monotonic_ns(utc_clock.utc_ns(at_ns)) == at_ns
 
 
+@pytest.mark.parametrize("step_ns", [-400_000_000, 300_000_000, -3 * 86_400 * 10**9, 2_000_000])
+def test_utc_that_is_set_stamps_the_very_next_frame(monkeypatch: pytest.MonkeyPatch, step_ns: int) -> None:
+    now_ns, ahead_ns = 10**12, UTC_AHEAD_NS
+    monkeypatch.setattr(clock, "monotonic_ns", lambda: now_ns)
+    monkeypatch.setattr(clock, "utc_ns", lambda: now_ns + ahead_ns)
+    utc_clock = UtcClock()
+    for _ in range(10):
+        assert utc_clock.utc_ns(now_ns) == now_ns + ahead_ns
+        now_ns += 33_000_000
+    ahead_ns += step_ns
+    assert utc_clock.utc_ns(now_ns) == now_ns + ahead_ns
+    assert utc_clock.monotonic_ns(now_ns + ahead_ns) == now_ns
+
+
+def test_being_held_up_is_not_taken_for_utc_that_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns, held_up_ns = 10**12, 0
+
+    def read() -> int:
+        nonlocal now_ns
+        now_ns += READING_NS + held_up_ns
+        return now_ns
+
+    monkeypatch.setattr(clock, "monotonic_ns", read)
+    monkeypatch.setattr(clock, "utc_ns", lambda: read() + UTC_AHEAD_NS)
+    utc_clock = UtcClock()
+    told_ns = utc_clock.utc_ns(0)
+    held_up_ns = 150_000_000
+    assert utc_clock.utc_ns(0) == told_ns
+    assert utc_clock.uncertainty_ns <= READING_NS
+
+
 def test_the_hosts_clocks_agree_with_themselves() -> None:
     before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     told_ns = UtcClock().monotonic_ns(utc_ns)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, TrackState
 
@@ -39,3 +41,30 @@ def test_a_still_target_stands_still_while_gimbal_and_body_turn() -> None:
     assert track.v_ned_target_mps is not None
     np.testing.assert_allclose(track.t_ned_target_m, T_NED_TARGET_M, atol=4.0)
     assert np.linalg.norm(track.v_ned_target_mps) < 4.0
+
+
+@pytest.mark.parametrize("pitch_deg", [-90.0, -89.0, -80.0, -70.0, 0.0, 70.0, 80.0, 89.0, 90.0])
+@pytest.mark.parametrize("frame", list(GimbalFrame))
+def test_a_nose_that_points_up_or_down_leaves_no_heading_to_tell_a_gimbal_against(
+    pitch_deg: float, frame: GimbalFrame
+) -> None:
+    """An attitude that is off by half a degree may turn the camera by no more than what tracks have for it, 2 degrees
+    of heading, three times over."""
+    heading_deg, rng = 70.0, np.random.default_rng(2)
+    body = Rotation.from_euler("ZYX", [heading_deg, pitch_deg, 5.0], degrees=True)
+    gimbal = Rotation.from_euler("ZYX", [25.0, -10.0, 0.0], degrees=True)
+    earth = gimbal if frame is GimbalFrame.EARTH else Rotation.from_euler("Z", heading_deg, degrees=True) * gimbal
+    for _ in range(100):
+        told = body * Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, 0.5, 3)))
+        buffer = OwnShipBuffer(gimballed=True)
+        for time_ns in (0, 20_000_000):
+            buffer.add_attitude(time_ns, np.roll(told.as_quat(), 1), np.zeros(3))
+            buffer.add_gimbal(time_ns, np.roll(gimbal.as_quat(), 1), frame)
+        own = buffer.at(10_000_000)
+        if frame is GimbalFrame.HEADING and abs(pitch_deg) > 78.0:
+            assert own is None
+            continue
+        assert own is not None
+        assert own.R_body_gimbal is not None
+        off = earth.inv() * Rotation.from_matrix(own.R_ned_body @ own.R_body_gimbal)
+        assert np.rad2deg(off.magnitude()) < 6.0

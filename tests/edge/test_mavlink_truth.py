@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import linalg
+from scipy.spatial.transform import Rotation
 
 from edge.config import MavlinkSettings
 from edge.links import mavlink_messages as words
@@ -29,12 +31,43 @@ VARIANCES_NED = np.array([4.0, 9.0, 16.0, 1.0, 4.0, 2.0, 0.01, 0.02, 0.09])
 
 
 def test_the_heading_on_the_globe_comes_with_the_heading_s_own_accuracy() -> None:
-    track = make_track(NOW_NS, covariance_ned=np.diag(VARIANCES_NED))
+    level = Rotation.from_euler("ZYX", [2.5, 0.0, 0.4]).as_matrix()
+    track = make_track(NOW_NS, R_ned_target=level, covariance_ned=np.diag(VARIANCES_NED))
     geo = words.geo_status(make_report(track, now_ns=NOW_NS), track)
     assert geo is not None
     assert geo.hdg_acc == pytest.approx(0.3)
     assert geo.v_acc == pytest.approx(4.0)
     assert geo.vel_acc == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "told"), [(-90.0, False), (-86.0, False), (-60.0, True), (60.0, True), (88.0, False)]
+)
+def test_a_target_that_points_straight_up_or_down_has_no_heading(pitch_deg: float, told: bool) -> None:
+    steep = Rotation.from_euler("ZYX", [2.0, np.deg2rad(pitch_deg), 0.7])
+    covariance = np.diag(VARIANCES_NED)
+    track = make_track(NOW_NS, R_ned_target=steep.as_matrix(), covariance_ned=covariance)
+    geo = words.geo_status(make_report(track, now_ns=NOW_NS), track)
+    assert geo is not None
+    turns = np.random.default_rng(5).multivariate_normal(np.zeros(3), covariance[6:, 6:], 20_000)
+    noses = (Rotation.from_rotvec(turns) * steep).apply([1.0, 0.0, 0.0])
+    off_rad = (np.arctan2(noses[:, 1], noses[:, 0]) - 2.0 + np.pi) % (2.0 * np.pi) - np.pi
+    assert (float(np.sqrt(np.mean(off_rad**2))) < 0.7) == told
+    assert np.isfinite([geo.hdg, geo.hdg_acc]).tolist() == [told, told]
+
+
+@pytest.mark.parametrize("pitch_deg", [-45.0, -20.0, 0.0, 30.0, 50.0])
+def test_a_slope_makes_the_heading_less_sure_by_as_much_as_tilts_turn_it(pitch_deg: float) -> None:
+    nose_on = Rotation.from_euler("ZYX", [2.0, np.deg2rad(pitch_deg), 0.7])
+    P = 0.01 * np.array([[4.0, 1.0, 0.5], [1.0, 9.0, -2.0], [0.5, -2.0, 3.0]])
+    track = make_track(NOW_NS, R_ned_target=nose_on.as_matrix(), covariance_ned=linalg.block_diag(np.eye(6), P))
+    geo = words.geo_status(make_report(track, now_ns=NOW_NS), track)
+    assert geo is not None
+    small = 0.1  # of the deviations, so that what is linear shows
+    turns = np.random.default_rng(5).multivariate_normal(np.zeros(3), small**2 * P, 50_000)
+    noses = (Rotation.from_rotvec(turns) * nose_on).apply([1.0, 0.0, 0.0])
+    off_rad = np.arctan2(noses[:, 1], noses[:, 0]) - 2.0
+    assert geo.hdg_acc == pytest.approx(float(np.std(off_rad)) / small, rel=0.03)
 
 
 def test_a_velocity_against_the_own_ship_is_not_told_as_one_over_ground() -> None:

@@ -1,0 +1,86 @@
+"""A computer that sleeps and wakes: by the monotonic clock nothing has grown older meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge import clock
+from edge.clock import SLEPT_NS, SleepWatch
+from edge.daemon import Pipeline
+from edge.estimator.model import load_model
+from edge.types import Estimate, Frame, FrameMeta, TrackState
+
+from .looping import HELD, PERIOD_NS, Gated, frame, looping
+from .toy_scene import SIZE_WH, K
+
+HOUR_NS = 3_600_000_000_000
+Sleep = Callable[[int], None]
+
+
+@pytest.fixture
+def sleep(monkeypatch: pytest.MonkeyPatch) -> Sleep:
+    """Let the computer have slept for so many nanoseconds more."""
+    slept_ns = [5 * HOUR_NS]
+    monkeypatch.setattr(clock, "asleep_ns", lambda: slept_ns[0])
+    return lambda ns: slept_ns.__setitem__(0, slept_ns[0] + ns)
+
+
+def empty(index: int) -> Frame:
+    time_ns = frame(0, HELD).meta.capture_ns + index * PERIOD_NS
+    return Frame(FrameMeta(index, time_ns, time_ns), np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8), K)
+
+
+def hold(loop: Pipeline) -> None:
+    """A sure target, and an own attitude that would do for the next frame."""
+    for index in range(6):
+        loop._process(frame(index, HELD))
+    loop._own_ship.add_attitude(empty(5).meta.capture_ns, [1.0, 0.0, 0.0, 0.0], np.zeros(3))
+
+
+def test_what_was_known_before_the_computer_slept_is_not_told_when_it_wakes(toy_model: Path, sleep: Sleep) -> None:
+    with looping(Gated(load_model(toy_model, 1))) as (loop, ear, _):
+        hold(loop)
+        (track,) = ear.reports[-1].tracks
+        assert track.state is TrackState.CONFIRMED
+        told = len(ear.reports)
+        sleep(HOUR_NS)
+        loop._process(empty(6))  # may have waited in the camera's buffer
+        assert len(ear.reports) == told
+        loop._process(empty(7))
+        assert ear.reports[-1].tracks == ()
+        assert ear.reports[-1].own_ship is None
+
+
+def test_a_frame_that_the_computer_slept_over_is_not_told(
+    toy_model: Path, sleep: Sleep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gated = Gated(load_model(toy_model, 1))
+    with looping(gated) as (loop, ear, _):
+        hold(loop)
+        told, track = len(ear.reports), gated.track
+
+        def track_asleep(*seen: Any) -> list[Estimate | None]:
+            sleep(HOUR_NS)
+            return track(*seen)
+
+        monkeypatch.setattr(gated, "track", track_asleep)
+        loop._process(frame(6, HELD))
+        assert len(ear.reports) == told
+
+
+def test_a_computer_that_is_held_up_has_not_slept(sleep: Sleep) -> None:
+    watch, told = SleepWatch(), []
+    for ns in (0, SLEPT_NS - 1, -200_000_000, 200_000_000, SLEPT_NS, 0):
+        sleep(ns)
+        told.append(watch.slept_ns())
+    assert told == [0, 0, 0, 0, SLEPT_NS, 0]
+
+
+def test_this_computer_has_slept_no_longer_than_it_is_up() -> None:
+    assert -1_000_000_000 < clock.asleep_ns() < time.clock_gettime_ns(time.CLOCK_BOOTTIME)
