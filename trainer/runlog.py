@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import platform
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
 from sim_replay.benchmark.manifest import PACKAGES, package_version
+from sim_replay.lock import take_lock
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME
 from trainer.config import ConfigError, TrainerConfig, made_folder
 from trainer.evaluate import null_where_unknown
@@ -47,14 +47,12 @@ def run_folder(out: Path, resume: bool, hold: bool = True) -> Iterator[None]:
 def _alone_in(out: Path) -> Iterator[None]:
     path = made_folder(out) / LOCK_NAME
     try:
-        lock = path.open("w")
+        lock = take_lock(path)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
+    if lock is None:
+        raise ConfigError(f"{out}: another run is at work there; give another --out")
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"{out}: another run is at work there; give another --out") from None
         try:
             yield
         finally:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.tracking import so3
-from edge.tracking.range_scale import RangeScale, corrected, in_metres
+from edge.tracking.range_scale import RangeScale, corrected, in_metres, rates_of
 from edge.tracking.view import NS_PER_S, FrameKind, View
 from edge.types import Array, Estimate
 
@@ -227,8 +227,8 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
     log_residual = float(seen.residual_m @ seen.predicted_m) / range_m2
     log_variance = float(seen.predicted_m @ seen.predicted_covariance @ seen.predicted_m) / range_m2**2
     predicted = 0.5 * float(np.log(range_m2))
-    rate_per_s = float(_relative_velocity(motion, view) @ view.R_frame_cam @ seen.predicted_m) / range_m2
-    scale = motion.scale.seen(motion.time_ns, predicted + log_residual, seen.log_range_variance, predicted, rate_per_s)
+    rates = rates_of(_relative_velocity(motion, view) @ view.R_frame_cam, seen.predicted_m, motion.kind != "cam")
+    scale = motion.scale.seen(motion.time_ns, predicted + log_residual, seen.log_range_variance, predicted, rates)
     away = scale.away(log_variance)
     if away:
         motion, seen = _rescaled(motion, away, view), _rescaled_innovation(seen, away)

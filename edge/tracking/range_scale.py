@@ -24,7 +24,7 @@ FRAME_STD_MIN = 0.01
 PRIOR_FRAMES = 4.0  # the network's word on the scatter counts as so many frames
 MAD_TO_STD = 1.4826  # of a normal distribution
 WINDOW_S = 1.5  # over which frames are compared
-CLOSING_MAX_PER_S, OPENING_MAX_PER_S = 1.0, 0.3  # of range, by the range; a track that runs faster is not believed
+CLOSING_MAX_PER_S, OPENING_MAX_PER_S = 1.0, 0.4  # of range, by the range; a track that runs faster is not believed
 RATE_STD_PER_S = 0.05
 SIGMA_MEMORY_S = 1.0
 TAIL_DOF = 3.0  # Student's t
@@ -57,16 +57,21 @@ class RangeScale:
         return max((1.0 - FRAME_SHARE) * max(self.sigma**2, self.frame_variance / FRAME_SHARE), self.discord)
 
     def seen(
-        self, time_ns: int, log_range: float, log_range_variance: float, track_log_range: float, rate_per_s: float
+        self,
+        time_ns: int,
+        log_range: float,
+        log_range_variance: float,
+        track_log_range: float,
+        rates_per_s: tuple[float, float],
     ) -> RangeScale:
-        """With another frame; the track's log range and how fast it changes are those predicted for it."""
+        """With another frame; the track's log range and how it moves (`rates_of`) are those predicted for it."""
         dt_s = (time_ns - self.recent[-1][0]) * 1e-9
         fade = math.exp(-dt_s / SIGMA_MEMORY_S)
         sigma2 = fade * self.sigma**2 + (1.0 - fade) * log_range_variance
         oldest_ns = time_ns - round(WINDOW_S * 1e9)
         recent = (*(one for one in self.recent if one[0] >= oldest_ns), (time_ns, log_range))
         now = [
-            value + _gone_since((time_ns - then_ns) * 1e-9, rate_per_s) - track_log_range for then_ns, value in recent
+            value + _gone_since((time_ns - then_ns) * 1e-9, *rates_per_s) - track_log_range for then_ns, value in recent
         ]
         center = median(now)
         scatter = (MAD_TO_STD * median(abs(one - center) for one in now)) ** 2
@@ -87,14 +92,23 @@ class RangeScale:
         return self.center if self.center**2 > OFF_STD**2 * spread else 0.0
 
 
-def _gone_since(ago_s: float, rate_per_s: float) -> float:
-    """How log range has changed in that time, by its rate now.
+def rates_of(velocity_mps: Array, ray_m: Array, across_known: bool) -> tuple[float, float]:
+    """How fast a target at ray_m [3] from the camera moves against it by velocity_mps [3], as shares of its range:
+    along the ray, away positive, and across it; 0 where that is not known, being mostly the camera's own turning."""
+    range_m2 = float(ray_m @ ray_m)
+    along_per_s = float(velocity_mps @ ray_m) / range_m2
+    across2 = float(velocity_mps @ velocity_mps) / range_m2 - along_per_s**2
+    return along_per_s, math.sqrt(max(across2, 0.0)) if across_known else 0.0
 
-    Of who closes at one speed its rate grows: farther off it was less. Who draws away came past, not from the camera.
+
+def _gone_since(ago_s: float, along_per_s: float, across_per_s: float) -> float:
+    """How log range has changed in that time, of one that moves straight on against the camera.
+
+    What passes abeam was farther off before, though its range does not change just now.
     """
-    if rate_per_s < 0.0:
-        return -math.log1p(min(-rate_per_s, CLOSING_MAX_PER_S) * ago_s)
-    return min(rate_per_s, OPENING_MAX_PER_S) * ago_s
+    shares_then = math.hypot(1.0 + min(-along_per_s, CLOSING_MAX_PER_S) * ago_s, across_per_s * ago_s)
+    # Who draws away did not start at the camera itself.
+    return -math.log(max(shares_then, math.exp(-OPENING_MAX_PER_S * ago_s)))
 
 
 def corrected(relative_m: Array, change_m: Array) -> tuple[Array, float]:

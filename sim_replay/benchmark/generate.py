@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fcntl
 import re
 import shlex
 import sys
@@ -25,6 +24,7 @@ from sim_replay.benchmark.preset import Preset, parse_preset, preset_text
 from sim_replay.benchmark.progress import Report, flights_bar
 from sim_replay.benchmark.sequence_files import FrameNews, Job, make_sequence
 from sim_replay.bop import write_models
+from sim_replay.lock import take_lock
 
 
 def run(args: argparse.Namespace) -> int:
@@ -124,14 +124,12 @@ def _alone_in(out: Path) -> Iterator[None]:
     """Hold the folder against a second run. The lock goes with the process, however that ends."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        lock = (out / LOCK_FILE).open("w")
+        lock = take_lock(out / LOCK_FILE)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    if lock is None:
+        raise InputError(f"{out}: another generate is at work there")
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"{out}: another generate is at work there") from error
         try:
             yield
         finally:

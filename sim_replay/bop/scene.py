@@ -227,6 +227,10 @@ def picture_size_wh(path: Path) -> tuple[int, int]:
     try:
         with PIL.Image.open(path) as picture:
             return picture.size
-    except (OSError, PIL.Image.DecompressionBombError):  # of kinds and sizes that OpenCV reads none the less
+    except (
+        OSError,
+        ValueError,
+        PIL.Image.DecompressionBombError,
+    ):  # of what OpenCV reads none the less
         height, width = read_picture_bgr(path).shape[:2]
         return width, height

@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
-from statistics import median_low
 from typing import Literal
 
 import numpy as np
@@ -100,10 +99,11 @@ class _Sequence:
 def _by_number(image_ids: Sequence[int]) -> list[int]:
     """Which frame each picture is, from 0, by their rising numbers: one left out is a frame that was not kept.
 
-    How far apart the numbers of two frames lie, what most often lies between two pictures tells.
+    How far apart the numbers of two frames lie, the lesser gaps tell: where few frames were kept, most hold several.
+    Not the least of all: numbers may be times, which jitter.
     """
     apart = [after - before for before, after in pairwise(image_ids)]
-    frame = median_low(apart) if apart else 1
+    frame = sorted(apart)[len(apart) // 4] if apart else 1
     return list(accumulate((max(1, round(gap / frame)) for gap in apart), initial=0))
 
 

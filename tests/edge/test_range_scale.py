@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,14 @@ def follow(
     return flown
 
 
+def looking_at(ray_m: np.ndarray) -> np.ndarray:
+    """R_ned_cam [3, 3] of an upright camera that is turned to ray_m [3]."""
+    z = ray_m / np.linalg.norm(ray_m)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
 def range_std(track: Track) -> float:
     """Share of the range."""
     t = track.t_cam_target_m
@@ -73,6 +83,26 @@ def test_a_target_that_comes_head_on_is_not_told_farther_than_it_is(closing_mps:
         flown = follow(errors, 30.0, own_ship_known, 100.0 + 4.0 * closing_mps, -closing_mps)
         last_m = [np.linalg.norm([track.t_cam_target_m, truth], axis=1) for track, truth in flown[-30:]]
         assert max(abs(np.log(told_m / true_m)) for told_m, true_m in last_m) < 0.07
+
+
+@pytest.mark.parametrize("position_known", [True, False], ids=["ned", "ned_relative"])
+@pytest.mark.parametrize("abeam_m", [100.0, 150.0])
+def test_a_target_that_passes_abeam_is_told_where_it_is(abeam_m: float, position_known: bool) -> None:
+    """Its range stands still there, and was twice as far a second ago: frames that are right must not be outvoted."""
+    velocity_mps, own_mps = np.array([-80.0, 0.0, 0.0]), np.array([20.0, 0.0, 0.0])
+    for seed in range(3):
+        tracker = Tracker(1, Mount(np.eye(3), np.zeros(3)))
+        for i, error in enumerate(np.random.default_rng(seed).normal(scale=0.02, size=180)):
+            t_s = i / 30.0
+            own_m, target_m = t_s * own_mps, np.array([300.0, abeam_m, -5.0]) + t_s * velocity_mps
+            R_ned_cam = looking_at(target_m - own_m)
+            t_cam = R_ned_cam.T @ (target_m - own_m)
+            own = OwnShip(1 + round(t_s * 1e9), R_ned_cam, own_m, own_mps, None)
+            if not position_known:
+                own = replace(own, t_ned_body_m=None, v_ned_body_mps=None)
+            (track,) = tracker.update(own.time_ns, [sight(t_cam, float(error))], own, K, SIZE_WH)
+            told_m, true_m = np.linalg.norm([track.t_cam_target_m, t_cam], axis=1)
+            assert t_s < 0.5 or abs(np.log(told_m / true_m)) < 0.07
 
 
 @pytest.mark.parametrize("own_ship_known", [True, False], ids=["ned", "cam"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from sim_replay.bop import BopError, read_scene
+from sim_replay.bop.scene import picture_size_wh
 from sim_replay.cli import main
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import truths_of
@@ -123,6 +125,16 @@ def test_each_picture_of_a_scene_cuts_its_targets_at_its_own_edge(scene: Path) -
         np.testing.assert_allclose(boxes[k], [198.8, 139.2, 241.4, 181.2], atol=1.5)
     np.testing.assert_allclose(boxes[3], [79.8, 59.8, 104.5, 82.5], atol=0.3)
     np.testing.assert_allclose(boxes[5], [79.8, 59.8, 104.5, 100.2], atol=0.3)
+
+
+def test_a_picture_with_much_written_in_its_head_has_a_size(tmp_path: Path) -> None:
+    """As a camera's colour profile; Pillow refuses more than a megabyte of it, OpenCV passes over it."""
+    coded = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
+    note = b"zTXt" + b"note\0\0" + zlib.compress(bytes(2_000_000))
+    chunk = (len(note) - 4).to_bytes(4, "big") + note + zlib.crc32(note).to_bytes(4, "big")
+    head = 33  # signature and IHDR
+    (tmp_path / "a.png").write_bytes(coded[:head] + chunk + coded[head:])
+    assert picture_size_wh(tmp_path / "a.png") == (30, 20)
 
 
 @pytest.mark.parametrize(

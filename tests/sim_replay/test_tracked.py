@@ -14,6 +14,7 @@ from edge.errors import InputError
 from edge.links import outgoing
 from sim_replay import metrics
 from sim_replay.datasets import open_dataset
+from sim_replay.evaluation import tracked
 from sim_replay.evaluation.judge import JudgedFrame, judge_frames
 from sim_replay.evaluation.tracked import tracker_answers
 from sim_replay.offline import load_model
@@ -161,3 +162,9 @@ def test_frames_left_out_of_a_scene_are_time_that_passed(
     errors_m = [frame.matches[0].translation_error_m for frame in results]
     assert all(error_m is not None and error_m < 3.0 for error_m in errors_m[3:]), errors_m
     assert told(results)[8:] == [True] * 6
+
+
+@pytest.mark.parametrize("apart", [1, 12])
+def test_of_frames_of_which_fewer_than_half_were_kept_no_time_is_lost(apart: int) -> None:
+    kept = np.flatnonzero(np.random.default_rng(3).random(400) < 0.4)
+    assert tracked._by_number([apart * int(frame) for frame in kept]) == (kept - kept[0]).tolist()
