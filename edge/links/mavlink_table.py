@@ -54,33 +54,35 @@ class Read:
 COMPUTER, CAMERA, VIRTUAL = "onboard computer", "camera", "virtual system"
 
 SENT = (
-    Sent(HEARTBEAT, "HEARTBEAT", f"{COMPUTER}, {CAMERA}", "on", "1 Hz", None, "health; stops with the loop"),
+    Sent(HEARTBEAT, "HEARTBEAT", f"{COMPUTER}, {CAMERA}", "on", "1 Hz", None, "health; stops if the main loop stalls"),
     Sent(TARGET_RELATIVE, "TARGET_RELATIVE", COMPUTER, "on, off to PX4", "each frame, at most 50 Hz", (0.1, 50.0),
-         "each target's whole pose in the camera's frame"),
-    Sent(IMAGE_STATUS, "CAMERA_TRACKING_IMAGE_STATUS", CAMERA, "on", "10 Hz", (1.0, 20.0), "the box in the picture"),
-    Sent(GEO_STATUS, "CAMERA_TRACKING_GEO_STATUS", CAMERA, "on", "10 Hz", (1.0, 20.0), "the target on the globe"),
-    Sent(CAMERA_INFORMATION, "CAMERA_INFORMATION", CAMERA, "on request", "on request", None, "what the camera is"),
-    Sent(FOLLOW_TARGET, "FOLLOW_TARGET", VIRTUAL, "off", "10 Hz", (1.0, 10.0), "the target as something to follow"),
-    Sent(ADSB_VEHICLE, "ADSB_VEHICLE", VIRTUAL, "off", "2 Hz", (1.0, 5.0), "each target as traffic; may make it avoid"),
-    Sent(TIMESYNC, "TIMESYNC", COMPUTER, "on", "5 Hz", None, "asks the autopilot's clock, answers with ours"),
+         "full pose of each target in the camera frame"),
+    Sent(IMAGE_STATUS, "CAMERA_TRACKING_IMAGE_STATUS", CAMERA, "on", "10 Hz", (1.0, 20.0), "bounding box in the image"),
+    Sent(GEO_STATUS, "CAMERA_TRACKING_GEO_STATUS", CAMERA, "on", "10 Hz", (1.0, 20.0), "global position of the target"),
+    Sent(CAMERA_INFORMATION, "CAMERA_INFORMATION", CAMERA, "on request", "on request", None, "camera properties"),
+    Sent(FOLLOW_TARGET, "FOLLOW_TARGET", VIRTUAL, "off", "10 Hz", (1.0, 10.0), "the target as a vehicle to follow"),
+    Sent(ADSB_VEHICLE, "ADSB_VEHICLE", VIRTUAL, "off", "2 Hz", (1.0, 5.0),
+         "each target as traffic; may trigger avoidance manoeuvres"),
+    Sent(TIMESYNC, "TIMESYNC", COMPUTER, "on", "5 Hz", None, "asks for the autopilot's clock, answers with ours"),
     Sent(STATUSTEXT, "STATUSTEXT", COMPUTER, "on", "on change", None, "target acquired or lost, degraded, fault"),
     Sent(COMPUTER_STATUS, "ONBOARD_COMPUTER_STATUS", COMPUTER, "off", "1 Hz", (0.1, 1.0), "load, memory, temperature"),
-    Sent(COMMAND_LONG, "COMMAND_LONG", COMPUTER, "on", "until told", None, "SET_MESSAGE_INTERVAL for what is read"),
-    Sent(COMMAND_ACK, "COMMAND_ACK", f"{COMPUTER}, {CAMERA}", "on", "each command", None, "answer to a command for us"),
+    Sent(COMMAND_LONG, "COMMAND_LONG", COMPUTER, "on", "until the rate is met", None,
+         "SET_MESSAGE_INTERVAL for what is received"),
+    Sent(COMMAND_ACK, "COMMAND_ACK", f"{COMPUTER}, {CAMERA}", "on", "per command", None, "answer to a command to us"),
 )  # fmt: skip
 
 READ = (
-    Read(HEARTBEAT, "HEARTBEAT", "1 Hz", "which vehicle, which autopilot, whether it lives"),
-    Read(ATTITUDE_QUATERNION, "ATTITUDE_QUATERNION", "50 Hz asked", "own attitude at the exposure"),
-    Read(ATTITUDE, "ATTITUDE", "50 Hz asked at need", "own attitude where ATTITUDE_QUATERNION does not come"),
-    Read(LOCAL_POSITION_NED, "LOCAL_POSITION_NED", "20 Hz asked", "own position and velocity"),
-    Read(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "5 Hz asked", "where that lies on the globe"),
-    Read(GIMBAL_ATTITUDE, "GIMBAL_DEVICE_ATTITUDE_STATUS", "50 Hz asked with a gimbal", "the camera's attitude"),
-    Read(SYSTEM_TIME, "SYSTEM_TIME", "1 Hz asked", "boot time: a fall is a reboot; UTC, beside our own"),
-    Read(TIMESYNC, "TIMESYNC", "answers ours", "the autopilot's clock"),
-    Read(COMMAND_ACK, "COMMAND_ACK", "answers ours", "whether a rate was granted"),
-    Read(COMMAND_LONG, "COMMAND_LONG", "as it comes", "commands for us"),
-    Read(COMMAND_INT, "COMMAND_INT", "as it comes", "commands for us"),
+    Read(HEARTBEAT, "HEARTBEAT", "1 Hz", "the vehicle's system id, the autopilot's type, whether it is alive"),
+    Read(ATTITUDE_QUATERNION, "ATTITUDE_QUATERNION", "50 Hz requested", "own attitude at the exposure time"),
+    Read(ATTITUDE, "ATTITUDE", "50 Hz requested if needed", "own attitude where ATTITUDE_QUATERNION does not arrive"),
+    Read(LOCAL_POSITION_NED, "LOCAL_POSITION_NED", "20 Hz requested", "own position and velocity"),
+    Read(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "5 Hz requested", "global position of the local frame"),
+    Read(GIMBAL_ATTITUDE, "GIMBAL_DEVICE_ATTITUDE_STATUS", "50 Hz requested with a gimbal", "attitude of the camera"),
+    Read(SYSTEM_TIME, "SYSTEM_TIME", "1 Hz requested", "boot time: a decrease means a reboot; UTC, compared with ours"),
+    Read(TIMESYNC, "TIMESYNC", "answers to ours", "the autopilot's clock"),
+    Read(COMMAND_ACK, "COMMAND_ACK", "answers to ours", "whether a rate was granted"),
+    Read(COMMAND_LONG, "COMMAND_LONG", "as received", "commands to us"),
+    Read(COMMAND_INT, "COMMAND_INT", "as received", "commands to us"),
 )
 
 RATE_LIMITS_HZ = {sent.message_id: sent.limits_hz for sent in SENT if sent.limits_hz is not None}
@@ -89,9 +91,9 @@ READ_IDS = frozenset(read.message_id for read in READ)
 
 def tables() -> str:
     """Both tables as Markdown."""
-    lines = ["| sent | id | by | default | rate | says |", "|---|---|---|---|---|---|"]
+    lines = ["| sent | id | component | default | rate | content |", "|---|---|---|---|---|---|"]
     lines += [f"| {s.name} | {s.message_id} | {s.sender} | {s.default} | {_rate(s)} | {s.says} |" for s in SENT]
-    lines += ["", "| read | id | rate | used for |", "|---|---|---|---|"]
+    lines += ["", "| received | id | rate | used for |", "|---|---|---|---|"]
     lines += [f"| {r.name} | {r.message_id} | {r.rate} | {r.used_for} |" for r in READ]
     return "\n".join(lines)
 

@@ -53,7 +53,7 @@ def test_every_message_goes_and_is_asked_for_as_often_as_the_tables_say() -> Non
     for row in SENT:
         if (hz := told_hz(row.rate)) is not None:
             assert went[row.name] == pytest.approx(SECONDS * hz, abs=1), row.name
-    assert asked_hz == pytest.approx({row.message_id: told_hz(row.rate) for row in READ if "asked" in row.rate})
+    assert asked_hz == pytest.approx({row.message_id: told_hz(row.rate) for row in READ if "requested" in row.rate})
 
 
 @pytest.mark.parametrize("autopilot", [dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, dialect.MAV_AUTOPILOT_PX4])
