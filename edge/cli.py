@@ -27,51 +27,67 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uavpose-edge",
-        description="Find another fixed-wing aircraft in one camera's frames; tell its pose over zenoh and MAVLink.",
+        description="Estimate the pose of other fixed-wing aircraft with one camera; publish it by zenoh and MAVLink.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    run = commands.add_parser("run", help="fly: read the camera and publish poses until told to stop")
+    run = commands.add_parser("run", help="run the daemon: read the camera and publish poses until stopped")
     run.add_argument("--config", type=Path, required=True, help="TOML file")
     run.set_defaults(act=_run)
 
-    check = commands.add_parser(
-        "check", help="validate a configuration with its model and camera, and say what is in it"
-    )
+    check = commands.add_parser("check", help="validate a configuration with its model and camera, and print a summary")
     check.add_argument("--config", type=Path, required=True, help="TOML file")
     check.set_defaults(act=_check)
 
-    status = commands.add_parser("status", help="ask the running daemon how it is")
-    status.add_argument("--config", type=Path, help="its TOML file, for its address and name")
-    status.add_argument("--connect", metavar="ENDPOINT", help="its zenoh endpoint (default tcp/127.0.0.1:7448)")
-    status.add_argument("--vehicle", default=None, help="its name (default: whoever answers there)")
+    status = commands.add_parser("status", help="query the state of the running daemon")
+    status.add_argument("--config", type=Path, help="the daemon's TOML file, for its address and name")
+    status.add_argument(
+        "--connect", metavar="ENDPOINT", help="the daemon's zenoh endpoint (default tcp/127.0.0.1:7448)"
+    )
+    status.add_argument("--vehicle", default=None, help="the vehicle's name (default: any that answers)")
     status.add_argument("--json", action="store_true", help="print one JSON object: info, config, model")
     status.set_defaults(act=_status)
 
-    doctor = commands.add_parser("doctor", help="look at all the daemon needs here, and say what to do")
+    doctor = commands.add_parser(
+        "doctor", help="check everything the daemon needs on this machine, with advice on faults"
+    )
     doctor.add_argument("--config", type=Path, required=True, help="TOML file")
-    doctor.add_argument("--json", action="store_true", help="print one JSON object: findings with their advice")
+    doctor.add_argument("--json", action="store_true", help="print one JSON object: findings and advice")
     doctor.set_defaults(act=_doctor)
 
     bench.register(commands)
 
-    calibrate = commands.add_parser("calibrate", help="make a camera's intrinsics file from pictures of a board")
-    calibrate.add_argument("source", type=Path, nargs="?", help="video, or folder of pictures, of a board held still")
-    calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="file to write (default camera.yaml)")
-    calibrate.add_argument("--name", default="camera", help="the camera's name in the file (default camera)")
-    calibrate.add_argument("--pattern", choices=("charuco", "chessboard"), default="charuco", help="default charuco")
-    calibrate.add_argument("--squares", default="9x6", help="squares across and down, black and white (default 9x6)")
-    calibrate.add_argument("--dictionary", default="5X5_100", help="a ChArUco board's markers (default 5X5_100)")
-    calibrate.add_argument("--marker-share", type=float, default=0.75, help="marker's side / square's (default 0.75)")
-    calibrate.add_argument(
-        "--coefficients", type=int, choices=(4, 5, 8), default=4, help="of distortion: k1 k2 p1 p2, k3, k4 k5 k6"
+    calibrate = commands.add_parser(
+        "calibrate", help="calibrate a camera from images of a board, and write its intrinsics file"
     )
-    calibrate.add_argument("--json", action="store_true", help="print one JSON object instead of sentences")
-    calibrate.add_argument("--draw", type=Path, metavar="PICTURE", help="write the board to print, and no more")
+    calibrate.add_argument("source", type=Path, nargs="?", help="video, or folder of images, of a board held still")
+    calibrate.add_argument("--out", type=Path, default=Path("camera.yaml"), help="output file (default camera.yaml)")
+    calibrate.add_argument("--name", default="camera", help="camera name in the file (default camera)")
+    calibrate.add_argument(
+        "--pattern", choices=("charuco", "chessboard"), default="charuco", help="kind of board (default charuco)"
+    )
+    calibrate.add_argument(
+        "--squares", default="9x6", help="number of squares, black and white, columns x rows (default 9x6)"
+    )
+    calibrate.add_argument(
+        "--dictionary", default="5X5_100", help="marker dictionary of a ChArUco board (default 5X5_100)"
+    )
+    calibrate.add_argument(
+        "--marker-share", type=float, default=0.75, help="side of a marker / side of a square (default 0.75)"
+    )
+    calibrate.add_argument(
+        "--coefficients",
+        type=int,
+        choices=(4, 5, 8),
+        default=4,
+        help="number of distortion coefficients: k1 k2 p1 p2, k3, k4 k5 k6 (default 4)",
+    )
+    calibrate.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    calibrate.add_argument("--draw", type=Path, metavar="IMAGE", help="only write an image of the board, for printing")
     calibrate.set_defaults(act=_calibrate)
 
-    keygen = commands.add_parser("keygen", help="write a new key that signs MAVLink, for [mavlink] signing_key")
-    keygen.add_argument("--out", type=Path, required=True, help="file to write; one that exists is left alone")
+    keygen = commands.add_parser("keygen", help="write a new MAVLink signing key, for [mavlink] signing_key")
+    keygen.add_argument("--out", type=Path, required=True, help="output file; an existing one is not overwritten")
     keygen.set_defaults(act=_keygen)
     return parser
 
@@ -126,7 +142,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         write_board(board, options.draw)
         return 0
     if options.source is None:
-        raise InputError("calibrate needs a video or a folder of pictures, or --draw")
+        raise InputError("calibrate needs a video, a folder of images, or --draw")
     refuse_unwritable(options.out)
     found = calibrate(options.source, board, options.coefficients)
     write_calibration(found, options.name, options.out)
@@ -138,7 +154,7 @@ def _keygen(options: argparse.Namespace) -> int:
     from edge.links.signing_key import write_new_key
 
     write_new_key(options.out)
-    print(f"{options.out}: 32 random bytes, readable by its owner alone; the autopilot needs the same key")
+    print(f"{options.out}: 32 random bytes, readable by its owner only; the autopilot needs the same key")
     return 0
 
 

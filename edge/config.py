@@ -63,21 +63,21 @@ LeverM = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]  # longer a
 
 class VehicleSettings(Section):
     name: Annotated[str, AfterValidator(check_uav_name)] = Field(
-        default="uav1", description="ROS-legal name, first part of every topic"
+        default="uav1", description="legal ROS name, first part of every topic"
     )
 
 
 class MountSettings(Section):
-    """How the camera sits on the vehicle: three angles, or the matrix. All zero: it looks along the nose, upright."""
+    """Camera pose on the vehicle: three angles, or a matrix. All zero: along the nose, upright."""
 
-    roll_deg: Finite = Field(default=0.0, description="about the nose, right side down positive")
-    pitch_deg: Finite = Field(default=0.0, ge=-90, le=90, description="optical axis above the nose positive")
-    yaw_deg: Finite = Field(default=0.0, description="optical axis to the right of the nose positive")
+    roll_deg: Finite = Field(default=0.0, description="about the nose axis; positive: right side down")
+    pitch_deg: Finite = Field(default=0.0, ge=-90, le=90, description="positive: optical axis above the nose")
+    yaw_deg: Finite = Field(default=0.0, description="positive: optical axis to the right of the nose")
     R_body_cam: list[list[Finite]] | None = Field(
-        default=None, description="3x3 rotation, cam (optical) into body (FRD)"
+        default=None, description="3x3 rotation matrix from cam (optical) to body (FRD)"
     )
     t_body_cam_m: tuple[LeverM, LeverM, LeverM] = Field(
-        default=(0.0, 0.0, 0.0), strict=False, description="camera in body, metres"
+        default=(0.0, 0.0, 0.0), strict=False, description="camera position in body, metres"
     )
 
     @model_validator(mode="after")
@@ -105,85 +105,100 @@ class MountSettings(Section):
 
 
 class ModelSettings(Section):
-    path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file that carries its contract")
+    path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file with its contract in the metadata")
     provider: Provider = Field(
-        default="cpu", description="what it runs on; the CPU, with a warning, where the machine does not have it"
+        default="cpu", description="execution provider; falls back to the CPU, with a warning, if it is not available"
     )
-    threads: int = Field(default=2, ge=1, le=64, description="CPU threads of one inference")
+    threads: int = Field(default=2, ge=1, le=64, description="CPU threads per inference")
     spinning: bool = Field(
-        default=False, description="threads spin between inferences: faster alone, slower beside others"
+        default=False,
+        description="threads spin between inferences: faster on an idle machine, slower beside other load",
     )
 
 
 class EstimatorSettings(Section):
-    max_targets: int = Field(default=4, ge=1, le=4, description="targets tracked at once")
-    acquire_every_n: int = Field(
-        default=30, ge=1, description="whole frame searched every so many frames while tracking"
-    )
+    max_targets: int = Field(default=4, ge=1, le=4, description="maximum number of simultaneously tracked targets")
+    acquire_every_n: int = Field(default=30, ge=1, description="while tracking, search the whole frame every N frames")
 
 
 class MavlinkSettings(Section):
-    enabled: bool = Field(default=True, description="speak MAVLink to the autopilot")
+    enabled: bool = Field(default=True, description="enable the MAVLink link to the autopilot")
     endpoints: list[Endpoint] = Field(
         default=["udpin:127.0.0.1:14550"],
         min_length=1,
-        description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD; the autopilot's own link first; "
-        "spoken on at once",
+        description="udpin, udpout, tcpin, tcpout:HOST:PORT or serial:DEVICE:BAUD, all used at the same time; in order "
+        "of preference, the autopilot's own link first",
     )
     system_id: int | None = Field(
-        default=None, ge=1, le=255, description="the vehicle's; default: taken from its heartbeat"
+        default=None, ge=1, le=255, description="the vehicle's system id; default: taken from its heartbeat"
     )
     component_id: int = Field(
-        default=191, ge=2, le=255, description="ours; 191 is the onboard computer, 1 is the autopilot's own"
+        default=191,
+        ge=2,
+        le=255,
+        description="the daemon's component id; 191 is the onboard computer, 1 is the autopilot",
     )
-    camera_component_id: int = Field(default=100, ge=2, le=255, description="the camera's; 100 is the first")
+    camera_component_id: int = Field(
+        default=100, ge=2, le=255, description="the camera's component id; 100 is the first camera"
+    )
     allowed_hosts: list[Annotated[str, AfterValidator(plain_host)]] = Field(
         default_factory=list,
-        description="addresses heard on udpin and tcpin; empty: the first that sends a valid autopilot heartbeat",
+        description="addresses accepted on udpin and tcpin; empty: the first that sends a valid autopilot heartbeat",
     )
     commanders: list[Annotated[int, Field(ge=1, le=255)]] = Field(
-        default_factory=list, description="system ids whose commands are obeyed; empty: all heard on an endpoint"
+        default_factory=list, description="system ids whose commands are accepted; empty: all received on an endpoint"
     )
     signing_key: Annotated[ConfigPath, AfterValidator(_signing_key)] | None = Field(
-        default=None, description="file of 32 bytes by `uavpose-edge keygen`; all is signed, nothing unsigned is heard"
+        default=None,
+        description="32-byte file from `uavpose-edge keygen`; all messages are signed, unsigned ones are rejected",
     )
     signing_state: Annotated[ConfigPath, AfterValidator(_no_folder)] | None = Field(
-        default=None, description="where the last signing timestamp is kept; default: beside the key, .timestamp"
+        default=None,
+        description="file for the last signing timestamp; default: path of the key file plus .timestamp",
     )
     target_relative: bool = Field(default=True, description="send TARGET_RELATIVE (511) to autopilots other than PX4")
     target_relative_to_px4: bool = Field(
-        default=False, description="send it to PX4 too: with VTE_EN=0 it is a landing target there"
+        default=False, description="also send it to PX4, where with VTE_EN=0 it is a landing target"
     )
-    target_relative_rate_hz: float = Field(default=50.0, ge=0.1, le=50, description="upper bound of its rate")
+    target_relative_rate_hz: float = Field(default=50.0, ge=0.1, le=50, description="maximum rate of TARGET_RELATIVE")
     tracking_rate_hz: float = Field(default=10.0, ge=5, le=20, description="rate of CAMERA_TRACKING_* messages")
     follow_target: bool = Field(default=False, description="send FOLLOW_TARGET from virtual_system_id")
     adsb_icao_address: int | None = Field(
         default=None,
         ge=1,
         le=0xFFFFFF - 3,
-        description="send ADSB_VEHICLE with this ICAO address plus the target's number; may make the autopilot avoid",
+        description="send ADSB_VEHICLE with this ICAO address plus the target's number; the autopilot may avoid it",
     )
     virtual_system_id: int = Field(
-        default=200, ge=1, le=255, description="the target's own system, for FOLLOW_TARGET and ADSB_VEHICLE"
+        default=200, ge=1, le=255, description="system id of the target in FOLLOW_TARGET and ADSB_VEHICLE"
     )
     onboard_computer_status: bool = Field(default=False, description="send ONBOARD_COMPUTER_STATUS once a second")
     sensor_width_mm: float | None = Field(
-        default=None, gt=0, le=100, description="of the part that makes the picture; CAMERA_INFORMATION's lens needs it"
+        default=None,
+        gt=0,
+        le=100,
+        description="width of the sensor area that forms the image; needed for the focal length in CAMERA_INFORMATION",
     )
     gimbal_component_id: int | None = Field(
         default=None,
         ge=1,
         le=255,
-        description="whose gimbal attitude is the camera's: a component, or 1 to 6 of a gimbal that the autopilot "
-        "speaks for; default: the first heard",
+        description="source of the camera's gimbal attitude: a component id, or 1 to 6 for a gimbal whose attitude "
+        "the autopilot sends; default: the first received",
     )
     attitude_rate_hz: float = Field(
-        default=50.0, ge=7, le=400, description="asked of the autopilot; of fewer no frame has any use"
+        default=50.0,
+        ge=7,
+        le=400,
+        description="requested from the autopilot; lower rates could not be used for any frame",
     )
     position_rate_hz: float = Field(
-        default=20.0, ge=3, le=100, description="asked of the autopilot; of fewer no frame has any use"
+        default=20.0,
+        ge=3,
+        le=100,
+        description="requested from the autopilot; lower rates could not be used for any frame",
     )
-    max_age_ms: float = Field(default=200.0, gt=0, le=10_000, description="an older measurement is never sent")
+    max_age_ms: float = Field(default=200.0, gt=0, le=10_000, description="maximum age of a measurement to be sent")
 
     @model_validator(mode="after")
     def _fits_together(self) -> MavlinkSettings:
@@ -200,19 +215,24 @@ class MavlinkSettings(Section):
 
 
 class HealthSettings(Section):
-    no_frame_s: float = Field(default=2.0, ge=0.2, le=60, description="without a frame for so long: fault")
+    no_frame_s: float = Field(
+        default=2.0, ge=0.2, le=60, description="time without a frame after which the state is FAULT"
+    )
     latency_max_ms: float | None = Field(
-        default=None, gt=0, le=10_000, description="degraded when p95 from exposure to the links is above"
+        default=None,
+        gt=0,
+        le=10_000,
+        description="state DEGRADED if the p95 latency from exposure to the links exceeds this; default: no limit",
     )
     loop_stuck_s: float = Field(
         default=5.0,
         ge=1,
         le=7,
-        description="the process ends when its loop stands still for so long, and says where; longer, and the unit's "
-        "WatchdogSec=15 would end it first, without a word",
+        description="if the main loop is stuck for this long, the process ends and logs where; with a longer time, the "
+        "unit's WatchdogSec=15 would end it first, without a log entry",
     )
     prometheus_port: int | None = Field(
-        default=None, ge=1, le=65535, description="serve metrics to Prometheus on this port of 127.0.0.1"
+        default=None, ge=1, le=65535, description="serve Prometheus metrics on this port of 127.0.0.1"
     )
 
 

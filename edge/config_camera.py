@@ -1,4 +1,4 @@
-"""The section of where frames are from: [camera], one type of it for each kind, and its intrinsics."""
+"""The section of source of the frames: [camera], one type of it for each kind, and its intrinsics."""
 
 from __future__ import annotations
 
@@ -47,17 +47,19 @@ def _device(text: str) -> str:
 
 
 class IntrinsicsSettings(Section):
-    """Either `file`, or the numbers themselves."""
+    """Either `file`, or the values themselves."""
 
-    file: ConfigPath | None = Field(default=None, description="calibration YAML as ROS camera_info or OpenCV write it")
+    file: ConfigPath | None = Field(
+        default=None, description="calibration YAML as written by ROS camera_info or OpenCV"
+    )
     fx: PositivePx | None = Field(default=None, description="focal length along x, pixels")
     fy: PositivePx | None = Field(default=None, description="focal length along y, pixels")
     cx: Finite | None = Field(default=None, description="principal point x, pixels; pixel centres at integers")
     cy: Finite | None = Field(default=None, description="principal point y, pixels; pixel centres at integers")
-    width: Side | None = Field(default=None, description="width of the calibrated picture, pixels")
-    height: Side | None = Field(default=None, description="height of the calibrated picture, pixels")
+    width: Side | None = Field(default=None, description="width of the calibration images, pixels")
+    height: Side | None = Field(default=None, description="height of the calibration images, pixels")
     distortion: list[Finite] = Field(
-        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: the picture has none"
+        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: no distortion"
     )
 
     @model_validator(mode="after")
@@ -74,58 +76,63 @@ class IntrinsicsSettings(Section):
 
 class Camera(Section):
     mount: Literal["fixed", "gimbal"] = Field(
-        default="fixed", description="gimbal: [mount] says how the camera sits on it, MAVLink how it is turned"
+        default="fixed",
+        description="gimbal: [mount] is the pose of the camera on the gimbal, whose attitude comes over MAVLink",
     )
 
 
 class SequenceCamera(Camera):
     type: Literal["sequence"]
     path: ConfigPath = Field(description="BOP scene folder (rgb/, scene_camera.json)")
-    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
+    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames per second")
     start_at_ns: int | None = Field(
         default=None,
         le=MONOTONIC_MAX_NS,
-        description="monotonic ns of frame 0's exposure; default: when all is ready",
+        description="exposure of frame 0, ns of the monotonic clock; default: when everything is ready",
     )
-    loop: bool = Field(default=False, description="begin again after the last frame")
+    loop: bool = Field(default=False, description="restart after the last frame")
     lockstep: Annotated[str, AfterValidator(_own_machine)] | None = Field(
         default=None,
-        description="HOST:PORT of the player that steps the frames and the daemon's clock; not for flight",
+        description="HOST:PORT of the player that controls the frames and the daemon's clock; not for flight",
     )
-    intrinsics: IntrinsicsSettings | None = Field(default=None, description="in place of scene_camera.json's")
+    intrinsics: IntrinsicsSettings | None = Field(
+        default=None, description="replaces the intrinsics in scene_camera.json"
+    )
 
 
 class FolderCamera(Camera):
     type: Literal["folder"]
-    path: ConfigPath = Field(description="folder of pictures, played in the order of their names")
-    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames a second")
+    path: ConfigPath = Field(description="folder of images, played in the order of their names")
+    fps: float = Field(default=30.0, ge=0.01, le=240, description="frames per second")
     start_at_ns: int | None = Field(
         default=None,
         le=MONOTONIC_MAX_NS,
-        description="monotonic ns of the first picture's exposure; default: when all is ready",
+        description="exposure of the first image, ns of the monotonic clock; default: when everything is ready",
     )
-    loop: bool = Field(default=False, description="begin again after the last picture")
+    loop: bool = Field(default=False, description="restart after the last image")
     intrinsics: IntrinsicsSettings
 
 
 class FileCamera(Camera):
     type: Literal["file"]
-    path: ConfigPath = Field(description="video file, played by its own times")
+    path: ConfigPath = Field(description="video file, played by its own timestamps")
     intrinsics: IntrinsicsSettings
 
 
 class DeviceCamera(Camera):
     type: Literal["device"]
     device: Annotated[str, AfterValidator(_device)] = Field(default="/dev/video0", description="V4L2 device")
-    width: Side = Field(default=1920, description="pixels asked of the device")
-    height: Side = Field(default=1080, description="pixels asked of the device")
-    fps: float = Field(default=30.0, ge=0.01, le=1000, description="rate asked of the device")
-    fourcc: str = Field(default="MJPG", min_length=4, max_length=4, description="pixel format asked of the device")
+    width: Side = Field(default=1920, description="requested from the device, pixels")
+    height: Side = Field(default=1080, description="requested from the device, pixels")
+    fps: float = Field(default=30.0, ge=0.01, le=1000, description="requested from the device, frames per second")
+    fourcc: str = Field(
+        default="MJPG", min_length=4, max_length=4, description="pixel format requested from the device"
+    )
     exposure_ms: float | None = Field(
-        default=None, gt=0, le=1000, description="fixed exposure, where the driver has it; default: left as it is"
+        default=None, gt=0, le=1000, description="fixed exposure time, if the driver supports it; default: unchanged"
     )
     latency_ms: float = Field(
-        default=0.0, ge=0, le=1000, description="measured time from exposure to the driver's stamp, milliseconds"
+        default=0.0, ge=0, le=1000, description="measured time from exposure to the driver's timestamp, milliseconds"
     )
     intrinsics: IntrinsicsSettings
 
@@ -133,11 +140,11 @@ class DeviceCamera(Camera):
 class StreamCamera(Camera):
     type: Literal["stream"]
     url: Annotated[str, AfterValidator(_network_address)] = Field(
-        description="RTSP, HTTP or UDP address, as ffmpeg takes it"
+        description="RTSP, HTTP or UDP address, in ffmpeg syntax"
     )
-    rtsp_transport: Literal["tcp", "udp"] = Field(default="tcp", description="what RTSP's pictures come by")
+    rtsp_transport: Literal["tcp", "udp"] = Field(default="tcp", description="transport of RTSP images")
     latency_ms: float = Field(
-        default=0.0, ge=0, le=5000, description="measured time from exposure to the fastest arrival, milliseconds"
+        default=0.0, ge=0, le=5000, description="measured minimum time from exposure to arrival, milliseconds"
     )
     intrinsics: IntrinsicsSettings
 
@@ -145,13 +152,13 @@ class StreamCamera(Camera):
 class ZenohCamera(Camera):
     type: Literal["zenoh"]
     topic: Annotated[str, AfterValidator(_topic)] = Field(
-        description="sensor_msgs/CompressedImage, as ROS names it, without the first slash"
+        description="ROS topic of type sensor_msgs/CompressedImage, without the leading slash"
     )
     connect: str = Field(default="tcp/127.0.0.1:7447", description="endpoint of the router or publisher")
-    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of the key")
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of the zenoh key")
     tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
     latency_ms: float = Field(
-        default=0.0, ge=0, le=5000, description="measured time from exposure to the header's stamp, milliseconds"
+        default=0.0, ge=0, le=5000, description="measured time from exposure to the header's timestamp, milliseconds"
     )
     intrinsics: IntrinsicsSettings
 
@@ -163,7 +170,7 @@ class ZenohCamera(Camera):
 
 CameraSettings = Annotated[
     SequenceCamera | FolderCamera | FileCamera | DeviceCamera | StreamCamera | ZenohCamera,
-    Field(discriminator="type", description="where frames are from"),
+    Field(discriminator="type", description="source of the frames"),
 ]
 
 

@@ -27,9 +27,9 @@ RateOrNone = Annotated[float, AfterValidator(_seldom_or_never)]
 
 
 class ZenohTlsSettings(Section):
-    root_ca: ConfigPath = Field(description="the authority that signed both ends' certificates, PEM")
-    certificate: ConfigPath = Field(description="the vehicle's; its common name is the vehicle's name, PEM")
-    private_key: ConfigPath = Field(description="the vehicle's, PEM, mode 0600")
+    root_ca: ConfigPath = Field(description="CA certificate that signed the certificates of both ends, PEM")
+    certificate: ConfigPath = Field(description="the vehicle's certificate, PEM; its common name is the vehicle's name")
+    private_key: ConfigPath = Field(description="the vehicle's private key, PEM, mode 0600")
 
     def files(self) -> TlsFiles:
         return TlsFiles(self.root_ca, self.certificate, self.private_key)
@@ -43,30 +43,30 @@ class ZenohTlsSettings(Section):
 
 class ZenohSettings(Section):
     enabled: bool = Field(default=True, description="publish over zenoh")
-    listen: list[str] = Field(default=["tcp/127.0.0.1:7448"], description="endpoints for tools on board")
+    listen: list[str] = Field(default=["tcp/127.0.0.1:7448"], description="endpoints to listen on, for tools on board")
     connect: list[str] = Field(
-        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447; retried for ever"
+        default_factory=list, description="endpoints of the ground, e.g. quic/HOST:7447; retried indefinitely"
     )
     tls: ZenohTlsSettings | None = Field(default=None, description="certificates, for tls/ and quic/ endpoints")
     pose_rate_max_hz: float | None = Field(
         default=None,
         ge=0.1,
         le=240,
-        description="upper bound for poses and odometry on tls/ and quic/ links; default: all",
+        description="maximum rate of poses and odometry on tls/ and quic/ links; default: unlimited",
     )
     image_max_hz: RateOrNone = Field(
         default=1.0,
         ge=0,
         le=10,
-        description="upper bound for live pictures, sent while somebody looks, never on tls/ and quic/ links; 0: none",
+        description="maximum rate of live images, sent only to subscribers, never on tls/ and quic/ links; 0: none",
     )
-    commands: bool = Field(default=True, description="obey commands: track, stop, select, record, rate, reload")
-    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every key")
+    commands: bool = Field(default=True, description="accept commands: track, stop, select, record, rate, reload")
+    domain: int = Field(default=0, ge=0, le=232, description="ROS domain, first chunk of every zenoh key")
     ros_distribution: Literal["jazzy", "humble", "off"] = Field(
-        default="jazzy", description="whose keys and type hashes"
+        default="jazzy", description="ROS distribution that keys and type hashes follow"
     )
     max_age_ms: float = Field(
-        default=500.0, gt=0, le=10_000, description="an older measurement is not published as a pose"
+        default=500.0, gt=0, le=10_000, description="maximum age of a measurement to be published as a pose"
     )
 
     @model_validator(mode="after")
@@ -84,20 +84,28 @@ class ZenohSettings(Section):
 
 
 class RecorderSettings(Section):
-    """What goes to the ground, as MCAP on disk; zenoh may be off."""
+    """Records what is published to the ground, as MCAP on disk; also works with zenoh disabled."""
 
-    enabled: bool = Field(default=False, description="record from the start on")
-    folder: ConfigPath = Field(default=Path("recordings"), validate_default=True, description="made if it is not there")
+    enabled: bool = Field(default=False, description="record from startup")
+    folder: ConfigPath = Field(default=Path("recordings"), validate_default=True, description="created if missing")
     image_max_hz: RateOrNone = Field(
-        default=0.0, ge=0, le=240, description="pictures recorded a second, so that the recording can be flown again"
+        default=0.0,
+        ge=0,
+        le=240,
+        description="maximum rate of recorded images, needed to replay the recording; 0: none",
     )
-    file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="then the next file begins")
-    file_max_minutes: float = Field(default=10.0, gt=0, le=1440, description="then the next file begins")
+    file_max_mb: float = Field(default=256.0, ge=1, le=16_000, description="limit at which the next file begins")
+    file_max_minutes: float = Field(default=10.0, gt=0, le=1440, description="limit at which the next file begins")
     total_max_mb: float | None = Field(
-        default=None, gt=0, le=DISK_MAX_MB, description="of all of this vehicle's files; default: the disk's end"
+        default=None,
+        gt=0,
+        le=DISK_MAX_MB,
+        description="limit for all files of this vehicle; default: none except the disk's size",
     )
-    free_min_mb: float = Field(default=1000.0, ge=0, le=DISK_MAX_MB, description="left on the disk for others")
-    when_full: Literal["oldest", "stop"] = Field(default="oldest", description="remove the oldest files, or stop")
+    free_min_mb: float = Field(default=1000.0, ge=0, le=DISK_MAX_MB, description="free disk space to leave")
+    when_full: Literal["oldest", "stop"] = Field(
+        default="oldest", description="remove the oldest files, or stop recording"
+    )
 
     @model_validator(mode="after")
     def _room_for_two(self) -> RecorderSettings:

@@ -1,4 +1,4 @@
-"""docs/configuration.md from the configuration tree itself: every key with its values, its default and what it is for.
+"""docs/configuration.md from the configuration tree itself: every key with its values, default and description.
 
 python -m edge.config_reference > docs/configuration.md
 """
@@ -12,13 +12,13 @@ from edge.config import Config
 
 HEAD = """# Configuration
 
-One TOML file; `deploy/examples/` has some to begin with. This page is made from the code by `python -m
-edge.config_reference`, and held current by a test.
+The configuration is one TOML file; `deploy/examples/` has examples. This page is generated from the code by
+`python -m edge.config_reference > docs/configuration.md`; a test keeps it up to date.
 
     uavpose-edge check --config flight.toml
 
-names every key at fault with file and line; once the keys do, what is wrong with the certificates, the model and the
-camera that they name, the first fault of each. A key that is not here is refused. Paths are taken from the file's own
+reports every invalid key with file and line. If all keys are valid, it reports the first fault of each of the
+certificates, the model and the camera that they name. Unknown keys are rejected. Paths are relative to the file's
 folder. `systemctl reload` reads the file again: [install.md](install.md) says what changes in flight.
 """
 SHIPPED = "the shipped model"
@@ -59,12 +59,12 @@ def _told(section: Schema) -> list[str]:
 
 
 def _table(section: Schema, definitions: Schema) -> list[str]:
-    lines = ["| key | takes | default | |", "|---|---|---|---|"]
+    lines = ["| key | value | default | description |", "|---|---|---|---|"]
     for key, field in section["properties"].items():
         if key == "type":
             continue
         needed = key in section.get("required", [])
-        default = "needed" if needed else _default(field)
+        default = "required" if needed else _default(field)
         takes = "a table" if _alternatives(field, definitions) else _takes(field)
         lines.append(f"| `{key}` | {takes} | {default} | {field.get('description', '')} |")
     return lines
@@ -94,8 +94,8 @@ def _kind(value: Schema) -> str:
         count = value.get("maxItems")
         return f"list ({f'{count} × ' if count and count == value.get('minItems') else ''}{_kind(items)})"
     if value["type"] in ("number", "integer"):
-        return ("whole number" if value["type"] == "integer" else "number") + _bounds(value)
-    return {"boolean": "true, false", "string": "path" if value.get("format") == "path" else "text"}[value["type"]]
+        return ("integer" if value["type"] == "integer" else "number") + _bounds(value)
+    return {"boolean": "true, false", "string": "path" if value.get("format") == "path" else "string"}[value["type"]]
 
 
 def _bounds(value: Schema) -> str:

@@ -1,4 +1,4 @@
-"""`uavpose-replay`: make datasets, play sequences through the real daemon, and score what comes out."""
+"""Generate datasets, play sequences through the real daemon, and score its output."""
 
 from __future__ import annotations
 
@@ -45,32 +45,34 @@ def _parser() -> argparse.ArgumentParser:
 
     demo = commands.add_parser(
         "demo",
-        help="play the bundled sequence through the daemon and show what it makes of it",
+        help="play the bundled sequence through the daemon and score its output",
         description="Start the daemon, a simulated autopilot (MAVLink over UDP) and a zenoh subscriber on this host, "
         "play the bundled sequence in real time, and write report.html, score.json and overlay.mp4. "
         "Needs no GPU, no display and no network. Exit code 0 only if both peers received poses.",
     )
     play = commands.add_parser(
         "play",
-        help="the same with a sequence of your own, or in lock-step",
+        help="like demo, with a sequence of your own, or in lock-step",
         description="Like demo, with a BOP scene folder that also holds sequence.toml and telemetry.csv, with an MCAP "
-        "recording that the daemon made ([recorder] image_max_hz), or with a video and its telemetry. Of these two "
-        "no truth is known: nothing is scored. Exit code 1 if a target is seen and a peer received no pose, or if the "
-        "sky is known to be empty and a peer received one.",
+        "recording made by the daemon ([recorder] image_max_hz), or with a video and its telemetry. The last two have "
+        "no ground truth and are not scored. Exit code 1 if a target is visible and a peer received no pose, or if the "
+        "labels show no target and a peer received one.",
     )
     taken = f"{WHAT} (default: the bundled sequence)"
     play.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="PATH", help=taken)
     play.add_argument(
         "--record",
         action="store_true",
-        help="have the daemon record what it sees and tells into OUT/recordings, for `uavpose-ground view` and `play`",
+        help="have the daemon record images and outputs into OUT/recordings, for `uavpose-ground view` and `play`",
     )
-    link = play.add_argument_group("the autopilot and its link, in real time")
-    link.add_argument("--autopilot", choices=FIRMWARES, default="ardupilot", help="whose peculiarities (ardupilot)")
+    link = play.add_argument_group("the simulated autopilot and its link, in real time")
+    link.add_argument(
+        "--autopilot", choices=FIRMWARES, default="ardupilot", help="firmware to imitate (default: ardupilot)"
+    )
     bad_link.add_options(link)
     lockstep.add_options(play)
     for name, command in (("demo", demo), ("play", play)):
-        command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="folder to write to")
+        command.add_argument("--out", type=Path, default=Path("out") / name, metavar="DIR", help="output folder")
         command.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
 
     benchmark.register(commands)
@@ -82,18 +84,18 @@ def _parser() -> argparse.ArgumentParser:
 
     score = commands.add_parser(
         "score",
-        help="score a recorded flight against the truth, or a model on a dataset frame by frame",
-        description="With FLIGHT, a folder that demo or play wrote: set what the subscriber and the autopilot received "
-        "against the truth and write report.html, score.json, frames.jsonl and overlay.mp4. With --dataset: run "
-        "acquire and track on every frame by itself, with no tracker, no clock and no daemon.",
+        help="score a recorded flight against ground truth, or a model on a dataset frame by frame",
+        description="With FLIGHT, a folder that demo or play wrote: compare what the subscriber and the autopilot "
+        "received with ground truth and write report.html, score.json, frames.jsonl and overlay.mp4. With --dataset: "
+        "run acquire and track on every single frame, without tracker, clock and daemon.",
     )
     score.add_argument("flight", type=Path, nargs="?", metavar="FLIGHT", help="folder that demo or play wrote")
-    score.add_argument("--sequence", type=Path, metavar="DIR", help="scene folder (default: the one that was flown)")
-    score.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: FLIGHT)")
+    score.add_argument("--sequence", type=Path, metavar="DIR", help="scene folder (default: the one that was played)")
+    score.add_argument("--out", type=Path, metavar="DIR", help="output folder (default: FLIGHT)")
     score.add_argument("--dataset", type=Path, metavar="DIR", help="BOP scene, split or dataset folder")
     score.add_argument("--model", type=Path, help="ONNX file (default: the shipped one)")
-    score.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
-    score.add_argument("--every", type=int, metavar="N", help="take every N-th picture (default: all)")
+    score.add_argument("--split", metavar="NAME", help="split of the dataset (default: all)")
+    score.add_argument("--every", type=int, metavar="N", help="use every N-th image (default: all)")
     score.add_argument("--json", action="store_true", help="print the score as JSON")
     return parser
 
@@ -104,12 +106,12 @@ def _run(args: argparse.Namespace) -> int:
     console = Console()
     if args.command == "score":
         if (args.flight is None) == (args.dataset is None):
-            raise InputError("score: say either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
+            raise InputError("score: give either FLIGHT, a folder that demo or play wrote, or --dataset DIR")
         _check_score_options(args)
         return _score_dataset(args, console) if args.flight is None else _score_flight(args, console)
     if args.command == "play" and lockstep.asked_for(args):
         if args.record or args.autopilot != "ardupilot" or bad_link.link_faults(args) != bad_link.LinkFaults():
-            raise InputError("--record, --autopilot, --link-…: go with real time alone, not with lock-step")
+            raise InputError("--record, --autopilot, --link-…: only in real time, not in lock-step")
         return lockstep.run(args, console)
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
     settings = PlaySettings(open_sequence(folder, args.out, console), args.out, args.model)
@@ -136,7 +138,7 @@ def _score_flight(args: argparse.Namespace, console: Console) -> int:
     flight = read_flight(args.flight)
     sequence = read_sequence(args.sequence or flight.sequence)
     if not sequence.scene.truths:
-        raise InputError(f"{sequence.scene.folder}: no truth is known: there is nothing to score against")
+        raise InputError(f"{sequence.scene.folder}: there is no ground truth to score against")
     sequence = replace(sequence, fps=sequence.fps * flight.speed)
     told = Console(stderr=True, quiet=True) if args.json else console
     score = report_flight(sequence, flight, args.out or args.flight, told)

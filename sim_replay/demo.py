@@ -139,16 +139,16 @@ def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
         report_flight(sequence, flight, out, console)
     else:
         told = f"{len(recording.poses)} poses over zenoh, {len(recording.targets)} by MAVLink"
-        say(f"{told}, written to {out}; not scored: no truth is known")
+        say(f"{told}, written to {out}; not scored: no ground truth")
     return recording
 
 
 def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, console: Console) -> dict[str, Any]:
     """Score a flight, write the report of it into `out` and tell of both; returns the score. Raises OSError."""
     say = partial(console.print, highlight=False, soft_wrap=True)
-    say(f"scoring and drawing {len(sequence.scene.images)} frames")
+    say(f"scoring {len(sequence.scene.images)} frames and rendering the report")
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task("drawing", total=len(sequence.scene.images))
+        task = progress.add_task("rendering", total=len(sequence.scene.images))
         score, files = write_report(sequence, flight, out, lambda: progress.advance(task))
     console.print(summary_table(score))
     say(f"written to {out}: {', '.join(files)}")
@@ -158,14 +158,14 @@ def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, c
 def summary_table(score: dict[str, Any]) -> Table:
     """The figures of a score, as a person reads them."""
     overall = score["overall"]
-    table = Table("figure", "value", title=f"score of {score['sequence']}", title_justify="left")
+    table = Table("metric", "value", title=f"score of {score['sequence']}", title_justify="left")
     rows = {
         "frames / poses received": f"{overall['frames']} / {score['poses']}",
-        "targets found": _text(overall["recall"], "{:.1%}"),
+        "recall": _text(overall["recall"], "{:.1%}"),
         "rotation error, mean / median": _pair(overall["rotation_error_deg"], "{:.2f}°"),
         "translation error, mean / median": _pair(overall["translation_error_m"], "{:.2f} m"),
-        "depth error, mean": _text(overall["depth_error_rel"]["mean"], "{:.2%}"),
-        "pose within 10° and 5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
+        "relative depth error, mean": _text(overall["depth_error_rel"]["mean"], "{:.2%}"),
+        "Pose@10°/5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
         "capture to MAVLink, p50 / p95 / p99": _percentiles(score["latency_ms"]),
         "withheld by MAVLink, unconfirmed or too old": _text(score["latency_ms"]["tracks_withheld"], "{:d}"),
         "frames dropped": _text(score["dropped_frames"], "{:d}"),

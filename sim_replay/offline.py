@@ -58,7 +58,7 @@ def with_score_min(model: Model, score_min: float | None) -> Model:
     if score_min is None:
         return model
     if not 0.0 <= score_min <= 1.0:
-        raise InputError(f"a least score of {score_min} is not between 0 and 1")
+        raise InputError(f"the score threshold {score_min} is not between 0 and 1")
     model.contract = model.contract.model_copy(update={"acquire_score_min": score_min, "track_score_min": score_min})
     return model
 

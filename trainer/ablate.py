@@ -76,7 +76,7 @@ def chosen(names: Sequence[str] | None) -> tuple[Variant, ...]:
     known = {variant.name: variant for variant in VARIANTS}
     for name in names or ():
         if name not in known:
-            raise ConfigError(f"--variants: no variant is called {name!r}; there are {', '.join(known)}")
+            raise ConfigError(f"--variants: unknown variant {name!r}; known variants: {', '.join(known)}")
     return tuple(v for v in VARIANTS if names is None or v.name in names)
 
 
@@ -118,11 +118,11 @@ def ablate(
         say(f"{variant.name}: {variant.says}")
         started = (folder / WEIGHTS_NAME).exists()
         if started and parse_config(load_file(folder)["config"], f"{folder} (config)") != config:
-            raise ConfigError(f"{folder}: holds a run of another configuration or scale; give another --out")
+            raise ConfigError(f"{folder}: contains a run of another configuration or scale; give another --out")
         if not started or int(load_model(folder)[2]["samples"]) < scale.samples:
             opener = lambda seed, size, data=config.data: open_view(data, seed, size)  # noqa: E731
             if run_training(config, text, folder, resume=started, open_sampler=opener).samples < scale.samples:
-                say(f"{variant.name}: interrupted; the same command goes on from here")
+                say(f"{variant.name}: interrupted; the same command continues here")
                 break
         result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
         result["windows"] = int(result["rows"][variant.name]["windows"])  # they are rendered in whole chunks
@@ -152,7 +152,7 @@ def table(result: dict[str, Any]) -> str:
         lines.append("| " + " | ".join([row["says"], *cells, f"`{row['weights_sha256'][:12]}`"]) + " |")
     commits = ", ".join(f"`{commit}`" for commit in dict.fromkeys(row["commit"] for row in result["rows"].values()))
     scale = (
-        f"Trained with the code of {commits}: {result['samples']} training windows of {result['size_px']} px a variant "
+        f"Trained with the code of {commits}: {result['samples']} training windows of {result['size_px']} px each "
         f"(seed {result['seed']}), {result['windows']} held-out windows (seed {result['validation_seed']})."
     )
     return "\n".join([*lines, "", scale, ""])

@@ -20,7 +20,7 @@ def count(text: str) -> int:
     """A whole number from 1 on."""
     number = _whole_number(text)
     if number is None or number < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 on")
+        raise argparse.ArgumentTypeError(f"'{text}' is not an integer of at least 1")
     return number
 
 
@@ -28,7 +28,7 @@ def whole(text: str) -> int:
     """A whole number from 0 on that a generator takes as its seed."""
     number = _whole_number(text)
     if number is None or not 0 <= number <= SEED_MAX:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
+        raise argparse.ArgumentTypeError(f"'{text}' is not an integer from 0 to {SEED_MAX}")
     return number
 
 

@@ -17,9 +17,9 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     Raises ConfigError for fewer than two, and for networks of different configurations.
     """
     if len(runs) < 2:
-        raise ConfigError("the mean of fewer than two runs is no other network")
+        raise ConfigError("average needs at least two runs")
     if (out / RESUME_NAME).exists():
-        raise ConfigError(f"{out}: holds a run that training may go on with; give another --out")
+        raise ConfigError(f"{out}: contains a run that can be resumed; give another --out")
     contents = [load_file(run) for run in runs]
     _, configs, _, hashes = zip(*map(load_model, runs), strict=True)
     for run, config in zip(runs, configs, strict=True):

@@ -180,7 +180,7 @@ class RepVit(nn.Module):
 
 def _first(stem: nn.Module, blocks: list[nn.Module], count: int) -> list[nn.Module]:
     if count > len(blocks):
-        raise ConfigError(f"[schedule] frozen_blocks = {count}: the backbone has {len(blocks)}")
+        raise ConfigError(f"[schedule] frozen_blocks = {count}: the backbone has {len(blocks)} blocks")
     return [stem, *blocks[:count]]
 
 

@@ -84,12 +84,12 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
     """`weights.pt` to an evaluation-ready network (without training-only heads), its configuration, origin and hash."""
     content = load_file(path)
     if not {"weights", "config", "training"} <= content.keys():
-        raise ConfigError(f"{path}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
+        raise ConfigError(f"{path}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
     model = PoseNet(config.model.deployed())
     weights = deployed_weights(content["weights"])
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
     except RuntimeError:  # its text is a line for each of some hundred tensors
-        raise ConfigError(f"{path}: its weights are not of the network that its [model] describes") from None
+        raise ConfigError(f"{path}: its weights do not match the network that its [model] describes") from None
     return model.eval(), config, content["training"], weights_sha256(weights)

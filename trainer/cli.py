@@ -1,4 +1,4 @@
-"""`uavpose-trainer`: train, evaluate and export the pose network."""
+"""Train, evaluate and export the pose network."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.untrained is not None or arguments.unmeasured:
         source, untrained = arguments.untrained or arguments.checkpoint, arguments.untrained is not None
         path = export_unmeasured(source, arguments.out, untrained=untrained, contract=contract)
-        print(f"wrote {path}, for timing alone")
+        print(f"wrote {path}, for timing only")
         return
     export_models(
         arguments.checkpoint,
@@ -86,23 +86,25 @@ def _parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser(
         "train",
-        help="train a network on rendered windows",
-        description="Train a network on rendered windows. Stops with a checkpoint when the planned samples are done, "
-        "the budget is used up, or on SIGTERM or Ctrl-C; --resume goes on at the next step. Where the loss has no "
-        "finite gradient it stops too, and the last checkpoint stays. The run folder holds weights.pt, "
-        "resume.pt, config.toml, run.json (how each start was asked for), log.jsonl and TensorBoard "
-        "scalars and pictures.",
+        help="train a network on rendered windows, on datasets, or on both",
+        description="Train a network on the windows that the configuration asks for, rendered or cropped from datasets."
+        " Stops with a checkpoint when the planned number of samples or the time budget is reached, or on SIGTERM or "
+        "Ctrl-C; --resume continues at the next step. It also stops when the gradient of the loss is not finite; the "
+        "last checkpoint is then kept. The run folder contains weights.pt, resume.pt, config.toml, run.json (the "
+        "settings of each start), log.jsonl, and TensorBoard scalars and images.",
     )
     train.add_argument("--config", type=Path, required=True, help="TOML, such as trainer/configs/edge.toml")
     train.add_argument("--out", type=Path, required=True, help="run folder")
     train.add_argument(
-        "--budget-minutes", type=positive, help="wall-clock limit of this start; fits the schedule into it"
+        "--budget-minutes", type=positive, help="wall-clock limit of this start; the schedule is fitted into it"
     )
     train.add_argument(
-        "--samples", type=count, help="planned samples in all; default: the resumed run's, or the configuration's"
+        "--samples",
+        type=count,
+        help="total number of training samples (default: the resumed run's, or the configuration's)",
     )
-    train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="begin with another run's weights.pt")
-    train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="initialise from another run's weights.pt")
+    train.add_argument("--resume", action="store_true", help="continue from the run folder's checkpoint")
     train.set_defaults(run=_train)
     evaluate_command.register(commands)
     results.register(commands)
@@ -117,22 +119,24 @@ def _parser() -> argparse.ArgumentParser:
 def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine = commands.add_parser(
         "refine",
-        help="teach a trained network how sure it is, and what to correct",
-        description="Show a trained network rendered windows, and teach its refinement head alone by its answers: "
-        "a correction of the range, and sigma. All else stays as it is. Writes weights.pt into --out.",
+        help="train the uncertainty and range correction of a trained network",
+        description="Run a trained network on rendered windows and train only its refinement head on the outputs: it "
+        "predicts a correction of the range, and sigma. All other weights are unchanged. Writes weights.pt to --out.",
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
-    refine.add_argument("--out", type=Path, required=True, help="folder for the weights")
-    refine.add_argument("--seed", type=whole, required=True, help="of the windows: one that no run before had")
+    refine.add_argument("--out", type=Path, required=True, help="output folder for the weights")
     refine.add_argument(
-        "--windows", type=count, default=100_000, help="how many to look at, 14 KB of memory each (default %(default)s)"
+        "--seed", type=whole, required=True, help="seed of the windows; it must not have been used by any earlier run"
     )
-    refine.add_argument("--epochs", type=count, default=8, help="how often to learn from each (default %(default)s)")
+    refine.add_argument(
+        "--windows", type=count, default=100_000, help="number of windows, 14 KB of memory each (default %(default)s)"
+    )
+    refine.add_argument("--epochs", type=count, default=8, help="passes over the windows (default %(default)s)")
     refine.add_argument(
         "--strangers",
         type=share,
         default=0.35,
-        help="share of targets that are invented aircraft, of some that no training draws (default %(default)s)",
+        help="share of targets that are randomly generated aircraft not used in training (default %(default)s)",
     )
     refine.set_defaults(run=_refine)
 
@@ -141,26 +145,33 @@ def _add_average(commands: argparse._SubParsersAction) -> None:
     mean = commands.add_parser(
         "average",
         help="write the mean of several runs' weights",
-        description="Write weights.pt with the mean of the weights of runs that began alike, such as a run and the one "
-        "that went on from it. Often it is better than each; evaluate it to know.",
+        description="Write weights.pt with the mean of the weights of runs with a common origin, such as a run and its "
+        "continuation. The mean is often better than each of them; evaluate it to be sure.",
     )
     mean.add_argument("checkpoints", type=Path, nargs="+", metavar="RUN", help="run folders or their weights.pt")
-    mean.add_argument("--out", type=Path, required=True, help="folder for the mean")
+    mean.add_argument("--out", type=Path, required=True, help="output folder for the mean")
     mean.set_defaults(run=_average)
 
 
 def _add_ablate(commands: argparse._SubParsersAction) -> None:
     ablate = commands.add_parser(
         "ablate",
-        help="train the same network with one thing left out at a time, and print the table",
-        description="Train every variant for the same number of windows, measure all on the same held-out ones, and "
-        "write table.md and ablation.json. Runs that are there already are kept, and an interrupted one goes on.",
+        help="train variants of a network with one change at a time, and print a table",
+        description="Train every variant for the same number of windows, evaluate all on the same held-out ones, and "
+        "write table.md and ablation.json. Existing runs are kept, and an interrupted one is continued. Exception: a "
+        "variant trained on whole reduced frames alone is evaluated on such frames.",
     )
-    ablate.add_argument("--config", type=Path, default=EDGE_CONFIG, help="what is varied (default: configs/edge.toml)")
-    ablate.add_argument("--out", type=Path, required=True, help="folder of the runs and the table")
-    ablate.add_argument("--variants", metavar="A,B", help="only these (default: all)")
-    ablate.add_argument("--samples", type=count, default=20000, help="training windows a variant (default %(default)s)")
-    ablate.add_argument("--size", type=count, default=128, metavar="PX", help="side of a window (default %(default)s)")
+    ablate.add_argument(
+        "--config", type=Path, default=EDGE_CONFIG, help="base configuration (default: configs/edge.toml)"
+    )
+    ablate.add_argument("--out", type=Path, required=True, help="output folder for the runs and the table")
+    ablate.add_argument("--variants", metavar="A,B", help="only these variants (default: all)")
+    ablate.add_argument(
+        "--samples", type=count, default=20000, help="training windows per variant (default %(default)s)"
+    )
+    ablate.add_argument(
+        "--size", type=count, default=128, metavar="PX", help="side of the windows (default %(default)s)"
+    )
     ablate.add_argument("--windows", type=count, default=512, help="held-out windows (default %(default)s)")
     ablate.add_argument("--json", action="store_true", help="print JSON instead of the table")
     ablate.set_defaults(run=_ablate)
@@ -169,32 +180,41 @@ def _add_ablate(commands: argparse._SubParsersAction) -> None:
 def _add_export(commands: argparse._SubParsersAction) -> None:
     export = commands.add_parser(
         "export",
-        help="write a checkpoint as FP32 and INT8 model files",
-        description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics measured on windows "
-        "of a seed of their own, and print how far INT8 is from FP32 and FP32 from PyTorch. With --unmeasured or "
-        "--untrained: write NAME-unmeasured-fp32.onnx alone, in seconds, to be timed and not flown.",
+        help="export a checkpoint as FP32 and INT8 model files",
+        description="Write NAME-fp32.onnx and NAME-int8.onnx, each with its contract and metrics evaluated on windows "
+        "of a separate seed, and print the differences between INT8 and FP32 and between FP32 and PyTorch. With "
+        "--unmeasured or --untrained: write only NAME-unmeasured-fp32.onnx, in seconds, for timing, not for flight.",
     )
     source = export.add_mutually_exclusive_group(required=True)
     source.add_argument("--checkpoint", type=Path, help="run folder or its weights.pt")
-    source.add_argument("--untrained", type=Path, metavar="CONFIG", help="the network of this TOML, random weights")
-    export.add_argument("--unmeasured", action="store_true", help="render, measure and quantise nothing")
-    export.add_argument("--out", type=Path, required=True, help="folder for the INT8 file")
-    export.add_argument("--float-out", type=Path, help="folder for the FP32 file; default: --out")
-    export.add_argument("--config", type=Path, help="take [contract] from this TOML, not from the checkpoint")
+    source.add_argument(
+        "--untrained", type=Path, metavar="CONFIG", help="the network of this TOML file, with random weights"
+    )
+    export.add_argument("--unmeasured", action="store_true", help="without rendering, evaluation and quantisation")
+    export.add_argument("--out", type=Path, required=True, help="output folder for the INT8 file")
+    export.add_argument("--float-out", type=Path, help="output folder for the FP32 file (default: --out)")
+    export.add_argument(
+        "--config", type=Path, help="take [contract] from this TOML file instead of from the checkpoint"
+    )
     export.add_argument(
         "--samples",
         type=count,
         default=300,
-        help="track windows to calibrate and to compare on, and half as many acquire windows (default %(default)s)",
+        help="number of track windows for calibration and for comparison, with half as many acquire windows "
+        "(default %(default)s)",
     )
     for option, unit, default, what in (
-        ("--tolerance", "DEG", 2.0, "median rotation differs from FP32's by more degrees"),
-        ("--tolerance-depth", "PERCENT", 2.0, "median depth differs from FP32's by more"),
-        ("--tolerance-pose", "POINTS", 5.0, "Pose@10°/5 %% is worse than FP32's by more"),
-        ("--tolerance-sigma", "PERCENT", 10.0, "median sigma is smaller than FP32's by more"),
+        ("--tolerance", "DEG", 2.0, "the median rotation difference from FP32 is larger, degrees"),
+        ("--tolerance-depth", "PERCENT", 2.0, "the median depth difference from FP32 is larger, %%"),
+        ("--tolerance-pose", "POINTS", 5.0, "Pose@10°/5 %% is lower than FP32's by more, percentage points"),
+        ("--tolerance-sigma", "PERCENT", 10.0, "the median sigma is smaller than FP32's by more, %%"),
     ):
         export.add_argument(
-            option, type=positive, default=default, metavar=unit, help=f"no INT8 file if {what} (default %(default)s)"
+            option,
+            type=positive,
+            default=default,
+            metavar=unit,
+            help=f"write no INT8 file if {what} (default %(default)s)",
         )
     export.set_defaults(run=_export)
 

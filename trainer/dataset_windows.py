@@ -52,7 +52,7 @@ class DatasetSampler:
         except BopError as error:
             raise ConfigError(str(error)) from error
         if not self._frames:
-            raise ConfigError(f"{root}: holds no frames to train on")
+            raise ConfigError(f"{root}: contains no frames to train on")
         _judge_range(root, self._frames)
 
     @property

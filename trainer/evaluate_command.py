@@ -17,11 +17,11 @@ def register(commands: argparse._SubParsersAction) -> None:
     """Add the sub-command."""
     evaluate = commands.add_parser(
         "evaluate",
-        help="score a model, a checkpoint or another method's results with the paper's metrics",
-        description="Score a model on every picture of a BOP dataset through the daemon's own estimator, or another "
-        "method's results file, and write metrics.json, frames.jsonl, a model's BOP results file and figures. A target "
-        "that was not found counts as a failure in every rate; mean and median errors are over found targets. With "
-        "--windows, measure the network alone on rendered windows that training never saw.",
+        help="compute the paper's metrics for a model, a checkpoint or another method's results",
+        description="Evaluate a model on every image of a BOP dataset through the daemon's own estimator, or another "
+        "method's results file, and write metrics.json, frames.jsonl, a BOP results file (of a model) and figures. A "
+        "missed target counts as a failure in every rate; mean and median errors are over detected targets. With "
+        "--windows, evaluate the network alone on rendered windows that were not used in training.",
     )
     source = evaluate.add_mutually_exclusive_group()
     source.add_argument(
@@ -31,45 +31,50 @@ def register(commands: argparse._SubParsersAction) -> None:
         dest="model",
         type=Path,
         metavar="PATH",
-        help="ONNX file, or a checkpoint (run folder or weights.pt), which is exported to FP32 first; "
+        help="ONNX file, or a checkpoint (run folder or weights.pt), which is first exported to FP32; "
         "default: the shipped INT8 file",
     )
     source.add_argument(
-        "--results", type=Path, metavar="CSV", help="METHOD_DATASET-SPLIT.csv in BOP's results format, any method's"
+        "--results", type=Path, metavar="CSV", help="METHOD_DATASET-SPLIT.csv in BOP's results format, from any method"
     )
     evaluate.add_argument(
         "--dataset", type=Path, metavar="DIR", help="BOP dataset, split or scene; default: the bundled scene 'crossing'"
     )
-    evaluate.add_argument("--split", metavar="NAME", help="folder of the dataset to take (default: all there are)")
-    evaluate.add_argument("--every", type=int, default=1, metavar="N", help="score every N-th picture (default: all)")
+    evaluate.add_argument("--split", metavar="NAME", help="split of the dataset (default: all)")
+    evaluate.add_argument("--every", type=int, default=1, metavar="N", help="evaluate every N-th image (default: all)")
     evaluate.add_argument(
         "--mode",
         choices=("frames", "track"),
         default="frames",
-        help="frames: each picture by itself; track: whole sequences through the daemon's tracker, which is told the "
-        "camera's attitude where the scene has it (default %(default)s)",
+        help="frames: every image on its own; track: whole sequences through the daemon's tracker, with the camera's "
+        "attitude and position if the scene contains them (default %(default)s)",
     )
     evaluate.add_argument(
         "--own-ship",
         choices=("exact", "usual"),
-        help="track: tell it the camera's attitude and place as they are, or off by what an autopilot usually is, "
-        "drawn by the scene's name (default usual)",
+        help="with --mode track: the own-ship pose given to the tracker, exact or with errors typical of autopilots, "
+        "seeded by the scene's name (default usual)",
     )
     evaluate.add_argument(
         "--score-min",
         type=float,
         metavar="P",
-        help="what whole frame and windows together make a target of less probably is none (default: what the ONNX "
-        "file says; a checkpoint: 0.3)",
+        help="score threshold of both stages, 0 to 1; at acquisition it applies to the combined score of whole frame "
+        "and windows (default: those of the ONNX file; 0.3 for a checkpoint)",
     )
     evaluate.add_argument(
-        "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="folder to write to (default %(default)s)"
+        "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="output folder (default %(default)s)"
     )
     windows = evaluate.add_argument_group("rendered windows instead of a dataset")
-    windows.add_argument("--windows", type=int, metavar="N", help="measure on N windows; a seed gives the same ones")
+    windows.add_argument("--windows", type=int, metavar="N", help="evaluate on N windows, which the seed determines")
     windows.add_argument("--seed", type=whole, default=WINDOWS_SEED, help="seed of the windows (default %(default)s)")
-    windows.add_argument("--stage", choices=("track", "acquire"), default="track", help="windows as it sees them")
-    windows.add_argument("--size", type=int, metavar="PX", help="side of the windows; default: the model's")
+    windows.add_argument(
+        "--stage",
+        choices=("track", "acquire"),
+        default="track",
+        help="stage whose kind of windows is used (default %(default)s)",
+    )
+    windows.add_argument("--size", type=int, metavar="PX", help="side of the windows (default: the model's)")
     evaluate.add_argument("--json", action="store_true", help="print one JSON object")
     evaluate.set_defaults(run=run)
 
@@ -93,9 +98,9 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     asked = arguments
     for name, unasked in {"seed": WINDOWS_SEED, "stage": "track", "size": None}.items():
         if getattr(asked, name) != unasked:
-            raise ConfigError(f"--{name}: is of rendered windows; say how many with --windows")
+            raise ConfigError(f"--{name}: applies to rendered windows only; give their number with --windows")
     if asked.own_ship is not None and asked.mode != "track":
-        raise ConfigError("--own-ship: is of --mode track; single frames are told none")
+        raise ConfigError("--own-ship: applies to --mode track only")
     refuse_no_folder(asked.out)
     own_ship: OwnShipTold = asked.own_ship or "usual"
     request = DatasetRequest(
@@ -134,10 +139,10 @@ def _on_windows(arguments: argparse.Namespace) -> None:
     for name, unasked in alone.items():
         if getattr(arguments, name) != unasked:
             raise ConfigError(
-                f"--{name.replace('_', '-')}: is of a dataset, --windows of rendered pictures; give one of them"
+                f"--{name.replace('_', '-')}: applies to datasets, --windows to rendered images; give only one of them"
             )
     if arguments.score_min is not None:
-        raise ConfigError("--score-min: --windows measures at what the file says")
+        raise ConfigError("--score-min: cannot be combined with --windows, which uses the thresholds of the file")
     model = arguments.model or SHIPPED_MODEL
     request = Request(model, arguments.windows, arguments.seed, arguments.stage, arguments.size)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:

@@ -83,7 +83,7 @@ def evaluate_dataset(
         if request.mode == "frames":  # a tracker must see them all
             pictures = pictures[:: request.every]
         if not pictures:
-            raise ConfigError(f"{request.dataset}: holds no picture to evaluate on")
+            raise ConfigError(f"{request.dataset}: contains no image to evaluate")
         method, answer = _subject(request, dataset)
         on_start(len(pictures))
         judged = judge_frames(pictures, dataset.models, answer, on_frame)
@@ -108,9 +108,9 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
     """How the score names what is judged, and what answers for it."""
     if request.results is not None:
         if request.mode == "track":
-            raise ConfigError("--mode track: runs a model; a results file has its poses already")
+            raise ConfigError("--mode track: needs a model; a results file already contains poses")
         if request.score_min is not None:
-            raise ConfigError("--score-min: is for a model; a results file has its poses already")
+            raise ConfigError("--score-min: needs a model; a results file already contains poses")
         return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
     tracker = partial(tracker_answers, own_ship=request.own_ship)
     answers = tracker if request.mode == "track" else estimator_answers

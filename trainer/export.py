@@ -122,7 +122,7 @@ def make_contract(
     focal_px = np.concatenate([batch.K[:, 0, 0] for batch in batches])
     box_px = np.concatenate([batch.size_px.max(axis=1) for batch in batches])[on]
     if not len(box_px):
-        raise ConfigError("what the network was trained on shows no target")
+        raise ConfigError("the training data show no target")
     range_m = config.contract.trained_range_m or _trained_range_m(config.data, batches)
     return _contract(config, training, sha256, thresholds, range_m, _span(focal_px), _span(box_px))
 
@@ -233,7 +233,9 @@ def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tupl
         scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "sigma_rel": 100, "score": 1}
         cells = (f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items())
         lines.append(f"  {stage:22}" + "".join(cells) + f"{pose[0]:9.1f} /{pose[1]:7.1f}")
-    return "\n".join([*lines, "  (median / 95th percentile over windows with a target; Pose of the two)"]), worst
+    return "\n".join(
+        [*lines, "  (differences: median / 95th percentile over windows with a target; Pose@10°/5 %: both values)"]
+    ), worst
 
 
 def export_models(
@@ -263,7 +265,7 @@ def export_models(
     for path in (float_path, int8_path):
         made_folder(path.parent)
 
-    say("rendering calibration and comparison windows")
+    say("rendering windows for calibration and comparison")
     calibration = render_views(config, CALIBRATION_SEED, samples, trained_on)
     comparison = render_views(config, COMPARISON_SEED, samples, held_out)
 
@@ -280,7 +282,7 @@ def export_models(
     finally:
         unmeasured.unlink(missing_ok=True)
     by_torch = _predict(torch_predictor(model), comparison)
-    say(comparison_table(comparison, "FP32 against PyTorch", floats, by_torch)[0])
+    say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch)[0])
 
     say("quantising")
     write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance, say)
@@ -343,7 +345,7 @@ def write_int8(
     try:
         quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire])
         int8 = _predict(onnx_predictor(unproved), comparison)
-        table, strayed = comparison_table(comparison, "INT8 against FP32", int8, floats)
+        table, strayed = comparison_table(comparison, "INT8 vs. FP32", int8, floats)
         say(table)
         refusal = strayed.refusal(tolerance)
         if refusal is not None:

@@ -148,7 +148,7 @@ def read_contract(path: Path) -> ModelContract:
     """The contract a model file carries. Raises ConfigError naming the file."""
     metadata = open_session(path).get_modelmeta().custom_metadata_map
     if METADATA_KEY not in metadata:
-        raise ConfigError(f"{path}: carries no {METADATA_KEY}: not a model of this program")
+        raise ConfigError(f"{path}: has no {METADATA_KEY} metadata: not a model of this program")
     try:
         return ModelContract.model_validate_json(metadata[METADATA_KEY])
     except ValueError as error:

@@ -80,7 +80,7 @@ def evaluate_file(
     is_onnx = request.model.suffix == ".onnx"
     subject = _model_file(request.model, request.seed) if is_onnx else _checkpoint(request.model)
     if request.seed in subject.training_seeds:
-        raise ConfigError(f"--seed {request.seed}: is the training seed; give another")
+        raise ConfigError(f"--seed {request.seed}: was used in training; give another")
     size_px = request.size_px or (subject.track_px if request.stage == "track" else None)
     size_px = size_px or subject.acquire_px
     if size_px < 32 or size_px % 32:

@@ -63,13 +63,13 @@ def refine(
     """Write weights.pt with a refinement head learnt anew into `out`; returns its path. Raises ConfigError."""
     content = load_file(checkpoint)
     if not {"weights", "config", "training"} <= content.keys():
-        raise ConfigError(f"{checkpoint}: holds no weights; give the run folder or its {WEIGHTS_NAME}")
+        raise ConfigError(f"{checkpoint}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{checkpoint} (config)")
     if plan.seed in (config.data.seed, config.data.validation_seed):
-        raise ConfigError(f"--seed {plan.seed}: is one that the network was trained or validated with; give another")
+        raise ConfigError(f"--seed {plan.seed}: was used to train or validate the network; give another")
     refuse_no_folder(out)
     if (out / RESUME_NAME).exists():
-        raise ConfigError(f"{out}: holds a run that training may go on with; give another --out")
+        raise ConfigError(f"{out}: contains a run that can be resumed; give another --out")
     torch.set_num_threads(config.run.threads)
     commit = provenance(config)["commit"]
     model = network_without_head(config, content["weights"], checkpoint)
@@ -97,11 +97,11 @@ def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: 
     dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # what was made to fly has none
     model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}))
     if model.head_refine is None:
-        raise ConfigError(f"{named}: [model] uncertainty is false: there is nothing to refine with")
+        raise ConfigError(f"{named}: [model] uncertainty is false: the network has no refinement head")
     own = model.state_dict()
     for key in own:
         if not key.startswith(PREFIX) and (key not in weights or weights[key].shape != own[key].shape):
-            raise ConfigError(f"{named}: its weights are not of the network that its [model] describes")
+            raise ConfigError(f"{named}: its weights do not match the network that its [model] describes")
     given = {key: value for key, value in weights.items() if key in own and not key.startswith(PREFIX)}
     model.load_state_dict(given, strict=False)
     return model.eval().requires_grad_(False)
@@ -129,11 +129,11 @@ def look(
                     whole[count : count + len(one)] = one
                 count += len(part.residual)
                 if done % (100 * RENDERED_AT_ONCE) == 0:
-                    say(f"looked at {done} of {windows} windows")
+                    say(f"{done} of {windows} windows evaluated")
     finally:
         handle.remove()
     if count < FEWEST:
-        raise ConfigError(f"the network found {count} targets in {windows} windows: too few to learn from")
+        raise ConfigError(f"the network detected {count} targets in {windows} windows: too few to train on")
     *evidence, residual, strange = (whole[:count] for whole in found)
     return Kept(Evidence(*evidence), residual, strange)
 
@@ -181,7 +181,7 @@ def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callabl
             loss.backward()
             optimizer.step()
             schedule.step()
-        say(f"epoch {epoch + 1} of {epochs}: loss {loss.item():.3f}; held out: {told(head, kept, learnt)}")
+        say(f"epoch {epoch + 1} of {epochs}: training loss {loss.item():.3f}; held out: {told(head, kept, learnt)}")
     head.dropout.p = 0.0
     head.eval().requires_grad_(False)
 
@@ -194,14 +194,16 @@ def told(head: RefinementHead, kept: Kept, first: int) -> str:
     for start in range(first, len(kept.residual), BATCH):
         refined.append(head(kept.rows(slice(start, start + BATCH)).evidence))
     if not refined:
-        return "nothing"
+        return "no windows"
     correction, log_sigma = (torch.cat(values) for values in zip(*refined, strict=True))
     nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
     left = (residual[:, RANGE] + correction).abs()
-    words = [f"nll {nll:.3f}"]
-    for name, of in (("the fleet", ~strange), ("invented ones", strange)):
+    words = [f"NLL {nll:.3f}"]
+    for name, of in (("fleet", ~strange), ("generated aircraft", strange)):
         if of.any():
             before, after = residual[of, RANGE].abs().mean(), left[of].mean()
             scale = torch.exp(log_sigma[of, RANGE]).median()
-            words.append(f"log range of {name} off by {before:.3f}, now {after:.3f}, told scale {scale:.3f}")
+            words.append(
+                f"{name}: mean error of log range {before:.3f} before, {after:.3f} after, predicted scale {scale:.3f}"
+            )
     return "; ".join(words)

@@ -71,7 +71,9 @@ def datasets_in(benchmark: Path) -> list[Path]:
     """Folders with a dataset.toml in `benchmark`, sorted. Raises ConfigError if there is none."""
     found = sorted(path.parent for path in benchmark.glob("*/dataset.toml"))
     if not found:
-        raise ConfigError(f"{benchmark}: holds no folder with a dataset.toml; make some with uavpose-replay generate")
+        raise ConfigError(
+            f"{benchmark}: contains no folder with a dataset.toml; generate some with uavpose-replay generate"
+        )
     return found
 
 
@@ -105,7 +107,7 @@ def read_beside(paths: Sequence[Path]) -> list[dict[str, Any]]:
             score = json.loads(path.read_text(encoding="utf-8"))
             _pictures(score), _called(score["method"])
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise ConfigError(f"{path}: is no metrics.json of evaluate: {error}") from error
+            raise ConfigError(f"{path}: is not a metrics.json from evaluate: {error}") from error
         beside.append(score)
     return beside
 
@@ -115,7 +117,7 @@ def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], datasets: Sequenc
     known = {pictures for dataset in datasets for pictures in _to_judge(dataset)} if beside else set()
     for score in beside:
         if _pictures(score) not in known:
-            raise ConfigError(f"{_called(score['method'])}: was measured on other pictures: {_pictures(score)}")
+            raise ConfigError(f"{_called(score['method'])}: was evaluated on other images: {_pictures(score)}")
 
 
 def _pictures(score: Mapping[str, Any]) -> Pictures:
@@ -235,7 +237,7 @@ def gathered(earlier: Sequence[dict[str, Any]], runs: Sequence[Path]) -> list[di
     for folder in runs:
         lines = [line for line in read_history(folder / "log.jsonl") if line["kind"] == "validation"]
         if not lines:
-            raise ConfigError(f"{folder / 'log.jsonl'}: holds no validation")
+            raise ConfigError(f"{folder / 'log.jsonl'}: contains no validation")
         kept = ("samples", "size_px", "windows", *(key for key in lines[0] if key.startswith(KEPT_METRICS)))
         for line in lines:
             total = before + line["samples"]
@@ -293,27 +295,30 @@ def register(commands: argparse._SubParsersAction) -> None:
     """Add the sub-command."""
     results = commands.add_parser(
         "results",
-        help="measure the shipped model on generated datasets and write the results page",
+        help="evaluate the shipped model on generated datasets and write the results page",
         description="Evaluate the shipped INT8 file (and --model files) on every dataset in a folder and write "
         "results.md, results.json and learning.png.",
     )
     results.add_argument("--benchmark", type=Path, required=True, metavar="DIR", help="folder of generated datasets")
-    results.add_argument("--model", type=Path, action="append", default=[], help="an ONNX file to stand beside it")
+    results.add_argument(
+        "--model", type=Path, action="append", default=[], help="another ONNX file to evaluate; may be repeated"
+    )
     results.add_argument(
         "--beside",
         type=Path,
         action="append",
         default=[],
         metavar="FILE",
-        help="metrics.json that evaluate wrote of another model or method on one of the datasets: one more row",
+        help="metrics.json of evaluate for another model or method on the same images: adds a row; may be repeated",
     )
-    results.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write to")
+    results.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder")
     results.add_argument(
         "--runs",
         type=Path,
         nargs="+",
         metavar="DIR",
-        help="run folders to end the shipped weights' history with, oldest first; a run that it has begins anew",
+        help="run folders to append to the training history of the shipped weights, oldest first; a run that the "
+        "history already contains, and all after it, are replaced",
     )
     results.set_defaults(run=run)
 

@@ -37,9 +37,9 @@ def run_folder(out: Path, resume: bool, hold: bool = True) -> Iterator[None]:
     """
     with _alone_in(out) if hold and (not resume or out.is_dir()) else nullcontext():
         if not resume and (out / RESUME_NAME).exists():
-            raise ConfigError(f"{out}: holds a run already; add --resume or give another --out")
+            raise ConfigError(f"{out}: already contains a run; add --resume or give another --out")
         if not resume and (out / WEIGHTS_NAME).exists():
-            raise ConfigError(f"{out}: holds weights already; give another --out")
+            raise ConfigError(f"{out}: already contains weights; give another --out")
         yield
 
 
@@ -51,7 +51,7 @@ def _alone_in(out: Path) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written: {error.strerror}") from error
     if lock is None:
-        raise ConfigError(f"{out}: another run is at work there; give another --out")
+        raise ConfigError(f"{out}: is in use by another run; give another --out")
     with lock:
         try:
             yield
@@ -156,8 +156,8 @@ class RunLog:
         terms = " ".join(f"{name} {value:.3f}" for name, value in means.items() if name not in told_apart)
         print(
             f"step {step:6d}  samples {samples:7d}  {100 * progress:5.1f} %  {per_s:5.1f} images/s  lr {rate:.1e}  "
-            f"loss {means['loss']:.3f}  rotation {means['rotation_deg']:5.1f} deg  "
-            f"depth {100 * means['depth_rel']:5.1f} %  [{terms}]",
+            f"loss {means['loss']:.3f}  rotation error {means['rotation_deg']:5.1f} deg  "
+            f"depth error {100 * means['depth_rel']:5.1f} %  [{terms}]",
             flush=True,
         )
         record = {"step": step, "samples": samples, "progress": progress, "images_per_s": per_s, "lr": rate, **means}
@@ -167,10 +167,11 @@ class RunLog:
     def validation(self, step: int, samples: int, size_px: int, metrics: dict[str, float]) -> None:
         """Metrics on held-out windows."""
         print(
-            f"held out at {size_px} px after {samples} samples: rotation mean {metrics['E_r_mean_deg']:.1f} "
-            f"median {metrics['E_r_median_deg']:.1f} deg, depth median {100 * metrics['depth_rel_median']:.1f} %, "
-            f"pose@10/5 {100 * metrics['pose_10deg_5pct']:.1f} %, box IoU {metrics['box_iou_mean']:.2f}, "
-            f"recall {100 * metrics['recall']:.1f} %, false alarms {100 * metrics['false_alarms']:.1f} %, "
+            f"validation at {size_px} px after {samples} samples: "
+            f"rotation error mean {metrics['E_r_mean_deg']:.1f} median {metrics['E_r_median_deg']:.1f} deg, "
+            f"depth error median {100 * metrics['depth_rel_median']:.1f} %, "
+            f"Pose@10°/5 % {100 * metrics['pose_10deg_5pct']:.1f} %, box IoU {metrics['box_iou_mean']:.2f}, "
+            f"recall {100 * metrics['recall']:.1f} %, false positives {100 * metrics['false_alarms']:.1f} %, "
             f"score AUC {metrics['score_auc']:.3f}",
             flush=True,
         )

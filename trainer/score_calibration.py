@@ -30,7 +30,7 @@ def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
     on = np.array([candidate.is_target for candidate in seen], dtype=bool)
     if min(on.sum(), (~on).sum()) < LEAST_OF_EACH:
         raise TooFewCandidates(
-            f"{on.sum()} peaks on targets and {(~on).sum()} beside them: at least {LEAST_OF_EACH} of each are needed"
+            f"{on.sum()} peaks on targets and {(~on).sum()} elsewhere: at least {LEAST_OF_EACH} of each are needed"
         )
     peak = np.clip([candidate.peak for candidate in seen], 1e-6, 1.0 - 1e-6)
     logit = np.log(peak / (1.0 - peak))
@@ -42,7 +42,7 @@ def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
     _, cap, weights = min(fits, key=lambda one: one[0])
     offset, slope, size_slope = (round(float(weight), 4) for weight in weights)
     if slope <= 0:
-        raise ScoresTellNothing("its scores do not tell targets from the rest: train it longer")
+        raise ScoresTellNothing("its scores do not separate targets from background: train it longer")
     return ScoreCalibration(offset=offset, slope=slope, size_slope=size_slope, size_cap_px=cap)
 
 

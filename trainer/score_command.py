@@ -21,15 +21,17 @@ def register(commands: argparse._SubParsersAction) -> None:
     """Add the sub-command."""
     command = commands.add_parser(
         "calibrate-score",
-        help="fit what a heatmap peak's height and size say of its being a target",
-        description="Show the model the pictures of the datasets, fit for each stage the probability that a peak is a "
-        "target (logistic in the peak and the size shown), and write it into the file with the thresholds "
-        f"{ACQUIRE_PROBABILITY_MIN:g} (acquire) and {TRACK_PROBABILITY_MIN:g} (track). Take pictures that neither "
-        "training nor the test sees, some of them without a target.",
+        help="calibrate the score of a model file as a probability",
+        description="Run the model on the images of the datasets, fit for each stage the probability that a heatmap "
+        "peak is a target (logistic in the peak's height and its apparent size), and write it into the file with the "
+        f"thresholds {ACQUIRE_PROBABILITY_MIN:g} (acquire) and {TRACK_PROBABILITY_MIN:g} (track). Use images that are "
+        "in neither the training nor the test set, some of them without a target.",
     )
-    command.add_argument("--model", type=Path, required=True, metavar="ONNX", help="the file to calibrate, in place")
+    command.add_argument(
+        "--model", type=Path, required=True, metavar="ONNX", help="the file to calibrate, modified in place"
+    )
     command.add_argument("--dataset", type=Path, required=True, nargs="+", metavar="DIR", help="BOP datasets")
-    command.add_argument("--split", metavar="NAME", help="folder of each dataset to take (default: all there are)")
+    command.add_argument("--split", metavar="NAME", help="split of each dataset (default: all)")
     command.set_defaults(run=run)
 
 
@@ -39,7 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task("looking", total=None)
+        task = progress.add_task("evaluating", total=None)
         contract = calibrate_file(
             arguments.model,
             arguments.dataset,
@@ -69,7 +71,7 @@ def calibrate_file(
 
     contract = read_contract(path)
     if not os.access(path.parent, os.W_OK):
-        raise ConfigError(f"{path}: its folder cannot be written to")
+        raise ConfigError(f"{path}: its folder is not writable")
     try:
         datasets = [open_dataset(folder, split) for folder in folders]
         of_each = [dataset.boxed_frames() for dataset in datasets]

@@ -39,7 +39,9 @@ def refuse_unreadable(config: DataConfig) -> None:
     show_targets: dict[str, list[bool]] = {"train": [], "validate": []}
     for source in config.datasets:
         if source.split == source.validation_split:
-            raise ConfigError(f"{source.path}: validation_split {source.split!r} is what is trained on: give another")
+            raise ConfigError(
+                f"{source.path}: validation_split {source.split!r} is also used for training: give another"
+            )
         for purpose, split in zip(show_targets, (source.split, source.validation_split), strict=True):
             if split is not None:
                 opened = DatasetSampler(
@@ -48,7 +50,9 @@ def refuse_unreadable(config: DataConfig) -> None:
                 show_targets[purpose].append(opened.shows_targets)
     for purpose, shown in show_targets.items():
         if config.rendered_share == 0.0 and shown and not any(shown):
-            raise ConfigError(f"data.datasets: no picture to {purpose} on shows a target, and nothing is rendered")
+            raise ConfigError(
+                f"data.datasets: no image to {purpose} on shows a target, and there are no rendered windows"
+            )
 
 
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:

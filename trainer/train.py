@@ -168,7 +168,7 @@ class Trainer:
         own = self.model.state_dict()
         fitting = {key: value for key, value in given.items() if key in own and own[key].shape == value.shape}
         if not fitting:
-            raise ConfigError(f"{weights}: holds no weights that fit this network")
+            raise ConfigError(f"{weights}: contains no weights that fit this network")
         for network in (self.model, self.average):
             network.load_state_dict(fitting, strict=False)
         self.samples_before = samples_behind(content.get("training", {}))
@@ -220,7 +220,7 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     path = out / RESUME_NAME
     state = load_file(path)
     if not {"config", "trainer", "used_s"} <= state.keys():
-        raise ConfigError(f"{path}: holds no run to go on with")
+        raise ConfigError(f"{path}: contains no run to resume")
     earlier = parse_config(state["config"], f"{path} (config)")
     for section in ("model", "loss", "data", "schedule"):
         if getattr(earlier, section) != getattr(trainer.config, section):
@@ -255,7 +255,9 @@ def run_training(
     with joined_group() as group:
         trainer = Trainer(config, group.device, group)
         if resume and start_from is not None:
-            raise ConfigError(f"--start-from {start_from}: a resumed run goes on from its own weights")
+            raise ConfigError(
+                f"--start-from {start_from}: not with --resume, which continues from the run's own weights"
+            )
         if start_from is not None:
             trainer.start_from(start_from)
         with run_folder(out, resume, hold=group.first):
@@ -300,17 +302,17 @@ class _Loop:
 
     def run(self, stopped: list[int], max_steps: int | None) -> None:
         last_step = None if max_steps is None else self.trainer.steps + max_steps
-        reason = "the planned samples are done"
+        reason = "planned number of samples reached"
         worth_saving = True
         try:
             self.size_px = size_at(self.config.schedule, self.progress())  # a run may be resumed at its end
             while (progress := self.progress()) < 1.0:
                 size_px = size_at(self.config.schedule, progress)
                 if self._train_at(size_px, stopped, last_step):
-                    reason = "stopped before the end of the plan"
+                    reason = "stopped before the planned number of samples"
                     break
             if self.budget.total_s and self.used_s() >= self.budget.total_s:
-                reason = "the time budget is used up"
+                reason = "time budget used up"
         except Diverged:
             worth_saving = False
             raise ConfigError(self._divergence()) from None
@@ -325,18 +327,19 @@ class _Loop:
     def _divergence(self) -> str:
         """What became of the run, and how to get by it: the same steps would end it again."""
         told = (
-            f"{self.out}: after {self.trainer.samples} samples the loss has no finite gradient: training stopped; "
-            "most often [schedule] lr is too high"
+            f"{self.out}: training stopped after {self.trainer.samples} samples: the gradient of the loss is not "
+            "finite; the most frequent cause is a too high [schedule] lr"
         )
-        if not (self.out / WEIGHTS_NAME).exists():
+        weights = self.out / WEIGHTS_NAME
+        if not weights.exists():
             return told
-        return f"{told}. {WEIGHTS_NAME} is of before: begin another run with --start-from {self.out / WEIGHTS_NAME}"
+        return f"{told}. {WEIGHTS_NAME} was saved before that: start another run with --start-from {weights}"
 
     def _train_at(self, size_px: int, stopped: list[int], last_step: int | None) -> bool:
         """Train with windows of one size until the schedule changes it or ends. True: told to stop."""
         trainer, data, run = self.trainer, self.config.data, self.config.run
         self.size_px = size_px
-        self.note(f"windows of {size_px} px from sample {trainer.samples} on")
+        self.note(f"from sample {trainer.samples} on: windows of {size_px} px")
         opener = self.opener(data.seed, size_px)
         rank, ranks = self.group.rank, self.group.size
         with Feed(opener, data.batch_size, trainer.samples, data.workers, data.prefetch, rank, ranks) as feed:

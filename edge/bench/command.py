@@ -18,21 +18,21 @@ THREADS_MAX = 64  # as [model] threads has it
 def register(commands: argparse._SubParsersAction) -> None:
     bench = commands.add_parser(
         "bench",
-        help="time inference on this machine, or with --pipeline the whole daemon",
-        description="Time every given model by stage and number of threads, in turns, beside what this machine "
-        "multiplies at most. Ratios are of 10th percentiles: a busy machine adds to a call's time and never takes "
-        "from it. With --pipeline: fly a replayed sequence through the daemon instead and hold it to its budgets.",
+        help="measure inference speed on this machine, or with --pipeline the whole daemon",
+        description="Time every given model by stage and number of threads, interleaved, and compare it with this "
+        "machine's peak for matrix products. Ratios are of 10th percentiles: other load adds to a call's time and "
+        "never subtracts. With --pipeline: run the daemon on a replayed sequence instead and check its budgets.",
     )
-    bench.add_argument("models", type=Path, nargs="*", help="ONNX files; default: the model that ships")
-    bench.add_argument("--threads", metavar="N,N", help=f"CPU threads of one inference (default {THREADS})")
-    bench.add_argument("--runs", type=int, help=f"timed inferences of each row (default {RUNS})")
+    bench.add_argument("models", type=Path, nargs="*", help="ONNX files (default: the shipped model)")
+    bench.add_argument("--threads", metavar="N,N", help=f"CPU threads per inference (default {THREADS})")
+    bench.add_argument("--runs", type=int, help=f"timed inferences per row (default {RUNS})")
     bench.add_argument("--spinning", action="store_true", help="let threads spin between inferences")
-    bench.add_argument("--alone", action="store_true", help="ONNX Runtime alone, without the other engines installed")
+    bench.add_argument("--alone", action="store_true", help="only ONNX Runtime, without other installed engines")
     bench.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     bench.add_argument("--pipeline", action="store_true", help=f"run `{PIPELINE} bench-pipeline`")
-    bench.add_argument("--sequence", type=Path, metavar="DIR", help="with --pipeline: scene folder that is replayed")
-    bench.add_argument("--minutes", type=float, help="with --pipeline: how long")
-    bench.add_argument("--fps", type=float, help="with --pipeline: pictures a second (default: the sequence's rate)")
+    bench.add_argument("--sequence", type=Path, metavar="DIR", help="with --pipeline: scene folder to replay")
+    bench.add_argument("--minutes", type=float, help="with --pipeline: duration")
+    bench.add_argument("--fps", type=float, help="with --pipeline: frames per second (default: the sequence's rate)")
     bench.set_defaults(act=run)
 
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
 def _threads(text: str) -> list[int]:
     numbers = text.split(",")
     if not all(number.isdecimal() and 1 <= int(number) <= THREADS_MAX for number in numbers):
-        raise InputError(f"--threads {text}: give whole numbers from 1 to {THREADS_MAX}, such as 1,2")
+        raise InputError(f"--threads {text}: give integers from 1 to {THREADS_MAX}, such as 1,2")
     return sorted({int(number) for number in numbers})
 
 
@@ -73,9 +73,9 @@ def _pipeline(options: argparse.Namespace) -> int:
     """The replay harness is a program of its own, beside this one; the daemon's package does not import it."""
     for name in ("threads", "runs", "spinning", "alone"):
         if getattr(options, name) not in (None, False):
-            raise InputError(f"--{name} does not go with --pipeline, which flies the daemon as it is")
+            raise InputError(f"--{name} cannot be combined with --pipeline, which runs the daemon as configured")
     if len(options.models) > 1:
-        raise InputError(f"--pipeline flies one model, not {len(options.models)}")
+        raise InputError(f"--pipeline takes one model, not {len(options.models)}")
     command = Path(sys.executable).parent / PIPELINE
     if not command.exists():
         raise InputError(f"--pipeline needs {PIPELINE}, which is not installed beside {sys.executable}")

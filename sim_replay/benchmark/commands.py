@@ -24,21 +24,31 @@ def register(commands: Any) -> None:
 def _generate(commands: Any) -> None:
     parser = commands.add_parser(
         "generate",
-        help="make a BOP dataset from a preset and a seed",
-        description="Fly (JSBSim), draw and label every sequence of a preset. The same seed gives the same bytes on "
-        "one machine, the same labels on any. Ctrl-C stops after the frames in hand; --resume goes on.",
+        help="generate a BOP dataset from a preset and a seed",
+        description="Fly (JSBSim), render and label every sequence of a preset. The same seed gives the same bytes on "
+        "one machine; labels do not depend on the renderer. Ctrl-C stops after the frames in progress; --resume "
+        "continues.",
     )
     parser.add_argument("--preset", required=True, metavar="NAME", help="fw-uav6d, unseen, stress, or a .toml file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write the dataset to")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="0 or more (default %(default)s)")
-    parser.add_argument("--split", action="append", choices=("train", "val", "test"), help="only this; may be repeated")
-    parser.add_argument("--sequences", metavar="LIST", help="only these, for example 0-9,12")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="only each Nth frame of a sequence")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--resume", action="store_true", help="go on with the dataset that is in --out")
-    parser.add_argument("--labels-only", action="store_true", help="all but pictures and masks: minutes, not hours")
-    parser.add_argument("--undistorted", action="store_true", help="the same through lenses without distortion")
-    parser.add_argument("--backdrops", type=Path, metavar="DIR", help="photographs to use for half of the skies")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="output folder of the dataset")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed, 0 or more (default %(default)s)")
+    parser.add_argument(
+        "--split", action="append", choices=("train", "val", "test"), help="only this split; may be repeated"
+    )
+    parser.add_argument("--sequences", metavar="LIST", help="only these sequences, for example 0-9,12")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth frame of a sequence")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--resume", action="store_true", help="continue the dataset in --out")
+    parser.add_argument(
+        "--labels-only", action="store_true", help="everything except images and masks: minutes, not hours"
+    )
+    parser.add_argument("--undistorted", action="store_true", help="the same dataset with distortion-free lenses")
+    parser.add_argument(
+        "--backdrops",
+        type=Path,
+        metavar="DIR",
+        help="photographs that replace sky and ground in about half of the sequences",
+    )
     parser.set_defaults(run=_run_generate)
 
 
@@ -65,7 +75,7 @@ def _extra_packages() -> Iterator[None]:
 def _stats(commands: Any) -> None:
     parser = commands.add_parser(
         "stats",
-        help="measure what a BOP dataset holds, beside the paper's figures",
+        help="print statistics of a BOP dataset, next to the paper's figures",
         description="Sequences, frames, ranges, box sizes, lenses, targets and airframes, measured from the files.",
     )
     parser.add_argument("--dataset", type=Path, required=True, metavar="DIR", help="BOP dataset, split or scene folder")
@@ -82,13 +92,15 @@ def _run_stats(args: argparse.Namespace) -> int:
 def _bench(commands: Any) -> None:
     parser = commands.add_parser(
         "bench",
-        help="measure how fast this machine draws",
-        description="Whole frames a second as generate writes them, and training windows a second, of all workers "
-        "drawing at once.",
+        help="measure the rendering speed of this machine",
+        description="Whole frames per second as generate writes them, and training windows per second, with all "
+        "workers rendering at the same time.",
     )
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="N", help="for each figure (default 10)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a core)")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, metavar="N", help="duration of each measurement (default 10)"
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
     parser.set_defaults(run=_run_bench)
 
 
@@ -102,13 +114,15 @@ def _run_bench(args: argparse.Namespace) -> int:
 def _sheet(commands: Any) -> None:
     parser = commands.add_parser(
         "sheet",
-        help="one picture of the airframes from all sides, or of a dataset's frames",
+        help="draw a contact sheet of the airframes, or of a dataset's frames",
         description="Draw each airframe from the front, rear, side, top, below and two oblique sides; or, with "
-        "--dataset, frames of a dataset with the target's box and its surroundings enlarged.",
+        "--dataset, frames of a dataset with the target's box and an enlarged view around it.",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JPEG to write")
-    parser.add_argument("--airframe", nargs="+", metavar="NAME", help="which to draw (default: all)")
-    parser.add_argument("--livery-seed", type=int, default=0, metavar="N", help="paint (default %(default)s)")
+    parser.add_argument("--airframe", nargs="+", metavar="NAME", help="airframes to draw (default: all)")
+    parser.add_argument(
+        "--livery-seed", type=int, default=0, metavar="N", help="seed of the livery (default %(default)s)"
+    )
     parser.add_argument("--dataset", type=Path, metavar="DIR", help="show frames of this BOP dataset instead")
     parser.set_defaults(run=_run_sheet)
 

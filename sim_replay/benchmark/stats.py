@@ -180,7 +180,7 @@ def _shared(flights: dict[str, set[tuple[str, int]]]) -> int:
 def statistics_table(s: dict[str, Any]) -> Table:
     """The statistics as a table, beside the paper's."""
     table = Table(title=str(s["dataset"]), show_lines=False)
-    for column in ("", "here", "paper"):
+    for column in ("", "dataset", "paper"):
         table.add_column(column)
     for row in _rows(s):
         table.add_row(*row)
@@ -191,33 +191,33 @@ def _rows(s: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "sequences", _of_splits(s["sequences"]), PAPER["sequences"]
     yield "frames", f"{sum(s['frames'].values()):,}", PAPER["frames"]
     yield "frames by split", _of_splits(s["frames"]), PAPER["splits"]
-    yield "pictures", ", ".join(name.replace("x", "×") for name in s["pictures"]), PAPER["picture"]
+    yield "image size", ", ".join(name.replace("x", "×") for name in s["pictures"]), PAPER["picture"]
     if r := s["range_m"]:
         yield "range", f"{r['min']:.0f}–{r['max']:.0f} m, mean {r['mean']:.0f} m", PAPER["range"]
         total = sum(s["range_histogram_m"].values())
         for name, count in s["range_histogram_m"].items():
             yield f"  {name} m", f"{100 * count / total:.1f} %", ""
     if b := s["box_share"]:
-        spread = f"(5 % to 95 %: {100 * b['p5']:.2f}–{100 * b['p95']:.2f} %)"
-        yield "visible box / picture", f"{100 * b['mean']:.3f} % {spread}", PAPER["box_share"]
+        spread = f"(5th to 95th percentile: {100 * b['p5']:.2f}–{100 * b['p95']:.2f} %)"
+        yield "visible box / image area, mean", f"{100 * b['mean']:.3f} % {spread}", PAPER["box_share"]
     if f := s["focal_px"]:
         yield "focal length", f"{f['min']:.0f}–{f['max']:.0f} px, median {f['median']:.0f}", "not given"
-    yield "distorted sequences", str(s["distorted_sequences"]), "not given"
-    yield "targets in a frame", ", ".join(f"{n}: {c:,}" for n, c in s["targets_per_frame"].items()), "1"
+    yield "sequences with distortion", str(s["distorted_sequences"]), "not given"
+    yield "targets per frame: frames", ", ".join(f"{n}: {c:,}" for n, c in s["targets_per_frame"].items()), "1"
     if s["target_free_share"] is not None:
-        yield "frames without target", f"{100 * s['target_free_share']:.1f} %", "not given"
+        yield "frames without a target", f"{100 * s['target_free_share']:.1f} %", "not given"
     if v := s["visible_fraction"]:
-        hidden = f"{100 * s['partly_hidden_share']:.1f} % of targets below 0.98"
+        hidden = f"{100 * s['partly_hidden_share']:.1f} % of the targets below 0.98"
         yield "visible fraction", f"mean {v['mean']:.3f}; {hidden}", "not given"
     if s["below_camera_share"] is not None:
-        yield "targets lower than camera", f"{100 * s['below_camera_share']:.1f} %", "not given"
+        yield "targets below the camera", f"{100 * s['below_camera_share']:.1f} %", "not given"
     yield (
         "airframes by split",
         ", ".join(f"{split} {len(names)}" for split, names in s["airframes"].items()),
         "not given",
     )
     yield "airframes", ", ".join(sorted({name for names in s["airframes"].values() for name in names})), "not given"
-    yield "airframe-flights in two splits", str(s["airframe_flights_in_two_splits"]), "not given"
+    yield "airframe/flight pairs in two splits", str(s["airframe_flights_in_two_splits"]), "not given"
 
 
 def _of_splits(counts: dict[str, int]) -> str:

@@ -11,7 +11,7 @@ from rich.table import Table
 WIDTH = 130  # of tables where there is no terminal to ask
 _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "targets": lambda group: str(group["targets"]),
-    "found": lambda group: _text(group["recall"], "{:.1%}"),
+    "recall": lambda group: _text(group["recall"], "{:.1%}"),
     "E_r mean": lambda group: _text(group["rotation_error_deg"]["mean"], "{:.2f}°"),
     "E_r median": lambda group: _text(group["rotation_error_deg"]["median"], "{:.2f}°"),
     "E_t mean": lambda group: _text(group["translation_error_m"]["mean"], "{:.2f} m"),
@@ -26,7 +26,7 @@ _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
 }
 _AIRFRAME_COLUMNS = {
     "targets": "targets",
-    "found": "found",
+    "recall": "recall",
     "E_r mean": "E_r",
     "E_t mean": "E_t",
     "Pose@10°/5 %": "Pose",
@@ -43,13 +43,14 @@ def table_console(stderr: bool = False) -> Console:
 
 
 def score_table(score: dict[str, Any]) -> Group:
-    """The figures of a score (sim_replay.evaluation.judge.score_of)."""
+    """The metrics of a score (sim_replay.evaluation.judge.score_of)."""
     overall = score["overall"]
     title = f"{score['method']['file']} on {score['dataset']}, {overall['frames']} frames"
     false_rate = _text(overall["false_positives_per_1000"], "{:.1f}")
-    caption = f"false positives in 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
+    caption = f"false positives per 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
     if overall["rotations_not_known"]:
-        caption += f"\nposes whose rotation is not known, in no E_r and no hit: {overall['rotations_not_known']}"
+        not_known = overall["rotations_not_known"]
+        caption += f"\nposes whose rotation is not known, excluded from E_r and counted as failures: {not_known}"
     if score.get("intervals_95") is not None:
         caption += f"\n{_intervals(score['intervals_95'])}"
     if score.get("consistency") is not None:
@@ -74,37 +75,34 @@ def score_table(score: dict[str, Any]) -> Group:
 
 def _calibration(group: dict[str, Any]) -> str:
     if group["calibration"] is None:
-        return "no covariances to check"
+        return "no covariances to evaluate"
     shares = (f"{name} {_text(value['inside_1sigma'], '{:.0%}')}" for name, value in group["calibration"].items())
-    return "truth inside one sigma (an honest one: 68 %): " + ", ".join(shares)
+    return "true values within 1 sigma (68 % expected): " + ", ".join(shares)
 
 
 def consistency_line(found: dict[str, Any]) -> str:
     told = {name: found[name] for name in ("position", "rotation") if found[name]}
     if not told:
-        return f"no covariance of {found['singular']} poses can be inverted: they tell no error"
+        return f"NEES not available: the covariances of all {found['singular']} poses are singular"
     low, high = next(iter(told.values()))["bounds_95"]
     means = ", ".join(f"{name} {one['nees_mean']:.2f}" for name, one in told.items())
-    left_out = f"; {found['singular']} poses left out, their covariance has no inverse" if found["singular"] else ""
-    return (
-        f"error squared by told variance, mean of {found['flights']} flights (honest: {low:.1f} to {high:.1f}): {means}"
-        f"{left_out}"
-    )
+    left_out = f"; {found['singular']} poses with a singular covariance excluded" if found["singular"] else ""
+    return f"NEES, mean over {found['flights']} flights (95 % bounds {low:.1f} to {high:.1f}): {means}{left_out}"
 
 
 def _intervals(intervals: dict[str, tuple[float, float]]) -> str:
-    found, pose = (
+    recall, pose = (
         "{:.0f} to {:.0f} %".format(*(100 * end for end in intervals[name])) for name in ("recall", "pose_10deg_5pct")
     )
-    return f"in 95 of 100 sets of as many flights, drawn from these: found {found}, Pose@10°/5 % {pose}"
+    return f"95 % bootstrap confidence intervals, resampled over flights: recall {recall}, Pose@10°/5 % {pose}"
 
 
 def _filtering(found: dict[str, Any]) -> str:
     translation_m, rotation_deg = found["translation_error_m"], found["rotation_error_deg"]
     return (
-        f"the tracker beside what it was given, {found['targets']} targets: "
-        f"E_t {translation_m['measured']:.2f} to {translation_m['track']:.2f} m, "
-        f"E_r {_text(rotation_deg['measured'], '{:.2f}')} to {_text(rotation_deg['track'], '{:.2f}°')}"
+        f"tracker input → output, mean over {found['targets']} targets: "
+        f"E_t {translation_m['measured']:.2f} → {translation_m['track']:.2f} m, "
+        f"E_r {_text(rotation_deg['measured'], '{:.2f}°')} → {_text(rotation_deg['track'], '{:.2f}°')}"
     )
 
 

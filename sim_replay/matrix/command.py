@@ -32,29 +32,36 @@ def register(commands: Any) -> None:
     """Add it to what argparse's add_subparsers() gave."""
     parser = commands.add_parser(
         "matrix",
-        help="fly sequences at several speeds, with and without faults, and print one table",
-        description="Every combination of what is asked for, one after the other, through the real daemon. Without a "
-        "fault a flight is scored against the truth; with one it is judged as `faults` does. Writes matrix.json. "
-        "Exit code 0 if all was as it should be, 1 if not.",
+        help="play sequences at several speeds, with and without faults, and print one table",
+        description="Play every combination of the given sequences, speeds and faults through the real daemon, one "
+        "after the other. Without a fault a flight is scored against ground truth; with one it is judged by the "
+        "criteria of `faults`. Writes matrix.json. Exit code 0 if every run passed, 1 if not.",
     )
     parser.add_argument(
         "--sequence", type=Path, action="append", default=[], metavar="DIR", help="scene folder; may be repeated"
     )
     parser.add_argument(
         "--dataset", type=Path, action="append", default=[], metavar="DIR",
-        help="what `generate --preset` wrote: its first test sequences are flown; may be repeated",
+        help="dataset written by `generate --preset`: its first test sequences are played; may be repeated",
     )  # fmt: skip
-    parser.add_argument("--take", type=int, default=1, metavar="N", help="sequences of each dataset (default 1)")
+    parser.add_argument(
+        "--take", type=int, default=1, metavar="N", help="number of sequences of each dataset (default 1)"
+    )
     parser.add_argument(
         "--fault", action="append", default=[], metavar="NAME",
         help=f"a timeline of `faults`, or {NO_FAULT}; may be repeated (default: {NO_FAULT})",
     )  # fmt: skip
     parser.add_argument(
-        "--speed", type=float, action="append", default=[], metavar="X", help="times real time; may be repeated (1)"
+        "--speed",
+        type=float,
+        action="append",
+        default=[],
+        metavar="X",
+        help="speed relative to real time; may be repeated (default 1)",
     )
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
-    parser.add_argument("--out", type=Path, default=Path("out") / "matrix", metavar="DIR", help="folder to write to")
-    parser.add_argument("--json", action="store_true", help="print the cells as JSON")
+    parser.add_argument("--out", type=Path, default=Path("out") / "matrix", metavar="DIR", help="output folder")
+    parser.add_argument("--json", action="store_true", help="print the results as JSON")
     parser.set_defaults(run=run)
 
 
@@ -73,7 +80,9 @@ def run(args: argparse.Namespace) -> int:
     named += [(f, f"{dataset.name}/{f.name}") for dataset in args.dataset for f in flyable(dataset, args.take)]
     sequences = [(read_sequence(folder), name) for folder, name in named]
     if NO_FAULT not in faults and all(sequence.scene.target_free for sequence, _ in sequences):
-        raise InputError(f"--fault: no sequence shows a target, which faults are judged by; say --fault {NO_FAULT}")
+        raise InputError(
+            f"--fault: no sequence shows a target, which is needed to judge faults; use --fault {NO_FAULT}"
+        )
     args.out.mkdir(parents=True, exist_ok=True)
     for name, timeline in timelines.items():
         if timeline.volume and not can_mount(args.out):
@@ -81,13 +90,15 @@ def run(args: argparse.Namespace) -> int:
     console = table_console(stderr=args.json)
     for sequence, name in sequences:
         if timelines and sequence.scene.target_free:
-            console.print(f"{name}: shows no target, which faults are judged by: flown without them", highlight=False)
+            console.print(
+                f"{name}: shows no target, which is needed to judge faults: played without them", highlight=False
+            )
     cells: list[Cell] = []
     _write(args.out, cells)  # of an earlier run nothing is left
     for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
         cells.append(cell)
         _write(args.out, cells)  # after each: what was flown for hours is kept if the next cannot be
-        told = "; ".join(cell.wrong) or "as it should be"
+        told = "; ".join(cell.wrong) or "passed"
         console.print(f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False)
     if args.json:
         print(json.dumps([asdict(cell) for cell in cells]))
@@ -128,7 +139,7 @@ def table(cells: Sequence[Cell]) -> Table:
     shown = Table(title="matrix", title_justify="left")
     for name in ("sequence", "speed", "fault", ""):
         shown.add_column(name)
-    for name in ("poses", "found", "E_r median", "range", "age p50", "age max", "dropped"):
+    for name in ("poses", "recall", "E_r median", "range", "age p50", "age max", "dropped"):
         shown.add_column(name, justify="right")
     for cell in cells:
         shown.add_row(

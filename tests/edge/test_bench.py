@@ -175,13 +175,13 @@ def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
     [
         (["--threads", "two"], "--threads two"),
         (["--threads", "0"], "--threads 0"),
-        (["--threads", "1,99999999999999999999"], "whole numbers from 1 to 64"),
+        (["--threads", "1,99999999999999999999"], "integers from 1 to 64"),
         (["--runs", "0"], "--runs 0"),
         (["none.onnx"], "none.onnx"),
         (["--minutes", "1"], "--minutes needs --pipeline"),
-        (["--pipeline", "--threads", "1"], "--threads does not go with --pipeline"),
-        (["--pipeline", "--alone"], "--alone does not go with --pipeline"),
-        (["--pipeline", "a.onnx", "b.onnx"], "--pipeline flies one model, not 2"),
+        (["--pipeline", "--threads", "1"], "--threads cannot be combined with --pipeline"),
+        (["--pipeline", "--alone"], "--alone cannot be combined with --pipeline"),
+        (["--pipeline", "a.onnx", "b.onnx"], "--pipeline takes one model, not 2"),
     ],
 )
 def test_what_cannot_be_timed_is_named(cli: Cli, arguments: list[str], named: str) -> None:

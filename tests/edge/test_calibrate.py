@@ -133,7 +133,7 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "calibrate needs a video or a folder"),
+        ([], "calibrate needs a video, a folder of images"),
         (["nowhere"], "nowhere does not exist"),
         (["notes.txt"], "neither a folder of pictures nor a readable video"),
         (["grey"], "no picture shows the whole board"),

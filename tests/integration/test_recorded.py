@@ -106,7 +106,7 @@ def test_the_daemons_own_recording_flies_again(
 ) -> None:
     recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
     assert recorded.returncode == 0, recorded.stderr
-    assert "not scored: no truth is known" in recorded.stdout.replace("\n", " ")
+    assert "not scored: no ground truth" in recorded.stdout.replace("\n", " ")
     (path,) = (tmp_path / "first/recordings").glob("*.mcap")
     with path.open("rb") as file:
         kept = make_reader(file).iter_messages("/uav1/image/compressed")

@@ -145,7 +145,7 @@ def test_the_table_stands_beside_the_papers(dataset: Path, capsys: pytest.Captur
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["stats", "--dataset", str(dataset)]) == 0
     said = capsys.readouterr().out
-    for words in ("161", "15,325", "2.333 %", "about 1.20 %", "1500–8000 px", "25.0 %", "targets lower than camera"):
+    for words in ("161", "15,325", "2.333 %", "about 1.20 %", "1500–8000 px", "25.0 %", "targets below the camera"):
         assert words in said
 
 

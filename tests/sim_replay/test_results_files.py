@@ -147,5 +147,8 @@ def test_covariances_that_cannot_be_inverted_are_told_in_the_table() -> None:
     for found in ({"position": None, "rotation": rotation}, {"position": None, "rotation": None}):
         console.print(consistency_line({"flights": 1, "singular": 4, **found}))
     said = console.export_text()
-    assert "mean of 1 flights (honest: 0.2 to 9.3): rotation 3.10; 4 poses left out" in said
-    assert "no covariance of 4 poses can be inverted" in said
+    assert (
+        "NEES, mean over 1 flights (95 % bounds 0.2 to 9.3): rotation 3.10; 4 poses with a singular covariance excluded"
+        in said
+    )
+    assert "the covariances of all 4 poses are singular" in said

@@ -121,7 +121,7 @@ def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(tmp_path: Path) -
 
 
 def test_an_unknown_variant_is_named_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match="'no-such'; there are full, no-ray"):
+    with pytest.raises(ConfigError, match="'no-such'; known variants: full, no-ray"):
         chosen(["no-such"])
 
 

@@ -72,11 +72,11 @@ def test_commands_end_with_2_and_a_sentence(
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("train --samples 0", "--samples: '0' is not a whole number from 1 on"),
+        ("train --samples 0", "--samples: '0' is not an integer of at least 1"),
         ("train --budget-minutes nan", "--budget-minutes: 'nan' is not a number above 0"),
-        ("refine --seed 2147483648", "--seed: '2147483648' is not a whole number from 0 to 2147483647"),
+        ("refine --seed 2147483648", "--seed: '2147483648' is not an integer from 0 to 2147483647"),
         ("refine --strangers 35", "--strangers: '35' is not a number from 0 to 1"),
-        ("export --samples many", "--samples: 'many' is not a whole number from 1 on"),
+        ("export --samples many", "--samples: 'many' is not an integer of at least 1"),
     ],
 )
 def test_a_number_out_of_bounds_is_told_with_the_bounds(

@@ -267,7 +267,7 @@ def test_a_network_trains_on_a_dataset_named_in_its_configuration(dataset: Path,
     assert trainer.samples == 4
 
 
-@pytest.mark.parametrize(("split", "named"), [("vall", "'vall'"), ("train", "is what is trained on")])
+@pytest.mark.parametrize(("split", "named"), [("vall", "'vall'"), ("train", "is also used for training")])
 def test_a_wrong_validation_split_is_told_before_the_first_step(
     dataset: Path, tmp_path: Path, split: str, named: str
 ) -> None:

@@ -48,7 +48,7 @@ def test_what_was_saved_before_stays_and_is_named(tmp_path: Path) -> None:
     config = parse_config(tiny.TOML, "tiny.toml")
     run_training(config, tiny.TOML, tmp_path, open_sampler=spoilt, max_steps=2)
     saved = digests(tmp_path)
-    with pytest.raises(ConfigError, match=r"after 8 samples .*--start-from .*weights\.pt"):
+    with pytest.raises(ConfigError, match=r"after 8 samples: .*--start-from .*weights\.pt"):
         run_training(config, tiny.TOML, tmp_path, open_sampler=spoilt, resume=True)
     assert digests(tmp_path) == saved
 

@@ -292,9 +292,9 @@ def test_json_that_nobody_reads_ends_without_a_traceback(dataset: Path, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ([], "--own-ship: is of --mode track"),
-        (["--results", "method_crossing-test.csv"], "--own-ship: is of --mode track"),
-        (["--windows", "8"], "--own-ship: is of a dataset"),
+        ([], "--own-ship: applies to --mode track"),
+        (["--results", "method_crossing-test.csv"], "--own-ship: applies to --mode track"),
+        (["--windows", "8"], "--own-ship: applies to datasets"),
     ],
 )
 def test_an_own_ship_that_nobody_is_told_of_is_refused(

@@ -106,7 +106,7 @@ def test_both_files_carry_a_contract_with_what_was_measured(exported: Exported) 
     np.testing.assert_allclose(int8.pixel_std_bgr, 255 * np.array([0.225, 0.224, 0.229]))
     assert int8.metrics["track_windows"] == 16.0
     assert 0 <= int8.metrics["acquire_E_r_median_deg"] <= 180
-    assert any("INT8 against FP32" in text for text in exported.said)
+    assert any("INT8 vs. FP32" in text for text in exported.said)
 
 
 def windows(seed: int, size_px: int) -> TrainingBatch:
@@ -167,7 +167,7 @@ def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None
     expected = measure(predict_all(onnx_predictor(exported.fp32), batches), batches, threshold)
     expected |= {"size_px": 64.0, "score_min": threshold, **constant_guess(batches)}
     assert got == pytest.approx(expected, nan_ok=True)
-    with pytest.raises(ConfigError, match="training seed"):
+    with pytest.raises(ConfigError, match="was used in training"):
         evaluate_file(request._replace(seed=3), open_view=open_view)
 
 

@@ -113,6 +113,6 @@ def test_a_run_whose_whole_group_is_told_to_stop_ends_as_one_that_was_asked_to(t
         finally:
             process.kill()
     assert process.returncode == 0
-    assert "stopped before the end of the plan" in said
+    assert "stopped before the planned number of samples" in said
     if renderer == "rendering":  # else it may have been stopped before it had learnt anything
         assert (tmp_path / "run" / "resume.pt").exists()

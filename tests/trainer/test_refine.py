@@ -126,22 +126,22 @@ def test_a_correction_by_what_an_answer_is_off_by_makes_the_truth() -> None:
 
 def test_what_cannot_be_refined_is_a_sentence(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    with pytest.raises(ConfigError, match="--seed 3: is one that the network was trained"):
+    with pytest.raises(ConfigError, match="--seed 3: was used to train or validate the network"):
         refine(run, tmp_path / "out", PLAN._replace(seed=3), open_sampler=open_plates, say=silent)
-    with pytest.raises(ConfigError, match="found 0 targets in 96 windows: too few"):
+    with pytest.raises(ConfigError, match="detected 0 targets in 96 windows: too few"):
         refine(run, tmp_path / "out", PLAN, open_sampler=open_empty, say=silent)
     unsure = write_run(tmp_path / "unsure", tiny.TOML.replace("uncertainty = true", "uncertainty = false"))
     with pytest.raises(ConfigError, match="uncertainty is false"):
         refine(unsure, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
     write_atomic(tmp_path / "going" / "resume.pt", {})
-    with pytest.raises(ConfigError, match="a run that training may go on with"):
+    with pytest.raises(ConfigError, match="a run that can be resumed"):
         refine(run, tmp_path / "going", PLAN, open_sampler=open_plates, say=silent)
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="file is a file"):
         refine(run, tmp_path / "file", PLAN, open_sampler=open_plates, say=silent)
     content = load_file(run)
     write_atomic(run / "weights.pt", content | {"weights": {**content["weights"], "head_trans.weight": torch.zeros(1)}})
-    with pytest.raises(ConfigError, match="not of the network"):
+    with pytest.raises(ConfigError, match="do not match the network"):
         refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
     assert not (tmp_path / "out" / "weights.pt").exists()
 

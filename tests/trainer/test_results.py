@@ -132,7 +132,7 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
     refuse_other_pictures([track], [CROSSING])
     fewer = {**other, "overall": {**other["overall"], "frames": 3}}
     for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
-        with pytest.raises(ConfigError, match="other pictures"):
+        with pytest.raises(ConfigError, match="other images"):
             refuse_other_pictures([unlike], [CROSSING])
     for text in ("no json", "{}", "[]"):
         path.write_text(text)
@@ -196,7 +196,7 @@ def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None
     [
         (["--out", "{tmp}/file"], "{tmp}/file: cannot be made a folder"),
         (["--out", "{tmp}/out", "--model", "{tmp}/typo.onnx"], "{tmp}/typo.onnx: no such model file"),
-        (["--out", "{tmp}/out", "--beside", "{tmp}/none.json"], "{tmp}/none.json: is no metrics.json"),
+        (["--out", "{tmp}/out", "--beside", "{tmp}/none.json"], "{tmp}/none.json: is not a metrics.json"),
     ],
 )
 def test_what_is_wrong_is_told_before_anything_is_measured_or_changed(
@@ -227,7 +227,7 @@ def test_what_stands_beside_other_pictures_is_refused_before_the_hours_of_measur
     monkeypatch.setattr("trainer.results.measure", lambda *_: pytest.fail("it measured"))
     given = ["--benchmark", str(dataset.parent), "--beside", str(beside), "--out", str(tmp_path / "out")]
     assert main(["results", *given]) == 2
-    told = "other.csv: was measured on other pictures: ('crossing', None, 1, 150, 149, 'frames', None)"
+    told = "other.csv: was evaluated on other images: ('crossing', None, 1, 150, 149, 'frames', None)"
     assert told in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

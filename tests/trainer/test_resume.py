@@ -56,7 +56,7 @@ def test_a_run_is_neither_overwritten_nor_resumed_with_other_losses(whole: tuple
 @pytest.mark.parametrize("content", [[1], {"config": tiny.TOML}])
 def test_a_file_that_is_no_run_is_not_gone_on_with(tmp_path: Path, content: object) -> None:
     torch.save(content, tmp_path / "resume.pt")
-    with pytest.raises(ConfigError, match=r"resume\.pt: (not a checkpoint|holds no run)"):
+    with pytest.raises(ConfigError, match=r"resume\.pt: (not a checkpoint|contains no run)"):
         train(tmp_path, 1, resume=True)
 
 
@@ -150,7 +150,7 @@ def test_frozen_blocks_stay_as_another_run_left_them_and_the_rest_learns(
     assert learning
     assert not learning & same
 
-    with pytest.raises(ConfigError, match="frozen_blocks = 9: the backbone has 4"):
+    with pytest.raises(ConfigError, match="frozen_blocks = 9: the backbone has 4 blocks"):
         Trainer(
             parse_config(tiny.TOML.replace("[schedule]", "[schedule]\nfrozen_blocks = 9"), "f.toml"),
             torch.device("cpu"),

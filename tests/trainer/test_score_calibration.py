@@ -66,7 +66,7 @@ def test_peaks_that_part_perfectly_have_a_finite_answer() -> None:
 
 
 def test_too_few_peaks_are_refused_with_their_number() -> None:
-    with pytest.raises(TooFewCandidates, match=r"^7 peaks on targets and 30 beside them"):
+    with pytest.raises(TooFewCandidates, match=r"^7 peaks on targets and 30 elsewhere"):
         fit([Candidate("track", 0.7, 50.0, True)] * 7 + [Candidate("track", 0.2, 50.0, False)] * 30)
 
 
@@ -74,7 +74,7 @@ def test_a_network_whose_higher_peaks_are_no_surer_is_refused() -> None:
     rng = np.random.default_rng(0)
     on = [Candidate("track", float(peak), 30.0, True) for peak in rng.uniform(0.1, 0.5, 40)]
     off = [Candidate("track", float(peak), 30.0, False) for peak in rng.uniform(0.2, 0.7, 40)]
-    with pytest.raises(ScoresTellNothing, match="do not tell targets from the rest: train it longer"):
+    with pytest.raises(ScoresTellNothing, match="do not separate targets from background: train it longer"):
         fit(on + off)
     with pytest.raises(ScoresTellNothing):
         fit([Candidate("track", 0.5, 30.0, k % 2 == 0) for k in range(80)])
@@ -197,7 +197,7 @@ def test_what_tells_no_targets_or_not_where_they_are_is_named_and_the_file_left(
     content = model.read_bytes()
     command = ["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]
     assert main(command) == 2
-    assert f"{model}: acquire: its scores do not tell targets from the rest" in capsys.readouterr().err
+    assert f"{model}: acquire: its scores do not separate targets from background" in capsys.readouterr().err
     (scene / "scene_gt_info.json").unlink()
     (scene.parents[1] / "models" / "models_info.json").unlink()
     assert main(command) == 2
@@ -232,5 +232,5 @@ def test_a_dataset_without_false_peaks_is_refused_and_the_file_left(
     shutil.copy(dark_spot_model, model)
     content = model.read_bytes()
     assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 2
-    assert "--dataset: acquire: 2 peaks on targets and 0 beside them" in capsys.readouterr().err
+    assert "--dataset: acquire: 2 peaks on targets and 0 elsewhere" in capsys.readouterr().err
     assert model.read_bytes() == content

@@ -98,7 +98,7 @@ def test_pictures_that_show_no_target_are_refused_before_the_first_step(
     for split in ("train", "val"):
         discs(tmp_path / "own" / split / "000001", 1500.0, (200.0,), beside_px=() if split == empty else (0,))
     text = on_dataset(tmp_path / "own")
-    with pytest.raises(ConfigError, match=f"no picture to {purpose} on shows a target"):
+    with pytest.raises(ConfigError, match=f"no image to {purpose} on shows a target"):
         run_training(parse_config(text, "own.toml"), text, tmp_path / "run", max_steps=1)
     assert not (tmp_path / "run").exists()
 
