@@ -1,9 +1,8 @@
 """Pose metrics of the paper's section "Evaluation Metrics", one function each, broadcasting over leading axes.
 
-Arguments stand in the order R_est, t_est, R_gt, t_gt; rotations [..., 3, 3] turn target body axes into `cam`,
-translations [..., 3] are the target's origin in `cam`, metres. Covariances [..., 6, 6] are of (x, y, z m, rotation
-x, y, z rad) in `cam`, rotation as R = exp(w) R_est. Functions named after a threshold give booleans; a rate is their
-mean.
+The order of arguments is R_est, t_est, R_gt, t_gt; rotations [..., 3, 3] map target body axes to `cam`, translations
+[..., 3] are the target's origin in `cam`, metres. Covariances [..., 6, 6] are of (x, y, z m, rotation x, y, z rad) in
+`cam`, rotation as R = exp(w) R_est. Functions named after a threshold return booleans; a rate is their mean.
 """
 
 from __future__ import annotations
@@ -81,12 +80,12 @@ def add_within(add: ArrayLike, diameter_m: ArrayLike, fraction: float) -> Boolea
 
 
 def recall(found: int, targets: int) -> float | None:
-    """Detection recall, 0..1: of the targets in all frames those with a pose, right or wrong; None without targets."""
+    """Detection recall, 0..1: share of all targets that have a pose, right or wrong; None without targets."""
     return found / targets if targets else None
 
 
 def false_positives_per_1000(false_poses: int, empty_frames: int) -> float | None:
-    """False poses in 1,000 frames without a target; None without such frames."""
+    """False poses per 1,000 frames without a target; None without such frames."""
     return 1000.0 * false_poses / empty_frames if empty_frames else None
 
 
@@ -97,7 +96,7 @@ def depth_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sigma
 
 
 def bearing_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
-    """[..., 2]: the same of the ray's two slopes, x/z and y/z; their variance by the Jacobian at the estimate."""
+    """[..., 2]: the same for the ray's two slopes, x/z and y/z; their variance by the Jacobian at the estimate."""
     est, gt = np.asarray(t_est, dtype=np.float64), np.asarray(t_gt, dtype=np.float64)
     slopes = est[..., :2] / est[..., 2:]
     J = np.concatenate([np.broadcast_to(np.eye(2), (*slopes.shape, 2)), -slopes[..., None]], axis=-1)
@@ -107,7 +106,7 @@ def bearing_inside(t_est: ArrayLike, t_gt: ArrayLike, covariance: ArrayLike, sig
 
 
 def rotation_inside(R_est: ArrayLike, R_gt: ArrayLike, covariance: ArrayLike, sigmas: float) -> Booleans:
-    """[..., 3]: the same of the rotation vector that turns the estimate into the truth, each axis of `cam`."""
+    """[..., 3]: the same for the rotation vector that turns the estimate into the truth, each axis of `cam`."""
     est, gt = np.asarray(R_est, dtype=np.float64), np.asarray(R_gt, dtype=np.float64)
     error_rad = so3_log(gt @ np.swapaxes(est, -1, -2))
     variance = np.diagonal(np.asarray(covariance, dtype=np.float64)[..., 3:, 3:], axis1=-2, axis2=-1)
@@ -119,7 +118,7 @@ def nees(
 ) -> tuple[Array, Array, Array]:
     """Normalised estimation error squared [...]: e' P^-1 e of the whole pose, of its position and of its rotation.
 
-    NaN for each of the three whose covariance is singular: what is told as beyond doubt has no such error.
+    NaN for each of the three whose covariance is singular: the error is undefined there.
     """
     est = np.asarray(R_est, dtype=np.float64)
     turn_rad = so3_log(np.asarray(R_gt, dtype=np.float64) @ np.swapaxes(est, -1, -2))

@@ -1,7 +1,8 @@
-"""Plays a sequence through the real daemon, with both of its peers, and keeps what they received.
+"""Plays a sequence through the real daemon with both of its peers, and records what they received.
 
-Four processes on one host share CLOCK_MONOTONIC: the daemon exposes frame 0 at `start_at_ns`, the simulated autopilot
-flies the telemetry from there, and the subscriber listens. This one only starts them, waits and reads.
+Four processes share the host's CLOCK_MONOTONIC: the daemon exposes frame 0 at `start_at_ns`, the simulated autopilot
+sends the telemetry from that time on, and the subscriber receives poses. This process only starts them, waits and
+reads their output.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
 
-LEADS_S = (5.0, 15.0, 45.0)  # time given to the daemon to be ready before frame 0; a slow host gets the next
+LEADS_S = (5.0, 15.0, 45.0)  # until frame 0, for the daemon to become ready; too slow: the next value is tried
 READY_MARGIN_NS = 100_000_000
 RECORDINGS = "recordings"  # folder in `out`
 MESSAGES_JSONL = "mavlink.jsonl"
@@ -41,19 +42,19 @@ Record = dict[str, Any]
 
 
 class PlayError(RuntimeError):
-    """The daemon or a peer did not do its part; the text is a whole sentence."""
+    """The daemon or a peer failed; the text is a whole sentence."""
 
 
 @dataclass
 class Recording:
-    """What came out of one replay. Times ending in `_ns` are monotonic unless they say UTC."""
+    """The output of one replay. Times ending in `_ns` are monotonic unless they say UTC."""
 
     start_at_ns: int
     utc_minus_monotonic_ns: int
     mavlink_port: int
     zenoh_endpoint: str  # empty in lock-step
     daemon_exit: int | None = None
-    daemon_counters: dict[str, int] = field(default_factory=dict)  # its own, as it said when it stopped
+    daemon_counters: dict[str, int] = field(default_factory=dict)  # the daemon's own, as logged when it stopped
     poses: list[Record] = field(default_factory=list)  # sim_replay.subscriber's `pose`
     targets: list[Record] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
     diagnostics: list[Record] = field(default_factory=list)
@@ -61,7 +62,7 @@ class Recording:
     zenoh: Record = field(default_factory=dict)  # the subscriber's `summary`
 
     def take(self, name: str, record: Record) -> None:
-        """File one line of a peer."""
+        """Store one record printed by a peer."""
         lists = {"pose": self.poses, "target_relative": self.targets, "diagnostics": self.diagnostics}
         if record["event"] in lists:
             lists[record["event"]].append(record)
@@ -70,7 +71,7 @@ class Recording:
 
     @property
     def in_lockstep(self) -> bool:
-        """Whether time stood still while the daemon worked: then ages and latencies say nothing."""
+        """Whether the daemon's clock stood still while it worked; ages and latencies are then meaningless."""
         return not self.zenoh_endpoint
 
     def capture_ns(self, record: Record) -> int:
@@ -85,7 +86,7 @@ class PlaySettings:
 
     sequence: PlayedSequence
     out: Path
-    model: Path | None = None  # None: the one the daemon ships with
+    model: Path | None = None  # None: the model shipped with the daemon
     uav: str = "uav1"
     record: bool = False  # into out/recordings, by the daemon
     firmware: str = "ardupilot"  # one of sim_replay.autopilot.FIRMWARES
@@ -93,10 +94,10 @@ class PlaySettings:
 
 
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
-    """Run the sequence once in real time; `on_record` sees each line of a peer as it comes.
+    """Run the sequence once in real time; `on_record` is called with each record of a peer as it arrives.
 
-    Raises InputError if the daemon refuses what it is given, PlayError if it is late, fails or does not end, or if a
-    peer ends before it or gives no summary.
+    Raises InputError if the daemon rejects its input, PlayError if it is late, fails or does not terminate, or if a
+    peer terminates before it or gives no summary.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     for lead_s in LEADS_S:
@@ -107,7 +108,7 @@ def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None])
 
 
 def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recording, Record], None]) -> Recording | None:
-    """One run with frame 0 `lead_s` from now; None if the daemon was ready only after that."""
+    """One run with frame 0 `lead_s` from now; None if the daemon became ready too late."""
     start_at_ns = time.monotonic_ns() + round(lead_s * 1e9)
     utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
@@ -160,7 +161,7 @@ def last_counters(log: str) -> dict[str, int]:
 
 
 def _check_exit(code: int | None, log: Path) -> None:
-    """Raise what the daemon's end means, with its last words: InputError for bad input, PlayError otherwise."""
+    """Raise what the daemon's exit code means, with its last output: InputError for bad input, PlayError otherwise."""
     if code == 0:
         return
     if code is None:
@@ -205,7 +206,7 @@ def _wait_until_ready(
     records: queue.SimpleQueue[tuple[str, Record]],
     on_record: Callable[[Recording, Record], None],
 ) -> bool:
-    """Whether the daemon was up (its first diagnostics came) in time for frame 0, or ended."""
+    """Whether the daemon was up (its first diagnostics arrived) in time for frame 0, or terminated."""
     while time.monotonic_ns() < recording.start_at_ns - READY_MARGIN_NS:
         _pass_on(records, recording, on_record, timeout_s=0.05)
         if recording.diagnostics or daemon.poll() is not None:
@@ -215,7 +216,7 @@ def _wait_until_ready(
 
 
 def _peers(settings: PlaySettings, recording: Recording, lead_s: float) -> dict[str, list[str]]:
-    """Arguments of each; the subscriber gives the daemon all of `lead_s` to appear."""
+    """Arguments of each peer; the subscriber waits up to `lead_s` for the daemon to appear."""
     telemetry = str(settings.sequence.telemetry_csv)
     address = f"127.0.0.1:{recording.mavlink_port}"
     start = str(recording.start_at_ns - settings.sequence.frame0_ns)
@@ -234,7 +235,7 @@ def _peers(settings: PlaySettings, recording: Recording, lead_s: float) -> dict[
 
 @contextmanager
 def _daemon(config: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`uavpose-edge run`, its words in `log`; told to stop at the end if it still runs."""
+    """`uavpose-edge run` with its output in `log`; told to stop at the end if it is still running."""
     command = Path(sys.executable).parent / "uavpose-edge"
     with log.open("wb") as output:
         process = subprocess.Popen(
@@ -254,7 +255,7 @@ def _daemon(config: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 def _peer(
     name: str, arguments: list[str], records: queue.SimpleQueue[tuple[str, Record]]
 ) -> Iterator[subprocess.Popen[str]]:
-    """`python -m sim_replay.<name>`, whose lines go to `records`; stopped, and read to its end, at the end."""
+    """`python -m sim_replay.<name>`, whose records go to `records`; at the end it is stopped and its output drained."""
     process = subprocess.Popen(
         [sys.executable, "-m", f"sim_replay.{name}", *arguments],
         stdin=subprocess.DEVNULL,

@@ -1,8 +1,8 @@
-"""The training feed: windows rendered on demand, each a pure function of (seed, index, size), with exact labels.
+"""Training data: windows rendered on demand, each a pure function of (seed, index, size), with exact labels.
 
     python -m sim_replay.sampler --size 128 --count 256
 
-measures how many windows a second this machine renders.
+measures how many windows per second this machine renders.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _labels_blank(count: int, height_px: int, width_px: int) -> dict[str, NDArra
 
 
 def _box(target: Target, camera: Camera, mask: NDArray[np.bool_], hidden: bool) -> Box | None:
-    """That of the outline, exact to a fraction of a pixel, where nothing cuts or hides it; else that of the mask."""
+    """The outline's box, exact to a fraction of a pixel, if neither truncated nor occluded; else the mask's box."""
     outline = extents_px(outline_px(target, camera))
     box = mask_extents_px(mask)
     whole = box is not None and not hidden and is_inside(outline, camera.width_px, camera.height_px)
@@ -88,7 +88,7 @@ def _enlarged(
 
 
 class WindowSampler:
-    """Windows of `size_px` square with, mostly, one aircraft. Make one in each worker process."""
+    """Windows of `size_px` square, most of them with one aircraft. Create one in each worker process."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class WindowSampler:
         return {**self.__dict__, "_renderer": None}
 
     def batch(self, first_index: int, count: int) -> SampleBatch:
-        """Windows first_index .. first_index + count - 1; the same whatever the batch they are asked for in."""
+        """Windows first_index .. first_index + count - 1; independent of how they are divided into batches."""
         if self._renderer is None:
             self._renderer = Renderer(self.size_px, self.size_px, *TILES)
         out = _labels_blank(count, self.size_px, self.size_px)
@@ -135,7 +135,7 @@ class WindowSampler:
         rng = np.random.default_rng([window.scene.sensor_seed, self.seed])
         image, coverage = rendered.image_bgr[tile, :side, :side], rendered.coverage[tile, :side, :side]
         noc = rendered.coordinate[tile, :side, :side]
-        # The target's number stays where cloud hides it, its coverage does not.
+        # Where cloud occludes the target, `target` keeps its number but `coverage` does not.
         whole_px = int(np.count_nonzero(rendered.target[tile, :side, :side]))
         clear = int(np.count_nonzero(coverage)) / max(whole_px, 1)
         if window.distractors:
@@ -155,7 +155,7 @@ class WindowSampler:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures and prints windows a second."""
+    """Measures and prints windows per second."""
     parser = argparse.ArgumentParser(description="Measure how fast training windows are rendered on this machine.")
     parser.add_argument("--size", type=int, default=128, help="side of a window, pixels (default %(default)s)")
     parser.add_argument("--count", type=int, default=256, help="windows to render (default %(default)s)")

@@ -1,7 +1,7 @@
-"""From poses and ground truth to the figures of a score: association, statistics, distance bands. Pure functions.
+"""Computes a score from poses and ground truth: association, statistics, distance bands. Pure functions.
 
-A target that no pose was found for counts as a failure in every rate; means and medians are over found targets. So
-does, in the rates that ask for a rotation, a pose that tells none; it is in no figure of rotation errors.
+A target without a pose counts as a failure in every rate; means and medians are over the targets that were found. A
+pose of unknown rotation counts as a failure in the rates that require a rotation, and in no rotation error statistic.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ ADD_FRACTIONS = {"add_0_5d": 0.5, "add_0_1d": 0.1}
 
 @dataclass(frozen=True, eq=False)
 class TargetPose:
-    """A target's pose in one frame, true or estimated, in `cam`; an estimate may say how sure it is."""
+    """A target's pose in one frame, true or estimated, in `cam`; an estimate may have a covariance."""
 
     frame: int  # index into the sequence
     R_cam_target: Array  # [3, 3]
     t_cam_target_m: Array  # [3]
     score: float | None = field(default=None, kw_only=True)
-    covariance: Array | None = field(default=None, kw_only=True)  # [6, 6], as edge.types.Estimate has it
-    track: str = field(default="", kw_only=True)  # the name that its sender knows the target by; empty: none
-    rotation_known: bool = field(default=True, kw_only=True)  # False: R_cam_target holds a place and says nothing
+    covariance: Array | None = field(default=None, kw_only=True)  # [6, 6], as in edge.types.Estimate
+    track: str = field(default="", kw_only=True)  # the sender's name of the target; empty: none
+    rotation_known: bool = field(default=True, kw_only=True)  # False: R_cam_target is only a placeholder
 
 
 @dataclass(frozen=True, eq=False)
 class Truth(TargetPose):
-    """What the sequence says of one target."""
+    """Ground truth of one target."""
 
     object_id: int  # BOP's obj_id: which airframe
     diameter_m: float  # largest distance between two points of the target
-    airframe: str = ""  # its name; empty: the dataset gives none
+    airframe: str = ""  # its name; empty: not in the dataset
     points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
-    instance: int = field(default=0, kw_only=True)  # which of the targets of that object
-    visible: bool = field(default=True, kw_only=True)  # False: the sequence says that nothing of it is to be seen
-    wanted: bool = field(default=True, kw_only=True)  # False: it is there, but the dataset asks nothing of it
+    instance: int = field(default=0, kw_only=True)  # distinguishes several targets of the same object
+    visible: bool = field(default=True, kw_only=True)  # False: not visible according to the dataset
+    wanted: bool = field(default=True, kw_only=True)  # False: present, but not to be estimated according to the dataset
 
     @property
     def airframe_label(self) -> str:
-        """The airframe's name, else one made of its number as BOP's files have it."""
+        """The airframe's name, otherwise one made from its number in BOP's files."""
         return self.airframe or f"obj_{self.object_id:06d}"
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A true target and the pose that was found for it, if any."""
+    """A true target and the pose matched to it, if any."""
 
     truth: Truth
     estimate: TargetPose | None
@@ -79,7 +79,7 @@ class Match:
 
     @cached_property
     def add_m(self) -> float | None:
-        """ADD; None where nothing was found, or the rotation or the target's model is not known."""
+        """ADD; None if nothing was found, or the rotation or the target's model is unknown."""
         if self.estimate is None or not self.estimate.rotation_known or self.truth.points_body_m is None:
             return None
         est, gt = self.estimate, self.truth
@@ -95,12 +95,12 @@ def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | N
 
 
 def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], list[TargetPose]]:
-    """Give each truth at most one pose of its frame: pairs by growing bearing error, at most one diameter apart.
+    """Match each truth to at most one pose of its frame: pairs by increasing bearing error, at most one diameter apart.
 
-    Visible truths choose first: of one that is hidden nobody could send a pose but by chance or from memory.
+    Visible truths are matched first: a pose of a hidden target can only be a coincidence or a prediction.
 
-    Association looks along the ray alone, so that a wrong depth or rotation is an error and not a miss. A pose less
-    than a diameter away would hold the camera: it lies in no direction and is nobody's.
+    Association uses the bearing alone, so that a wrong depth or rotation counts as an error and not as a miss. A pose
+    nearer than one diameter is never matched: the target would contain the camera, so its bearing means nothing.
 
     Returns:
         One match for each truth, in their order, and the poses that belong to no target.
@@ -129,10 +129,10 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
 def statistics(
     frames: int, matches: Sequence[Match], false_poses: Sequence[TargetPose] = (), also_occupied: Iterable[int] = ()
 ) -> dict[str, Any]:
-    """All figures of a score: {"overall", "by_range", "by_airframe"}, each of `pose_statistics`'s form.
+    """All figures of a score: {"overall", "by_range", "by_airframe"}, each in the form of `pose_statistics`.
 
-    `frames` is how many there are; matches and poses name theirs by index 0..frames-1, and so does `also_occupied`
-    those that show an aircraft of which nothing is asked. A range band counts the frames that hold a target in it, and
+    `frames` is their number; matches and poses refer to frames by index 0..frames-1. `also_occupied` are the indices of
+    frames that show an aircraft which is not to be estimated. A range band counts the frames with a target in it, and
     the false positives whose own range lies in it; an airframe has no false positives.
     """
     with_target = {match.truth.frame for match in matches}.union(also_occupied)
@@ -153,7 +153,7 @@ def statistics(
 
 
 def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1000: float | None) -> dict[str, Any]:
-    """The figures of one group of targets: degrees, metres and shares 0..1; None where there is nothing to tell."""
+    """The figures of one group of targets: degrees, metres and shares 0..1; None where there is no data."""
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
     R_gt, t_gt = stacked([truth for truth, _ in found])
     R_est, t_est = stacked([estimate for _, estimate in found])
@@ -179,10 +179,10 @@ def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1
 
 
 def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float | None]] | None:
-    """Share of the truth inside one and two predicted standard deviations, axis by axis; None without covariances.
+    """Share of the true values within one and two predicted standard deviations, by axis; None without covariances.
 
-    Of an honest Gaussian 0.683 and 0.954. Depth is one axis, bearing two, rotation three; each axis counts by itself.
-    Rotation is over the poses that tell one; None where there are none.
+    For a consistent Gaussian 0.683 and 0.954. Depth has one axis, bearing two, rotation three, each counted separately.
+    Rotation is over the poses of known rotation; None where there are none.
     """
     sure = [(m.truth, m.estimate) for m in matches if m.estimate is not None and m.estimate.covariance is not None]
     if not sure:
@@ -225,7 +225,7 @@ def stacked(poses: Sequence[TargetPose]) -> tuple[Array, Array]:
 
 
 def _bands(items: Sequence[Any], pose: Callable[[Any], TargetPose]) -> dict[str, list[Any]]:
-    """Items by the range of their pose, near to far: the paper's bands always, those beyond where they hold one."""
+    """Items by the range of their pose, near to far: always the paper's bands, others only if they are not empty."""
     order = ["below-100", *(f"{low:.0f}-{high:.0f}" for low, high in RANGE_BANDS_M), "above-500"]
     groups: dict[str, list[Any]] = {name: [] for name in order}
     for item in items:
@@ -238,7 +238,7 @@ def _frames_of(matches: Sequence[Match]) -> int:
 
 
 def _add_rates(matches: Sequence[Match]) -> dict[str, float | None]:
-    """ADD rates over the targets whose model is known, found or not."""
+    """ADD rates over the targets with a known model, found or not."""
     modelled = [m for m in matches if m.truth.points_body_m is not None]
     add = np.array([np.inf if m.add_m is None else m.add_m for m in modelled])
     diameter_m = np.array([m.truth.diameter_m for m in modelled])
@@ -253,7 +253,7 @@ def _share(part: int, whole: int) -> float | None:
 
 
 def _told(value: float | None) -> float | None:
-    """As all figures are told; None stays what it is."""
+    """Rounded as all figures are; None stays None."""
     return None if value is None else _rounded(value)
 
 

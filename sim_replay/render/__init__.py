@@ -1,1 +1,1 @@
-"""Renders fixed-wing aircraft before sky and ground, with exact labels, on any machine with EGL."""
+"""Renders fixed-wing aircraft in front of sky and ground, with exact labels, on any machine with EGL."""

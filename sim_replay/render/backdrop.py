@@ -1,4 +1,4 @@
-"""Photographs and panoramas that stand in for sky and ground."""
+"""Photographs and panoramas that replace sky and ground."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class BackdropError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Backdrop:
-    """A picture around the camera, fixed in the world."""
+    """An image around the camera, fixed in the world."""
 
     image_rgb: NDArray[np.uint8]  # [H, W, 3], gamma 2
     panorama: bool  # equirectangular, twice as wide as high; else a photograph
 
     def map_for(self, camera: Camera, seed: int) -> tuple[float, float, float]:
-        """(turn, rad; width, rad; height / width, 0 for a panorama): how world directions fall on the picture.
+        """(turn, rad; width, rad; height / width, 0 for a panorama): how world directions map to the image.
 
-        A seed turns it, so that sequences see different parts. A photograph is shown a little wider than the lens
-        sees, its middle at the horizon, and repeats mirrored beyond.
+        The seed turns it, so that sequences show different parts. A photograph is shown somewhat wider than the field
+        of view, its middle at the horizon, and repeats mirrored beyond its edges.
         """
         height, width = self.image_rgb.shape[:2]
         turn = 2.0 * np.pi * ((seed * _GOLDEN) % 1.0)
@@ -54,10 +54,10 @@ def load_backdrop(path: Path) -> Backdrop:
     linear = image.astype(np.float32)
     white = INTEGER_WHITE.get(image.dtype.name)
     if white is not None:
-        # Files of integers hold sRGB; the renderer works with gamma 2.
+        # Integer files are in sRGB; the renderer works with gamma 2.
         linear = (linear / white) ** 2.2
     else:
-        # Exposed for the middle, but so that all fits save the sun and its like.
+        # Exposed for the median, but so that only the brightest (the sun and its like) saturate.
         middle, bright = np.percentile(linear, [50.0, 98.0])
         linear *= min(0.25 / max(float(middle), 1e-9), 0.9 / max(float(bright), 1e-9))
     pixels = np.sqrt(np.clip(linear, 0.0, 1.0)) * 255.0

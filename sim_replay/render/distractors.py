@@ -1,4 +1,4 @@
-"""Things in the air that are no aircraft: birds, specks, shreds of cloud."""
+"""Distractors, objects in the air that are not aircraft: birds, specks, wisps of cloud."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sim_replay.render.scene import Scene
 
 _SPAN_PX = (5.0, 60.0)
 _MARGIN_PX = 80
-_WINDOW_SPAN_PX, _WINDOW_SPAN_SHARE = 3.0, 0.35  # in a window: from so many pixels to so much of its side
+_WINDOW_SPAN_PX, _WINDOW_SPAN_SHARE = 3.0, 0.35  # in a window: from this many pixels to this share of its side
 _PALE_SHARE = 0.15
-_RUFFLED = 0.012  # 1-sigma of an outline's corners, share of the span
+_RUFFLED = 0.012  # 1-sigma displacement of an outline's corners, share of the span
 
 
 _WISP_SHARE = 0.25  # of decoys; the others are birds
@@ -22,7 +22,7 @@ _WISP_SHARE = 0.25  # of decoys; the others are birds
 
 @dataclass(frozen=True)
 class Decoy:
-    """A bird or a wisp of cloud to be looked at as a target is."""
+    """A bird or a wisp of cloud placed like a target."""
 
     center_px: tuple[float, float]
     span_px: float
@@ -57,16 +57,16 @@ def _filled(points: NDArray[np.float64], width: int, height: int) -> NDArray[np.
 def _bird(
     rng: np.random.Generator, side: int, decoy: Decoy | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Cover [side, side] in 0..1 and colour [3] of a bird; without a `decoy` of any size anywhere.
+    """Opacity [side, side] in 0..1 and colour [3] of a bird; without a `decoy` of random size and place.
 
-    No two are of one shape: what tells birds from aircraft is not to be learned from one drawing of a bird.
+    Every shape is different, so that a network cannot learn to recognise birds by one fixed drawing.
     """
     span = decoy.span_px if decoy else rng.uniform(_WINDOW_SPAN_PX, _WINDOW_SPAN_SHARE * side)
     center = np.array(decoy.center_px) if decoy else rng.uniform(0, side, 2)
     flap, turn = rng.uniform(-0.5, 0.5), rng.uniform(0, 2 * np.pi)
     outline = bird_outline(span, flap, rng.uniform(0.08, 0.2), rng.uniform(0.0, 0.25), turn)
     outline += rng.normal(0.0, _RUFFLED * span, outline.shape)
-    along, narrower = rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)  # seen aslant
+    along, narrower = rng.uniform(0, np.pi), rng.uniform(0.6, 1.0)  # viewed obliquely
     across = np.array([np.cos(along), np.sin(along)])
     outline -= (1.0 - narrower) * np.outer(outline @ across, across)
     level = rng.uniform(110, 235) if rng.random() < _PALE_SHARE else rng.uniform(10, 110)
@@ -74,7 +74,7 @@ def _bird(
 
 
 def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) -> NDArray[np.float32]:
-    """A soft ellipse [side, side] in 0..1 anywhere in the picture."""
+    """A soft ellipse [side, side] in 0..1 at a random place in the image."""
     y, x = np.mgrid[:side, :side].astype(np.float32)
     centre, turn = rng.uniform(0, side, 2), rng.uniform(0, np.pi)
     a, b = rng.uniform(*radius_px, 2)
@@ -84,10 +84,10 @@ def blob(rng: np.random.Generator, side: int, radius_px: tuple[float, float]) ->
 
 
 def _wisp(rng: np.random.Generator, side: int, decoy: Decoy) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Cover [side, side] in 0..1 and colour [3] of a ragged shred of cloud, or of a gap in one."""
+    """Opacity [side, side] in 0..1 and colour [3] of a ragged wisp of cloud, or of a gap in one."""
     y, x = np.mgrid[:side, :side].astype(np.float32) - np.array(decoy.center_px, np.float32)[::-1, None, None]
     turn = rng.uniform(0, np.pi)
-    long_px = decoy.span_px / 4.0  # of a bell, whose edges lie two sigma from its middle
+    long_px = decoy.span_px / 4.0  # sigma of a Gaussian whose span is +-2 sigma
     wide_px = long_px * rng.uniform(0.15, 0.7)
     u = (np.cos(turn) * x + np.sin(turn) * y) / np.float32(long_px)
     v = (np.cos(turn) * y - np.sin(turn) * x) / np.float32(wide_px)
@@ -99,7 +99,7 @@ def _wisp(rng: np.random.Generator, side: int, decoy: Decoy) -> tuple[NDArray[np
 
 
 def add_decoy(image_bgr: NDArray[np.uint8], decoy: Decoy, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A bird or a wisp of cloud on a square picture [S, S, 3]."""
+    """Draw a bird or a wisp of cloud on a square image [S, S, 3]."""
     draw = _wisp if rng.random() < _WISP_SHARE else _bird
     alpha, level = draw(rng, image_bgr.shape[0], decoy)
     image = image_bgr + alpha[..., None] * (level.astype(np.float32) - image_bgr)
@@ -109,7 +109,7 @@ def add_decoy(image_bgr: NDArray[np.uint8], decoy: Decoy, rng: np.random.Generat
 def add_distractors(
     image_bgr: NDArray[np.uint8], coverage: NDArray[np.uint8], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Birds, specks and shreds of cloud on a square picture [S, S, 3], behind the aircraft."""
+    """Draw birds, specks and wisps of cloud on a square image [S, S, 3], behind the aircraft."""
     side = image_bgr.shape[0]
     image, behind = image_bgr.astype(np.float32), 1.0 - coverage.astype(np.float32) / 255
     for _ in range(int(rng.integers(1, 5))):
@@ -131,15 +131,15 @@ class Sprite:
 
     x0_px: int
     y0_px: int
-    alpha: NDArray[np.float32]  # [h, w], inside the picture
+    alpha: NDArray[np.float32]  # [h, w], within the image
     level: float  # 0..255, gamma 2
-    before: bool  # nearer than the targets
+    before: bool  # in front of the targets
 
 
 def sprites(scene: Scene) -> list[Sprite]:
-    """The scene's distractors where they are in this frame, some of them perhaps outside the picture and left out.
+    """The scene's distractors at their places in this frame; those outside the image are left out.
 
-    Their paths depend on the sensor seed alone, so from frame to frame they fly on and beat their wings.
+    Their paths depend on the sensor seed alone, so they fly on and beat their wings from frame to frame.
     """
     out = []
     width, height = scene.camera.width_px, scene.camera.height_px

@@ -1,4 +1,4 @@
-"""Light, sky, clouds and ground of one world, drawn from a seed."""
+"""Light, sky, clouds and ground of a world, drawn from a seed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Weather = Literal["clear", "haze", "overcast", "low_sun", "dusk", "fog", "glare", "broken_cloud"]
 WEATHERS: tuple[Weather, ...] = get_args(Weather)
-# How often training sees each: mostly days on which one flies.
+# Frequency of each in training: mostly weather in which one flies.
 SHARES = (0.38, 0.13, 0.15, 0.11, 0.05, 0.03, 0.05, 0.10)
 GROUND_KINDS = ("fields", "forest", "desert", "sea", "town", "snow")
 GROUND_SHARES = (0.34, 0.2, 0.12, 0.17, 0.11, 0.06)
@@ -34,7 +34,7 @@ class Environment:
     sun_ned: Array  # [3], unit, towards the sun
     sun_colour: Array  # [3]
     zenith: Array  # [3]
-    horizon: Array  # [3], also the colour that haze tends to
+    horizon: Array  # [3], also the colour that haze converges to
     haze_per_m: float  # extinction; visibility is 3.9 / haze (Koschmieder, 2 % contrast)
     cloud: Array  # [3]
     cloud_threshold: float  # noise above it is cloud: 0 overcast, 1 clear
@@ -48,15 +48,15 @@ class Environment:
     ground_turn_rad: float
     noise_offset: tuple[float, float]
     glow: float
-    relief_m: float = 0.0  # height of the hills that stand on the horizon
-    veil: float = 0.0  # light that the lens scatters over the picture when the sun is in or near it
-    horizon_away: Array | None = None  # [3], the horizon opposite the sun; None: the same all round
-    near_cloud: float = 0.0  # share of the view that shreds of cloud nearer than any target cover, 0 none
+    relief_m: float = 0.0  # height of the hills on the horizon
+    veil: float = 0.0  # veiling glare: light that the lens scatters over the image when the sun is in or near it
+    horizon_away: Array | None = None  # [3], the horizon opposite the sun; None: the same in all directions
+    near_cloud: float = 0.0  # share of the view covered by wisps of cloud nearer than any target, 0: none
 
 
 @dataclass(frozen=True)
 class _Light:
-    """Ranges that a kind of weather draws from."""
+    """Ranges from which a kind of weather is drawn."""
 
     sun_elevation_deg: tuple[float, float]
     sun_colour: tuple[float, float, float]
@@ -96,7 +96,7 @@ _LIGHTS: dict[Weather, _Light] = {
 
 
 def direction_ned(elevation_rad: float, azimuth_rad: float) -> Array:
-    """Unit vector [3] that points so far above the horizon and east of north."""
+    """Unit vector [3] at this elevation above the horizon and azimuth from north through east."""
     level = np.cos(elevation_rad)
     return np.array([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), -np.sin(elevation_rad)])
 
@@ -114,7 +114,7 @@ def _sun_ned(rng: np.random.Generator, elevation_rad: float, weather: Weather, s
 def environment_from_seed(seed: int, weather: Weather | None = None, sight_ned: Array | None = None) -> Environment:
     """The world of that seed; `weather` None draws one with training's SHARES.
 
-    Under "glare" the sun stands within some degrees of `sight_ned` [3], the direction that the camera looks along.
+    With "glare" the sun is within some degrees of `sight_ned` [3], the camera's viewing direction.
     """
     rng = np.random.default_rng([seed, 0x5C1E])
     drawn = WEATHERS[int(rng.choice(len(WEATHERS), p=SHARES))]

@@ -1,4 +1,4 @@
-"""Whole frames: surroundings, aircraft and what hides them in layers, exposed by a camera, with exact labels."""
+"""Whole frames: surroundings, aircraft and what occludes them in layers, exposed by a camera, with exact labels."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from sim_replay.render.sensor import Sensor, exposed_frame, sensor_from
 Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 MASK_COVERAGE_MIN = 64  # of 255: a quarter of the pixel, so that thin wings stay in the mask
-HIDDEN_FROM = 128  # of 255: cloud or a bird that takes half of a pixel's light hides what is behind
+HIDDEN_FROM = 128  # of 255: cloud or a bird that blocks half of a pixel's light occludes what is behind it
 
 
 @dataclass(frozen=True)
 class SeenTarget:
-    """What one target looks like in a frame. Boxes' edges lie half a pixel outside the outermost pixel centres."""
+    """One target's appearance in a frame. Box edges lie half a pixel outside the outermost pixel centres."""
 
     mask_visib: NDArray[np.bool_]  # [H, W]
-    mask: NDArray[np.bool_]  # [H, W], the silhouette inside the picture as if nothing hid it
-    box_visible_xyxy_px: Box | None  # None where nothing of it is seen
-    box_whole_xyxy_px: Box | None  # of the whole outline, also beyond the picture; None behind the camera
+    mask: NDArray[np.bool_]  # [H, W], the silhouette inside the image without occlusion
+    box_visible_xyxy_px: Box | None  # None if nothing of it is visible
+    box_whole_xyxy_px: Box | None  # of the whole outline, also beyond the image; None behind the camera
     visible_px: int  # pixels of mask_visib
     whole_px: int  # pixels of mask
     origin_px: Array  # [2], the projected model origin; NaN behind the camera
@@ -36,14 +36,14 @@ class SeenTarget:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """A picture and its targets, in the order of the scene's."""
+    """An image and its targets, in the scene's order."""
 
     image_bgr: NDArray[np.uint8]  # [H, W, 3]
     targets: tuple[SeenTarget, ...]
 
 
 def outline_px(target: Target, camera: Camera) -> Array:
-    """Projected vertices [V, 2] of the target without its propeller disc; enough of them to follow a lens's bends."""
+    """Projected vertices [V, 2] of the target without its propeller disc, dense enough to follow lens distortion."""
     points = (solid_vertices_m if camera.distortion is None else fine_solid_vertices_m)(target.airframe_id)
     return project_px(points, *target.pose_in(camera), camera.K, camera.distortion)
 
@@ -55,7 +55,7 @@ def mask_extents_px(mask: NDArray[np.bool_]) -> Box | None:
 
 
 def is_inside(box: Box | None, width_px: int, height_px: int) -> bool:
-    """Whether a box lies within the picture's edges."""
+    """Whether a box lies within the image."""
     return box is not None and min(box[:2]) >= -0.5 and box[2] <= width_px - 0.5 and box[3] <= height_px - 0.5
 
 
@@ -63,7 +63,7 @@ _renderers: dict[tuple[int, int], Renderer] = {}
 
 
 def frame_renderer(width_px: int, height_px: int) -> Renderer:
-    """This process's renderer for frames of that size, made on first use."""
+    """This process's renderer for frames of that size, created on first use."""
     if (width_px, height_px) not in _renderers:
         _renderers[(width_px, height_px)] = Renderer(width_px, height_px, 1, 1)
     return _renderers[(width_px, height_px)]
@@ -72,10 +72,9 @@ def frame_renderer(width_px: int, height_px: int) -> Renderer:
 def render_frame(scene: Scene, sensor: Sensor | None = None) -> RenderedFrame:
     """A whole frame with every target labelled. Raises BackdropError.
 
-    The sky, the ground and the camera (unless given) depend on the scene's values alone, so the frames of a sequence
-    that share an environment and a sensor seed show one world; noise, exposure drift and distractors follow
-    `frame_index`. Where the scene says how the shutter closes, the picture is blurred by that motion instead of the
-    sensor's `motion_px`.
+    Sky, ground and camera (unless given) depend on the scene's values alone, so frames of a sequence that share an
+    environment and a sensor seed show the same world; noise, exposure drift and distractors follow `frame_index`. If
+    the scene has a `shutter_close`, the image is blurred by that motion instead of the sensor's `motion_px`.
     """
     camera = scene.camera
     renderer = frame_renderer(camera.width_px, camera.height_px)
@@ -113,7 +112,7 @@ def _motion_of(scene: Scene, index: int) -> Array | None:
 
 
 def _put_aircraft(image_bgr: NDArray[np.uint8], layer: Layer, motion: Array | None) -> None:
-    """Average an aircraft over the picture [H, W, 3] in place, smeared along its own motion."""
+    """Composite an aircraft onto the image [H, W, 3] in place, blurred along its own motion."""
     colour = np.square(layer.colour_bgr.astype(np.float32) / np.float32(255))
     cover, x0, y0 = layer.cover, layer.x0_px, layer.y0_px
     if motion is not None:
@@ -176,7 +175,7 @@ def _label(target: Target, camera: Camera, mask: NDArray[np.bool_], visible: NDA
     whole_px, visible_px = int(mask.sum()), int(visible.sum())
     outline = extents_px(outline_px(target, camera))
     box = mask_extents_px(visible)
-    # A target that nothing cuts or hides has the box of its outline, exact to a fraction of a pixel.
+    # A target that is neither truncated nor occluded has its outline's box, exact to a fraction of a pixel.
     if box is not None and visible_px == whole_px and is_inside(outline, camera.width_px, camera.height_px):
         box = outline
     origin = project_px(np.zeros((1, 3)), *target.pose_in(camera), camera.K, camera.distortion)[0]

@@ -1,4 +1,4 @@
-"""Blur along the true motion of the picture while the shutter is open."""
+"""Blur along the true image motion while the shutter is open."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from sim_replay.render.projection import distorted, project_px, solid_vertices_m
 from sim_replay.render.scene import Camera, Target, rays_ned
 
 Array = NDArray[np.float64]
-FEWEST_PX = 0.7  # shorter motion is lost in the lens's own blur
-UNIFORM_PX = 1.0  # a field that varies less over the picture is blurred with one kernel
+FEWEST_PX = 0.7  # shorter motion is not visible in the lens's own blur
+UNIFORM_PX = 1.0  # a motion field that varies less over the image is blurred with one kernel
 FARTHEST_GROUND_M = 30_000.0
 STEPS_MAX = 24
 
 
 def motion_kernel(motion_px: tuple[float, float]) -> NDArray[np.float32] | None:
-    """A line of that length and direction, centred, summing to 1; None if it is too short to see."""
+    """A line of that length and direction, centred, summing to 1; None if it is too short to be visible."""
     length = float(np.hypot(*motion_px))
     if length < FEWEST_PX:
         return None
@@ -34,12 +34,12 @@ def motion_kernel(motion_px: tuple[float, float]) -> NDArray[np.float32] | None:
 
 
 def _affine(start_px: Array, moved_px: Array) -> Array:
-    """[2, 3] least-squares fit of the displacement [N, 2] over pixels [N, 2]; zeros if nothing was seen to move."""
+    """[2, 3] least-squares fit of the displacement [N, 2] over pixels [N, 2]; zeros if no motion is observed."""
     seen = np.isfinite(start_px).all(axis=1) & np.isfinite(moved_px).all(axis=1)
     if seen.sum() < 4:
         return np.zeros((2, 3))
     here = np.hstack([start_px[seen], np.ones((int(seen.sum()), 1))])
-    # A slender aircraft says little about the gradient across it: small gradients are preferred.
+    # A slender aircraft hardly determines the gradient across it: small gradients are preferred.
     ridge = 1e-3 * np.diag([1.0, 1.0, 0.0])
     centre = np.append(here[:, :2].mean(axis=0), 0.0)
     local = here - centre
@@ -49,7 +49,7 @@ def _affine(start_px: Array, moved_px: Array) -> Array:
 
 
 def target_motion(target: Target, camera: Camera, target_close: Target, camera_close: Camera) -> Array:
-    """[2, 3] affine displacement of the target's picture, pixels, from mid exposure to the shutter's close."""
+    """[2, 3] affine displacement of the target's image, pixels, from mid exposure to the shutter's close."""
     points = solid_vertices_m(target.airframe_id)
     points = points[:: max(len(points) // 60, 1)]
     start = project_px(points, *target.pose_in(camera), camera.K, camera.distortion)

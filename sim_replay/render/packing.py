@@ -1,4 +1,4 @@
-"""Scene values as the shaders' uniforms, and the textures they read."""
+"""Scene values as the shaders' uniforms, and the textures that they read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def noise_texture(side: int = 512, seed: int = 20) -> NDArray[np.float16]:
     fy, fx = np.fft.fftfreq(side)[:, None] * side, np.fft.rfftfreq(side)[None, :] * side
     radius = np.maximum(np.hypot(fx, fy), 1.0)
     channels = []
-    # Slow waves of the rough channel would show its period where it repeats many times across a landscape.
+    # Low frequencies of the rough channel would make its period visible where it repeats across a landscape.
     for exponent, slowest in ((1.75, 1.0), (1.75, 1.0), (0.9, 9.0), (0.0, 1.0)):
         spectrum = np.fft.rfft2(rng.standard_normal((side, side))) / radius**exponent
         spectrum[np.hypot(fx, fy) < slowest] = 0.0
@@ -31,7 +31,7 @@ def noise_texture(side: int = 512, seed: int = 20) -> NDArray[np.float16]:
 
 
 def packed_environment(e: Environment) -> NDArray[np.float32]:
-    """[11, 4], the rows that world.glsl and aircraft.frag name by number."""
+    """[11, 4], the rows that world.glsl and aircraft.frag refer to by number."""
     rows = [
         [*e.sun_ned, e.cloud_threshold],
         [*e.sun_colour, e.cloud_softness],
@@ -49,7 +49,7 @@ def packed_environment(e: Environment) -> NDArray[np.float32]:
 
 
 def packed_livery(seed: int) -> NDArray[np.float32]:
-    """[19, 4], the rows that aircraft.frag names by number."""
+    """[19, 4], the rows that aircraft.frag refers to by number."""
     paint = livery_from_seed(seed)
     out = np.zeros((PALETTE_ROWS + 3, 4), np.float32)
     out[: len(paint.palette), :3], out[: len(paint.palette), 3] = paint.palette, paint.gloss
@@ -60,12 +60,12 @@ def packed_livery(seed: int) -> NDArray[np.float32]:
 
 
 def write_rows(uniform: Any, rows: NDArray[np.float32]) -> None:
-    """Write the rows of an array uniform; a driver drops the trailing ones that a shader never reads."""
+    """Write the rows of an array uniform; drivers remove trailing rows that a shader never reads."""
     uniform.write(rows[: uniform.array_length].tobytes())
 
 
 def columns(matrix: Array) -> bytes:
-    """A matrix as OpenGL stores it."""
+    """A matrix in OpenGL's memory layout (column-major)."""
     return np.ascontiguousarray(matrix.T, dtype=np.float32).tobytes()
 
 

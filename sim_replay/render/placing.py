@@ -1,4 +1,4 @@
-"""Draws the training distribution: lens, range, attitude and place of a target, and the window cut around it."""
+"""Draws from the training distribution: lens, range, attitude and position of a target, and the window around it."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Kind = Literal["track", "acquire"]
 FRAME_WIDTH_PX, FRAME_HEIGHT_PX = 1920, 1080
 RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
-BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly
-# A small aircraft far off: that many are log-uniformly of these sizes, as far as lenses go, or hardly any would be so.
-# Windows without a target are so more often: of what is large, its shape tells that it is none.
+BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly distributed
+# Small, distant aircraft: this share is log-uniform in these sizes, as far as lenses allow; otherwise hardly any would
+# be as small. The share is higher for windows without a target: a large non-target is recognisable by its shape.
 SMALL_BOX_PX, SMALL_RANGE_M, SMALL_SHARE, SMALL_EMPTY_SHARE = (16.0, 130.0), (250.0, 550.0), 0.25, 0.7
 WINDOW_SCALE = 1.8
-ACQUIRE_DOWNSCALE = (1.5, 3.0)  # of the whole frame when the acquire stage sees it
+ACQUIRE_DOWNSCALE = (1.5, 3.0)  # downscaling of the whole frame for the acquire stage
 VISIBLE_SHARE_MIN = 0.35
 DISTRACTORS_SHARE, DISTRACTORS_EMPTY_SHARE = 0.2, 0.5  # of windows with a target, and of those without
-# Of windows without a target: a bird or a wisp where it would be. What the whole frame takes for a target and is none
-# is one of these more often than not, and the window around it shows it as large as a target.
+# Share of the windows without a target that show a bird or a wisp in its place. More often than not, a false
+# detection in the whole frame is one of these, and the window around it shows it as large as a target.
 DECOY_SHARE = 0.75
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
@@ -42,12 +42,12 @@ QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
 
 @dataclass(frozen=True)
 class Window:
-    """One window to render: the scene at render resolution and what becomes of it."""
+    """One window to render: the scene at render resolution and how it is processed."""
 
     scene: Scene
     kind: Kind
     size_px: int  # side of the finished window; the scene may be rendered smaller and then enlarged
-    native_scale: float  # rendered pixels per native pixel, at most 1; of a squashed frame the sides' geometric mean
+    native_scale: float  # rendered pixels per native pixel, at most 1; geometric mean of both axes if they differ
     visible_share: float  # share of the target's outline inside the window; 0 without a target
     distractors: bool
     quality: Quality
@@ -65,13 +65,13 @@ def crop_K(K: Array, x0_px: float, y0_px: float, scale_x: float, scale_y: float)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    # np.cross takes a tenth of a millisecond for one pair, and a window needs several.
+    # np.cross takes a tenth of a millisecond per pair, and a window needs several.
     (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
     return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def looking_along(direction_ned: Array, roll_rad: float, ray_cam: Array) -> Array:
-    """R_ned_cam of a camera rolled about, and with its pixel ray [3] along, a direction [3] that is not vertical."""
+    """R_ned_cam of a camera whose pixel ray [3] points along a direction [3] that is not vertical, rolled about it."""
     z = direction_ned / np.sqrt(direction_ned @ direction_ned)
     x = np.array([-z[1], z[0], 0.0]) / np.hypot(z[0], z[1])
     upright = np.stack([x, _cross(z, x), z], axis=1)
@@ -90,7 +90,7 @@ def _clipped_normal(rng: np.random.Generator, sigma_deg: float, limit_deg: float
 def _lens_for(
     rng: np.random.Generator, vertices_m: Array, R_ned_body: Array, los: Array, range_m: float, small: bool
 ) -> float:
-    """Focal length, pixels, that shows the target as large as BOX_PX or SMALL_BOX_PX, within the lenses there are."""
+    """Focal length, pixels, that shows the target in a size of BOX_PX or SMALL_BOX_PX, within the available lenses."""
     if not small and rng.random() < 0.16:
         return float(np.exp(rng.uniform(*np.log(FOCAL_PX))))
     across = vertices_m @ R_ned_body.T @ looking_along(los, 0.0, np.array([0.0, 0.0, 1.0]))
@@ -107,7 +107,7 @@ def frame_scene(
     invention: Invention = FLEET_ALONE,
     small_share: float = SMALL_SHARE,
 ) -> Scene:
-    """A whole 1920 x 1080 frame with one target wholly inside it where the lens allows."""
+    """A whole 1920 x 1080 frame with one target, entirely inside it where the lens allows."""
     if invention.share > 0.0 and rng.random() < invention.share:
         airframe_id = draw_invented(rng, airframe_ids, invention.variants)
     else:
@@ -163,18 +163,18 @@ def _track_cut(rng: np.random.Generator, scene: Scene) -> tuple[float, float, fl
 
 
 def _acquire_cut(rng: np.random.Generator, scene: Scene, size_px: int) -> tuple[float, float, float]:
-    """(x0, y0, side) on the frame of a window of the reduced frame with the target anywhere in it."""
+    """(x0, y0, side) on the frame of a window of the downscaled frame, with the target at a random place in it."""
     side = size_px * float(np.exp(rng.uniform(*np.log(ACQUIRE_DOWNSCALE))))
     pixel = outline_px(scene.targets[0], scene.camera).mean(axis=0)
     corner = pixel - rng.uniform(0.0, 1.0, 2) * side
-    # Where the frame is larger than the window, the window lies inside the frame.
+    # If the frame is larger than the window, the window lies inside the frame.
     limit = np.array([FRAME_WIDTH_PX, FRAME_HEIGHT_PX]) - side
     corner = np.where(limit > 0, np.clip(corner, 0.0, np.maximum(limit, 0.0)), corner)
     return float(corner[0]), float(corner[1]), side
 
 
 def _decoy(rng: np.random.Generator, target: Target, camera: Camera) -> Decoy | None:
-    """What is no target in the place of one, about as large."""
+    """A non-target in place of the target, about as large."""
     box = extents_px(outline_px(target, camera))
     if box is None:
         return None

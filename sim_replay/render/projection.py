@@ -1,4 +1,4 @@
-"""Where body points fall in the picture: OpenCV's pinhole camera with its five-coefficient lens. Pure NumPy."""
+"""Projects body points into the image: OpenCV's pinhole camera with its five-coefficient lens. Pure NumPy."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 Distortion = tuple[float, float, float, float, float]  # OpenCV's k1, k2, p1, p2, k3
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 NEAREST_VERTEX_M = 1.0
-# Straight edges bow under distortion; pieces this small, as a share of the diameter, bow by nothing one could see.
+# Straight edges curve under distortion; pieces this short, as a share of the diameter, do not visibly.
 LONGEST_EDGE = 1 / 40
-FARTHEST_RADIUS2 = 25.0  # squared tangent of 79 degrees: no lens here sees further aside
+FARTHEST_RADIUS2 = 25.0  # squared tangent of 79 degrees: wider than the field of view of any lens here
 
 
 @cache
@@ -29,7 +29,7 @@ def vertices_m(airframe_id: int) -> Array:
 
 @cache
 def solid_vertices_m(airframe_id: int) -> Array:
-    """Vertices [V, 3] of the airframe without its propeller disc, which no mask holds; read-only."""
+    """Vertices [V, 3] of the airframe without its propeller disc, which no mask contains; read-only."""
     return _without_disc(airframe_of(airframe_id).mesh())
 
 
@@ -43,7 +43,7 @@ def _without_disc(mesh: Mesh) -> Array:
 def fine_mesh(airframe_id: int) -> Mesh:
     """The airframe with edges halved until none is longer than LONGEST_EDGE of the diameter; the surface is the same.
 
-    Halving the longest edge first leaves no sliver, and every vertex of the airframe stays one.
+    Halving the longest edge first avoids slivers, and every vertex of the airframe is kept.
     """
     airframe = airframe_of(airframe_id)
     mesh, longest_m = airframe.mesh(), airframe.diameter_m() * LONGEST_EDGE
@@ -76,7 +76,7 @@ def fine_solid_vertices_m(airframe_id: int) -> Array:
 
 
 def fold_radius2(distortion: Distortion) -> float:
-    """Squared radius, normalised, beyond which the lens model would fold the picture back on itself."""
+    """Squared radius, normalised, beyond which the lens model is no longer monotonic and would fold the image."""
     k1, k2, _, _, k3 = distortion
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]

@@ -1,8 +1,8 @@
 """Draws scenes with OpenGL: aircraft supersampled, surroundings at pixel resolution.
 
 Windows are drawn many at a time as tiles of one framebuffer. A whole frame is drawn in layers, each target alone, so
-that what hides what is known. Runs on whatever EGL offers: a GPU, or Mesa's llvmpipe. The context belongs to the
-process and thread that made it.
+that occlusions are known. Runs on any EGL: a GPU, or Mesa's llvmpipe. The context belongs to the process and thread
+that created it.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from sim_replay.render.view import Crop, Parts, crop_of, depth_projection, diame
 
 Array = NDArray[np.float64]
 SUN_THAT_CASTS_SHADOW = 0.2
-SHADOWED_FROM_PX = 40.0  # of diameter: what a smaller aircraft casts on itself is finer than the picture
+SHADOWED_FROM_PX = 40.0  # of diameter: shadows that a smaller aircraft casts on itself are below the resolution
 PIECES = (8, 6)  # of a whole frame, across and down
 _NOISE_UNIT, _COLOUR_UNIT, _COORDINATE_UNIT, _SHADOW_UNIT, _SKY_UNIT, _BACKDROP_UNIT = range(6)
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """N images of H x W, colour with gamma 2, before any sensor."""
+    """N images of H x W, colour with gamma 2, before the sensor model."""
 
     image_bgr: NDArray[np.uint8]  # [N, H, W, 3]
     coverage: NDArray[np.uint8]  # [N, H, W], share of the pixel that is aircraft, 255: all
-    coordinate: NDArray[np.float16]  # [N, H, W, 3], body point / model diameter; zeros where no aircraft is
+    coordinate: NDArray[np.float16]  # [N, H, W, 3], body point / model diameter; zeros outside aircraft
     target: NDArray[np.uint8]  # [N, H, W], 0: none, k: the scene's k-th target
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One aircraft alone, as if nothing hid it, in a crop of the frame."""
+    """One aircraft alone, without occlusion, in a crop of the frame."""
 
     x0_px: int
     y0_px: int
     colour_bgr: NDArray[np.uint8]  # [h, w, 3], gamma 2, premultiplied by the cover
-    cover: NDArray[np.float32]  # [h, w], share of the pixel's light that it takes, propeller disc included
+    cover: NDArray[np.float32]  # [h, w], share of the pixel's light that it blocks, propeller disc included
     solid: NDArray[np.uint8]  # [h, w], share of the pixel that is aircraft, 255: all; without the propeller disc
 
 
@@ -66,7 +66,7 @@ class _GpuMesh:
     aircraft: Any  # vertex array with normals and parts
     shadow: Any  # vertex array with positions alone
     solid_indices: int  # indices of faces that cast shadow; the propeller disc comes after them
-    radius_m: float  # of the sphere about the origin that holds it
+    radius_m: float  # of the sphere about the origin that contains it
 
 
 class Renderer:
@@ -103,7 +103,7 @@ class Renderer:
 
     @property
     def capacity(self) -> int:
-        """Scenes that one call of `draw` takes."""
+        """Number of scenes in one call of `draw`."""
         return self.columns * self.rows
 
     # --- programs, buffers, meshes ------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class Renderer:
         return self._context.program(texts[0], prelude + texts[1])
 
     def _screen(self, name: str, parts: Parts | None = None) -> tuple[Any, Any]:
-        """(program, vertex array) of a fragment shader that covers its viewport, with those parts of the world."""
+        """(program, vertex array) of a fragment shader that covers its viewport, with these parts of the world."""
         if (name, parts) not in self._screens:
             prelude = ""
             if parts is not None:
@@ -145,7 +145,7 @@ class Renderer:
         if key not in self._meshes:
             mesh: Mesh = fine_mesh(airframe_id) if fine else airframe_of(airframe_id).mesh()
             vertex = np.hstack([mesh.vertices_m, mesh.normals, mesh.part[:, None].astype(np.float32)])
-            # The nearly transparent disc goes last, so that it hides nothing it does not cover.
+            # The nearly transparent disc is drawn last, so that it does not hide what is behind it.
             disc = mesh.part[mesh.faces[:, 0]] == Part.PROPELLER_DISC
             faces = mesh.faces[np.argsort(disc, kind="stable")].astype(np.int32)
             vertices = self._context.buffer(vertex.astype(np.float32).tobytes())
@@ -164,12 +164,12 @@ class Renderer:
     def draw(self, scenes: Sequence[Scene], first_tile: int = 0) -> Rendered:
         """Scenes in the tiles from `first_tile` on; pixels beyond a scene's own width and height are undefined.
 
-        Interpolation rounds by a tile's place, so only the same tile gives the same coordinates to the last bit.
+        Interpolation rounds depending on a tile's place, so only the same tile gives bit-identical coordinates.
         """
         stop = first_tile + len(scenes)
         if stop > self.capacity:
             raise ValueError(f"{len(scenes)} scenes from tile {first_tile} do not fit {self.capacity} tiles")
-        # A process may hold several renderers, each with a context of its own.
+        # A process may have several renderers, each with its own context.
         with self._context:
             slots = self._draw_shadows(scenes)
             self._fine.use()
@@ -198,7 +198,7 @@ class Renderer:
         samples = int(np.clip(self._fine_px // max(width, height), 1, 4))
         corner = (tile % self.columns * self._fine_px, tile // self.columns * self._fine_px)
         self._fine.viewport = (*corner, width * samples, height * samples)
-        # One depth range for all targets, so that the nearer hides the farther.
+        # One depth range for all targets, so that the nearer occludes the farther.
         projection = depth_projection(drawn, scene.camera, crop)
         for number, target in enumerate(scene.targets, start=1):
             if is_ahead(target, scene.camera):
@@ -224,7 +224,7 @@ class Renderer:
     # --- whole frames -------------------------------------------------------------------------------------------------
 
     def surroundings(self, scene: Scene) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """(BGR [H, W, 3] with gamma 2, without any aircraft; what near cloud hides [H, W], 255: all).
+        """(BGR [H, W, 3] with gamma 2, without any aircraft; opacity of near cloud [H, W], 255: opaque).
 
         The scene's camera must be as large as a tile. Raises BackdropError if its backdrop cannot be read.
         """
@@ -255,7 +255,7 @@ class Renderer:
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2BGR), np.uint8), pixels[..., 3]
 
     def _pieces(self) -> list[Crop]:
-        """The frame in pieces, most of which show sky or ground alone."""
+        """The frame in pieces, most of which show only sky or only ground."""
         x = np.linspace(0, self.width_px, PIECES[0] + 1).astype(int).tolist()
         y = np.linspace(0, self.height_px, PIECES[1] + 1).astype(int).tolist()
         return [(x0, y0, x1, y1) for y0, y1 in pairwise(y) for x0, x1 in pairwise(x)]
@@ -283,7 +283,7 @@ class Renderer:
         return backdrop.map_for(scene.camera, scene.sensor_seed)
 
     def layer(self, scene: Scene, index: int) -> Layer | None:
-        """The scene's target of that index alone; None where no pixel of the picture can show it."""
+        """The scene's target of that index alone; None if no pixel of the image can show it."""
         target, camera = scene.targets[index], scene.camera
         crop = crop_of((target,), camera)
         width, height = crop[2] - crop[0], crop[3] - crop[1]
@@ -313,7 +313,7 @@ class Renderer:
     # --- aircraft -----------------------------------------------------------------------------------------------------
 
     def _draw_shadows(self, scenes: Sequence[Scene]) -> dict[tuple[int, int], int]:
-        """Each target as the sun sees it, in a slot of the atlas; gives slots by (scene, target number)."""
+        """Each target as seen from the sun, in a slot of the atlas; returns slots by (scene, target number)."""
         casting = [
             ((order, number), target, scene.environment.sun_ned)
             for order, scene in enumerate(scenes)
@@ -355,7 +355,7 @@ class Renderer:
             atlas[axis, 3] = (place + 0.5) * self._shadow_px / size[axis]
         atlas[2, :3], atlas[2, 3] = -0.5 * basis[2] / radius_m, 0.5 - 1e-4
         program["shadow_from_body"].write(columns(atlas))
-        # Lifted by two texels, a lit surface does not shadow itself.
+        # With an offset of two texels, a lit surface does not shadow itself.
         program["sun_body"].value = (*basis[2], 4.0 * radius_m / self._shadow_px)
 
     def _draw_target(
@@ -381,7 +381,7 @@ class Renderer:
 
 def _write_world(program: Any, scene: Scene) -> None:
     camera = scene.camera
-    # Programs that lack parts of the world lack their uniforms.
+    # Programs without some parts of the world lack their uniforms.
     used = set(program)
     if "K" in used:
         program["K"].value = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])

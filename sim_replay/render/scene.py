@@ -1,4 +1,4 @@
-"""What is to be drawn: a camera, targets and the surroundings, as plain values in local NED metres."""
+"""What is to be drawn: camera, targets and surroundings, as plain values in local NED metres."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Camera:
 
 
 def rays_ned(pixels: Array, camera: Camera) -> Array:
-    """Unit vectors [N, 3], NED, that pixels [N, 2] look along."""
+    """Unit vectors [N, 3], NED, along the rays of pixels [N, 2]."""
     plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
     if camera.distortion is not None:
         plane = undistorted(plane, camera.distortion)
@@ -47,20 +47,20 @@ class Target:
     t_ned_body_m: Array  # [3]
 
     def pose_in(self, camera: Camera) -> tuple[Array, Array]:
-        """(R_cam_target [3, 3], t_cam_target_m [3]) as that camera sees it."""
+        """(R_cam_target [3, 3], t_cam_target_m [3]) in that camera."""
         R_cam_ned = camera.R_ned_cam.T
         return R_cam_ned @ self.R_ned_body, R_cam_ned @ (self.t_ned_body_m - camera.t_ned_cam_m)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One exposure. `camera` and `targets` are at its middle, which is what labels describe."""
+    """One exposure. `camera` and `targets` are at its middle, which the labels describe."""
 
     camera: Camera
     targets: tuple[Target, ...]
     environment: Environment
     sensor_seed: int = 0  # blur, exposure and colour of the camera; the distractors' paths
-    frame_index: int = 0  # noise, exposure drift and distractors go on from frame to frame
+    frame_index: int = 0  # continues noise, exposure drift and distractors from frame to frame
     shutter_close: tuple[Camera, tuple[Target, ...]] | None = None  # the same when the shutter closes; None: no motion
-    distractors: int = 0  # birds and specks that cross the picture, before or behind the targets
+    distractors: int = 0  # birds and specks that cross the image, in front of or behind the targets
     backdrop: Path | None = None  # a photograph, or a panorama twice as wide as high, in place of sky and ground

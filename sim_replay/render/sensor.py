@@ -1,4 +1,4 @@
-"""A camera's own marks on a picture: lens blur, motion, mosaic, noise, exposure, colour, sharpening, compression."""
+"""A camera's effects on an image: lens blur, motion, mosaic, noise, exposure, colour, sharpening, compression."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sim_replay.render.motion import motion_kernel
 
 Quality = Literal["good", "ordinary", "poor"]
 _NOISE_VALUES = 2**23
-_BAYER_MIN_SCALE = 0.95  # below it a picture's pixels each average several of the mosaic's
+_BAYER_MIN_SCALE = 0.95  # below it, each pixel of the image averages several of the mosaic
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Lengths are pixels of the native frame; levels are of full scale, with gamma 2."""
+    """Lengths are in pixels of the native frame; levels are shares of full scale, with gamma 2."""
 
     blur_sigma_px: float
     motion_px: tuple[float, float]
@@ -27,17 +27,17 @@ class Sensor:
     contrast: float
     saturation: float
     cast_bgr: tuple[float, float, float]
-    noise: float  # gamma 2 makes shot noise the same at every level
-    read_noise: float  # felt in the dark
+    noise: float  # gamma 2 makes shot noise independent of the level
+    read_noise: float  # visible in the dark
     jpeg_quality: int | None
-    sharpening: float = 0.0  # strength of the unsharp mask, 0 none
-    mosaic: bool = False  # one colour a pixel, interpolated, as behind a Bayer filter
-    drift: float = 0.0  # how far exposure wanders from frame to frame, share of the gain
+    sharpening: float = 0.0  # strength of the unsharp mask, 0: none
+    mosaic: bool = False  # one colour per pixel, interpolated, as behind a Bayer filter
+    drift: float = 0.0  # how far exposure varies from frame to frame, share of the gain
 
 
 @dataclass(frozen=True)
 class _Ranges:
-    """What a quality draws from; shares are of cameras that have the fault."""
+    """Ranges for each quality; shares are of the cameras that have the defect."""
 
     blur_px: tuple[float, float]
     soft_share: float
@@ -57,7 +57,7 @@ _QUALITIES: dict[Quality, _Ranges] = {
 
 
 def sensor_from(rng: np.random.Generator, quality: Quality = "ordinary") -> Sensor:
-    """A camera of that quality at random."""
+    """A random camera of that quality."""
     ranges = _QUALITIES[quality]
     angle, moved = rng.uniform(0, np.pi), rng.uniform(0.5, 5.0) * (rng.random() < ranges.motion_share)
     grey = rng.random() < 0.07
@@ -79,7 +79,7 @@ def sensor_from(rng: np.random.Generator, quality: Quality = "ordinary") -> Sens
 
 
 def drifted(sensor: Sensor, seed: int, frame_index: int) -> Sensor:
-    """The sensor with the gain that its exposure control has wandered to by that frame."""
+    """The sensor with the gain that its exposure control has drifted to by that frame."""
     rng = np.random.default_rng([seed, 0xE8])
     period_frames, phase = rng.uniform(40.0, 150.0, 2) / [1.0, 3.0], rng.uniform(0.0, 2.0 * np.pi, 2)
     wave = np.sin(2.0 * np.pi * frame_index / period_frames + phase) @ [0.7, 0.3]
@@ -92,7 +92,7 @@ def _noise_values() -> NDArray[np.float32]:
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Standard normal noise: a stretch of a fixed table, from a random place, which is far faster than drawing it."""
+    """Standard normal noise: a slice of a fixed table from a random place, which is far faster than sampling."""
     count = int(np.prod(shape))
     if count > _NOISE_VALUES - 2**16:
         return rng.standard_normal(shape, dtype=np.float32)
@@ -101,7 +101,7 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float
 
 
 def _mosaic(image_bgr: Any) -> NDArray[np.uint8]:
-    """What each photosite sees [H, W]: blue and green in even rows, green and red in odd ones."""
+    """Value of each photosite [H, W]: blue and green in even rows, green and red in odd ones."""
     raw = np.array(image_bgr[..., 1])
     raw[::2, ::2] = image_bgr[::2, ::2, 0]
     raw[1::2, 1::2] = image_bgr[1::2, 1::2, 2]
@@ -117,7 +117,7 @@ def _with_noise(image: Any, sensor: Sensor, scale: float, rng: np.random.Generat
 
 
 def _colour_map(sensor: Sensor) -> NDArray[np.float32]:
-    """Saturation, colour cast, gain and contrast are one affine map [3, 4] of the three channels, 0..255."""
+    """Saturation, colour cast, gain and contrast as one affine map [3, 4] of the three channels, 0..255."""
     luma = np.tile(np.array([0.114, 0.587, 0.299]), (3, 1))
     mix = (sensor.saturation * np.eye(3) + (1 - sensor.saturation) * luma) * np.asarray(sensor.cast_bgr)[:, None]
     lift = np.full((3, 1), 255.0 * 0.45 * (1 - sensor.contrast))
@@ -125,7 +125,7 @@ def _colour_map(sensor: Sensor) -> NDArray[np.float32]:
 
 
 def exposed(image_bgr: NDArray[np.uint8], sensor: Sensor, scale: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture [H, W, 3] as this camera would deliver it; `scale` is picture pixels per native pixel, at most 1."""
+    """The image [H, W, 3] as this camera would deliver it; `scale` is image pixels per native pixel, at most 1."""
     image: Any = image_bgr
     sigma = sensor.blur_sigma_px * scale
     if sigma > 0.2:
@@ -151,7 +151,7 @@ def exposed(image_bgr: NDArray[np.uint8], sensor: Sensor, scale: float, rng: np.
 def exposed_frame(
     image_bgr: NDArray[np.uint8], sensor: Sensor, seed: int, frame_index: int, moved: bool
 ) -> NDArray[np.uint8]:
-    """A whole frame [H, W, 3]; `moved` says that its motion is in the picture already."""
+    """A whole frame [H, W, 3]; `moved` says that it already contains motion blur."""
     sensor = drifted(sensor, seed, frame_index)
     if moved:
         sensor = replace(sensor, motion_px=(0.0, 0.0))

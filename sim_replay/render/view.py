@@ -1,4 +1,4 @@
-"""What of a scene a picture can show: which parts of the world, which pixels of the targets."""
+"""What an image of a scene can show: which parts of the world, which pixels of the targets."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from sim_replay.render.scene import Camera, Scene, Target, rays_ned
 
 Array = NDArray[np.float64]
 Crop = tuple[int, int, int, int]  # x0, y0, x1, y1, pixels
-Parts = tuple[str, ...]  # names that world.glsl asks for
+Parts = tuple[str, ...]  # names that world.glsl tests for
 HILLS_M = 14_000.0  # as in world.glsl
 
 
 def parts_of(scene: Scene, crop: Crop) -> Parts:
-    """The parts of world.glsl that a crop of the scene's picture can show."""
+    """The parts of world.glsl that a crop of the scene's image can show."""
     camera, environment = scene.camera, scene.environment
     count = 2 if camera.distortion is None else 5
     u, v = np.meshgrid(np.linspace(crop[0] - 1, crop[2], count), np.linspace(crop[1] - 1, crop[3], count))
     down = rays_ned(np.stack([u.ravel(), v.ravel()], axis=1), camera)[:, 2]
-    # A lens bends the horizon between the points looked at.
+    # A lens curves the horizon between the points that are tested.
     margin = 0.0 if camera.distortion is None else 0.02
     parts = []
     if down.min() <= margin:
@@ -43,7 +43,7 @@ def is_ahead(target: Target, camera: Camera) -> bool:
 
 
 def diameter_px(target: Target, camera: Camera) -> float:
-    """Pixels that the target's diameter takes at its range, seen broadside."""
+    """Pixels spanned by the target's diameter at its range, seen broadside."""
     range_m = np.linalg.norm(target.t_ned_body_m - camera.t_ned_cam_m)
     return float(camera.K[0, 0] * airframe_of(target.airframe_id).diameter_m() / range_m)
 
@@ -55,7 +55,7 @@ def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
         points = vertices_m(target.airframe_id)
         box = extents_px(project_px(points, *target.pose_in(camera), camera.K, camera.distortion))
         if box is not None:
-            # Under distortion an edge may bow out beyond its ends.
+            # Under distortion an edge may curve beyond its end points.
             margin = 1 if camera.distortion is None else 6
             low, high = np.floor(box[:2]).astype(int) - margin, np.ceil(box[2:]).astype(int) + 1 + margin
             x0, y0, x1, y1 = min(x0, low[0]), min(y0, low[1]), max(x1, high[0]), max(y1, high[1])
@@ -64,7 +64,7 @@ def crop_of(targets: Sequence[Target], camera: Camera) -> Crop:
 
 
 def depth_projection(targets: Sequence[Target], camera: Camera, crop: Crop) -> Array:
-    """[4, 4] projection of a crop whose depth range holds those targets and no more."""
+    """[4, 4] projection of a crop whose depth range contains exactly those targets."""
     reach = [(t.pose_in(camera)[1][2], airframe_of(t.airframe_id).diameter_m()) for t in targets]
     near_m, far_m = min(z - size for z, size in reach), max(z + size for z, size in reach)
     return clip_from_cam(camera.K, crop[0], crop[1], crop[2] - crop[0], crop[3] - crop[1], near_m, far_m)
