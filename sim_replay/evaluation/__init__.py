@@ -1,1 +1,1 @@
-"""Holding poses against a BOP dataset: judged picture by picture, then figures, files and pictures of the result."""
+"""Compares poses with the ground truth of a BOP dataset, image by image; figures, files and plots of the result."""

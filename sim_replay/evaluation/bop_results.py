@@ -1,7 +1,7 @@
-"""BOP results files (bop_toolkit docs/bop_challenge_2019 format): any method's poses in, the evaluated model's out.
+"""BOP results files (bop_toolkit docs/bop_challenge_2019 format): reads any method's poses, writes those of a model.
 
-METHOD_DATASET-SPLIT.csv with a header and one pose a line: scene_id,im_id,obj_id,score,R,t,time. R is nine and t
-three numbers parted by spaces, of the dataset's model axes, t in millimetres; time in seconds, -1 where not known.
+METHOD_DATASET-SPLIT.csv with a header and one pose per line: scene_id,im_id,obj_id,score,R,t,time. R is nine and t
+three numbers separated by spaces, of the dataset's model axes, t in millimetres; time in seconds, -1 if unknown.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1
 UNKNOWN_TIME_S = -1.0
 _ROTATION_TOLERANCE = 0.02
-_LARGEST = 1e15  # beyond it squares and sums leave what JSON can tell
+_LARGEST = 1e15  # beyond it, squares and sums exceed what JSON can represent
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class ResultRow:
-    """One pose as the file has it, lengths in metres."""
+    """One pose of the file, lengths in metres."""
 
     scene_id: int
     image_id: int
@@ -46,7 +46,7 @@ class ResultRow:
 def read_results(path: Path) -> list[ResultRow]:
     """All rows of a results file. Raises InputError, naming file, line and column."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before UTF-8
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark before UTF-8
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
             if tuple(header) != COLUMNS:
@@ -78,14 +78,15 @@ def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
 
 
 def file_answers(path: Path, dataset: Dataset) -> Answerer:
-    """Answers from a results file; poses of pictures that are not asked for stay unused.
+    """Answers from a results file; poses of images that are not evaluated are ignored.
 
-    Of each object, a picture has as many poses held against the truth as aircraft of it are there: as in BOP those of
-    the best score, of equal ones the first, or the truth would choose. Where one has none, it is the best of those
-    that name an object which is not there (a model-free method names none). The rest are false.
+    Of each object, as many poses are compared with the ground truth of an image as there are instances of it: as in BOP
+    those with the highest score, the first of equal ones, because otherwise the ground truth would choose. If an object
+    has too few, the best of those that name an object which is not in the image take their place (a model-free method
+    names none). The rest are false.
 
-    Raises InputError if the file is not as it should be, none of its rows is of the dataset's pictures, or two splits
-    of the dataset share a scene's number.
+    Raises InputError if the file is invalid, none of its rows belongs to an image of the dataset, or two splits of the
+    dataset share a scene number.
     """
     by_picture: dict[tuple[int, int], list[ResultRow]] = {}
     for row in read_results(path):
@@ -112,7 +113,7 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
 
 
 def _best(rows: Sequence[ResultRow], there: Sequence[int]) -> set[int]:
-    """Which rows, by id(), count for the aircraft that are `there`, told by their objects."""
+    """Rows, by id(), that are compared with the aircraft `there`, given by their object ids."""
     left, best = Counter(there), set()
     others = []
     for row in sorted(rows, key=lambda row: -row.score):
@@ -125,20 +126,20 @@ def _best(rows: Sequence[ResultRow], there: Sequence[int]) -> set[int]:
 
 
 def _pose(index: int, row: ResultRow, picture: DatasetFrame) -> TargetPose:
-    """The pose of the body axes that the row's model axes stand for."""
+    """The pose of the body axes, from that of the row's model axes."""
     u, _, vt = np.linalg.svd(row.R_cam_model)
     R, t_m = picture.scene.models.of(row.object_id).pose_of_body(u @ vt, row.t_cam_model_m)
     return TargetPose(index, R, t_m, score=row.score)
 
 
 def results_name(method: str, dataset: Dataset) -> str:
-    """METHOD_DATASET-SPLIT.csv; BOP parts the name at the underscore."""
+    """METHOD_DATASET-SPLIT.csv; BOP splits the name at the underscore."""
     parts = (part.replace("_", "-") for part in (method, dataset.name, dataset.split or "all"))
     return "{}_{}-{}.csv".format(*parts)
 
 
 def write_results(path: Path, judged: Iterable[JudgedFrame]) -> None:
-    """Write every pose, found targets under their true obj_id (a model-free method names none), others under 0."""
+    """Write every pose, matched ones under their true obj_id (a model-free method names none), others under 0."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)

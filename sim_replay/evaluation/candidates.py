@@ -1,4 +1,4 @@
-"""What the two stages take for targets in whole frames, before any threshold, and which of it is one."""
+"""Detections of both stages in whole frames, before any threshold, and whether each is a target."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from edge.types import Array, Estimate, Frame, FrameMeta
 from msgs.contract import ScoreCalibration
 from sim_replay.datasets import DatasetFrame
 
-PEAK_LEAST = 0.08  # below it lies the noise between the peaks
+PEAK_LEAST = 0.08  # below it are the noise peaks
 PEAKS_MOST = 8
-ON_TARGET, OFF_TARGET = 0.2, 0.05  # intersection over union with a truth's box; between them it is neither
+ON_TARGET, OFF_TARGET = 0.2, 0.05  # intersection over union with a truth's box; in between it counts as neither
 
 
 class Candidate(NamedTuple):
@@ -27,17 +27,17 @@ class Candidate(NamedTuple):
 
     stage: Literal["acquire", "track"]
     peak: float  # of the heatmap, 0..1
-    shown_px: float  # as edge.estimator.decode.shown_size_px
+    shown_px: float  # see edge.estimator.decode.shown_size_px
     is_target: bool
 
 
 def candidates(
     model: Model, pictures: Sequence[DatasetFrame], on_frame: Callable[[], None] = lambda: None
 ) -> Iterator[Candidate]:
-    """Every peak of the whole frames, and what the track stage sees in a window around each.
+    """Every peak in the whole frames, and what the track stage detects in a window around each.
 
-    Whatever calibration and thresholds the model has are left aside. Raises InputError if the model does not run,
-    BopError for a picture that cannot be read.
+    The model's calibration and thresholds are not applied. Raises InputError if the model does not run, BopError for an
+    image that cannot be read.
     """
     estimator = Estimator(_bare(model), PEAKS_MOST)
     model.warm_up()

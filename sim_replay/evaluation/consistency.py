@@ -1,4 +1,4 @@
-"""Whether told covariances are honest over many flights: the normalised error squared against chi-square. Pure."""
+"""Whether predicted covariances are consistent over many flights: NEES compared with chi-square. Pure."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from sim_replay.score import Match, stacked
 
 DEGREES_OF_FREEDOM = 3
 SHARE_INSIDE = 0.95
-_Scene = tuple[str, int]  # folder and number: those of an imagewise dataset share a folder
+_Scene = tuple[str, int]  # folder and number: the scenes of an imagewise dataset share a folder
 
 
 def consistency(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
-    """{"flights", "singular", "position", "rotation"}; None where no pose has a covariance.
+    """{"flights", "singular", "position", "rotation"}; None if no pose has a covariance.
 
     e' P^-1 e (Bar-Shalom's NEES) is averaged over the frames of each flight, one target through one scene. Frames of a
     flight share most of their error, so a flight counts as one draw of chi-square with 3 degrees of freedom: the mean
-    over n honest flights is 3 and lies inside `bounds_95` 95 times in 100, and 95 % of them lie inside their own.
-    A mean below says that covariances are too wide, one above that they are too narrow. Rotation's is over the poses
-    that tell one, and over the flights that have such a pose: None where none has. A covariance that has no inverse,
-    of position or of rotation, tells no such error: `singular` counts the poses with one, and they are in no mean.
+    over n consistent flights is 3, is inside `bounds_95` 95 times in 100, and 95 % of the flights are inside their own.
+    A lower mean says that covariances are too wide, a higher one that they are too narrow. Rotation's is over the poses
+    of known rotation, and over the flights with such a pose: None where there are none. A singular covariance, of
+    position or of rotation, defines no such error: `singular` counts the poses with one, and no mean includes them.
     """
     flights = [_mean_nees(matches) for matches in _flights(judged).values()]
     if not flights:
@@ -41,9 +41,9 @@ def consistency(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
 
 
 def _mean_nees(matches: Sequence[Match]) -> tuple[float, float, int]:
-    """Mean of position's and of rotation's normalised error squared, and how many poses are left out of one or both.
+    """Mean NEES of position and of rotation, and the number of poses left out of one or both as singular.
 
-    NaN where no pose has such an error, or tells a rotation. Each match has an estimate with covariance.
+    NaN if no pose has such an error, or a known rotation. Each match has an estimate with covariance.
     """
     estimates = [match.estimate for match in matches if match.estimate is not None]
     R_gt, t_gt = stacked([match.truth for match in matches])
@@ -61,8 +61,8 @@ def _mean(values: Array) -> float:
 
 
 def bounds_95(flights: int) -> tuple[float, float]:
-    """Between which the mean of so many draws of chi-square with 3 degrees of freedom lies 95 times in 100."""
-    from scipy.stats import chi2  # takes its time
+    """Interval that contains the mean of this many draws of chi-square with 3 degrees of freedom 95 times in 100."""
+    from scipy.stats import chi2  # slow to import
 
     tail = (1.0 - SHARE_INSIDE) / 2.0
     low, high = chi2.ppf([tail, 1.0 - tail], DEGREES_OF_FREEDOM * flights) / flights

@@ -21,7 +21,7 @@ from sim_replay.score import Match, stacked
 
 Array = NDArray[np.float64]
 
-SEQUENCES_MAX = 24  # of more scenes, as many evenly spread ones are drawn
+SEQUENCES_MAX = 24  # if there are more scenes, this many evenly spread ones are drawn
 _OWN_NAMES = re.compile(r"sequence_(?:[\w.-]+_)?\d{6,}\.png|worst_frames\.jpg")
 TRUTH_COLOR, ESTIMATE_COLOR = "#0097a7", "#d500a0"
 _RATES = {
@@ -37,13 +37,13 @@ _RATES = {
 def write_figures(
     out: Path, score: dict[str, Any], judged: Sequence[JudgedFrame], models: Mapping[int, Model]
 ) -> list[Path]:
-    """Draw everything into `out`, where figures of another evaluation give way; returns the files.
+    """Draw everything into `out`, replacing the figures of an earlier evaluation; returns the files.
 
-    Raises BopError if a picture can no longer be read.
+    Raises BopError if an image can no longer be read.
     """
     out.mkdir(parents=True, exist_ok=True)
     for path in list(out.iterdir()):
-        if _OWN_NAMES.fullmatch(path.name):  # of scenes that this one may not have
+        if _OWN_NAMES.fullmatch(path.name):  # of scenes that this evaluation may not have
             path.unlink()
     matches = [match for frame in judged for match in frame.matches]
     files = [out / "error_by_range.png", out / "cumulative_error.png"]
@@ -61,14 +61,14 @@ def write_figures(
 
 
 def _scene_name(frame: JudgedFrame, split: str | None) -> str:
-    """The scene's number, with its split where the dataset was opened with several."""
+    """The scene's number, with its split if the dataset was opened with several."""
     own = frame.picture.scene.split
     prefix = f"{own}_" if split is None and own is not None else ""
     return f"{prefix}{frame.picture.scene_id:06d}"
 
 
 def error_by_range(score: dict[str, Any]) -> Figure:
-    """Mean and median errors and the rates of each distance band that holds a target."""
+    """Mean and median errors and the rates of each distance band that contains a target."""
     bands = {name: group for name, group in score["by_range"].items() if group["targets"]}
     figure = Figure(figsize=(13, 4.2), layout="constrained")
     rotation, translation, rates = figure.subplots(1, 3)
@@ -100,7 +100,7 @@ def _bars(axes: Axes, bands: dict[str, Any], curves: dict[str, tuple[str, str]])
 
 
 def cumulative_error(matches: Sequence[Match]) -> Figure:
-    """Share of all targets with an error below x; one that was not found, or whose rotation is not known, never is."""
+    """Share of all targets with an error below x; a missed target, or one of unknown rotation, never counts."""
     found = [(m.truth, m.estimate) for m in matches if m.estimate is not None]
     _, t_gt = stacked([truth for truth, _ in found])
     _, t_est = stacked([estimate for _, estimate in found])

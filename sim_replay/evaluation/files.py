@@ -1,4 +1,4 @@
-"""What an evaluation leaves on disk: metrics.json, frames.jsonl and, of a model, a BOP results file."""
+"""Output files of an evaluation: metrics.json, frames.jsonl and, for a model, a BOP results file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def write_files(
 ) -> list[Path]:
     """Write the score and every frame's result into `out`; returns the files. `method` names the results file.
 
-    Poses that came from a results file are not written as one: it may lie in `out` under the same name.
+    Poses that were read from a results file are not written as one: it may be in `out` under the same name.
     """
     out.mkdir(parents=True, exist_ok=True)
     metrics_json, frames_jsonl = out / "metrics.json", out / "frames.jsonl"
@@ -38,7 +38,7 @@ def write_files(
 
 
 def frame_record(frame: JudgedFrame, root: Path) -> dict[str, Any]:
-    """One line of frames.jsonl: the picture, each true target with what was found of it, and poses of no target."""
+    """One line of frames.jsonl: the image, each true target with its match, and the poses that belong to no target."""
     path = frame.picture.image_path
     return {
         "scene_id": frame.picture.scene_id,
@@ -51,7 +51,7 @@ def frame_record(frame: JudgedFrame, root: Path) -> dict[str, Any]:
 
 
 def target_record(match: Match) -> dict[str, Any]:
-    """A true target, what was found of it, and the errors of that: metres, degrees."""
+    """A true target, the pose matched to it, and its errors: metres, degrees."""
     truth, estimate = match.truth, match.estimate
     record: dict[str, Any] = {
         "obj_id": truth.object_id,
@@ -76,7 +76,7 @@ def target_record(match: Match) -> dict[str, Any]:
 
 
 def pose_record(pose: TargetPose) -> dict[str, Any]:
-    """A pose in `cam`, rounded, with score and sigma where they are known; null for a rotation that is not."""
+    """A pose in `cam`, rounded, with score and sigma where they are known; null for an unknown rotation."""
     record: dict[str, Any] = {
         "R_cam_target": _rounded(pose.R_cam_target, 6) if pose.rotation_known else None,
         "t_cam_target_m": _rounded(pose.t_cam_target_m, 4),

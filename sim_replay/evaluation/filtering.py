@@ -1,4 +1,4 @@
-"""What a tracker makes of the estimates that it is given: its errors beside theirs, target by target. Pure."""
+"""The errors of a tracker beside those of its input estimates, target by target. Pure."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from sim_replay.evaluation.judge import JudgedFrame
 def filtering(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
     """{"targets", "translation_error_m", "rotation_error_deg"}, the errors each {"measured", "track"}.
 
-    They are means over the targets of which the tracker was given an estimate and told a pose in the same frame; None
-    where there are none, and so without a tracker. Of rotation, over those of them whose rotation it told.
+    They are means over the targets for which the tracker was given an estimate and returned a pose in the same frame;
+    None where there are none, and thus without a tracker. For rotation, over those of known rotation.
     """
     pairs = [
         (measured, told)
@@ -33,7 +33,7 @@ def filtering(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
 
 
 def _means(errors: Sequence[tuple[float | None, float | None]]) -> dict[str, float | None]:
-    """Of what was measured and of the track, where both are known."""
+    """Means of the measured and of the tracked errors, where both are known."""
     known = np.array([pair for pair in errors if None not in pair], dtype=np.float64)
     if not known.size:
         return {"measured": None, "track": None}

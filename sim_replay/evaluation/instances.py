@@ -1,4 +1,4 @@
-"""Which of an object's targets is which over a scene: BOP's ground truth tells the object and no identity. Pure."""
+"""Identifies the targets of an object over a scene: BOP's ground truth states the object but no instance. Pure."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sim_replay.score import Truth
 
 
 def instances(truths: Sequence[Truth], places_m: Sequence[Array]) -> list[int]:
-    """A number for each truth that is its target's own, among those of its object, in every frame.
+    """A number for each truth that identifies its target, among those of its object, in every frame.
 
-    As long as a frame holds as many of an object as the one before, they stand in the same order. Where one has come or
-    gone, each is the target that was last seen nearest.
+    As long as a frame contains as many of an object as the one before, their order is the same. Where one has appeared
+    or vanished, each is the target that was last seen nearest.
 
     Args:
         truths: Of one scene; those of a frame in the order of its scene_gt.json.
-        places_m: Where each is, [3], in axes that stand still if they are known, else in `cam`.
+        places_m: Where each is, [3], in axes that do not move if they are known, otherwise in `cam`.
     """
     by_object: dict[int, dict[int, list[int]]] = {}
     for i, truth in enumerate(truths):
@@ -30,7 +30,7 @@ def instances(truths: Sequence[Truth], places_m: Sequence[Array]) -> list[int]:
         before_frame = -1
         for frame, present in sorted(frames.items()):
             here_m = [places_m[i] for i in present]
-            # After a frame with none at all, those who are back are the same only if none is missing.
+            # After a frame without any, the order is the same only if all are back.
             unbroken = frame == before_frame + 1 or len(before) == len(last_seen_m)
             if not (unbroken and len(before) == len(present)):
                 before = _nearest(here_m, last_seen_m)
@@ -42,7 +42,7 @@ def instances(truths: Sequence[Truth], places_m: Sequence[Array]) -> list[int]:
 
 
 def _nearest(here_m: Sequence[Array], last_seen_m: dict[int, Array]) -> list[int]:
-    """Numbers of those here: pairs by growing distance, then numbers that are new."""
+    """Numbers of those in this frame: pairs by increasing distance, then new numbers."""
     pairs = [
         (float(np.linalg.norm(a - b)), i, number) for i, a in enumerate(here_m) for number, b in last_seen_m.items()
     ]

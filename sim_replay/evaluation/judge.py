@@ -1,4 +1,4 @@
-"""A method's poses against the truth of a dataset's pictures, one by one. What answers may be a model or a file."""
+"""Compares a method's poses with a dataset's ground truth, image by image. The source may be a model or a file."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from sim_replay.score import Match, TargetPose, Truth, latency_statistics, match
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method says of one picture."""
+    """A method's output for one image."""
 
     poses: tuple[TargetPose, ...]
-    time_ms: float | None  # it took; None: not known
-    measured: tuple[TargetPose, ...] | None = None  # what a tracker was given of this picture; None: no tracker
-    surplus: tuple[TargetPose, ...] = ()  # poses beyond the aircraft there are: false, wherever they lie
+    time_ms: float | None  # processing time; None: unknown
+    measured: tuple[TargetPose, ...] | None = None  # a tracker's inputs for this image; None: no tracker
+    surplus: tuple[TargetPose, ...] = ()  # poses beyond the number of aircraft: false, wherever they are
 
 
-Answerer = Callable[[int, DatasetFrame], Answer]  # the index is what the poses name as their frame
+Answerer = Callable[[int, DatasetFrame], Answer]  # the index is the poses' `frame`
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedFrame:
-    """One picture, judged by itself."""
+    """The result for one image."""
 
     picture: DatasetFrame
-    matches: tuple[Match, ...]  # of the targets of which something is seen, in the order of picture.targets
+    matches: tuple[Match, ...]  # of the visible targets, in the order of picture.targets
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
-    measured: tuple[Match, ...] = ()  # of the same targets, what a tracker was given of them; empty without one
-    not_asked: tuple[Truth, ...] = ()  # others that are there: who finds them is neither right nor wrong
+    measured: tuple[Match, ...] = ()  # matches of the tracker's inputs with the same targets; empty without a tracker
+    not_asked: tuple[Truth, ...] = ()  # others that are present: detecting them is neither right nor wrong
 
 
 def is_seen(target: BopTarget) -> bool:
-    """Whether something of it may be seen: the dataset says so, or does not say and it is not behind the camera."""
+    """Whether it may be visible: the dataset says so, or it does not say and the target is not behind the camera."""
     known = target.visible_px is not None or target.box_visible_xyxy_px is not None
     return target.visible_px != 0 if known else bool(target.t_cam_target_m[2] > 0)
 
 
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
-    """The picture's targets of which something is seen, with size, name and model points; then those not asked for.
+    """The image's visible targets, with size, name and model points; then those that are not to be estimated.
 
-    Raises InputError for an object without a model that is asked for; of others it is passed over.
+    Raises InputError for an object without a model that is to be estimated; others without one are skipped.
     """
     truths = []
     for target, wanted in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
@@ -81,7 +81,7 @@ def judge_frames(
     answer: Answerer,
     on_frame: Callable[[JudgedFrame], None] = lambda _: None,
 ) -> list[JudgedFrame]:
-    """Ask for every picture's poses and match them; `on_frame` sees each as it comes. Raises InputError."""
+    """Get every image's poses and match them; `on_frame` is called with each result. Raises InputError."""
     judged = []
     for index, picture in enumerate(pictures):
         answered = answer(index, picture)
@@ -107,9 +107,9 @@ def _wanted(matches: Sequence[Match]) -> tuple[Match, ...]:
 
 
 def score_of(dataset: Dataset, method: dict[str, Any], judged: Sequence[JudgedFrame]) -> dict[str, Any]:
-    """The score of many frames: shares 0..1, degrees, metres, milliseconds; None where there is nothing to tell.
+    """The score of many frames: shares 0..1, degrees, metres, milliseconds; None where there is no data.
 
-    `method` says what was judged. The figures are those of `sim_replay.score.statistics`.
+    `method` describes what was evaluated. The figures are those of `sim_replay.score.statistics`.
     """
     matches = [match for frame in judged for match in frame.matches]
     false_poses = [pose for frame in judged for pose in frame.false_poses]

@@ -1,6 +1,6 @@
-"""How far a rate may be from what many more flights would give. Pure.
+"""Confidence intervals: how far a rate may be from its value over many more flights. Pure.
 
-Frames of one flight show one aircraft against one sky and are right or wrong together, so flights are drawn anew, not
+Frames of one flight show one aircraft against one sky and are right or wrong together, so flights are resampled, not
 frames (the percentile bootstrap over clusters, Efron and Tibshirani, An Introduction to the Bootstrap, chapter 13).
 """
 
@@ -20,9 +20,9 @@ TAILS_PERCENT = (2.5, 97.5)
 
 
 def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]] | None:
-    """Of each rate over all targets the interval that holds it in 95 of 100 such draws; None of fewer than two flights.
+    """95 % confidence interval of each rate over all targets; None for fewer than two flights.
 
-    The draws are the same each time.
+    The resampling is the same each time.
     """
     by_flight: dict[tuple[str, int], list[Match]] = {}
     for frame in judged:
@@ -37,7 +37,7 @@ def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]
 
 
 def _interval(rates: Array, targets: Array) -> tuple[float, float]:
-    """Of the rate over all targets, by the rates of N flights and how many targets each has."""
+    """Interval of the rate over all targets, from the rates of N flights and the number of targets of each."""
     drawn = np.random.default_rng(0).integers(len(rates), size=(DRAWS, len(rates)))
     overall = (rates * targets)[drawn].sum(axis=1) / targets[drawn].sum(axis=1)
     low, high = np.percentile(overall, TAILS_PERCENT)

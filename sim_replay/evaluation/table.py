@@ -1,4 +1,4 @@
-"""A score as a person reads it: a column for each distance band, then a line for each airframe."""
+"""A score as readable tables: a column for each distance band, then a row for each airframe."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console, Group
 from rich.table import Table
 
-WIDTH = 130  # of tables where there is no terminal to ask
+WIDTH = 130  # of tables that are not written to a terminal
 _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "targets": lambda group: str(group["targets"]),
     "recall": lambda group: _text(group["recall"], "{:.1%}"),
@@ -35,7 +35,7 @@ _AIRFRAME_COLUMNS = {
 
 
 def table_console(stderr: bool = False) -> Console:
-    """Where there is no terminal, as wide as tables need: nobody can widen a file."""
+    """Without a terminal, as wide as the tables need: a file cannot be widened."""
     console = Console(stderr=stderr)
     if not console.is_terminal:
         console.width = max(console.width, WIDTH)

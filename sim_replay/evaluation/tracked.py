@@ -1,8 +1,8 @@
-"""A model on whole sequences: the daemon's estimator and tracker over the pictures in their order, without its clock.
+"""A model on whole sequences: the daemon's estimator and tracker over the images in their order, without its clock.
 
-A scene with sequence.toml is of this project's making: its fps counts, and its world is local NED, so the tracker is
-told the camera's attitude and place from cam_R_w2c: exactly as the files have it, or with an autopilot's usual errors.
-Any other scene is taken at DEFAULT_FPS, with nothing known of the own ship; time passes there as pictures' numbers do.
+A scene with sequence.toml was made by this project: its fps applies, and its world is local NED, so the tracker is
+given the camera's attitude and position from cam_R_w2c, either exactly or with errors typical of autopilots.
+Any other scene is taken at DEFAULT_FPS, with an unknown own ship; time then follows the image numbers.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import TargetPose
 
-OwnShipTold = Literal["exact", "usual"]  # what the tracker is told of the own ship: the truth, or with usual errors
+OwnShipTold = Literal["exact", "usual"]  # what the tracker is given: the true own-ship pose, or one with typical errors
 DEFAULT_FPS = 30.0
 FIRST_FRAME_NS = 1_000_000_000
 _SETTINGS = EstimatorSettings()
 _MAX_AGE_MS = MavlinkSettings().max_age_ms
-_CAMERA_ITSELF = Mount(np.eye(3), np.zeros(3))  # the own ship that cam_R_w2c tells of
+_CAMERA_ITSELF = Mount(np.eye(3), np.zeros(3))  # cam_R_w2c is taken as the pose of the own ship
 
 
 @dataclass
 class _Sequence:
-    """One scene as it is flown through."""
+    """State of the flight through one scene."""
 
     scene: BopScene
     fps: float
     in_ned: bool
-    places: dict[int, tuple[int, BopFrame]]  # by image id: its place among the scene's pictures
-    frames: list[int]  # of the sequence, that each of them is
+    places: dict[int, tuple[int, BopFrame]]  # by image id: its position among the scene's images
+    frames: list[int]  # frame number in the sequence of each of them
     errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
@@ -74,7 +74,7 @@ class _Sequence:
         return FIRST_FRAME_NS + round(self.frames[self.places[image_id][0]] * 1e9 / self.fps)
 
     def own_ship(self, image_id: int) -> OwnShip | None:
-        """The camera as a vehicle of its own: nose along the optical axes, mount nil."""
+        """The camera as a vehicle of its own: nose along the optical axis, mount without rotation."""
         k, frame = self.places[image_id]
         place = _place(frame)
         if not self.in_ned or place is None:
@@ -87,7 +87,7 @@ class _Sequence:
         return OwnShip(self.capture_ns(image_id), R_ned_cam, t_ned_cam_m, None, None)
 
     def _rates(self, k: int) -> tuple[Array, Array]:
-        """Turning [3], rad/s, and velocity [3], m/s, both in ned, between the frames before and after the k-th."""
+        """Angular rate [3], rad/s, and velocity [3], m/s, both in ned, between the frames before and after the k-th."""
         first, last = max(k - 1, 0), min(k + 1, len(self.places) - 1)
         before, after = _place(self.scene.frames[first]), _place(self.scene.frames[last])
         if before is None or after is None or first == last:
@@ -97,10 +97,10 @@ class _Sequence:
 
 
 def _by_number(image_ids: Sequence[int]) -> list[int]:
-    """Which frame each picture is, from 0, by their rising numbers: one left out is a frame that was not kept.
+    """Frame number of each image, from 0, by increasing image number: a gap is a frame that was not kept.
 
-    How far apart the numbers of two frames lie, the lesser gaps tell: where few frames were kept, most hold several.
-    Not the least of all: numbers may be times, which jitter.
+    The image number step of one frame is the lower quartile of the gaps: where few frames were kept, most gaps span
+    several. Not the minimum: numbers may be times, which jitter.
     """
     apart = [after - before for before, after in pairwise(image_ids)]
     frame = sorted(apart)[len(apart) // 4] if apart else 1
@@ -108,14 +108,14 @@ def _by_number(image_ids: Sequence[int]) -> list[int]:
 
 
 def _place(frame: BopFrame) -> tuple[Array, Array] | None:
-    """R_ned_cam [3, 3] and t_ned_cam_m [3]; None where the file does not say."""
+    """R_ned_cam [3, 3] and t_ned_cam_m [3]; None if the file does not state them."""
     if frame.R_cam_world is None or frame.t_cam_world_m is None:
         return None
     return frame.R_cam_world.T, -frame.R_cam_world.T @ frame.t_cam_world_m
 
 
 def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
-    """What the daemon would send of each picture if it flew through its scene; pictures must come in their order.
+    """What the daemon would send for each image if it flew through its scene; images must come in their order.
 
     Raises InputError if the model does not run.
     """
@@ -146,7 +146,7 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
 
 
 def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) -> tuple[TargetPose, ...]:
-    """`known` says of each whether its rotation is."""
+    """`known` says for each whether its rotation is known."""
     return tuple(
         TargetPose(
             index,
@@ -161,7 +161,7 @@ def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) 
 
 
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
-    """Windows around what is expected; the whole frame where they show nothing, and now and then for more."""
+    """Windows around the predicted boxes; the whole frame if they show nothing, and periodically for more targets."""
     found: list[Estimate] = []
     unhurried = sequence.pace.unhurried(frame.meta)
     if expected and estimator.has_track_stage:

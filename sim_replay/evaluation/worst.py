@@ -1,4 +1,4 @@
-"""The worst frames of an evaluation as one sheet of pictures, true and estimated box drawn on each."""
+"""The worst frames of an evaluation on one contact sheet, with true and estimated box."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ MISSES_SHOWN_MAX = 4
 _COLUMNS = 4
 _TILE_PX = 420
 _CAPTION_PX = 54
-_VIEW_SCALE = 2.6  # side of what is shown over the target's projected box
+_VIEW_SCALE = 2.6  # side of the cut-out over the target's projected box
 _VIEW_MIN_PX = 96
 
 
 def badness(match: Match) -> float:
-    """How many times over the limits of Pose@10°/5 % an estimate is; infinite for a target that was not found.
+    """An estimate's error as a multiple of the limits of Pose@10°/5 %; infinite for a missed target.
 
-    One whose rotation is not known is judged by its place.
+    If its rotation is unknown, only the position counts.
     """
     if match.estimate is None:
         return float("inf")
@@ -42,7 +42,7 @@ def badness(match: Match) -> float:
 
 
 def worst_matches(judged: Sequence[JudgedFrame], shown: int = SHOWN) -> list[tuple[JudgedFrame, Match]]:
-    """The `shown` worst targets, worst first; a few evenly spread misses stand for all of them."""
+    """The `shown` worst targets, worst first; a few evenly spread misses represent all of them."""
     ordered = sorted(((frame, match) for frame in judged for match in frame.matches), key=lambda p: -badness(p[1]))
     missed = [pair for pair in ordered if pair[1].estimate is None]
     found = [pair for pair in ordered if pair[1].estimate is not None]
@@ -52,7 +52,7 @@ def worst_matches(judged: Sequence[JudgedFrame], shown: int = SHOWN) -> list[tup
 
 
 def write_worst(path: Path, judged: Sequence[JudgedFrame], models: Mapping[int, Model]) -> Path | None:
-    """Write the sheet; None, and no file, where there is no target. Raises BopError on an unreadable picture."""
+    """Write the sheet; None, and no file, if there is no target. Raises BopError on an unreadable image."""
     tiles = [_tile(frame, match, models) for frame, match in worst_matches(judged)]
     if not tiles:
         return None
@@ -83,7 +83,7 @@ def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Imag
 
 
 def close_up(image_bgr: Image, K: Array, match: Match, extents: Extents, side_px: int) -> Image:
-    """The target's surroundings enlarged to [side_px, side_px, 3], true and estimated box drawn on them."""
+    """The target's surroundings enlarged to [side_px, side_px, 3], with true and estimated box."""
     truth, estimate = match.truth, match.estimate
     corners = project(extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, K)
     low, high = (np.zeros(2), np.array(image_bgr.shape[1::-1])) if corners is None else (corners.min(0), corners.max(0))
@@ -99,7 +99,7 @@ def close_up(image_bgr: Image, K: Array, match: Match, extents: Extents, side_px
 
 
 def _cut(image_bgr: Image, left: int, top: int, side: int) -> Image:
-    """A square of the picture; black where it reaches beyond."""
+    """A square of the image; black beyond its edges."""
     height, width = image_bgr.shape[:2]
     out = np.zeros((side, side, 3), dtype=np.uint8)
     rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))

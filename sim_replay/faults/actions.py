@@ -39,17 +39,17 @@ from sim_replay.play import PlayError
 
 FILLER = "filler"
 _BUSY = "while True: pass"
-LOOK_EVERY_N = 32  # datagrams of a flood between two looks at what is not read yet
+LOOK_EVERY_N = 32  # datagrams of a flood between two checks of the unread bytes
 QUEUED_MAX_BYTES = 50_000  # of the socket's 200 kB, as the kernel counts them
 QUEUE_LOOK_S = 0.001
-PACED_S = 30.0  # on a busy machine; what is left then comes as fast as it can
+PACED_S = 30.0  # on a busy machine; the rest is then sent as fast as possible
 
 
 @singledispatch
 def act(step: object, rig: Rig) -> str | None:
-    """Carry out a step that is an act; what there is to tell of it.
+    """Carry out a step that is an act; returns a text about it, if any.
 
-    Raises PlayError when the host does not let it, naming why, InputError when what it acts upon does not run.
+    Raises PlayError, with the reason, if the host does not allow it, InputError if its process is not running.
     """
     raise TypeError(f"{type(step).__name__} is no act")
 
@@ -96,7 +96,7 @@ def _flood(step: Flood, rig: Rig) -> str:
         for datagram in hostile.take_bytes(_datagrams(step, rig), step.total_bytes):
             send(datagram)
             sent += 1
-            # Of a faster flood the kernel would drop most, and the daemon never see it.
+            # The kernel would drop most of a faster flood before the daemon reads it.
             while sent % LOOK_EVERY_N == 0 and udp_queue(rig.mavlink_port)[0] > QUEUED_MAX_BYTES:
                 if time.monotonic() > paced_until_s:
                     break
@@ -135,7 +135,7 @@ def _disk(step: Disk, rig: Rig) -> None:
             raise PlayError("a disk can be filled only with `volume = true`")
         return
     _remount(rig, pid, "rw")
-    # The volume is seen by the daemon alone; /proc shows it to us.
+    # Only the daemon sees the volume; /proc gives access to it.
     filler = Path(f"/proc/{pid}/root{rig.recordings}") / FILLER
     filler.unlink(missing_ok=True)
     if step.full:

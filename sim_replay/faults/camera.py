@@ -2,8 +2,8 @@
 
     python -m sim_replay.faults.camera --scene DIR --listen tcp/127.0.0.1:7450 --fps 10
 
-Takes one JSON object a line on its standard input (frozen, stamp_offset_s, stamp_jitter_s), and prints one a line:
-`ready`, and each `frame` with the stamp it told and the true time of its exposure. Ends with its standard input.
+Reads one JSON object per line from standard input (frozen, stamp_offset_s, stamp_jitter_s), and prints one per line:
+`ready`, and each `frame` with the published stamp and the true time of its exposure. Stops at the end of its input.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TOPIC = f"{NODE}/{topics.IMAGE.name}"
 
 @dataclass(frozen=True)
 class Manners:
-    """What is wrong with it."""
+    """The camera's current defects."""
 
     frozen: bool = False
     stamp_offset_s: float = 0.0
@@ -42,7 +42,7 @@ class Manners:
 
 
 class Control(threading.Thread):
-    """Reads standard input; `manners` is replaced whole."""
+    """Reads standard input; each line replaces all of `manners`."""
 
     def __init__(self) -> None:
         super().__init__(name="control", daemon=True)
@@ -56,7 +56,7 @@ class Control(threading.Thread):
 
 
 def to_and_fro(number: int, count: int) -> int:
-    """Index of the picture to show: 0 … count-1 … 0 …, so that nothing leaps."""
+    """Index of the image to show: 0 … count-1 … 0 …, without jumps."""
     if count == 1:
         return 0
     phase = number % (2 * count - 2)
@@ -64,7 +64,7 @@ def to_and_fro(number: int, count: int) -> int:
 
 
 def play(scene: Path, listen: str, fps: float, control: Control) -> None:
-    """Publish until the control ends."""
+    """Publish until standard input ends."""
     pictures = [picture.path for picture in read_scene(scene)]
     with zenoh.open(router_config([listen])) as session, Node(session, NODE, name="driver") as node:
         publisher = node.publisher(topics.IMAGE)
@@ -78,7 +78,7 @@ def play(scene: Path, listen: str, fps: float, control: Control) -> None:
             stamp_ns = manners.stamp_ns(exposed_ns, number)
             kind = "png" if pictures[index].suffix.lower() == ".png" else "jpeg"
             image = CompressedImage(stamp_ns, "camera_optical_frame", kind, pictures[index].read_bytes())
-            # Told before it is sent, so that whoever sees a pose knows the frame that it is of.
+            # Printed before the frame is published, so that its reader knows the frame before any pose from it arrives.
             _emit({"event": "frame", "stamp_utc_ns": stamp_ns, "exposed_utc_ns": exposed_ns, "frozen": manners.frozen})
             publisher.put(image.encode())
             number = max(number + 1, int((time.monotonic() - begun_s) * fps))

@@ -1,4 +1,4 @@
-"""What must be seen after a fault; each waits for the event itself and tells how long it took."""
+"""What must be observed after a fault; each expectation waits for its event and reports the time it took."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Since:
-    """What the waiting counts from."""
+    """The reference from which waiting counts."""
 
-    acted_ns: int  # UTC, when the last act was over
-    began_ns: int  # UTC, when it began: the daemon may answer before it is over
+    acted_ns: int  # UTC, end of the last act
+    began_ns: int  # UTC, its beginning: the daemon may react before the act has ended
     counters: dict[str, int] = field(default_factory=dict)  # of the last diagnostics before it
 
 
 @dataclass(frozen=True)
 class Seen:
-    """`took_s` counts from the end of the last act; `text` says what was seen."""
+    """`took_s` counts from the end of the last act; `text` says what was observed."""
 
     text: str
     took_s: float
 
 
 class Unmet(AssertionError):
-    """What was expected was not seen in time; a sentence."""
+    """An expectation was not met in time; the text is a sentence."""
 
 
 @singledispatch
@@ -131,7 +131,7 @@ def _still(step: ExpectStill, rig: Rig, since: Since) -> Seen:
         nonlocal grown_ns, count
         if witness.counters.get(step.name, 0) != count:
             grown_ns, count = witness.counted_ns, witness.counters.get(step.name, 0)
-        # By the diagnostics' own times: none that came is no proof.
+        # Measured between diagnostics: if none arrive, that proves nothing.
         return witness.counted_ns - grown_ns >= step.for_s * NS
 
     if not witness.wait_for(still, step.within_s):
@@ -143,7 +143,7 @@ def _still(step: ExpectStill, rig: Rig, since: Since) -> Seen:
 
 
 def _unheard(name: str, rig: Rig) -> str:
-    """Of a counter that the diagnostics do not tell of: it never counted, or is written wrongly."""
+    """A note if the diagnostics have never contained this counter: it never counted, or its name is misspelt."""
     return "" if name in rig.witness.counters else " (which the daemon has not told of)"
 
 

@@ -1,4 +1,4 @@
-"""Datagrams that no daemon should trip over: noise, and MAVLink that is sound to the checksum and absurd within."""
+"""Hostile input for the daemon: noise, and MAVLink with valid checksums and absurd content."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _BOOT_MS = 5_000
 
 
 def random_datagrams(chance: random.Random) -> Iterator[bytes]:
-    """Of any length; every second one begins like MAVLink 2."""
+    """Of random length; every second one begins like MAVLink 2."""
     while True:
         yield chance.randbytes(chance.randrange(1, DATAGRAM_MAX))
         yield b"\xfd" + chance.randbytes(chance.randrange(1, 300))
 
 
 def hostile_datagrams() -> Iterator[bytes]:
-    """Valid checksums: telemetry of another system or component, NaN, infinities, no rotations, absurd places."""
+    """Valid checksums: telemetry of another system or component, NaN, infinities, no rotations, absurd positions."""
     vehicle = MAVLink(None, srcSystem=VEHICLE, srcComponent=1)
     strangers = (
         MAVLink(None, srcSystem=STRANGE_SYSTEM, srcComponent=1),
@@ -39,14 +39,14 @@ def hostile_datagrams() -> Iterator[bytes]:
 
 
 def _packed(mav: Any, message: Any) -> bytes:
-    """As pymavlink packs it: ours would refuse what is not finite."""
+    """Packed by pymavlink: our own encoder rejects non-finite values."""
     packed = bytes(message.pack(mav))
     mav.seq = (mav.seq + 1) % 256
     return packed
 
 
 def take_bytes(datagrams: Iterable[bytes], total: int) -> Iterator[bytes]:
-    """As many as hold `total` bytes together."""
+    """Datagrams until they add up to `total` bytes."""
     for datagram in datagrams:
         yield datagram
         total -= len(datagram)
@@ -55,7 +55,7 @@ def take_bytes(datagrams: Iterable[bytes], total: int) -> Iterator[bytes]:
 
 
 def _absurd() -> list[Any]:
-    """What no aircraft is: none of it may reach the own ship."""
+    """Impossible values, none of which may reach the own-ship state."""
     nan, inf = math.nan, math.inf
     attitude, place = dialect.MAVLink_attitude_quaternion_message, dialect.MAVLink_local_position_ned_message
     return [
@@ -81,7 +81,7 @@ def _absurd() -> list[Any]:
 
 
 def _upside_down() -> list[Any]:
-    """Sound in itself, and not our vehicle's."""
+    """Valid in itself, but not from our vehicle."""
     fixed_wing, autopilot = dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
     return [
         dialect.MAVLink_heartbeat_message(fixed_wing, autopilot, 0, 0, dialect.MAV_STATE_ACTIVE, 3),

@@ -1,6 +1,6 @@
-"""What must hold all the time, whatever breaks: no peer is given anything stale, invented or invalid. Pure.
+"""Invariants that must hold under any fault: no peer receives anything stale, invented or invalid. Pure.
 
-Judged are all poses, and all other messages that tell of a target or of the own attitude.
+All poses are checked, and all other messages about a target or the own attitude.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from msgs.geometry import q_wxyz_from_R
 from sim_replay.faults.messages import ReceivedMessage
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose, Witness
 
-# The daemon's own limits on a measurement's age, and what a loaded host may add between its look and the peer's.
+# The daemon's own limits on a measurement's age, and what a loaded host may add from that check until it arrives.
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
 TRANSIT_MAX_NS = 900_000_000
 SAME_FRAME_NS = 30_000_000
-# The rig's own ship hovers level and looks north through a camera along its nose.
+# The rig's own ship hovers level, facing north, with a camera along its nose.
 Q_NED_CAM_WXYZ = q_wxyz_from_R(R_BODY_CAM_FORWARD)
 ATTITUDE_TOLERANCE = 1e-2
-# To refuse these is right: what a relay spoiled, and what comes as from the system that another has just replaced.
+# These may be refused: packets that a relay corrupted, and messages under the system id of a replaced autopilot.
 MAY_REFUSE = {
     AUTOPILOT: ("not MAVLink", "unknown message", "not from a component of this vehicle"),
 }
 
 
 def violations(witness: Witness) -> list[str]:
-    """Sentences, none if all was well, of a run that is over."""
+    """Violations over a run that has ended, as sentences; empty if there are none."""
     found = faults_since(witness)
     for name, summary in witness.summaries:
         refused = summary["refused"].items()
@@ -38,28 +38,30 @@ def violations(witness: Witness) -> list[str]:
 
 
 def faults_since(witness: Witness, poses: int = 0, messages: int = 0) -> list[str]:
-    """Sentences, none if all was well, of what the peers received after so many poses and messages."""
+    """Violations among what the peers received after this many poses and messages, as sentences."""
     sent_on_time = [one for one in witness.poses[poses:] if not _held_back(one, witness.held_back)]
     told_on_time = [one for one in witness.messages[messages:] if not _held_back(one, witness.held_back)]
     return pose_faults(sent_on_time, witness.frames) + message_faults(told_on_time, witness.frames)
 
 
 def pose_faults(poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame]) -> list[str]:
-    """Sentences for poses that should not have come. A camera's wrong stamps are seen through: ages count from the
-    true exposure."""
+    """Violations among the poses, as sentences. Wrong stamps of the camera do not matter: ages count from the true
+    exposure.
+    """
     exposures = _Exposures(frames)
     return [text for pose in poses if (text := _fault_of(pose, exposures))]
 
 
 def message_faults(messages: Sequence[ReceivedMessage], frames: Sequence[ExposedFrame]) -> list[str]:
-    """The same for other messages. One without a stamp speaks of now: a living frame must have been exposed just
-    before it came."""
+    """The same for other messages. One without a stamp describes the present: a frame that is not frozen must have been
+    exposed just before it arrived.
+    """
     exposures = _Exposures(frames)
     return [text for message in messages if (text := _fault_of_message(message, exposures))]
 
 
 def ages_ms(witness: Witness, peer: str) -> list[float]:
-    """Age on receipt of each pose, by its own stamp, sorted."""
+    """Age on arrival of each pose, by its own stamp, sorted."""
     return sorted((pose.arrival_ns - pose.capture_ns) / 1e6 for pose in witness.poses if pose.peer == peer)
 
 
@@ -76,11 +78,11 @@ class _Exposures:
         self._living = sorted(frame.exposed_ns for frame in frames if not frame.frozen)
 
     def any_living(self, from_ns: int, to_ns: int) -> bool:
-        """Whether a picture that shows something new was exposed then."""
+        """Whether an image that is not frozen was exposed in this interval."""
         return bisect.bisect_left(self._living, from_ns) < bisect.bisect_right(self._living, to_ns)
 
     def of(self, capture_ns: int) -> list[ExposedFrame]:
-        """Those told with this stamp, or else told with one so wrong that their arrival may have taken its place."""
+        """Frames with this stamp, or else wrongly stamped ones whose arrival time may have replaced their stamp."""
         first = bisect.bisect_left(self._stamps, capture_ns - SAME_FRAME_NS)
         last = bisect.bisect_right(self._stamps, capture_ns + SAME_FRAME_NS)
         if first < last:
@@ -121,7 +123,7 @@ def _stamp_fault(told: str, peer: str, capture_ns: int, arrival_ns: int, exposur
 
 
 def _held_back(received: ReceivedPose | ReceivedMessage, windows: Sequence[tuple[int, int]]) -> bool:
-    """Whether it was sent to the ground into a link that kept it."""
+    """Whether it was sent to the ground while the link held data back."""
     capture_ns = received.capture_ns
     if received.peer != SUBSCRIBER or capture_ns is None:
         return False
@@ -130,6 +132,6 @@ def _held_back(received: ReceivedPose | ReceivedMessage, windows: Sequence[tuple
 
 
 def _attitude_holds(pose: ReceivedPose) -> bool:
-    """Whether the own attitude is the true one, or said to be unknown."""
+    """Whether the own attitude is the true one, or marked as unknown."""
     q = pose.q_ned_cam_wxyz
     return q is None or not any(q) or bool(abs(np.dot(q, Q_NED_CAM_WXYZ)) >= 1.0 - ATTITUDE_TOLERANCE)

@@ -1,6 +1,6 @@
-"""What the peers received beside the poses: of which exposure each message is, and whether it can be true. Pure.
+"""Messages that the peers received besides poses: which exposure each belongs to, and whether it is plausible. Pure.
 
-The rig's own ship hovers level and looks north: a target on the globe lies north of it.
+The rig's own ship hovers level, facing north: a target's global position is north of it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ METRES_A_DEGREE = 111_195.0
 RANGE_TOLERANCE = 0.02
 LEVEL_TOLERANCE = 1e-2
 IDLE = dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
-# What tells of a target, by the name of the message or topic.
+# Messages and topics about a target, by name.
 KINDS = (
     *("CAMERA_TRACKING_IMAGE_STATUS", "CAMERA_TRACKING_GEO_STATUS", "FOLLOW_TARGET", "ADSB_VEHICLE"),
     *("odom", "detections", "tf"),
@@ -36,12 +36,12 @@ class ReceivedMessage:
     peer: str
     kind: str
     arrival_ns: int
-    capture_ns: int | None  # as it says; None: it has no stamp, and speaks of when it comes
-    fault: str | None  # why it cannot be true, whenever it came
+    capture_ns: int | None  # as stated in the message; None: no stamp, it describes the time of its arrival
+    fault: str | None  # why it cannot be true, regardless of the time
 
 
 def from_mavlink(record: dict[str, Any], utc_ns: Callable[[int], int]) -> ReceivedMessage | None:
-    """A `message` line of the autopilot (`utc_ns` turns monotonic into UTC); None if it tells of no target."""
+    """A `message` line of the autopilot (`utc_ns` converts monotonic to UTC); None if it is not about a target."""
     kind = record["message"]
     if kind not in KINDS or (kind == "CAMERA_TRACKING_IMAGE_STATUS" and record["tracking_status"] == IDLE):
         return None

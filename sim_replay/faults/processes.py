@@ -1,4 +1,4 @@
-"""The processes of a rig: each started, heard line by line, signalled and ended by its own id."""
+"""The processes of a rig: each is started, read line by line, signalled and ended by its own id."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 _END_S = 10.0
 
-Heard = Callable[[str, int], None]  # a line, and when it came (monotonic ns)
+Heard = Callable[[str, int], None]  # a line, and its arrival time (monotonic ns)
 
 
 class Process:
-    """A child process whose standard output and error are one stream of lines for `heard`, in a thread of its own.
+    """A child process; a thread passes each line of its standard output and error to `heard`.
 
     `ended` is called in the same thread once there is an exit code.
     """
@@ -40,18 +40,18 @@ class Process:
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs; minus the signal's number if one ended it."""
+        """None while it runs; minus the signal's number if a signal ended it."""
         return self._popen.poll()
 
     def wait(self, within_s: float) -> int | None:
-        """Its exit code, as soon as there is one; None if it still runs after `within_s`."""
+        """Its exit code as soon as there is one; None if it is still running after `within_s`."""
         try:
             return self._popen.wait(within_s)
         except subprocess.TimeoutExpired:
             return None
 
     def tell(self, line: str) -> None:
-        """A line for its standard input."""
+        """Write a line to its standard input."""
         assert self._popen.stdin is not None
         self._popen.stdin.write(line + "\n")
         self._popen.stdin.flush()
@@ -60,7 +60,7 @@ class Process:
         self._popen.send_signal(number)
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """End it, by force if it does not heed the signal; its exit code, once its last line was heard."""
+        """End it, by force if it ignores the signal; returns its exit code once all its output was read."""
         if self._popen.poll() is None:
             self._popen.send_signal(number)
             self._popen.send_signal(signal.SIGCONT)

@@ -1,4 +1,4 @@
-"""Links that can be cut, slowed and spoiled: a UDP relay for MAVLink and a TCP relay for zenoh, each on loopback."""
+"""Links that can be cut, delayed and corrupted: a UDP relay for MAVLink and a TCP relay for zenoh, each on loopback."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ _MAVLINK_2 = 0xFD
 
 @dataclass(frozen=True)
 class LinkState:
-    """How a link is just now."""
+    """Current state of a link."""
 
     cut: bool = False
     delay_s: float = 0.0
     corrupt: float = 0.0  # share of packets with one flipped bit
-    drop_ids: frozenset[int] = frozenset()  # MAVLink messages that do not get through
+    drop_ids: frozenset[int] = frozenset()  # MAVLink messages that are dropped
 
 
 class UdpRelay:
-    """Stands between an autopilot, which sends to `port`, and a daemon that listens at `daemon`.
+    """Connects an autopilot, which sends to `port`, with a daemon that listens at `daemon`.
 
-    The daemon sees one address whoever speaks as the autopilot, as behind a serial line. `tape` keeps what it said.
+    The daemon sees one address whichever process sends as the autopilot, as on a serial line. `tape` keeps what the
+    autopilot sent.
     """
 
     def __init__(self, daemon: Address, seed: int = 0) -> None:
@@ -118,9 +119,9 @@ class UdpRelay:
 
 
 class TcpRelay:
-    """Stands between who connects to `port` and a server at `upstream`.
+    """Connects clients of `port` with a server at `upstream`.
 
-    A cut holds the bytes back, as a radio does: both ends see silence, not the end of the connection.
+    A cut holds the bytes back, as a radio does: both ends see silence, not a closed connection.
     """
 
     def __init__(self, upstream: Address, seed: int = 0) -> None:
@@ -186,7 +187,7 @@ class TcpRelay:
         source.close()
 
     def _send_all(self, sink: socket.socket, data: bytes) -> None:
-        """Like sendall, but ends with the relay. Raises OSError."""
+        """Like sendall, but stops when the relay closes. Raises OSError."""
         while data and not self._stopping.is_set():
             with contextlib.suppress(TimeoutError):
                 data = data[sink.send(data) :]
@@ -206,7 +207,7 @@ def flip_a_bit(data: bytes, chance: random.Random) -> bytes:
 
 
 def udp_queue(port: int) -> tuple[int, int]:
-    """Bytes that wait to be read at a local UDP port, as the kernel counts them, and datagrams dropped there so far."""
+    """Unread bytes at a local UDP port, as the kernel counts them, and datagrams dropped there so far."""
     for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
         columns = line.split()
         if int(columns[1].rpartition(":")[2], 16) == port:

@@ -36,19 +36,19 @@ from sim_replay.play import PlayError
 from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
 
 START_S = 120.0
-UPTIME_NS = 734_567_891_234  # of an autopilot that was there before
+UPTIME_NS = 734_567_891_234  # of an autopilot that was already running
 VOLUME_MB = 4
 UAV = "uav1"
-# The subscriber tells of everything, however late: what is stale is for the judge to say.
+# The subscriber reports everything, however late: the judge decides what is stale.
 PATIENT = ("--wait-s", str(START_S), "--all", "--max-age-s", "3600")
 KEY = "mavlink.key"
 ICAO_ADDRESS = 0xF00000
-SERVING: tuple[Who, ...] = ("camera", "router", "daemon")  # each listens at a port that is its own throughout
+SERVING: tuple[Who, ...] = ("camera", "router", "daemon")  # each listens at its own port throughout
 
 
 @dataclass(frozen=True)
 class RigSettings:
-    """What flies. With `volume`, recordings go to a small file system of their own, that can be filled."""
+    """What flies. With `volume`, recordings go to a small file system of their own that can be filled."""
 
     out: Path
     scene: Path = BUNDLED_SEQUENCE
@@ -59,7 +59,7 @@ class RigSettings:
 
 
 class Rig:
-    """Started by `with`; afterwards every process is gone and `daemon.log` is in the folder."""
+    """Used with `with`; afterwards all processes have ended and `daemon.log` is in the folder."""
 
     def __init__(self, settings: RigSettings) -> None:
         self.settings = settings
@@ -87,7 +87,7 @@ class Rig:
         self.close()
 
     def close(self) -> None:
-        """End all, peers first, so that their summaries hold all that the daemon sent."""
+        """End all, peers first, so that their summaries cover all that the daemon sent."""
         for process in (*self.extras, *self.processes.values()):
             if process.exit_code is None:
                 process.send_signal(signal.SIGCONT)
@@ -106,7 +106,7 @@ class Rig:
         return self.processes["daemon"]
 
     def running(self, who: Who) -> Process:
-        """Raises InputError if it has ended: then there is nothing to act upon."""
+        """Raises InputError if it has ended, so that there is nothing to act on."""
         process = self.processes[who]
         if process.exit_code is not None:
             raise InputError(f"the {who} does not run any more: the timeline must `start` it before it acts upon it")
@@ -114,7 +114,7 @@ class Rig:
 
     @property
     def own_endpoint(self) -> str:
-        """Where the daemon serves tools on board."""
+        """Where the daemon serves on-board tools."""
         return f"tcp/{LOOPBACK}:{self._own_port}"
 
     @property
@@ -127,13 +127,12 @@ class Rig:
         return self.settings.out.resolve() / "recordings"
 
     def start(self, step: Start) -> None:
-        """Start a process and wait until it is ready; one of that name that still runs is killed.
+        """Start a process and wait until it is ready; a running one of that name is killed.
 
-        Of those that serve, the port must first be free again. An autopilot is killed when the next one speaks, but
-        first if that comes with another clock: of two that speak in turn, each would seem to start again when the
-        other has spoken.
+        For a server, the port must first be free again. An autopilot is killed once its successor sends, but before
+        that if the successor has another clock: if two send alternately, each change of sender looks like a reboot.
 
-        Raises InputError if the daemon refuses its configuration, PlayError if anything else does not start.
+        Raises InputError if the daemon rejects its configuration, PlayError if anything else does not start.
         """
         who = step.who
         before = self.processes.get(who)
@@ -240,7 +239,7 @@ class Rig:
 
 
 def at_rest() -> Telemetry:
-    """An own ship that hovers level, looking north: faults are not about flying."""
+    """An own ship that hovers level, facing north: these tests are not about flying."""
     row = np.zeros(len(COLUMNS) - 1)
     row[0] = 1.0
     row[9], row[-3:] = -OWN_UP_M, OWN_LAT_LON_ALT
@@ -248,13 +247,13 @@ def at_rest() -> Telemetry:
 
 
 def in_volume(folder: Path) -> list[str | Path]:
-    """What to put before a command so that `folder` is a small file system that only this command sees."""
+    """Prefix for a command, so that `folder` is a small file system that only this command sees."""
     script = f'mount -t tmpfs -o size={VOLUME_MB}m none "$0" && exec "$@"'
     return ["unshare", "--map-root-user", "--mount", "sh", "-c", script, folder]
 
 
 def can_mount(folder: Path) -> bool:
-    """Whether this host lets a user do so."""
+    """Whether this host allows a user to do so."""
     if shutil.which("unshare") is None:
         return False
     tried = subprocess.run([*in_volume(folder.resolve()), "true"], capture_output=True, check=False)

@@ -1,4 +1,4 @@
-"""`uavpose-replay faults`: play a timeline of faults on the real daemon and tell what followed, and when."""
+"""`uavpose-replay faults`: play a timeline of faults on the real daemon and report the reactions and their times."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ Say = Callable[[str], None]
 
 @dataclass
 class Outcome:
-    """What a timeline came to: what was seen at each step, and what should not have been."""
+    """Result of a timeline: what was observed at each step, and violations."""
 
     title: str
     seen: list[dict[str, Any]] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
 
     def recovery(self) -> str:
-        """In a line: when processes were up again, poses came again, and the daemon ended when told to."""
+        """In one line: when processes ran again, when poses arrived again, and when the daemon ended on request."""
         told = [one["seen"] for one in self.seen if one["step"]["do"] in ("start", "expect_poses", "expect_exit")]
         return "; ".join(told)
 
 
 def play_timeline(rig: Rig, timeline: Timeline, say: Say) -> Outcome:
-    """Carry out every step on a running rig, first waiting until both peers have poses; stops at the first unmet."""
+    """Run every step on a running rig, once both peers receive poses; stops at the first unmet expectation."""
     outcome = Outcome(timeline.title)
     say(timeline.title)
     now_ns = time.time_ns()
@@ -81,7 +81,7 @@ def _take(step: Step, rig: Rig, since: Since, outcome: Outcome, say: Say) -> Sin
 
 
 def register(commands: Any) -> None:
-    """Add the command to what argparse's add_subparsers() gave; it sets `run`, a function of the parsed arguments."""
+    """Add the command to what add_subparsers() returned; it sets `run`, a function of the parsed arguments."""
     parser = commands.add_parser(
         "faults",
         help="break cameras, links, disks and peers of the real daemon by a timeline, and see it recover",
@@ -105,7 +105,7 @@ def bundled() -> list[str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the timelines one after the other on one rig. Raises InputError for a timeline that does not do."""
+    """Play the timelines one after the other on one rig. Raises InputError for an invalid timeline."""
     timelines = [load_timeline(timeline_path(name)) for name in args.timeline]
     if not args.model.is_file():
         raise InputError(f"--model {args.model}: is no file")
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def timeline_path(name: str) -> Path:
-    """The file of a timeline: one that comes with the package, or a path. Raises InputError where it is neither."""
+    """The file of a timeline: a bundled one, or a path. Raises InputError if it is neither."""
     if name in bundled():
         return TIMELINES / f"{name}.toml"
     if not Path(name).is_file():

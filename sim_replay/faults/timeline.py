@@ -1,4 +1,4 @@
-"""The schema of a timeline: steps in their order, each an act upon the rig or something that must then be seen.
+"""The schema of a timeline: steps in order, each an act on the rig or an expectation.
 
 title = "The autopilot's link is cut for six seconds"
 
@@ -45,7 +45,7 @@ def _expression(pattern: str) -> str:
 
 
 Pattern = Annotated[str, AfterValidator(_expression)]
-WITHIN_S = 60.0  # a loaded machine takes its time; what was taken is reported
+WITHIN_S = 60.0  # enough for a loaded machine; the time it took is reported
 
 
 class Hold(Section):
@@ -71,7 +71,7 @@ class Start(Section):
 
 
 class Signal(Section):
-    """STOP freezes a process, CONT lets it go on; after KILL and TERM it is waited for."""
+    """STOP freezes a process, CONT resumes it; KILL and TERM wait for its end."""
 
     do: Literal["signal"]
     who: Who
@@ -79,7 +79,7 @@ class Signal(Section):
 
 
 class Camera(Section):
-    """What the camera does from now on; what is left out is as it should be."""
+    """How the camera behaves from now on; what is left out returns to normal."""
 
     do: Literal["camera"]
     frozen: bool = Field(default=False, description="the same picture, stamped anew")
@@ -88,7 +88,7 @@ class Camera(Section):
 
 
 class Link(Section):
-    """How a link is from now on; what is left out is as it should be, so `which` alone mends it."""
+    """State of a link from now on; what is left out returns to normal, so `which` alone restores it."""
 
     do: Literal["link"]
     which: Literal["mavlink", "zenoh"] = Field(description="daemon to autopilot, or daemon to router")
@@ -113,7 +113,7 @@ class Link(Section):
 
 
 class Flood(Section):
-    """Datagrams at the daemon's MAVLink port, as fast as they go."""
+    """Datagrams to the daemon's MAVLink port, as fast as it reads them."""
 
     do: Literal["flood"]
     what: Literal["random", "hostile", "replay"] = Field(
@@ -124,14 +124,14 @@ class Flood(Section):
 
 
 class SlowSubscriber(Section):
-    """A second subscriber, frozen once it has subscribed, or let go of."""
+    """A second subscriber, frozen once it has subscribed, or removed."""
 
     do: Literal["slow_subscriber"]
     there: bool = True
 
 
 class Disk(Section):
-    """What the recorder's disk lets be written from now on; what is left out is as it should be."""
+    """What the recorder's disk accepts from now on; what is left out returns to normal."""
 
     do: Literal["disk"]
     full: bool = Field(default=False, description="no byte more on the volume; needs `volume = true`")
@@ -140,7 +140,7 @@ class Disk(Section):
 
 
 class ModelFile(Section):
-    """The file that the configuration names; `signal daemon HUP` has it read."""
+    """The file named in the configuration; `signal daemon HUP` makes the daemon read it."""
 
     do: Literal["model_file"]
     content: Literal["good", "cut_short"]
@@ -163,7 +163,7 @@ class ExpectPoses(Section):
 
 
 class ExpectSilence(Section):
-    """No pose for so long."""
+    """No pose for this long."""
 
     do: Literal["expect_silence"]
     at: Peer = "both"
@@ -172,7 +172,7 @@ class ExpectSilence(Section):
 
 
 class ExpectState(Section):
-    """The daemon's state and its reasons, as its diagnostics tell them to a subscriber."""
+    """The daemon's state and its reasons, as a subscriber receives them in the diagnostics."""
 
     do: Literal["expect_state"]
     pattern: Pattern = Field(
@@ -190,7 +190,7 @@ class ExpectSaid(Section):
 
 
 class ExpectCounter(Section):
-    """A counter of the daemon's diagnostics, as a subscriber hears them, grown since the last act."""
+    """A counter in the daemon's diagnostics, as a subscriber receives them, has grown since the last act."""
 
     do: Literal["expect_counter"]
     name: str
@@ -199,7 +199,7 @@ class ExpectCounter(Section):
 
 
 class ExpectStill(Section):
-    """Such a counter that does not grow for so long."""
+    """Such a counter does not grow for this long."""
 
     do: Literal["expect_still"]
     name: str
@@ -236,7 +236,7 @@ Step = Annotated[
 
 
 class Timeline(Section):
-    """It begins once both peers have poses."""
+    """It begins once both peers receive poses."""
 
     title: str
     signed: bool = Field(default=False, description="daemon and autopilot sign all that they say")
@@ -252,7 +252,7 @@ class Timeline(Section):
 
 
 def load_timeline(path: Path) -> Timeline:
-    """Raises InputError: one line a fault, each naming file, step and key."""
+    """Raises InputError: one line per error, each naming file, step and key."""
     return load_settings(path, Timeline, InputError, _step_and_key)
 
 

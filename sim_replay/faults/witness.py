@@ -1,4 +1,4 @@
-"""What was seen of a run: frames as the camera exposed them, poses as the peers received them, words of the daemon."""
+"""What was observed of a run: frames exposed by the camera, poses received by the peers, lines logged by the daemon."""
 
 from __future__ import annotations
 
@@ -22,40 +22,40 @@ class ExposedFrame:
     """Times are UTC."""
 
     exposed_ns: int
-    stamp_ns: int  # as the camera told it
-    frozen: bool  # the picture before, once more
+    stamp_ns: int  # as published by the camera
+    frozen: bool  # the previous image again
 
 
 @dataclass(frozen=True)
 class ReceivedPose:
-    """A pose that a peer found valid. Times are UTC."""
+    """A pose that a peer accepted as valid. Times are UTC."""
 
     peer: str
-    capture_ns: int  # as it says
+    capture_ns: int  # as stated in the pose
     arrival_ns: int
-    q_ned_cam_wxyz: tuple[float, ...] | None = None  # own attitude it was told with; zeros: unknown; None: not told
+    q_ned_cam_wxyz: tuple[float, ...] | None = None  # own attitude sent with it; zeros: unknown; None: not sent
 
 
 @dataclass
 class Witness:
-    """Written by the readers of all processes; `wait_for` is how anything waits for anything."""
+    """Filled by the reader threads of all processes; every wait uses `wait_for`."""
 
     frames: list[ExposedFrame] = field(default_factory=list)
     poses: list[ReceivedPose] = field(default_factory=list)
-    messages: list[ReceivedMessage] = field(default_factory=list)  # all else that tells of targets
-    held_back: list[tuple[int, int]] = field(default_factory=list)  # UTC ns: when a link kept what it was given
+    messages: list[ReceivedMessage] = field(default_factory=list)  # all other messages about targets
+    held_back: list[tuple[int, int]] = field(default_factory=list)  # UTC ns: intervals in which a link held data back
     said: list[tuple[int, str]] = field(default_factory=list)  # UTC ns, a line of the daemon's log
     counters: dict[str, int] = field(default_factory=dict)  # of the newest diagnostics
-    state: str = ""  # of the same, with its reasons
-    counted_ns: int = 0  # UTC when both came
+    state: str = ""  # with its reasons, of the same diagnostics
+    counted_ns: int = 0  # UTC when both arrived
     ready: set[str] = field(default_factory=set)
     summaries: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)  # of other processes than the daemon
+    complaints: list[str] = field(default_factory=list)  # other output of processes than the daemon
     _changed: threading.Condition = field(default_factory=threading.Condition)
     _clock: UtcClock = field(default_factory=UtcClock)
 
     def wait_for(self, seen: Callable[[], bool], within_s: float) -> bool:
-        """Whether `seen` came true; it is asked with the witness held still, at each change and ten times a second."""
+        """Whether `seen` came true; evaluated with the witness locked, at each change and ten times per second."""
         deadline_s = time.monotonic() + within_s
         with self._changed:
             while not seen():
@@ -71,7 +71,7 @@ class Witness:
             self._changed.notify_all()
 
     def hear(self, name: str, line: str) -> None:
-        """A line of another process: a JSON object, or else a complaint."""
+        """A line of another process: a JSON object, otherwise stored as a complaint."""
         try:
             record = json.loads(line)
             event = record["event"]
@@ -86,12 +86,12 @@ class Witness:
             self.ready.discard(name)
 
     def forget_counters(self) -> None:
-        """The daemon's count from 0 again."""
+        """The daemon's counters start at 0 again."""
         with self._changed:
             self.counters = {}
 
     def zenoh_cut(self, cut: bool, now_ns: int) -> None:
-        """The link to the ground keeps what it is given from now on, or gives it out."""
+        """From now on the link to the ground holds data back, or releases it."""
         with self._changed:
             if cut:
                 self.held_back.append((now_ns, NEVER_NS))
