@@ -1,1 +1,1 @@
-"""The benchmark: datasets made from a preset and a seed, their statistics, and how fast they are made."""
+"""The benchmark: datasets generated from a preset and a seed, their statistics, and the speed of generating them."""

@@ -1,4 +1,4 @@
-"""`uavpose-replay bench`: how fast this machine makes whole frames and training windows."""
+"""`uavpose-replay bench`: how fast this machine generates whole frames and training windows."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ Kind = Literal["frames", "windows"]
 
 @dataclass(frozen=True)
 class Measured:
-    """What one worker did in its time."""
+    """One worker's result."""
 
     count: int
     seconds: float
-    renderer: str  # as OpenGL names it
+    renderer: str  # as reported by OpenGL
 
     @property
     def rate(self) -> float:
-        """A second."""
+        """Per second."""
         return self.count / self.seconds
 
 
 def _measure(kind: Kind, seconds: float, worker: int, tell: Tell, stopped: Stopped) -> Measured:
-    """A crew's task: warm up, then draw for so long."""
+    """A crew's task: warm up, then render for `seconds`."""
     return _frames(seconds, worker) if kind == "frames" else _windows(seconds, worker)
 
 
 def _frames(seconds: float, worker: int) -> Measured:
-    """Frames of fw-uav6d, drawn, labelled, compressed and written as `generate` does."""
+    """Frames of fw-uav6d, rendered, labelled, compressed and written as `generate` does."""
     preset = load_preset("fw-uav6d")
     plans = plan_dataset(preset, 0)
     plan = plans[worker % len(plans)]
@@ -85,7 +85,7 @@ def _renderer_name() -> str:
 
 
 def cpu_name() -> str:
-    """The processor's model, as Linux tells it."""
+    """The processor's model, as reported by Linux."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -95,7 +95,7 @@ def cpu_name() -> str:
 
 
 def bench(seconds: float, workers: int) -> dict[str, Any]:
-    """Rates of each worker and together, all workers drawing at once. Raises CrewError."""
+    """Rates of each worker and in total, all workers rendering at once. Raises CrewError."""
     out: dict[str, Any] = {"cpu": cpu_name(), "cores": available_cores(), "workers": workers, "seconds": seconds}
     for kind in ("frames", "windows"):
         results = _run_all(kind, seconds, workers)
@@ -110,7 +110,7 @@ def _run_all(kind: Kind, seconds: float, workers: int) -> Sequence[Measured]:
 
 
 def run(seconds: float, workers: int | None, as_json: bool) -> int:
-    """Measure and print. Exit codes: 0 measured, 1 a worker could not go on. Raises InputError."""
+    """Measure and print. Exit codes: 0 measured, 1 a worker failed. Raises InputError."""
     chosen = available_cores() if workers is None else workers
     if seconds <= 0 or chosen < 1:
         raise InputError("--seconds and --workers: must be above 0")

@@ -1,4 +1,4 @@
-"""The benchmark's sub-commands of `uavpose-replay`. What they need beyond replay (OpenGL, JSBSim) loads on use."""
+"""The benchmark's sub-commands of `uavpose-replay`. Extra dependencies (OpenGL, JSBSim) are imported on use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RENDER_PACKAGES = ("moderngl", "jsbsim", "av")
 
 
 def register(commands: Any) -> None:
-    """Add them to what argparse's add_subparsers() gave; each sets `run`, a function of the parsed arguments."""
+    """Add them to what argparse's add_subparsers() returned; each sets `run`, a function of the parsed arguments."""
     _generate(commands)
     _stats(commands)
     _bench(commands)
@@ -61,7 +61,7 @@ def _run_generate(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _extra_packages() -> Iterator[None]:
-    """Tell of a missing package of the render extra in a sentence. Raises InputError."""
+    """Report a missing package of the render extra in a sentence. Raises InputError."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -41,7 +41,7 @@ def _inset(image_bgr: Image, box: NDArray[np.float64]) -> Image:
 
 
 def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
-    """A small picture [225, 400, 3] of the frame [H, W, 3]: boxes, the first target enlarged, its name and range."""
+    """A thumbnail [225, 400, 3] of the frame [H, W, 3]: boxes, the first target enlarged, its name and range."""
     scale = np.array(TILE_WH_PX) / image_bgr.shape[1::-1]
     out = np.asarray(cv2.resize(image_bgr, TILE_WH_PX, interpolation=cv2.INTER_AREA), np.uint8)
     boxes = [box for k in range(len(frame.targets)) if (box := _box(frame, k)) is not None]
@@ -49,7 +49,7 @@ def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
         corners = np.round((box.reshape(2, 2) + 0.5) * scale - 0.5 + [[-2, -2], [2, 2]]).astype(int)
         cv2.rectangle(out, [int(v) for v in corners[0]], [int(v) for v in corners[1]], BOX_BGR, 1)
     if boxes:
-        # In the corner that the target is not in.
+        # In a corner where the target is not.
         middle = 0.5 * (boxes[0][:2] + boxes[0][2:]) * scale
         left = TILE_WH_PX[0] - INSET_PX if middle[0] < 0.5 * TILE_WH_PX[0] else 0
         top = TILE_WH_PX[1] - INSET_PX if middle[1] < 0.5 * TILE_WH_PX[1] else 0
@@ -74,7 +74,7 @@ def _caption(tile_bgr: Image, text: str) -> None:
 
 
 def _chosen(scenes: Sequence[BopScene]) -> list[tuple[BopScene, BopFrame]]:
-    """Frames spread over the scenes: one of each in turn, from another part of the flight each time."""
+    """Frames spread over the scenes: one of each in turn, from a different part of the flight each time."""
     pictured = [(scene, scene.pictured) for scene in scenes]
     pictured = [(scene, frames) for scene, frames in pictured if frames]
     count = min(COLUMNS * ROWS, sum(len(frames) for _, frames in pictured))

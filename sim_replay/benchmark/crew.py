@@ -1,8 +1,8 @@
-"""Worker processes that do tasks side by side, each with whatever it needs (a renderer) of its own.
+"""Worker processes that run tasks in parallel, each with its own resources (a renderer).
 
-The parent hands out tasks through a pipe to each worker and hears of the work through the same pipe. Whatever arrives
-at a worker while it is at work, also the end of the pipe when the parent was killed, means: stop at the next chance.
-So nothing outlives the parent, however it ends.
+The parent exchanges tasks and results with each worker through a pipe. Anything that arrives at a busy worker, also
+the end of the pipe when the parent was killed, means: stop at the next opportunity. So no worker outlives the parent,
+however it ends.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from edge.errors import InputError
 from sim_replay.flight import FlightError
 from sim_replay.render.backdrop import BackdropError
 
-STOP_TIMEOUT_S = 60.0  # for the frame in hand, on a slow machine
+STOP_TIMEOUT_S = 60.0  # for the frame in progress, on a slow machine
 
 T = TypeVar("T")
 Tell = Callable[[Any], None]
@@ -30,14 +30,14 @@ Stopped = Callable[[], bool]
 
 
 class CrewError(RuntimeError):
-    """A worker could not go on; the text is a whole sentence."""
+    """A worker failed; the text is a whole sentence."""
 
 
 @dataclass(frozen=True)
 class Said:
-    """What a worker says of its task: news on the way, or what came of it; refused: what it was given does not do."""
+    """A worker's message about its task: progress, result, or refused (its input is unusable)."""
 
-    task: int  # its place among the tasks
+    task: int  # its index among the tasks
     kind: Literal["news", "done", "failed", "refused"]
     value: Any  # picklable
 
@@ -55,11 +55,11 @@ def available_cores() -> int:
 
 
 def crew(do: Callable[[T, Tell, Stopped], Any], tasks: Sequence[T], workers: int) -> Iterator[Said]:
-    """Do all tasks, and yield what is said of them as it comes.
+    """Run all tasks, and yield the workers' messages as they come.
 
-    `do` runs in the workers, so it must be picklable: it may tell news, and returns soon once it is stopped. Closing
-    the iterator, or an exception in the parent, stops every worker first. Raises CrewError, and InputError for what a
-    person must correct before it is tried again.
+    `do` runs in the workers, so it must be picklable: it may report progress, and returns soon once it is stopped.
+    Closing the iterator, or an exception in the parent, first stops every worker. Raises CrewError, and InputError for
+    what the user must correct.
     """
     waiting = deque(range(len(tasks)))
 
@@ -116,7 +116,7 @@ def _staff(do: Callable[..., Any], count: int) -> Iterator[list[_Worker]]:
 
 
 def _work(pipe: Connection, do: Callable[..., Any], threads: int) -> None:
-    """A worker's life. Ctrl-C, or SIGTERM to the group, reaches the parent too, which closes the pipe."""
+    """A worker's main loop. Ctrl-C, or SIGTERM to the group, also reaches the parent, which closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     limit_threads(threads)
@@ -149,8 +149,8 @@ def _tell(pipe: Connection, said: Said) -> None:
 
 
 def limit_threads(threads: int) -> None:
-    """Let this process draw and filter with so many threads; call it before the first picture."""
+    """Limit rendering and filtering in this process to this many threads; call it before the first image."""
     import cv2
 
-    os.environ["LP_NUM_THREADS"] = str(threads)  # read by Mesa when it makes a software context
+    os.environ["LP_NUM_THREADS"] = str(threads)  # read by Mesa when it creates a software context
     cv2.setNumThreads(threads)

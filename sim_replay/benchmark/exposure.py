@@ -1,4 +1,4 @@
-"""The exposure of a sequence: a camera's meter lets highlights burn out, but not the picture."""
+"""The exposure of a sequence: metered so that highlights may saturate, but not the whole image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEPS_MAX = 8
 
 
 def metered(film: Film) -> Film:
-    """The film with its sensor's gain lowered until its first frame is not blown out; darkness stays dark."""
+    """The film with its sensor's gain reduced until its first frame is not overexposed; dark frames stay dark."""
     for _ in range(STEPS_MAX):
         white = render_frame(film.scene(0), film.sensor).image_bgr.min(axis=2) >= WHITE_FROM
         if float(np.mean(white)) <= BLOWN_SHARE_MAX:

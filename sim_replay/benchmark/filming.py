@@ -1,4 +1,4 @@
-"""From a sequence's plan to the scene of each of its frames: flight, lens, shutter and labels, nothing drawn yet."""
+"""Converts a sequence's plan to the scene of each frame: flight, lens, shutter and labels; nothing is rendered yet."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sim_replay.render.scene import Camera, Environment, Scene, Target, environm
 from sim_replay.render.sensor import Sensor, sensor_from
 
 Array = NDArray[np.float64]
-POINTING_MARGIN = 1.3  # the aspect flown may ask for a lens that much longer than planned
+POINTING_MARGIN = 1.3  # the flown aspect may require a lens longer than planned by this factor
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A flown sequence, ready to be drawn frame by frame; every frame is a pure function of it."""
+    """A flown sequence, ready to be rendered frame by frame; every frame is a pure function of it."""
 
     plan: SequencePlan
     size_wh_px: tuple[int, int]
@@ -43,7 +43,7 @@ class Film:
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float] | None:
-        """OpenCV's k1 k2 p1 p2 k3 of the lens, or None if it has none or the undistorted variant is wanted."""
+        """OpenCV's k1 k2 p1 p2 k3 of the lens, or None if it has none or the undistorted variant is requested."""
         if self.plan.corner_distortion is None or self.undistorted:
             return None
         radius = 0.5 * float(np.hypot(*self.size_wh_px)) / self.focal_px
@@ -52,7 +52,7 @@ class Film:
         return (*(round(value, 9) for value in values), 0.0)  # type: ignore[return-value]
 
     def scene(self, frame: int) -> Scene:
-        """What the camera sees at mid exposure of a frame, and where all has moved when the shutter closes."""
+        """The scene at mid exposure of a frame, and the poses when the shutter closes."""
         middle_s = float(self.encounter.frame_t_s[frame])
         close_s = middle_s + 0.5 * self.plan.exposure_s
         R_ned_cam, t_ned_cam_m = (value[0] for value in self.encounter.camera_pose_at(np.array([close_s])))
@@ -89,7 +89,7 @@ def fly(
         fly_encounter(encounter_plan(plan, preset)),
         focal_px,
         environment_from_seed(plan.environment_seed, plan.weather),
-        # The one compression is that of the stored picture.
+        # The image is compressed only once, when it is stored.
         replace(sensor_from(np.random.default_rng([plan.sensor_seed, 1]), plan.quality), jpeg_quality=None),
         undistorted,
         backdrop,
@@ -97,12 +97,12 @@ def fly(
 
 
 def pointing_focal_px(plan: SequencePlan, preset: Preset) -> float:
-    """Focal length that the camera is pointed for: a shorter lens keeps in the picture whatever this one keeps."""
+    """Focal length for which the camera is pointed: a shorter lens also keeps in the image whatever this one does."""
     return min(POINTING_MARGIN * plan.focal_px, preset.lens.focal_px[1])
 
 
 def encounter_plan(plan: SequencePlan, preset: Preset) -> EncounterPlan:
-    """What the flight is asked for."""
+    """The requirements for the flight."""
     width, height = preset.size_wh_px
     focal_px = pointing_focal_px(plan, preset)
     return EncounterPlan(
@@ -120,14 +120,14 @@ def encounter_plan(plan: SequencePlan, preset: Preset) -> EncounterPlan:
 
 
 def mean_box_area(encounter: Encounter) -> float:
-    """Area of the main target's box at focal length 1, averaged over the frames, as if the picture had no edge."""
+    """Area of the main target's box at focal length 1, averaged over the frames, as if the image had no edge."""
     vertices = solid_vertices_m(airframe_id(encounter.plan.airframes[0]))
     track = encounter.targets[0].at(encounter.frame_t_s)
     areas = []
     for k in range(len(encounter.frame_t_s)):
         R_cam_ned = encounter.R_ned_cam[k].T
         t_cam = R_cam_ned @ (track.t_ned_body_m[k] - encounter.t_ned_cam_m[k])
-        # A target that has left the picture may be far off axis: its box is taken where it would be looked at.
+        # A target outside the image may be far off axis: its box is computed as if the camera pointed at it.
         towards = _turned_to_axis(t_cam)
         pixels = project_px(vertices, towards @ R_cam_ned @ track.R_ned_body[k], towards @ t_cam, np.eye(3))
         areas.append(float(np.prod(np.ptp(pixels, axis=0))))
@@ -135,7 +135,7 @@ def mean_box_area(encounter: Encounter) -> float:
 
 
 def _turned_to_axis(t_cam_m: Array) -> Array:
-    """R [3, 3] that turns a camera ray onto the optical axis by the shortest way."""
+    """R [3, 3] of the shortest rotation of a camera ray onto the optical axis."""
     d = t_cam_m / np.linalg.norm(t_cam_m)
     cross = np.array([d[1], -d[0], 0.0])
     skew = np.array([[0.0, 0.0, cross[1]], [0.0, 0.0, -cross[0]], [-cross[1], cross[0], 0.0]])
@@ -143,9 +143,9 @@ def _turned_to_axis(t_cam_m: Array) -> Array:
 
 
 def outline_labels(scene: Scene) -> tuple[BopTarget, ...]:
-    """Labels without drawing: boxes of the projected outlines, cut by the picture; no pixel is counted.
+    """Labels without rendering: boxes of the projected outlines, clipped to the image; pixels are not counted.
 
-    A target is listed if its outline's box touches the picture; what hides it is not known here.
+    A target is listed if its outline's box touches the image; occlusion is not known here.
     """
     camera = scene.camera
     limit = np.array([camera.width_px, camera.height_px]) - 0.5

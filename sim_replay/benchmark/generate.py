@@ -1,4 +1,4 @@
-"""`uavpose-replay generate`: a preset and a seed in, a BOP dataset out."""
+"""`uavpose-replay generate`: generates a BOP dataset from a preset and a seed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sim_replay.lock import take_lock
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the dataset. Exit codes: 0 made, 1 a worker could not go on. Raises InputError."""
+    """Generate the dataset. Exit codes: 0 done, 1 a worker failed. Raises InputError."""
     place, text = preset_text(args.preset)
     preset = parse_preset(place, text)
     plans = _plans(preset, args)
@@ -111,7 +111,7 @@ def _backdrops(folder: Path | None) -> tuple[Path, ...]:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command that makes the whole dataset; where it lies and how many workers made it is not told."""
+    """The command that generates the whole dataset, without its folder and the number of workers."""
     words = ["uavpose-replay", "generate", "--preset", str(args.preset), "--seed", str(args.seed)]
     words += ["--every", str(args.every)] if args.every != 1 else []
     words += [f"--{name.replace('_', '-')}" for name in ("labels_only", "undistorted") if getattr(args, name)]
@@ -121,7 +121,7 @@ def _command(args: argparse.Namespace) -> str:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Hold the folder against a second run. The lock goes with the process, however that ends."""
+    """Lock the folder against a second run. The lock ends with the process, however that ends."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = take_lock(out / LOCK_FILE)

@@ -1,8 +1,8 @@
-"""The lens of every sequence: planned from the airframe and the range, then settled by how the target was flown.
+"""The lens of every sequence: planned from airframe and range, then adjusted to the flown aspect of the target.
 
-A plan knows an airframe's mean size only; the aspect flown makes it larger or smaller. Flying takes a fraction of
-the time that drawing does, so all sequences are flown first and the lenses settled together: the mean share of the
-picture that the main target's box covers is then the preset's, over all frames of the dataset.
+A plan only knows an airframe's mean size; the flown aspect makes it larger or smaller. Flying takes a fraction of the
+time that rendering does, so all sequences are flown first and all lenses set together: the mean share of the image
+covered by the main target's box is then the preset's, over all frames of the dataset.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def settle_lenses(preset: Preset, plans: Sequence[SequencePlan], areas: Sequence
     Args:
         areas: Area of each main target's box at focal length 1, averaged over its frames.
 
-    Each lens shows its target as large as planned, times a factor common to all, found by bisection; none is longer
-    than what the camera was pointed for, so a target that was kept in the picture stays in it.
+    Each lens shows its target as large as planned, times a common factor found by bisection; none is longer than what
+    the camera was pointed for, so a target that was kept in the image stays in it.
     """
     picture = float(preset.size_wh_px[0] * preset.size_wh_px[1])
     area, frames = np.asarray(areas), np.array([plan.frames for plan in plans], dtype=np.float64)
@@ -57,9 +57,9 @@ def box_area(preset: Preset, plan: SequencePlan, tell: Tell, stopped: Stopped) -
 def lenses_of(
     folder: Path, preset: Preset, plans: Sequence[SequencePlan], workers: int, on_flown: Callable[[], None]
 ) -> dict[int, float]:
-    """The focal lengths that `folder` holds, or those of a flight of every plan, which it holds from then on.
+    """The focal lengths stored in `folder`; if there are none, every plan is flown and they are stored.
 
-    Raises InputError where the file there is not of these plans, and CrewError.
+    Raises InputError if the stored file does not match these plans, and CrewError.
     """
     path = folder / FILE
     if path.is_file():

@@ -1,4 +1,4 @@
-"""dataset.toml: what a dataset is, in words that make it again, and how much of it is there."""
+"""dataset.toml: what a dataset is, sufficient to reproduce it, and how much of it is finished."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ PACKAGES = ("mf-uavpose6d-edge", "numpy", "opencv-python-headless", "moderngl", 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What decides every byte of a dataset, on one machine, beside PACKAGES."""
+    """What determines every byte of a dataset, on one machine, besides PACKAGES."""
 
-    preset: str  # its own name for itself
+    preset: str  # the name that it gives itself
     seed: int
     every: int
     labels_only: bool
     undistorted: bool
-    backdrops: dict[str, str]  # photographs offered: SHA-256 by file name
+    backdrops: dict[str, str]  # available photographs: SHA-256 by file name
 
     def lines(self) -> list[str]:
-        """Its keys, as TOML; not the backdrops, which are a table."""
+        """Its keys, as TOML; without the backdrops, which are a table."""
         return [
             f'preset = "{self.preset}"  # its text is in {PRESET_FILE}',
             f"seed = {self.seed}",
@@ -44,7 +44,7 @@ class Recipe:
 
 
 def claim(out: Path, recipe: Recipe, preset_text: str, resume: bool) -> None:
-    """Make the dataset's folder ours, or go on with one that the same recipe began. Raises InputError."""
+    """Claim the dataset's folder, or continue one that was begun with the same recipe. Raises InputError."""
     if not (out / FILE).is_file():
         if out.is_dir() and any(path.name not in (LOCK_FILE, PRESET_FILE) for path in out.iterdir()):
             raise InputError(f"{out}: is not empty and holds no {FILE}; choose another --out")
@@ -74,7 +74,7 @@ def _check_same(path: Path, table: str, there: Mapping[str, object], now: Mappin
 
 
 def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> None:
-    """Write dataset.toml: recipe, packages, and what is finished of all planned sequences."""
+    """Write dataset.toml: recipe, packages, and which of the planned sequences are finished."""
     there = [plan for plan in plans if is_finished(job.folder(plan))]
     lines = [
         f"command = {toml_value(job.command)}  # makes it again",
@@ -113,7 +113,7 @@ def digests(paths: Sequence[Path]) -> dict[str, str]:
 
 
 def package_version(package: str) -> str:
-    """As installed, or that it is not."""
+    """The installed version, or a note that it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -1,7 +1,7 @@
-"""From a preset and a seed to the plan of every sequence: pure, quick, and the same on any machine.
+"""Plans every sequence from a preset and a seed: pure, quick, and the same on any machine.
 
-Nothing is flown or drawn here. The focal length planned is the lens that suits the airframe at that range on the
-average over aspects; `lenses` settles it once the aspects are flown.
+Nothing is flown or rendered here. The planned focal length suits the airframe at that range on average over aspects;
+`lenses` adjusts it once the aspects have been flown.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from sim_replay.benchmark.preset import SPLITS, Compression, Gust, Preset, Quali
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
-ASPECTS = 96  # attitudes that stand for all, where the mean size of an airframe is wanted
+ASPECTS = 96  # attitudes sampled for the mean size of an airframe
 PRINCIPAL_SIGMA_PX = 12.0
 LENS_LIMITS = (-2.5, 1.7)  # of the scatter, in sigmas
-LONGEST_SCATTER = 0.25  # of the logarithm of the longest lens on board
+LONGEST_SCATTER = 0.25  # of the logarithm of the longest available lens
 
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """One sequence, complete but for the flight itself."""
+    """One sequence, complete except for the flight itself."""
 
     index: int  # also the BOP scene id
     split: Split
@@ -36,7 +36,7 @@ class SequencePlan:
     fps: float
     range_m: float  # to the first target, in the middle of the sequence
     airframes: tuple[str, ...]  # flown; the first is the main target
-    shown: int  # of those, how many are drawn; 0: an empty sky
+    shown: int  # how many of those are rendered; 0: an empty sky
     flight_seed: int
     livery_seeds: tuple[int, ...]
     environment_seed: int
@@ -48,7 +48,7 @@ class SequencePlan:
     gust: Gust
     leaves: bool
     focal_px: float
-    box_share: float  # of the picture, that the main target's box is to cover on the average
+    box_share: float  # share of the image that the main target's box should cover on average
     principal_px: tuple[float, float]
     corner_distortion: tuple[float, float, float, float] | None  # displacement / radius at the corner: k1 k2 p1 p2
     exposure_s: float
@@ -79,7 +79,7 @@ def allotted(rng: np.random.Generator, weights: Mapping[T, float], count: int) -
 
 
 def spread_ranges(rng: np.random.Generator, frames: Sequence[int], bounds_m: tuple[float, float]) -> list[float]:
-    """A range for each sequence such that the frames, laid end to end in some order, fill the bounds evenly."""
+    """A range for each sequence such that the frames, concatenated in some order, fill the bounds evenly."""
     order = rng.permutation(len(frames))
     lengths = np.asarray(frames, dtype=np.float64)[order]
     middle = (np.cumsum(lengths) - 0.5 * lengths) / lengths.sum()
@@ -98,7 +98,7 @@ def mean_box_area_m2(airframe: str) -> float:
     for _ in range(ASPECTS):
         bank, pitch, up = np.radians(np.clip(rng.normal(0.0, (20.0, 6.0, 12.0)), -45.0, 45.0))
         R_ned_body = R_from_euler(bank, pitch, rng.uniform(-np.pi, np.pi))
-        R_ned_view = R_from_euler(0.0, up, 0.0)  # its y and z axes span the picture
+        R_ned_view = R_from_euler(0.0, up, 0.0)  # its y and z axes span the image
         width, height = np.ptp((vertices @ R_ned_body.T @ R_ned_view)[:, 1:], axis=0)
         areas.append(width * height)
     return float(np.mean(areas))
@@ -106,7 +106,7 @@ def mean_box_area_m2(airframe: str) -> float:
 
 @dataclass(frozen=True)
 class _Table:
-    """What is dealt out over all sequences at once, so that shares come out as asked; a column a field."""
+    """Properties allotted over all sequences at once, so that shares match the preset; one column per field."""
 
     split: list[Split]
     frames: list[int]
@@ -162,7 +162,7 @@ def _dealt(preset: Preset, seed: int) -> _Table:
         leaves=allotted(rng, _yes(preset.flight.leaves_share), count),
         distorted=allotted(rng, _yes(preset.lens.distorted_share), count),
         compression=[preset.compression[k] for k in squeezes],
-        # Every flight is flown once, so no pair of airframe and flight can occur in two splits.
+        # All flight seeds differ, so no pair of airframe and flight can occur in two splits.
         flight_seed=[int(s) for s in rng.choice(2**31, size=count, replace=False)],
     )
 
@@ -204,7 +204,7 @@ def _yes(share: float) -> dict[bool, float]:
 
 
 def _shown(rng: np.random.Generator, preset: Preset, frames: Sequence[int]) -> list[int]:
-    """Targets drawn in each sequence; empty ones hold at least the share of frames asked for."""
+    """Number of targets rendered in each sequence; empty ones have at least the requested share of frames."""
     wanted = preset.targets.empty_share * sum(frames)
     order = [int(k) for k in rng.permutation(len(frames))]
     shown = [1] * len(frames)
@@ -225,7 +225,7 @@ def _principal_px(rng: np.random.Generator, size_wh_px: tuple[int, int]) -> tupl
 
 
 def _corner_distortion(rng: np.random.Generator) -> tuple[float, float, float, float]:
-    """Barrel more often than pincushion, a few per cent at the corner, as lenses of this kind have."""
+    """Barrel more often than pincushion, a few per cent at the corner, as is typical of such lenses."""
     radial = rng.uniform(-0.04, 0.015)
     return radial, radial * rng.uniform(-0.3, 0.1), float(rng.normal(0.0, 4e-4)), float(rng.normal(0.0, 4e-4))
 
@@ -233,13 +233,13 @@ def _corner_distortion(rng: np.random.Generator) -> tuple[float, float, float, f
 def _lenses(
     rng: np.random.Generator, preset: Preset, frames: Sequence[int], ranges_m: Sequence[float], airframes: Sequence[str]
 ) -> tuple[list[float], list[float]]:
-    """(focal length, px; share of the picture) of each sequence, their mean over frames being the preset's.
+    """(focal length, px; share of the image) of each sequence, their mean over frames being the preset's.
 
-    The lens one would choose makes every airframe about as large at any range; what lenses there are limits it, so
-    the size that the others are given is found by bisection.
+    The ideal lens makes every airframe about as large at any range; available lenses limit it, so the size given to the
+    others is found by bisection.
     """
     low, high = preset.lens.focal_px
-    # Not every aircraft carries the longest lens there is; one limit for all would pile sequences up on it.
+    # Not every aircraft carries the longest lens; a common limit would concentrate sequences at it.
     longest = np.maximum(high * np.exp(-LONGEST_SCATTER * rng.random(len(frames))), low)
     scatter = np.exp(preset.lens.spread * np.clip(rng.normal(size=len(frames)), *LENS_LIMITS))
     area = np.array([mean_box_area_m2(name) for name in airframes]) / np.square(ranges_m)  # at focal length 1

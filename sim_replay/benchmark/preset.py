@@ -1,4 +1,4 @@
-"""What a dataset is made of: the preset file's schema, the shipped presets, and the airframes kept for testing."""
+"""The composition of a dataset: the preset file's schema, the shipped presets, and the airframes kept for testing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Gust = Literal["calm", "light", "moderate"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 SHIPPED = ("fw-uav6d", "unseen", "stress")
-RANGE_LIMITS_M = (95.0, 510.0)  # in the middle of a sequence; sim_replay.flight finds no encounter beyond
+RANGE_LIMITS_M = (95.0, 510.0)  # in the middle of a sequence; sim_replay.flight finds no encounter outside them
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Weight = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -185,11 +185,11 @@ class Preset(Section):
                     f"splits.{name}: {size.frames} frames cannot be cut into {size.sequences} sequences of "
                     f"{shortest} to {longest}"
                 )
-        self.airframe_names()  # of few parts there may not be as many as asked for
+        self.airframe_names()  # raises if few parts cannot give as many as requested
         return self
 
     def airframe_names(self) -> tuple[str, ...]:
-        """The airframes this dataset shows: in the fleet's order, or invented ones."""
+        """The airframes that this dataset shows: in the fleet's order, or invented ones."""
         if self.airframes.only:
             chosen = set(self.airframes.only)
         else:
@@ -202,12 +202,12 @@ class Preset(Section):
 
 
 def held_out_airframes() -> tuple[str, ...]:
-    """Airframes of the `unseen` preset: no training picture may show them."""
+    """Airframes of the `unseen` preset: no training image may show them."""
     return load_preset("unseen").airframe_names()
 
 
 def preset_text(name_or_path: str) -> tuple[str, str]:
-    """(where it lies, its text) of a shipped preset or a TOML file. Raises InputError."""
+    """(location, text) of a shipped preset or a TOML file. Raises InputError."""
     if name_or_path in SHIPPED:
         resource = files("sim_replay").joinpath("presets", f"{name_or_path}.toml")
         return f"{name_or_path}.toml", resource.read_text(encoding="utf-8")
@@ -218,10 +218,10 @@ def preset_text(name_or_path: str) -> tuple[str, str]:
 
 
 def load_preset(name_or_path: str) -> Preset:
-    """Read a shipped preset by name, or a file. Raises InputError: a line a fault, each naming file and key."""
+    """Read a shipped preset by name, or a file. Raises InputError: one line per error, each naming file and key."""
     return parse_preset(*preset_text(name_or_path))
 
 
 def parse_preset(place: str, text: str) -> Preset:
-    """The preset in `text`, which lies at `place`. Raises InputError."""
+    """The preset in `text`, which is located at `place`. Raises InputError."""
     return parse_settings(text, place, Preset, InputError)

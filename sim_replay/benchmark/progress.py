@@ -1,4 +1,4 @@
-"""What a person sees while a dataset is made: a bar on a terminal, a line a sequence elsewhere."""
+"""Progress while a dataset is generated: a bar on a terminal, otherwise a line per sequence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Rate(ProgressColumn):
 
 
 class Report:
-    """Counts frames as workers tell of them; use it in a `with` statement."""
+    """Counts frames reported by the workers; use it in a `with` statement."""
 
     def __init__(self, console: Console, job: Job, plans: Sequence[SequencePlan]) -> None:
         self._console, self._planned = console, len(plans)
@@ -58,7 +58,7 @@ class Report:
     def frames(self, news: FrameNews) -> None:
         """Count frames."""
         if news.kept:
-            # Not made now: leaving them out of the total keeps rate and time left true.
+            # Not made in this run: leaving them out of the total keeps rate and remaining time correct.
             self._kept += news.kept
             self._bar.update(self._task, total=self._total - self._kept)
         self._made += news.made
@@ -89,7 +89,7 @@ class Report:
 
 @contextmanager
 def flights_bar(console: Console, count: int) -> Iterator[Callable[[], None]]:
-    """A function to call once for each sequence flown; shown only if any is."""
+    """A function to call once for each flown sequence; shown only if there are any."""
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("flying all sequences, to choose lenses", total=count)
         yield lambda: bar.advance(task)

@@ -1,8 +1,8 @@
-"""A scene folder that may be stopped at any instant: what is finished stays readable, only the frame in hand is lost.
+"""A scene folder that may be interrupted at any time: finished frames stay readable, only the current one is lost.
 
-While a scene is being made, `.part/` in its folder holds a journal, one line for each finished frame, and whatever
-else is needed to go on. Pictures are moved into place whole, then the journal names them, then the indices do.
-A finished scene has no `.part/` and holds exactly the files that a scene made in one go holds.
+While a scene is being generated, `.part/` in its folder contains a journal, one line for each finished frame, and
+whatever else is needed to continue. Images are moved into place complete, then listed in the journal, then in the
+indices. A finished scene has no `.part/` and contains exactly the same files as one generated without interruption.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sim_replay.bop.write import write_picture
 
 INDICES = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
 PICTURES = ("rgb", "mask", "mask_visib")
-LAST_FILE = "sequence.toml"  # its presence says that the scene is finished
+LAST_FILE = "sequence.toml"  # its presence means that the scene is finished
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -37,11 +37,11 @@ def is_finished(folder: Path) -> bool:
 
 
 class SceneStore:
-    """One scene being made, by one process at a time; use it in a `with` statement.
+    """One scene being generated, by one process at a time; use it in a `with` statement.
 
     Args:
-        pictures: Whether pictures and masks are kept; without them only the indices are.
-        keep_raw: Keep each picture losslessly until the scene is finished, to pass the sequence through a video codec.
+        pictures: Whether images and masks are stored; without them only the indices are.
+        keep_raw: Keep each image losslessly until the scene is finished, to pass the sequence through a video codec.
     """
 
     def __init__(self, folder: Path, jpeg_quality: int, pictures: bool = True, keep_raw: bool = False) -> None:
@@ -56,9 +56,9 @@ class SceneStore:
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         self._part.mkdir(parents=True, exist_ok=True)
         self._lock = (self._part / "lock").open("w")
-        fcntl.flock(self._lock, fcntl.LOCK_EX)  # the process that was stopped may still be at its last frame
+        fcntl.flock(self._lock, fcntl.LOCK_EX)  # the interrupted process may still be at its last frame
         self._entries = dict(_journal_entries(self._part / "journal.jsonl"))
-        if self._keep_raw:  # a picture that is gone or torn is made again
+        if self._keep_raw:  # a missing or truncated image is rendered again
             self._entries = {number: entry for number, entry in self._entries.items() if self._raw(number) is not None}
         text = "".join(_journal_line(number, entry) for number, entry in self._entries.items())
         replace_text(self._part / "journal.jsonl", text)
@@ -71,13 +71,13 @@ class SceneStore:
 
     @property
     def done(self) -> frozenset[int]:
-        """Numbers of the frames that need not be made again."""
+        """Numbers of the frames that need not be generated again."""
         return frozenset(self._entries)
 
     def add(
         self, frame: BopFrame, image_bgr: Image | None, masks_visib: Sequence[Mask] = (), masks: Sequence[Mask] = ()
     ) -> None:
-        """Store one frame; once this returns, it outlives any stop. Without pictures, the image may be None."""
+        """Store one frame; once this returns, it survives any interruption. Without pictures, the image may be None."""
         fresh = self._part / "frame"
         shutil.rmtree(fresh, ignore_errors=True)
         with SceneWriter(fresh, self._jpeg_quality) as writer:
@@ -96,7 +96,7 @@ class SceneStore:
         self._write_indices()
 
     def raw_images(self) -> Iterator[Image]:
-        """The pictures kept so far, in order."""
+        """The images kept so far, in order."""
         for number in sorted(self._entries):
             pixels = self._raw(number)
             if pixels is None:
@@ -104,14 +104,14 @@ class SceneStore:
             yield np.asarray(pixels, np.uint8)
 
     def replace_images(self, images: Iterator[Image]) -> None:
-        """Put these pictures in the place of those stored, in order."""
+        """Replace the stored images by these, in order."""
         fresh = self._part / "replaced.jpg"
         for number, image in zip(sorted(self._entries), images, strict=True):
             write_picture(fresh, image, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])
             os.replace(fresh, self.folder / "rgb" / f"{number:06d}.jpg")
 
     def finish(self, files: Mapping[str, Callable[[Path], None]], last: str) -> None:
-        """Write the scene's other files, each by its function, then LAST_FILE with the text `last`; tidy up."""
+        """Write the scene's other files, each by its function, then LAST_FILE with the text `last`; clean up."""
         for name, write in files.items():
             write(self.folder / name)
         replace_text(self.folder / LAST_FILE, last)
@@ -126,7 +126,7 @@ class SceneStore:
         write_picture(path, image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
     def _raw(self, number: int) -> Image | None:
-        """None: there is none that can be read."""
+        """None if there is no readable one."""
         path = self._raw_path(number)
         return cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None  # type: ignore[return-value]
 
@@ -137,7 +137,7 @@ class SceneStore:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file such that a reader, at any instant, sees the old one or the new one."""
+    """Write a file atomically: at any time, a reader sees the old one or the new one."""
     fresh = path.with_name(f".{path.name}.new")
     fresh.write_text(text, encoding="utf-8")
     os.replace(fresh, path)
@@ -153,7 +153,7 @@ def _journal_line(number: int, entry: Mapping[str, str]) -> str:
 
 
 def _journal_entries(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """The whole lines of a journal; one that a stop cut short is as good as absent."""
+    """The complete lines of a journal; a truncated one is ignored."""
     if not path.is_file():
         return
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():

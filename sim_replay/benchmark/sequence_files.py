@@ -1,4 +1,4 @@
-"""Makes one sequence on disk: draws its frames into a scene folder and writes what flies beside them."""
+"""Generates one sequence on disk: renders its frames into a scene folder and writes the accompanying files."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from sim_replay.telemetry import write_telemetry
 
 @dataclass(frozen=True)
 class Job:
-    """What all sequences of a run share."""
+    """Settings shared by all sequences of a run."""
 
     preset: Preset
     out: Path
-    command: str  # that makes the same dataset
+    command: str  # that reproduces the dataset
     focal_px: Mapping[int, float]  # by sequence
-    every: int = 1  # of the frames planned, make this one in so many
+    every: int = 1  # render only every Nth of the planned frames
     labels_only: bool = False
     undistorted: bool = False
-    backdrops: tuple[Path, ...] = ()  # photographs; half of the sequences take one for sky and ground
+    backdrops: tuple[Path, ...] = ()  # photographs; half of the sequences use one in place of sky and ground
 
     def folder(self, plan: SequencePlan) -> Path:
         """The sequence's BOP scene folder."""
         return self.out / plan.split / f"{plan.index:06d}"
 
     def frames(self, plan: SequencePlan) -> range:
-        """Numbers of the frames to make; a picture keeps its number whatever `every` is."""
+        """Numbers of the frames to generate; an image keeps its number whatever `every` is."""
         return range(0, plan.frames, self.every)
 
     def film(self, plan: SequencePlan) -> Film:
@@ -54,7 +54,7 @@ class Job:
 
 @dataclass(frozen=True)
 class FrameNews:
-    """Frames that are there: made now, or kept from before."""
+    """Finished frames: generated now, or kept from before."""
 
     sequence: int
     made: int = 0
@@ -62,7 +62,7 @@ class FrameNews:
 
 
 def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) -> bool:
-    """A crew's task: make what is missing of a sequence, tell FrameNews; False if it was stopped between frames."""
+    """A crew's task: generate what is missing of a sequence, report FrameNews; False if interrupted between frames."""
     folder = job.folder(plan)
     if is_finished(folder):
         shutil.rmtree(folder / ".part", ignore_errors=True)
@@ -80,7 +80,7 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
             add_frame(store, film, number, job.labels_only)
             tell(FrameNews(plan.index, made=1))
         if squeezed and plan.h264_kbps is not None:
-            # At the full rate, whatever is left out: a picture then has as many bits as it would among all of them.
+            # At the full rate even if frames are left out: an image then has as many bits as among all of them.
             store.replace_images(through_h264(store.raw_images(), plan.fps, plan.h264_kbps))
         K, size, distortion = film.K, film.size_wh_px, film.distortion
         store.finish(
@@ -94,7 +94,7 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
 
 
 def add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) -> None:
-    """Draw and store one frame. A target of which nothing is seen is not listed."""
+    """Render and store one frame. A target without a visible pixel is not listed."""
     scene = film.scene(number)
     if labels_only:
         store.add(bop_frame(scene, outline_labels(scene)), None)
@@ -128,7 +128,7 @@ def _matrix_rows(matrix: Array) -> str:
 
 
 def sequence_toml(job: Job, film: Film) -> str:
-    """The text of sequence.toml, which says how the sequence was flown and how to play it."""
+    """The text of sequence.toml, which describes how the sequence was flown and how to play it."""
     plan, encounter = film.plan, film.encounter
     lever = ", ".join(f"{v:.3f}" for v in encounter.t_body_cam_m)
     origin = ", ".join(str(value) for value in ORIGIN_DEG_M)

@@ -1,4 +1,4 @@
-"""`uavpose-replay stats`: what a BOP dataset holds, measured from its files and set beside the paper's figures."""
+"""`uavpose-replay stats`: statistics of a BOP dataset, measured from its files, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sim_replay.bop.fields import integer, load_object
 from sim_replay.evaluation.judge import is_seen
 
 RANGE_EDGES_M = tuple(range(100, 501, 50))
-# FW-UAV6DPose as the paper's section on the dataset gives it. It prints 7,725 training images; its total needs 8,425.
+# FW-UAV6DPose according to the paper's dataset section. It prints 7,725 training images; its total requires 8,425.
 PAPER = {
     "sequences": "161",
     "frames": "15,325",
@@ -34,16 +34,16 @@ PAPER = {
 
 @dataclass
 class _Counts:
-    """What is gathered while scenes are read."""
+    """Values collected while scenes are read."""
 
     sequences: Counter[str] = field(default_factory=Counter)  # by split
     frames: Counter[str] = field(default_factory=Counter)
-    pictures: Counter[tuple[int, int]] = field(default_factory=Counter)  # width, height; a scene once
+    pictures: Counter[tuple[int, int]] = field(default_factory=Counter)  # width, height; once per scene
     targets_in_frame: Counter[int] = field(default_factory=Counter)
     airframes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))  # frames, by split
     flights: dict[str, set[tuple[str, int]]] = field(default_factory=lambda: defaultdict(set))
     range_m: list[float] = field(default_factory=list)
-    focal_px: list[float] = field(default_factory=list)  # one a scene
+    focal_px: list[float] = field(default_factory=list)  # one per scene
     box_share: list[float] = field(default_factory=list)
     visible_fraction: list[float] = field(default_factory=list)
     below_camera: list[bool] = field(default_factory=list)
@@ -53,10 +53,9 @@ class _Counts:
 def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Measure a BOP dataset, split or scene folder. Raises InputError, naming file and key.
 
-    Of targets that are said to be hidden nothing is counted. Ranges are distances of target origins from the camera;
-    box shares are those of the first target seen in each frame, of its visible box in the picture's area. Sizes are of
-    each scene's first picture, or of its camera.json where there are labels alone. A value that the files do not hold
-    is None.
+    Targets marked as hidden are not counted. Ranges are distances of target origins from the camera; box shares are
+    those of the first visible target in each frame, its visible box over the image's area. Sizes are of each scene's
+    first image, or from its camera.json if there are only labels. A value that the files do not contain is None.
     """
     counts = _Counts()
     try:
@@ -102,18 +101,18 @@ def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, name
         if target.whole_px:
             counts.visible_fraction.append((target.visible_px or 0) / target.whole_px)
         if frame.R_cam_world is not None:
-            # World is local NED where this project wrote it: further down than the camera is before the ground.
+            # This project's worlds are local NED: a target further down than the camera is seen against the ground.
             counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
         counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
 
 
 def _is_uncounted(target: BopTarget) -> bool:
-    """Whether it has a box, and nobody counted its pixels: labels alone say 0 of all."""
+    """Whether it has a box, but its pixels were not counted: with labels only, all counts are 0."""
     return target.box_visible_xyxy_px is not None and target.whole_px == 0
 
 
 def _picture_size(scene: BopScene) -> tuple[int, int]:
-    """Width and height of the scene's first picture, else as camera.json has them, else zeros. Raises BopError."""
+    """Width and height of the scene's first image, otherwise from camera.json, otherwise zeros. Raises BopError."""
     try:
         height, width = scene.image_bgr(scene.pictured[0]).shape[:2]
         return width, height

@@ -1,4 +1,4 @@
-"""Passes a sequence through H.264 as a radio link would carry it: encoded at a bitrate, decoded again."""
+"""Encodes a sequence with H.264 at a given bitrate and decodes it, as a video link would."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Image = NDArray[np.uint8]
 
 
 def through_h264(images_bgr: Iterator[Image], fps: float, kbps: int) -> Iterator[Image]:
-    """The pictures [H, W, 3], H and W even, as a decoder gives them back: as many, in the same order.
+    """The images [H, W, 3], H and W even, as decoded: the same number, in the same order.
 
-    libx264 on one thread, low delay, one key frame in two seconds: the same bytes for the same pictures.
+    libx264 on one thread, low delay, one key frame per two seconds: the same bytes for the same images.
     """
     stream = io.BytesIO()
     count = _encode(images_bgr, stream, fps, kbps)
@@ -44,7 +44,7 @@ def _encode(images_bgr: Iterator[Image], target: io.BytesIO, fps: float, kbps: i
         for image in images_bgr:
             if count == 0:
                 stream.height, stream.width = image.shape[:2]
-            # OpenCV's conversion both ways: libswscale's quick one tints every colour by a few levels.
+            # OpenCV's conversion both ways: libswscale's fast one shifts every colour by a few levels.
             planes = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420), np.uint8)
             frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
             frame.pts, frame.time_base = count, 1 / rate

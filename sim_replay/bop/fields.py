@@ -1,4 +1,4 @@
-"""Values out of JSON files, checked; whatever is wrong is told in a sentence that names the file and the key."""
+"""Validated values from JSON files; every error is a sentence that names the file and the key."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from sim_replay.bop.records import MM_PER_M, Array, BopError
 
-_DIGITS_MOST = 18  # of a picture's number, in 64 bits
-ROTATION_TOLERANCE = 0.02  # of R R^T from the unit matrix: single precision and rounded files pass, a shear does not
+_DIGITS_MOST = 18  # of an image's number, in 64 bits
+ROTATION_TOLERANCE = 0.02  # of R R^T from the identity: tolerates single precision and rounded files, not a shear
 
 
 def load_json(path: Path) -> Any:
-    """What the file holds. Raises BopError."""
+    """The file's content. Raises BopError."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -26,12 +26,12 @@ def load_json(path: Path) -> Any:
         raise BopError(f"{path} line {error.lineno} is not JSON: {error.msg}") from error
     except RecursionError as error:
         raise BopError(f"{path} nests lists or objects too deep") from error
-    except ValueError as error:  # of a number of thousands of digits
+    except ValueError as error:  # a number with thousands of digits
         raise BopError(f"{path} cannot be read: {error}") from error
 
 
 def load_object(path: Path, optional: bool = False) -> dict[str, Any]:
-    """The file's object by key; an empty one where an optional file is absent. Raises BopError."""
+    """The file's object by key; an empty one if an optional file does not exist. Raises BopError."""
     if optional and not path.is_file():
         return {}
     value = load_json(path)
@@ -41,12 +41,12 @@ def load_object(path: Path, optional: bool = False) -> dict[str, Any]:
 
 
 def by_number(path: Path, entries: dict[str, Any]) -> dict[int, Any]:
-    """The entries by the numbers that their keys are, '000003' or '3'. Raises BopError."""
+    """The entries by number, whose keys are '000003' or '3'. Raises BopError."""
     return {number_key(path, key): entry for key, entry in entries.items()}
 
 
 def number_key(path: Path, key: str) -> int:
-    """The number that a picture or model goes by. Raises BopError."""
+    """The number of an image or model. Raises BopError."""
     if not key.isdecimal() or len(key) > _DIGITS_MOST:
         raise BopError(f"{path}: {key[:80]!r} is not the number of a picture or model")
     return int(key)
@@ -66,12 +66,12 @@ def matrix(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) 
 
 
 def is_rotation(R: Array) -> bool:
-    """Whether R [3, 3] turns without shear, scale or mirror image."""
+    """Whether R [3, 3] is a rotation without shear, scale or reflection."""
     return bool(np.abs(R @ R.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0)
 
 
 def rotation(path: Path, key: str, entry: Any, name: str) -> Array:
-    """A rotation matrix [3, 3]. Raises BopError, for a mirror image (a left-handed frame) too."""
+    """A rotation matrix [3, 3]. Raises BopError, also for a reflection (a left-handed frame)."""
     R = matrix(path, key, entry, name, (3, 3))
     if not is_rotation(R):
         raise BopError(f"{path}: {name!r} of {key!r} is not a rotation (nine numbers, row by row, right-handed)")
@@ -79,12 +79,12 @@ def rotation(path: Path, key: str, entry: Any, name: str) -> Array:
 
 
 def length_m(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) -> Array:
-    """Lengths that the file gives in millimetres, in metres. Raises BopError."""
+    """Lengths stated in millimetres, converted to metres. Raises BopError."""
     return matrix(path, key, entry, name, shape) / MM_PER_M
 
 
 def integer(path: Path, key: str, entry: Any, name: str) -> int:
-    """A whole number, also where it is written as 5.0. Raises BopError."""
+    """An integer, also if it is written as 5.0. Raises BopError."""
     value = entry.get(name) if isinstance(entry, dict) else None
     if isinstance(value, int) or (isinstance(value, float) and value.is_integer()):
         return int(value)

@@ -1,4 +1,4 @@
-"""Entries of BOP's scene files to `BopFrame`: the same in scenewise and imagewise datasets. Lengths to metres."""
+"""Converts entries of BOP's scene files to `BopFrame`, for scenewise and imagewise datasets. Lengths in metres."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from sim_replay.bop.fields import integer, length_m, matrix, rotation
 from sim_replay.bop.model_frame import ModelFrames
 from sim_replay.bop.records import DISTORTION_KEY, Array, BopError, BopFrame, BopTarget, Distortion
 
-ROUNDING = 1e-6  # of what must be 0 or 1 in a camera's matrix
+ROUNDING = 1e-6  # of values in a camera matrix that must be 0 or 1
 
 
 class Source(NamedTuple):
-    """The files that a picture's entries come from, to name them in errors."""
+    """The files that an image's entries come from, to name them in errors."""
 
     camera: Path
     gt: Path
@@ -23,9 +23,9 @@ class Source(NamedTuple):
 
 
 def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, models: ModelFrames) -> BopFrame:
-    """One picture's record; `info` may be None, and `poses` where no file tells them. Raises BopError.
+    """One image's record; `info` may be None, and `poses` if no file has them. Raises BopError.
 
-    Targets' poses are of their body axes.
+    The targets' poses are those of their body axes.
     """
     key = str(image_id)
     K = matrix(source.camera, key, camera, "cam_K", (3, 3))
@@ -46,7 +46,7 @@ def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, 
 
 
 def distortion_of(path: Path, key: str, entry: dict[str, Any]) -> Distortion | None:
-    """The lens of a camera's entry; None if it has none. Raises BopError."""
+    """The lens distortion in a camera's entry; None if it has none. Raises BopError."""
     if DISTORTION_KEY not in entry:
         return None
     k1, k2, p1, p2, k3 = (float(value) for value in matrix(path, key, entry, DISTORTION_KEY, (5,)))
@@ -79,7 +79,7 @@ def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]
 
 
 def _seen(path: Path, key: str, entry: Any) -> dict[str, Any]:
-    """What scene_gt_info says of a target; its visible box is what others build on, the rest may be absent."""
+    """A target's entry in scene_gt_info; the visible box is required, the rest may be absent."""
     seen: dict[str, Any] = {}
     if not isinstance(entry, dict):
         raise BopError(f"{path}: {key!r} does not hold what is seen of each object")
@@ -97,7 +97,7 @@ def _seen(path: Path, key: str, entry: Any) -> dict[str, Any]:
 def _box(path: Path, key: str, entry: Any, name: str, pixels: int) -> Array | None:
     x, y, width, height = matrix(path, key, entry, name, (4,))
     if pixels > 0 and min(width, height) == 0:
-        width, height = max(width, 1), max(height, 1)  # bop_toolkit's sides are one pixel short
+        width, height = max(width, 1), max(height, 1)  # bop_toolkit's side lengths are one pixel short
     if width <= 0 or height <= 0:
         return None
     return np.array([x, y, x + width, y + height]) - 0.5

@@ -1,4 +1,4 @@
-"""Where the scenes of a BOP dataset lie, and where its models and lists do, whatever folder of it is named."""
+"""Finds the scenes of a BOP dataset, and its models and lists, from any folder of it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sim_replay.bop.records import BopError
 from sim_replay.bop.scene import BopScene, ImagewiseScene, imagewise_keys
 
 _SCENE_FILES = ("scene_camera.json", "scene_gt.json")
-_DEEPEST = 4  # folders between the one that is named and a scene
-_LEVELS_UP = 3  # from a scene to its dataset: ROOT/SPLIT/SCENE, and one for those who pack it deeper
+_DEEPEST = 4  # levels between the given folder and a scene
+_LEVELS_UP = 3  # from a scene to its dataset: ROOT/SPLIT/SCENE, and one more for deeper layouts
 TARGETS_FILE = "test_targets_bop19.json"
 
 
 def find_scenes(path: Path) -> tuple[BopScene, ...]:
     """The scenes in `path`, a scene, split or dataset folder, by split and number; their files are not read yet.
 
-    Raises BopError if there is none, or two of one split have one number.
+    Raises BopError if there is none, or two of one split have the same number.
     """
     if not path.is_dir():
         raise BopError(f"{path} is not a folder")
@@ -37,14 +37,14 @@ def find_scenes(path: Path) -> tuple[BopScene, ...]:
 
 
 def read_scene(folder: Path) -> BopScene:
-    """One scene folder, its files read and checked; all but the camera and pictures may be absent. Raises BopError."""
+    """One scene folder, its files read and checked; all except the camera and images are optional. Raises BopError."""
     (scene,) = _numbered([_scene(folder)])
     _ = scene.frames
     return scene
 
 
 def find_root(folder: Path) -> Path | None:
-    """The dataset that a folder belongs to: the nearest one up with models, model_frame.toml or a list of targets."""
+    """The dataset that a folder belongs to: the nearest parent with models, model_frame.toml or a list of targets."""
     here = _absolute(folder)
     for candidate in (here, *here.parents[:_LEVELS_UP]):
         named = (candidate / name for name in (MODEL_FRAME_FILE, TARGETS_FILE))
@@ -54,7 +54,7 @@ def find_root(folder: Path) -> Path | None:
 
 
 def dataset_of(scene: BopScene) -> Path | None:
-    """The dataset that holds the scene; None where nothing tells, as where a camera.json lies in the scene itself."""
+    """The dataset that contains the scene; None if unknown, for example if a camera.json is in the scene itself."""
     return None if scene.root == _absolute(scene.folder) else scene.root
 
 
@@ -63,7 +63,7 @@ def _absolute(folder: Path) -> Path:
 
 
 def _walk(folder: Path, deepest: int) -> Iterator[Path]:
-    """`folder` and those below it, sorted, that may be or hold scenes; nothing inside a scene."""
+    """`folder` and those below it, sorted, that may be or contain scenes; nothing inside a scene."""
     yield folder
     if deepest == 0 or _is_scene(folder):
         return
@@ -96,18 +96,18 @@ def _scene(folder: Path) -> BopScene:
 
 
 def _root_and_split(folder: Path, holder: Path) -> tuple[Path | None, str | None]:
-    """The dataset of `folder`, and its split's name if `holder`, which holds the scenes, is one or lies in one."""
+    """The dataset of `folder`, and its split's name if `holder`, the scenes' parent folder, is in one or is one."""
     root, named = find_root(folder), re.match(r"train|val|test", holder.name)
     if root is None:
         return (holder.parent, holder.name) if named else (None, None)
     if root in holder.parents:
         return root, holder.relative_to(root).parts[0]
-    # A camera.json of the scene's own makes it no dataset of its own.
+    # A camera.json in the scene itself does not make it a dataset.
     return root, holder.name if named and root != holder else None
 
 
 def _numbered(scenes: list[BopScene]) -> tuple[BopScene, ...]:
-    """Sorted; in each split, scenes whose folders are no numbers count on above the highest. Raises BopError."""
+    """Sorted; scenes whose folders are not numbers are numbered after the others of their split. Raises BopError."""
     ordered = sorted(scenes, key=lambda s: (s.split or "", s.scene_id < 0, s.scene_id, str(s.folder)))
     out = []
     for split in dict.fromkeys((dataset_of(scene), scene.split) for scene in ordered):

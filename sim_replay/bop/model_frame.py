@@ -1,11 +1,11 @@
-"""model_frame.toml: how a dataset's own model axes lie in the target's body frame (FRD), for all its objects or each.
+"""model_frame.toml: orientation of a dataset's model axes in the target's body frame (FRD), for all objects or each.
 
 R_body_model = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]   # this one: models drawn nose x, left wing y, up z
 t_body_model_m = [0.0, 0.0, 0.0]                     # optional: the models' origin, in body
 
 [objects.2]                                          # optional: object 2 differs
 R_body_model = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-diameter_m = 12.0                                    # optional: for datasets that come without models
+diameter_m = 12.0                                    # optional: for datasets without models
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _KEYS = ("R_body_model", "t_body_model_m", "diameter_m")
 
 @dataclass(frozen=True, eq=False)
 class ModelFrame:
-    """Where the axes of a model file lie in body (FRD): x_body = R_body_model x_model + t_body_model_m."""
+    """Pose of a model file's axes in body (FRD): x_body = R_body_model x_model + t_body_model_m."""
 
     R_body_model: Array = field(default_factory=lambda: np.eye(3))  # [3, 3]
     t_body_model_m: Array = field(default_factory=lambda: np.zeros(3))  # [3]
     diameter_m: float | None = None
 
     def points_in_body(self, points_model_m: Array) -> Array:
-        """Points [N, 3] of the model file, metres, in body axes."""
+        """Points [N, 3] of the model file, metres, converted to body axes."""
         return points_model_m @ self.R_body_model.T + self.t_body_model_m
 
     def pose_of_body(self, R_cam_model: Array, t_cam_model_m: Array) -> tuple[Array, Array]:
@@ -54,7 +54,7 @@ class ModelFrames:
         return self.by_object.get(object_id, self.common)
 
     def in_body(self, target: BopTarget) -> BopTarget:
-        """The target with its pose told of its body axes instead of its model file's."""
+        """The target with the pose of its body axes instead of its model file's."""
         R, t = self.of(target.object_id).pose_of_body(target.R_cam_target, target.t_cam_target_m)
         return dataclasses.replace(target, R_cam_target=R, t_cam_target_m=t)
 

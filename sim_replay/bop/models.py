@@ -40,10 +40,10 @@ def read_models_info(folder: Path) -> dict[int, ModelInfo]:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One object. Its vertices are read when they are first asked for."""
+    """One object. Its vertices are read on first use."""
 
     diameter_m: float  # largest distance between two vertices
-    low_m: tuple[float, float, float] | None = None  # corner of the box along the body axes; None: not known
+    low_m: tuple[float, float, float] | None = None  # corner of the box along the body axes; None: unknown
     size_m: tuple[float, float, float] | None = None
     ply: Path | None = None
     frame: ModelFrame | None = None
@@ -59,23 +59,23 @@ class Model:
 
     @property
     def points_m(self) -> Array | None:
-        """Points [N, 3] in body that bound the object: its vertices, else its box's corners; None: not known."""
+        """Points [N, 3] in body that bound the object: its vertices, otherwise its box's corners; None: unknown."""
         if self.vertices_m is not None or self.low_m is None or self.size_m is None:
             return self.vertices_m
         return _corners(np.array(self.low_m), np.array(self.size_m))
 
 
 def models_folder(root: Path) -> Path | None:
-    """models/, else models_eval/, else another models_*/ that holds models_info.json or obj_*.ply."""
+    """models/, otherwise models_eval/, otherwise another models_*/ with models_info.json or obj_*.ply."""
     preferred = ("models", "models_eval")
     names = sorted(root.glob("models*"), key=lambda path: (*(path.name != name for name in preferred), path.name))
     return next((path for path in names if (path / "models_info.json").is_file() or any(path.glob("obj_*.ply"))), None)
 
 
 def object_names(root: Path | None) -> dict[int, str]:
-    """What models_info.json of a dataset calls its objects, by id; those without "name" are left out. Raises BopError.
+    """Names of a dataset's objects in models_info.json, by id; those without "name" are left out. Raises BopError.
 
-    "name" is a key of ours: an id alone means another object in each dataset.
+    "name" is an extension of ours: an id alone means a different object in each dataset.
     """
     folder = None if root is None else models_folder(root)
     if folder is None:
@@ -111,7 +111,7 @@ def _files_of(folder: Path, frames: ModelFrames) -> Iterator[tuple[int, Model]]:
 
 
 def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame) -> Model:
-    """One object; what models_info.json leaves out comes from the mesh."""
+    """One object; values missing in models_info.json are computed from the mesh."""
     known = entry if isinstance(entry, dict) else {}
     name = str(known.get("name", ""))
     diameter_m = _metres(path, key, entry, "diameter") if "diameter" in known or ply is None else None
@@ -135,7 +135,7 @@ def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame
 def largest_distance(points: Array) -> float:
     """Largest distance between two of the points [N, 3] (BOP's diameter), exact, in their unit.
 
-    A walk to the farthest point gives a lower bound; points too near the middle to reach it are left out.
+    Walking to the farthest point gives a lower bound; points too near the middle to reach it are discarded.
     """
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = np.linalg.norm(points - middle, axis=1)

@@ -1,4 +1,4 @@
-"""PLY meshes, millimetres in the file (G. Turk, The PLY Polygon File Format, 1994): written, and vertices read."""
+"""PLY meshes, millimetres in the file (G. Turk, The PLY Polygon File Format, 1994): writes them, reads vertices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A BOP scene on disk: its frames are read when first asked for, its pictures and masks one at a time."""
+"""A BOP scene on disk: frame records are read on first use, images and masks one at a time."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sim_replay.bop.records import DISTORTION_KEY, BopError, BopFrame
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-PICTURE_FOLDERS = ("gray", "rgb")  # the later wins where a frame has both
+PICTURE_FOLDERS = ("gray", "rgb")  # the later one is used if a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
-SIXTEEN_BITS_LEAST = 2**14  # what cameras of 10 to 14 bits give does not reach it, unless it was scaled
+SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _log = logging.getLogger(__name__)
 
 
@@ -32,23 +32,23 @@ _log = logging.getLogger(__name__)
 class BopScene:
     """A scene folder: scene_camera.json, scene_gt.json, scene_gt_info.json, rgb/ or gray/, mask/, mask_visib/.
 
-    Only the camera and the pictures must be there. A scene without scene_camera.json takes the dataset's camera.json.
+    Only camera and images are required. A scene without scene_camera.json uses the dataset's camera.json.
     """
 
     folder: Path
     scene_id: int = 0
-    split: str | None = None  # the folder that holds the scene, if the dataset has splits
+    split: str | None = None  # the parent folder of the scene, if the dataset has splits
     root: Path | None = None  # of the dataset: models, camera.json
     models: ModelFrames = field(default_factory=ModelFrames)
 
     @cached_property
     def frames(self) -> tuple[BopFrame, ...]:
-        """By growing image id. Raises BopError, naming file and key."""
+        """By increasing image id. Raises BopError, naming file and key."""
         gt, gt_info = self.folder / "scene_gt.json", self.folder / "scene_gt_info.json"
         poses, info = (by_number(path, load_object(path, optional=True)) for path in (gt, gt_info))
         camera_file, cameras = self._cameras(poses)
         source = Source(camera_file, gt, gt_info)
-        unlisted: list[Any] | None = [] if gt.is_file() else None  # a picture that the file leaves out shows no target
+        unlisted: list[Any] | None = [] if gt.is_file() else None  # an image that the file omits shows no target
         return tuple(
             frame_of(
                 source, image_id, cameras[image_id], poses.get(image_id, unlisted), info.get(image_id), self.models
@@ -58,29 +58,29 @@ class BopScene:
 
     @property
     def pictured(self) -> tuple[BopFrame, ...]:
-        """The frames that have a picture: an index may list more than was kept. Raises BopError if none has."""
+        """The frames that have an image: an index may list more than exist. Raises BopError if none has."""
         frames = tuple(frame for frame in self.frames if frame.image_id in self._pictures)
         if self.frames and not frames:
             raise BopError(f"{self.folder} holds no picture of those that it lists in rgb/ or gray/")
         return frames
 
     def image_path(self, frame: BopFrame) -> Path:
-        """The frame's picture. Raises BopError if there is none."""
+        """Path of the frame's image. Raises BopError if there is none."""
         path = self._pictures.get(frame.image_id)
         if path is None:
             raise BopError(f"{self.folder / 'rgb'} holds no picture {frame.image_id:06d}")
         return path
 
     def image_bgr(self, frame: BopFrame) -> Image:
-        """The frame's picture [H, W, 3]; a gray one has three equal channels. Raises BopError."""
+        """The frame's image [H, W, 3]; a grey one has three equal channels. Raises BopError."""
         return read_picture_bgr(self.image_path(frame))
 
     def mask(self, frame: BopFrame, target_index: int) -> Mask | None:
-        """The visible mask [H, W] of a target, or None where the data set has no masks. Raises BopError."""
+        """The visible mask [H, W] of a target, or None if the dataset has no masks. Raises BopError."""
         return self._mask("mask_visib", frame, target_index)
 
     def whole_mask(self, frame: BopFrame, target_index: int) -> Mask | None:
-        """The mask [H, W] of a target's whole silhouette inside the picture, or None. Raises BopError."""
+        """The mask [H, W] of a target's whole silhouette inside the image, or None. Raises BopError."""
         return self._mask("mask", frame, target_index)
 
     def _cameras(self, poses: dict[int, Any]) -> tuple[Path, dict[int, Any]]:
@@ -97,14 +97,14 @@ class BopScene:
     def _pictures(self) -> dict[int, Path]:
         found = {}
         for name in PICTURE_FOLDERS:
-            for path in sorted((self.folder / name).glob("*"), reverse=True):  # of 7.jpg and 7.png the first wins
+            for path in sorted((self.folder / name).glob("*"), reverse=True):  # of 7.jpg and 7.png the first is used
                 if path.stem.isdecimal() and path.suffix.lower() in PICTURE_SUFFIXES:
                     found[int(path.stem)] = path
         return found
 
     @cached_property
     def _masks(self) -> dict[tuple[str, int, int], Path]:
-        """By kind, image and target: IMAGE_TARGET.png; IMAGE.png where a picture shows but one target."""
+        """By kind, image and target: IMAGE_TARGET.png; IMAGE.png if an image shows only one target."""
         found = {}
         for kind in ("mask", "mask_visib"):
             for path in (self.folder / kind).glob("*"):
@@ -118,18 +118,18 @@ class BopScene:
         if path is None:
             return None
         values = _pixels(path, cv2.IMREAD_GRAYSCALE)
-        return values > values.max() // 2  # the format says 255 for yes; some datasets write 1
+        return values > values.max() // 2  # the format defines 255 as set; some datasets write 1
 
 
 @dataclass(frozen=True, eq=False)
 class ImagewiseScene(BopScene):
-    """The pictures of one scene in a BOP-imagewise folder: KEY.rgb.jpg, KEY.camera.json, KEY.gt.json, ..."""
+    """The images of one scene in a BOP-imagewise folder: KEY.rgb.jpg, KEY.camera.json, KEY.gt.json, ..."""
 
     keys: tuple[tuple[int, str], ...] = ()  # image id and KEY, as 000001_000023
 
     @cached_property
     def frames(self) -> tuple[BopFrame, ...]:
-        """By growing image id. Raises BopError, naming file and key."""
+        """By increasing image id. Raises BopError, naming file and key."""
         return tuple(self._frame(image_id, key) for image_id, key in sorted(self.keys))
 
     def _frame(self, image_id: int, key: str) -> BopFrame:
@@ -157,7 +157,7 @@ class ImagewiseScene(BopScene):
 
 
 def imagewise_keys(folder: Path) -> dict[int, tuple[tuple[int, str], ...]]:
-    """Image ids and keys of a BOP-imagewise folder by scene id; empty if it is none."""
+    """Image ids and keys of a BOP-imagewise folder by scene id; empty for any other folder."""
     scenes: dict[int, list[tuple[int, str]]] = {}
     for path in sorted(folder.glob("*" + IMAGEWISE_CAMERA)):
         name = re.fullmatch(r"(?:(\d+)_)?(\d+)", path.name.removesuffix(IMAGEWISE_CAMERA))
@@ -167,7 +167,7 @@ def imagewise_keys(folder: Path) -> dict[int, tuple[tuple[int, str], ...]]:
 
 
 def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
-    """COCO's uncompressed run lengths: of no and yes in turn, beginning with no, column by column."""
+    """COCO's uncompressed run lengths: alternately unset and set, starting with unset, column by column."""
     try:
         height, width = entry["size"]
         counts = np.asarray(entry["counts"], dtype=np.int64)
@@ -178,7 +178,7 @@ def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
 
 
 def read_picture_bgr(path: Path) -> Image:
-    """The picture [H, W, 3]; of 16 bits the upper eight. Raises BopError."""
+    """The image [H, W, 3]; of 16 bits the upper eight. Raises BopError."""
     pixels = _pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels.dtype == np.uint16:
         if pixels.max() < SIXTEEN_BITS_LEAST:
@@ -205,7 +205,7 @@ def _pixels(path: Path, flags: int) -> NDArray[Any]:
         raise BopError(f"{path} cannot be read: {error.strerror}") from error
     if _is_torn_jpeg(coded):
         raise BopError(f"{path} is cut short: what is missing would be read as gray")
-    as_they_lie = flags | cv2.IMREAD_IGNORE_ORIENTATION  # labels are of the pixels as they lie
+    as_they_lie = flags | cv2.IMREAD_IGNORE_ORIENTATION  # labels refer to the pixels as stored
     pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), as_they_lie) if coded else None
     if pixels is None:
         raise BopError(f"{path} is not a readable picture")
@@ -213,7 +213,7 @@ def _pixels(path: Path, flags: int) -> NDArray[Any]:
 
 
 def _is_torn_jpeg(coded: bytes) -> bool:
-    """Whether a JPEG ends before its end is marked: OpenCV fills up the rest. Behind the mark may lie anything."""
+    """Whether a JPEG is truncated before its end marker: OpenCV pads the rest. Anything may follow the marker."""
     if not coded.startswith(b"\xff\xd8"):
         return False
     at = 2
@@ -223,7 +223,7 @@ def _is_torn_jpeg(coded: bytes) -> bool:
 
 
 def picture_size_wh(path: Path) -> tuple[int, int]:
-    """Width and height of a picture as its pixels lie, by its head where that tells. Raises BopError."""
+    """Width and height of an image as stored, from its header if possible. Raises BopError."""
     try:
         with PIL.Image.open(path) as picture:
             return picture.size
@@ -231,6 +231,6 @@ def picture_size_wh(path: Path) -> tuple[int, int]:
         OSError,
         ValueError,
         PIL.Image.DecompressionBombError,
-    ):  # of what OpenCV reads none the less
+    ):  # other formats that OpenCV reads
         height, width = read_picture_bgr(path).shape[:2]
         return width, height

@@ -20,12 +20,12 @@ from sim_replay.bop.records import DISTORTION_KEY, MM_PER_M, Array, BopFrame, Bo
 if TYPE_CHECKING:
     from sim_replay.airframes.mesh import Mesh
 
-DEPTH_SCALE = 1.0  # of files that hold no depth
+DEPTH_SCALE = 1.0  # of files without depth
 
 
 @dataclass
 class SceneWriter:
-    """Writes pictures as they come and the indices when it is closed; use it in a `with` statement."""
+    """Writes images as they come and the indices when it is closed; use it in a `with` statement."""
 
     folder: Path
     jpeg_quality: int = 90
@@ -46,12 +46,12 @@ class SceneWriter:
         masks: Sequence[NDArray[np.bool_]] = (),
         whole_masks: Sequence[NDArray[np.bool_]] = (),
     ) -> None:
-        """Write one picture [H, W, 3] and the masks [H, W] of its targets, in their order.
+        """Write one image [H, W, 3] and the masks [H, W] of its targets, in their order.
 
         Args:
-            masks: What is visible of each target.
-            whole_masks: Each target's silhouette as if nothing hid it; where there is none, the visible mask is
-                written as the silhouette too, unless the target's `whole_px` says that more of it exists.
+            masks: The visible part of each target.
+            whole_masks: Each target's silhouette without occlusion; if there is none, the visible mask is also written
+                as the silhouette, unless the target's `whole_px` says that it is larger.
         """
         path = self.folder / "rgb" / f"{frame.image_id:06d}.jpg"
         write_picture(path, image_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
@@ -64,7 +64,7 @@ class SceneWriter:
         self._frames.append(frame)
 
     def add_encoded(self, frame: BopFrame, data: bytes, suffix: str) -> None:
-        """Write one picture without targets as it is, byte for byte; `suffix` is jpg or png."""
+        """Write one image without targets unchanged, byte for byte; `suffix` is jpg or png."""
         (self.folder / "rgb" / f"{frame.image_id:06d}.{suffix}").write_bytes(data)
         self._frames.append(frame)
 
@@ -83,7 +83,7 @@ class SceneWriter:
 
 
 def write_picture(path: Path, pixels: NDArray[np.uint8], how: Sequence[int]) -> None:
-    """Encode by the name's suffix, `how` being OpenCV's flags. Raises OSError, also where imwrite overlooks one."""
+    """Encode in the suffix's format, with OpenCV's flags `how`. Raises OSError, also if imwrite ignores an error."""
     encoded, data = cv2.imencode(path.suffix, pixels, how)
     if not encoded:
         raise OSError(f"{path} cannot be written")
@@ -140,7 +140,7 @@ def _info_entry(target: BopTarget) -> dict[str, Any]:
 
 
 def write_camera(path: Path, K: Array, width_px: int, height_px: int, distortion: Distortion | None = None) -> None:
-    """Write camera.json: the intrinsics of a data set whose scenes share them (scene_camera.json has the last word)."""
+    """Write camera.json: the intrinsics shared by a dataset's scenes (scene_camera.json takes precedence)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     entry: dict[str, Any] = {
         "fx": K[0, 0],
@@ -159,7 +159,7 @@ def write_camera(path: Path, K: Array, width_px: int, height_px: int, distortion
 def write_models(folder: Path, meshes: Mapping[int, Mesh], names: Mapping[int, str] | None = None) -> None:
     """Write obj_NNNNNN.ply (millimetres, binary) of each object id and models_info.json into `folder`.
 
-    `names` of objects go into models_info.json as "name", a key of ours that scores are told by.
+    `names` of objects are written to models_info.json as "name", an extension of ours by which scores name them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     info = {}

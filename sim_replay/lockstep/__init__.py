@@ -1,1 +1,1 @@
-"""Replay in lock-step: the daemon's time is the sequence's, so that the same sequence gives the same outputs."""
+"""Replay in lock-step: the daemon runs on the sequence's time, so that the same sequence gives the same outputs."""

@@ -1,4 +1,4 @@
-"""`uavpose-replay play` in lock-step: at any speed, from any frame, round and round, or a frame at a time."""
+"""`uavpose-replay play` in lock-step: at any speed, from any frame, repeatedly, or frame by frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GO_ON = "g"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What `play` takes beside the sequence, its model and its folder."""
+    """Options of `play` besides sequence, model and output folder."""
     group = parser.add_argument_group(
         "lock-step",
         "the daemon's clock is the sequence's, and the next frame comes when the outputs of the last one are there; "
@@ -40,13 +40,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def asked_for(args: argparse.Namespace) -> bool:
-    """Whether the parsed options ask for lock-step."""
+    """Whether the parsed options imply lock-step."""
     given = (args.speed, args.start, args.loop, args.pause)
     return bool(args.lockstep or args.step or any(value is not None for value in given))
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Play, and write what came out. Raises InputError, PlayError."""
+    """Play, and write the outputs. Raises InputError, PlayError."""
     sequence = open_sequence(args.sequence, args.out, console)
     settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=_rounds(args.loop))
     if args.pause is not None and args.pause not in settings.frames:
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         outputs = play_lockstep(settings, gate.before, after_frame)
     outputs.write(args.out)
     files = f"{POSES_JSONL}, {MESSAGES_JSONL}"
-    if settings.frames == list(range(len(sequence.scene.images))):  # of a part, the rest would count as missed
+    if settings.frames == list(range(len(sequence.scene.images))):  # after a part only, the rest would count as missed
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
         files += "; uavpose-replay score takes it" if sequence.scene.truths else ""
@@ -77,12 +77,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 class Gate:
-    """Holds a frame back until its time has come, or until a person lets it through."""
+    """Holds a frame back until it is due, or until the user releases it."""
 
     def __init__(
         self, fps: float, speed: float | None, pause: int | None, step: bool, ask: Callable[[str], str]
     ) -> None:
-        """`speed` None: as fast as it goes; `ask` prompts a person and returns the line, or raises EOFError."""
+        """`speed` None: as fast as possible; `ask` prompts the user and returns the line, or raises EOFError."""
         self._period_s = 0.0 if speed is None else 1.0 / (fps * speed)
         self._pause = pause
         self._step = step
@@ -90,7 +90,7 @@ class Gate:
         self._due_s: float | None = None
 
     def before(self, frame: int) -> None:
-        """Returns when `frame` may be shown."""
+        """Returns when `frame` may be played."""
         if self._step or frame == self._pause:
             self._step = self._person_steps(frame)
             self._pause = None

@@ -1,4 +1,4 @@
-"""The player's end of lock-step: it listens, the daemon calls and is told each step (edge.cameras.lockstep)."""
+"""The player's side of lock-step: it listens, the daemon connects and receives each step (edge.cameras.lockstep)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _POLL_S = 0.2
 
 
 class Control:
-    """One line a step; each waits for the daemon's answer."""
+    """One line per step; each waits for the daemon's answer."""
 
     def __init__(self) -> None:
         self._listening = socket.create_server(("127.0.0.1", 0))
@@ -26,7 +26,7 @@ class Control:
         return f"127.0.0.1:{self._listening.getsockname()[1]}"
 
     def wait_until_ready(self, alive: Callable[[], bool]) -> None:
-        """Until the daemon has called and is warm. Raises PlayError if it ends before or takes too long."""
+        """Wait until the daemon has connected and warmed up. Raises PlayError if it ends first or takes too long."""
         deadline_s = time.monotonic() + STEP_TIMEOUT_S
         self._listening.settimeout(_POLL_S)
         while self._daemon is None:
@@ -40,7 +40,7 @@ class Control:
         self._expect("ready")
 
     def step(self, word: str, number: int) -> None:
-        """`time` NS or `frame` INDEX; returns when the daemon has done all that follows. Raises PlayError."""
+        """`time` NS or `frame` INDEX; returns when the daemon has processed all its consequences. Raises PlayError."""
         assert self._daemon is not None
         try:
             self._daemon.sendall(f"{word} {number}\n".encode())
@@ -49,7 +49,7 @@ class Control:
         self._expect("ok")
 
     def close(self) -> None:
-        """Hang up: to the daemon the recording is over."""
+        """Disconnect: the daemon sees this as the end of the recording."""
         for end in (self._daemon, self._listening):
             if end is not None:
                 end.close()

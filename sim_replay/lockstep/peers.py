@@ -1,6 +1,6 @@
-"""Both peers of the daemon in lock-step: an autopilot on the sequence's time, a subscriber that knows when all came.
+"""Both peers of the daemon in lock-step: an autopilot on the sequence's time, a subscriber that awaits all outputs.
 
-What they record holds no time but the sequence's: stamps count from the exposure of its first frame.
+Their records contain only times of the sequence: timestamps count from the exposure of its first frame.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Record = dict[str, Any]
 
 ARRIVAL_TIMEOUT_S = 60.0
 _DATAGRAM_BYTES = 65535
-# Fields that tell a time of the daemon's clock, and the nanoseconds of one unit.
+# Fields with a time of the daemon's clock, and the nanoseconds per unit.
 STAMPS_NS = {
     ("TARGET_RELATIVE", "timestamp"): 1_000,
     ("FOLLOW_TARGET", "timestamp"): 1_000_000,
@@ -37,7 +37,7 @@ STAMPS_NS = {
 
 
 class MavlinkPeer:
-    """A simulated autopilot behind a socket of its own; `records` has every message that it got."""
+    """A simulated autopilot with its own socket; `records` contains every message that it received."""
 
     def __init__(self, autopilot: Autopilot, port: int, frame0_ns: int) -> None:
         """`port` is the daemon's, `frame0_ns` the exposure of the first frame on the stepped clock."""
@@ -52,7 +52,7 @@ class MavlinkPeer:
         self._socket.setblocking(False)
 
     def next_due_ns(self) -> int | None:
-        """When it has something to say next."""
+        """Time of its next telemetry message."""
         return self._autopilot.next_due_ns()
 
     def speak(self, now_ns: int) -> None:
@@ -61,7 +61,7 @@ class MavlinkPeer:
             self._socket.send(packed)
 
     def listen(self, now_ns: int) -> bool:
-        """Take all that has come, and answer; whether there was anything to answer."""
+        """Process everything received, and answer; returns whether anything was to be answered."""
         answered = False
         while True:
             try:
@@ -82,19 +82,19 @@ class MavlinkPeer:
         for message in self._parser.parse_buffer(datagram) or []:
             record = message_record(message, now_ns - self._frame0_ns)
             for (stamped, field), unit_ns in STAMPS_NS.items():
-                # An unset stamp is 0 and stays it.
+                # An unset timestamp is 0 and remains 0.
                 if message.get_type() == stamped and record[field]:
                     record[field] -= self._frame0_ns // unit_ns
             self.records.append(record)
 
 
 class Subscriber:
-    """Takes poses as an integrator's program does; the frame's detections say which poses belong to it."""
+    """Receives poses like a user's program; the frame's detections say which poses belong to it."""
 
     def __init__(self, endpoint: str, uav: str, frame0_ns: int) -> None:
         """Raises PlayError if the daemon does not answer at `endpoint`."""
         self.records: list[Record] = []
-        self.received: list[Record] = []  # the same as sim_replay.subscriber tells them
+        self.received: list[Record] = []  # as in sim_replay.subscriber's output
         self._frame0_ns = frame0_ns
         self._receiver = PoseReceiver(uav)
         self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
@@ -108,7 +108,7 @@ class Subscriber:
         self._wait_until_known(uav)
 
     def collect(self, frame: int, now_ns: int) -> list[Record]:
-        """The records of the frame exposed at `now_ns`, waited for. Raises PlayError if they do not come."""
+        """Wait for the records of the frame exposed at `now_ns`. Raises PlayError if they do not arrive."""
         deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
         while now_ns not in self._frames or any((now_ns, name) not in self._poses for name in self._frames[now_ns]):
             try:
@@ -148,7 +148,7 @@ class Subscriber:
         return {"frame": frame, "t_ns": taken.stamp_ns - self._frame0_ns, **dict(sorted(values.items()))}
 
     def _wait_until_known(self, uav: str) -> None:
-        # An answer to a question asked after them says that the declarations have reached the daemon.
+        # Queries are ordered after declarations: an answer shows that those have reached the daemon.
         deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
         while not any(reply.ok for reply in self._session.get(key_of(uav, "info"), timeout=2.0)):
             if time.monotonic() > deadline_s:

@@ -1,7 +1,7 @@
-"""Plays a sequence in lock-step through the real daemon process: no step before the last one's outputs are there.
+"""Plays a sequence in lock-step through the real daemon process: a step begins when the last one's outputs arrived.
 
-Time is the sequence's: the daemon's clock (edge.clock) is stepped from message to message of the autopilot and from
-frame to frame, over the daemon's own sockets, and nothing in the outputs depends on how long a step took.
+Time is the sequence's: the daemon's clock (edge.clock) is stepped to each message of the autopilot and each frame,
+over the daemon's own sockets, and nothing in the outputs depends on how long a step took.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sim_replay.telemetry import read_telemetry
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot
 LEAD_NS = 1_000_000_000  # of telemetry before the first frame
 UAV = "uav1"
-ENDING_S = 3.0  # from hanging up to its end
+ENDING_S = 3.0  # from disconnecting to the daemon's end
 POSES_JSONL = "poses.jsonl"
 
 BeforeFrame = Callable[[int], None]
@@ -41,7 +41,7 @@ AfterFrame = Callable[[int, list[Record]], None]
 
 @dataclass(frozen=True)
 class LockstepSettings:
-    """What is played: the frames from `start` to before `stop` (None: to the last), `rounds` times over."""
+    """What is played: the frames from `start` up to before `stop` (None: to the last), `rounds` times."""
 
     sequence: PlayedSequence
     model: Path
@@ -51,7 +51,7 @@ class LockstepSettings:
 
     @property
     def frames(self) -> list[int]:
-        """Their numbers, in the order they are shown."""
+        """Their numbers, in the order of playing."""
         return list(range(self.start, len(self.sequence.scene.images))[: self._count]) * self.rounds
 
     @property
@@ -61,14 +61,14 @@ class LockstepSettings:
 
 @dataclass(frozen=True)
 class Outputs:
-    """What both peers got, in order; times count from the exposure of frame 0."""
+    """What both peers received, in order; times count from the exposure of frame 0."""
 
-    poses: list[Record]  # as the subscriber took them
-    mavlink: list[Record]  # as the autopilot got them, by field
-    recording: Recording  # the same as `sim_replay.score` takes it; its monotonic clock and UTC are the stepped one
+    poses: list[Record]  # as the subscriber received them
+    mavlink: list[Record]  # as the autopilot received them, by field
+    recording: Recording  # for `sim_replay.score`; its monotonic clock and UTC are the stepped clock
 
     def write(self, folder: Path) -> None:
-        """poses.jsonl and mavlink.jsonl."""
+        """Write poses.jsonl and mavlink.jsonl."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, records in ((POSES_JSONL, self.poses), (MESSAGES_JSONL, self.mavlink)):
             lines = "".join(json.dumps(record) + "\n" for record in records)
@@ -76,12 +76,12 @@ class Outputs:
 
 
 def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_frame: AfterFrame) -> Outputs:
-    """Play the sequence. `before_frame` hears each frame's number first and may take its time; `after_frame` hears it
-    again with the poses that came of it, none of a frame that was not recorded.
+    """Play the sequence. `before_frame` is called with each frame's number and may block; `after_frame` is called
+    afterwards with the number and the resulting poses, none for a frame that was not recorded.
 
     Raises:
-        InputError: the daemon refuses what it is given.
-        PlayError: it ends or does not answer; the text has its last words.
+        InputError: the daemon rejects its input.
+        PlayError: it terminates or does not answer; the text has its last output.
     """
     said: list[str] = []
     with ExitStack() as cleanup:
@@ -109,7 +109,7 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
 
 
 def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputError | PlayError:
-    """What the player met, with the daemon's last words if it has ended."""
+    """The player's error, with the daemon's last output if it has terminated."""
     if daemon.wait(ENDING_S) is None:
         return error
     code = daemon.reap()
@@ -118,7 +118,7 @@ def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputErr
 
 
 class Flight:
-    """Both peers and the clock of one play, once the daemon is warm."""
+    """Both peers and the clock of one replay, once the daemon has warmed up."""
 
     def __init__(self, settings: LockstepSettings, control: Control, mavlink_port: int, endpoint: str) -> None:
         sequence, frames = settings.sequence, settings.frames
@@ -163,7 +163,7 @@ class Flight:
 
 
 class Stepper:
-    """Moves the daemon's clock, and the autopilot's with it."""
+    """Steps the daemon's clock, and the autopilot's with it."""
 
     def __init__(self, control: Control, mavlink: MavlinkPeer, start_ns: int) -> None:
         self._control = control
@@ -171,7 +171,7 @@ class Stepper:
         self._now_ns = start_ns
 
     def advance(self, until_ns: int) -> None:
-        """Let time pass to `until_ns`, with a stop wherever the autopilot has something to say."""
+        """Advance to `until_ns`, stopping at each time at which the autopilot has a message to send."""
         while (due_ns := self._mavlink.next_due_ns()) is not None and due_ns < until_ns:
             self._now_ns = max(due_ns, self._now_ns)
             self._let_it_be_now()
@@ -179,7 +179,7 @@ class Stepper:
         self._let_it_be_now()
 
     def expose(self, frame: int) -> None:
-        """Give the daemon picture `frame` now; returns when it has come round."""
+        """Give image `frame` to the daemon now; returns when the daemon has processed it."""
         self._control.step("frame", frame)
         self._exchange()
 
@@ -189,6 +189,6 @@ class Stepper:
         self._exchange()
 
     def _exchange(self) -> None:
-        # What the autopilot answers is heard in the same instant: the link of a replay has no delay.
+        # The autopilot's answers arrive at the same instant: the link of a replay has no delay.
         while self._mavlink.listen(self._now_ns):
             self._control.step("time", self._now_ns)
