@@ -1,1 +1,1 @@
-"""Rendered data, recorded sequences and the harness that replays them through the real daemon."""
+"""Rendered data, recorded sequences, and the tools that replay them through the real daemon."""

@@ -1,15 +1,15 @@
 """A simulated autopilot: tells own-ship state over MAVLink on UDP, and takes what the daemon sends.
 
-It reports a sequence's telemetry as an ArduPilot plane would, or one that PX4 flies, on a boot clock of its own:
-HEARTBEAT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS
-of a gimbal of its own; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. Where rows of the telemetry are missing
-it tells nothing of the own ship. PX4 denies a command with parameters that it does not know, and asks for TIMESYNC
-itself, ten times a second, believing answers of at most 10 ms.
+It sends a sequence's telemetry as ArduPilot or PX4 would on a plane, on a boot clock of its own: HEARTBEAT,
+ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS of its own
+gimbal; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. Where telemetry rows are missing, it sends no own-ship
+state. PX4 denies a command with unknown parameters, and sends TIMESYNC requests itself, ten times per second,
+accepting answers within 10 ms.
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
-Prints one JSON object a line: `ready`, each `target_relative` with its receive time, with --all each `message` that it
-takes, and a `summary` when it is told to stop (SIGTERM, SIGINT) or the process that started it ends.
+Prints one JSON object per line: `ready`, each `target_relative` with its arrival time, with --all each accepted
+`message`, and a `summary` when it is told to stop (SIGTERM, SIGINT) or its parent process ends.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SYSTEM_ID = 1
 COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 TARGET_RELATIVE_ID = 511
 TRAFFIC_IDS = (dialect.MAVLINK_MSG_ID_FOLLOW_TARGET, dialect.MAVLINK_MSG_ID_ADSB_VEHICLE)  # of systems of their own
-# What it streams unasked; MAV_CMD_SET_MESSAGE_INTERVAL changes it.
+# Rates without a request; MAV_CMD_SET_MESSAGE_INTERVAL changes them.
 DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
@@ -51,7 +51,7 @@ DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
-GIMBAL_RATE_HZ = 10.0  # unasked
+GIMBAL_RATE_HZ = 10.0  # without a request
 FIRMWARES = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
 PX4_TIMESYNC_HZ = 10.0
 PX4_TIMESYNC_RTT_MAX_NS = 10_000_000
@@ -62,7 +62,7 @@ GIMBAL_FLAGS = (
     | dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 )
 GIMBAL_UNKNOWN = ("angular_velocity_x", "angular_velocity_y", "angular_velocity_z", "delta_yaw", "delta_yaw_velocity")
-# Up for an odd while before the first frame: no test may pass by taking boot time for the host's.
+# An arbitrary time before the first frame: a test that confuses boot time with host time must fail.
 BOOT_BEFORE_START_NS = 734_567_891_234
 INTERVAL_MIN_NS = 1_000_000
 OWN_SHIP_IDS = (
@@ -70,7 +70,7 @@ OWN_SHIP_IDS = (
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
 )
-SPEED_MAX_CMPS = 32767  # that GLOBAL_POSITION_INT can tell
+SPEED_MAX_CMPS = 32767  # largest speed in GLOBAL_POSITION_INT
 _POLL_S = 0.2
 _DATAGRAM_BYTES = 65535
 
@@ -78,7 +78,7 @@ _DATAGRAM_BYTES = 65535
 class Autopilot:
     """Bytes in, bytes out, on the host's monotonic clock; no sockets, no waiting.
 
-    `received` counts valid messages by name, `refused` everything else by reason.
+    `received` counts valid messages by name, `refused` all others by reason.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Autopilot:
         firmware: str = "ardupilot",
         on_message: Callable[[Any, int], None] = lambda _message, _now_ns: None,
     ) -> None:
-        """`firmware` is one of FIRMWARES; `on_message` hears each message that is taken, and when it came."""
+        """`firmware` is one of FIRMWARES; `on_message` is called with each accepted message and its arrival time."""
         self._telemetry = telemetry
         self._gimbal = gimbal
         self._start_at_ns = start_at_ns
@@ -118,7 +118,7 @@ class Autopilot:
         return min(self._next_ns.values(), default=None)
 
     def due(self, now_ns: int) -> list[bytes]:
-        """Telemetry to be sent by `now_ns`, packed. What fell behind is skipped, not sent in a burst."""
+        """Telemetry to be sent by `now_ns`, packed. Missed messages are skipped, not sent in a burst."""
         packed = []
         for message_id, next_ns in self._next_ns.items():
             if next_ns <= now_ns:
@@ -129,12 +129,12 @@ class Autopilot:
         return packed
 
     def take(self, datagram: bytes, now_ns: int) -> tuple[list[bytes], list[dict[str, Any]]]:
-        """Take one datagram off the wire; nothing in it is trusted.
+        """Process one received datagram; nothing in it is trusted.
 
         Returns:
             Packed replies, and a record of each valid TARGET_RELATIVE.
         """
-        # A parser for each datagram: a truncated frame must not swallow what follows.
+        # One parser per datagram: a truncated frame must not swallow what follows.
         parser = MAVLink(None)
         parser.robust_parsing = True
         replies, records = [], []
@@ -195,14 +195,14 @@ class Autopilot:
         )
 
     def _timesync_refusal(self, answer: Any, now_ns: int) -> str | None:
-        """What this autopilot asked, answered in time?"""
+        """Refusal of the answer to this autopilot's own request, if it took too long."""
         if self._firmware != "px4":
             return None
         round_trip_ns = now_ns - self._boot_at_ns - answer.ts1
         return None if 0 <= round_trip_ns <= PX4_TIMESYNC_RTT_MAX_NS else "TIMESYNC took too long"
 
     def _refusal(self, message: Any, now_ns: int) -> str | None:
-        """Why a parsed message is not taken, or None."""
+        """Why a parsed message is not accepted, or None."""
         kind = message.get_type()
         if kind == "BAD_DATA":
             return "not MAVLink"
@@ -277,7 +277,7 @@ def _emit(record: dict[str, Any]) -> None:
 
 
 def _fly(autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event) -> None:
-    """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process is gone."""
+    """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process has ended."""
     parent = os.getppid()
     outward, inward = Lane(faults), Lane(faults, seed=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
@@ -314,7 +314,7 @@ def _tell(message: Any, now_ns: int) -> None:
 
 
 def _writer(args: argparse.Namespace, stack: ExitStack) -> Callable[[Any, int], None]:
-    """Writes each message to --messages; `t_ns` counts on the telemetry's clock."""
+    """Writes each message to --messages; `t_ns` is on the telemetry's clock."""
     file = stack.enter_context(args.messages.open("w", encoding="utf-8"))
 
     def write(message: Any, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""A link between daemon and autopilot as it is in the air: late, uneven, losing and swapping datagrams. Pure."""
+"""A degraded link between daemon and autopilot: delay, jitter, loss and reordering of datagrams. Pure."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ class LinkFaults:
     """The same in both directions."""
 
     delay_ms: float = 0.0  # of every datagram
-    jitter_ms: float = 0.0  # on top of it, uniform from 0; the order is kept
+    jitter_ms: float = 0.0  # in addition, uniform from 0; the order is kept
     loss: float = 0.0  # share that never arrives
-    reorder: float = 0.0  # share that the next one overtakes
+    reorder: float = 0.0  # share that is overtaken by the next one
 
     @property
     def late_ms_max(self) -> float:
-        """What may pass until the last datagram is there."""
+        """Longest time until the last datagram has arrived."""
         return self.delay_ms + self.jitter_ms
 
     def arguments(self) -> list[str]:
-        """For the command line that `add_options` reads."""
+        """As command-line arguments for `add_options`."""
         given = {name: value for name, value in asdict(self).items() if value}
         return [word for name, value in given.items() for word in (_option(name), str(value))]
 
 
 def add_options(parser: argparse._ActionsContainer) -> None:
-    """An option for each, `--link-delay-ms` and so on."""
+    """One option per fault, `--link-delay-ms` and so on."""
     words = {
         "delay_ms": ("MS", "every datagram takes so long"),
         "jitter_ms": ("MS", "and up to so much more, by chance"),
@@ -47,12 +47,12 @@ def add_options(parser: argparse._ActionsContainer) -> None:
 
 
 def link_faults(args: argparse.Namespace) -> LinkFaults:
-    """What was asked for."""
+    """The faults requested on the command line."""
     return LinkFaults(*(getattr(args, f"link_{one.name}") for one in fields(LinkFaults)))
 
 
 class Lane:
-    """One direction. Give it datagrams in the order of their times (ns of any one clock), and ask what comes out."""
+    """One direction. Takes datagrams in order of time (ns of any one clock), returns those that have arrived."""
 
     def __init__(self, faults: LinkFaults, seed: int = SEED) -> None:
         self._faults = faults
@@ -63,7 +63,7 @@ class Lane:
         self._held: bytes | None = None
 
     def put(self, datagram: bytes, now_ns: int) -> None:
-        """One goes in."""
+        """Send one datagram."""
         if self._chance.random() < self._faults.loss:
             return
         if self._held is None and self._chance.random() < self._faults.reorder:
@@ -77,14 +77,14 @@ class Lane:
             self._held = None
 
     def due(self, now_ns: int) -> list[bytes]:
-        """What has come out by `now_ns`, in the order in which it did."""
+        """Datagrams that have arrived by `now_ns`, in the order of arrival."""
         out = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             out.append(heapq.heappop(self._waiting)[2])
         return out
 
     def next_due_ns(self) -> int | None:
-        """When the next comes out; None: nothing is on its way."""
+        """Arrival time of the next one; None: none is in flight."""
         return self._waiting[0][0] if self._waiting else None
 
     def _push(self, datagram: bytes) -> None:

@@ -126,7 +126,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _check_score_options(args: argparse.Namespace) -> None:
-    """Raise InputError for what the other way of scoring takes."""
+    """Raise InputError for options of the other kind of scoring."""
     others = _OF_A_DATASET if args.dataset is None else _OF_A_FLIGHT
     given = ", ".join(f"--{name}" for name in others if getattr(args, name) is not None)
     if given:
@@ -168,9 +168,9 @@ def _score_dataset(args: argparse.Namespace, console: Console) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit codes: 0 done, 1 the replay failed, 2 bad input, 130 interrupted."""
     args = _parser().parse_args(argv)
-    # As with Ctrl-C: the processes of a replay are stopped on the way out.
+    # Like Ctrl-C, so that the processes of a replay are stopped.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     try:
         return _run(args)
@@ -178,7 +178,7 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     except BrokenPipeError:
-        raise  # who read the output has had enough: no failure, and `launch` ends as such a command does
+        raise  # the reader of the output has closed it: not a failure, and `launch` exits as usual for that
     except (PlayError, OSError) as error:
         print(error, file=sys.stderr)
         return 1

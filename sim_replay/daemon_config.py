@@ -1,4 +1,4 @@
-"""The configuration of a daemon that plays a sequence: on loopback alone, its camera on the sequence's own mount."""
+"""The configuration of a daemon that plays a sequence: loopback only, the camera mounted as in the sequence."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def sequence_config(
     """The text of its TOML file.
 
     Args:
-        model: ONNX file; None: the daemon's own choice.
-        camera: What else [camera] holds: when, how often or by whose leave the sequence is played.
-        recordings: Folder for the daemon's own recordings, pictures and all; None: it makes none.
-        to_px4: Send TARGET_RELATIVE to PX4 too, which takes it for a landing target.
+        model: ONNX file; None: the daemon's default.
+        camera: Further keys of [camera]: when, how often or under whose control the sequence is played.
+        recordings: Folder for the daemon's own recordings, including images; None: no recordings.
+        to_px4: Also send TARGET_RELATIVE to PX4, which takes it for a landing target.
     """
     tables: dict[str, dict[str, object]] = {
         "vehicle": {"name": uav},

@@ -1,11 +1,11 @@
-"""A BOP dataset as evaluation and training see it: its frames, cameras, targets in body axes (FRD) and models.
+"""A BOP dataset for evaluation and training: its frames, cameras, targets in body axes (FRD) and models.
 
     dataset = open_dataset(Path("FW-UAV6DPose"), "test")
     for frame in dataset.frames():
         picture = frame.undistorted_bgr()   # of the pinhole camera frame.K
 
-What a dataset leaves out is derived: visible boxes from masks, else from the projected model; diameters from the
-meshes, else from how large the targets look at their known depth.
+What a dataset omits is derived: visible boxes from masks, otherwise from the projected model; diameters from the
+meshes, otherwise from the targets' apparent size at their known depth.
 """
 
 from __future__ import annotations
@@ -29,50 +29,50 @@ from sim_replay.bop.scene import Image, Mask, picture_size_wh, read_picture_bgr
 
 Array = NDArray[np.float64]
 Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
-_MASKS_LOOKED_AT = 200  # to guess an object's diameter where there are neither models nor boxes
+_MASKS_LOOKED_AT = 200  # masks that are read to estimate diameters if there are neither models nor boxes
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetFrame:
-    """One picture with its truth."""
+    """One image with its ground truth."""
 
     scene_id: int
     image_id: int
     K: Array  # [3, 3], pixel centres at integers
-    distortion: Distortion | None  # k1, k2, p1, p2, k3 of the picture on disk; None: a pinhole camera
+    distortion: Distortion | None  # k1, k2, p1, p2, k3 of the stored image; None: a pinhole camera
     image_path: Path
-    targets: tuple[BopTarget, ...]  # poses of body axes (FRD); boxes in the picture on disk
+    targets: tuple[BopTarget, ...]  # poses of body axes (FRD); boxes in the stored image
     scene: BopScene = field(repr=False)
-    target_indices: tuple[int, ...]  # of each target among all that the scene lists for this picture
-    truth_known: bool = True  # as sim_replay.bop.BopFrame has it
-    unlisted: tuple[BopTarget, ...] = ()  # others that are there, but test_targets_bop19.json does not ask for
+    target_indices: tuple[int, ...]  # of each target among all that the scene lists for this image
+    truth_known: bool = True  # see sim_replay.bop.BopFrame
+    unlisted: tuple[BopTarget, ...] = ()  # others that are present but not listed in test_targets_bop19.json
 
     def image_bgr(self) -> Image:
-        """The picture as it is on disk [H, W, 3]. Raises BopError."""
+        """The image as stored [H, W, 3]. Raises BopError."""
         return read_picture_bgr(self.image_path)
 
     def undistorted_bgr(self) -> Image:
-        """The picture [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
+        """The image [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
         return read_undistorted_bgr(self.image_path, self.K, self.distortion)
 
     def undistorted_boxes_xyxy_px(self, frame_wh: tuple[int, int]) -> list[Array | None]:
-        """The visible box [4] of each target where undistorted_bgr(), frame_wh large, shows it; None: it shows none.
+        """The visible box [4] of each target in undistorted_bgr() of size frame_wh; None: not visible there.
 
-        A lens may show more than the pinhole's picture has room for, so boxes end at its edges.
+        The original image may show more than the undistorted one, so boxes are clipped to its edges.
         """
         boxes = [target.box_visible_xyxy_px for target in self.targets]
         lens = lens_of(self.K, self.distortion or ())
         return boxes if lens is None else [None if box is None else _straight(lens, box, frame_wh) for box in boxes]
 
     def mask(self, k: int) -> Mask | None:
-        """The visible mask [H, W] of targets[k] in the picture on disk; None if the dataset has none."""
+        """The visible mask [H, W] of targets[k] in the stored image; None if the dataset has none."""
         return self.scene.mask(BopFrame(self.image_id, self.K), self.target_indices[k])
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Scenes of one dataset; indices are read scene by scene, pictures never before they are asked for."""
+    """Scenes of one dataset; indices are read scene by scene, images only on use."""
 
     name: str
     root: Path
@@ -83,8 +83,8 @@ class Dataset:
     def models(self) -> dict[int, Model]:
         """By object id; sizes in body axes, metres. Raises BopError.
 
-        A dataset without any model gets diameters from its boxes (or masks): the largest side at the target's depth
-        over all its pictures. That is never above the true diameter by more than a pixel's worth.
+        For a dataset without any model, diameters come from its boxes (or masks): the largest side at the target's
+        depth over all its images. This exceeds the true diameter by at most the equivalent of one pixel.
         """
         frames = self.scenes[0].models
         models = read_models(self.root, frames)
@@ -97,9 +97,9 @@ class Dataset:
         }
 
     def frames(self) -> Iterator[DatasetFrame]:
-        """Every frame that has a picture, by scene and image id; of a test split those in test_targets_bop19.json.
+        """Every frame that has an image, by scene and image id; of a test split those in test_targets_bop19.json.
 
-        Raises BopError, naming file and key; at the end, too, if that lists no picture that there is.
+        Raises BopError, naming file and key; also at the end if that file lists no existing image.
         """
         wanted = self._wanted
         passed_over, listed = 0, False
@@ -120,15 +120,15 @@ class Dataset:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
 
     def pictured_frames(self) -> Iterator[DatasetFrame]:
-        """Every frame that has a picture, whatever test_targets_bop19.json lists. Raises BopError."""
+        """Every frame that has an image, whatever test_targets_bop19.json lists. Raises BopError."""
         for scene in self.scenes:
             for frame in scene.pictured:
                 yield self._frame(scene, frame, range(len(frame.targets)))
 
     def labelled_frames(self) -> list[DatasetFrame]:
-        """Those of frames() whose truth is known: some datasets keep that of their test splits to themselves.
+        """The frames() with known ground truth: some datasets do not publish that of their test splits.
 
-        Raises BopError, also if it is known of none.
+        Raises BopError, also if it is known for none.
         """
         frames = list(self.frames())
         labelled = [frame for frame in frames if frame.truth_known]
@@ -139,9 +139,9 @@ class Dataset:
         return labelled
 
     def boxed_frames(self) -> list[DatasetFrame]:
-        """Those of labelled_frames(); of each of their targets it is known where it is seen, or that it is not.
+        """The labelled_frames(), each target with a visible box or known to be invisible.
 
-        Raises BopError, also for a target of which nothing tells that.
+        Raises BopError, also for a target of unknown visibility.
         """
         frames = self.labelled_frames()
         for frame in frames:
@@ -183,12 +183,12 @@ def open_dataset(path: Path, split: str | None = None) -> Dataset:
     """Open a BOP dataset, a split of it or one scene, scenewise or imagewise.
 
     Args:
-        path: Any folder of the dataset that holds scenes or is one.
-        split: Name of a split below `path`; `test` finds `test_primesense` too where it is the only one of its kind.
-            None takes all that is in `path`.
+        path: Any folder of the dataset that contains scenes or is one.
+        split: Name of a split below `path`; `test` also finds `test_primesense` if it is the only one of its kind.
+            None takes all splits in `path`.
 
     Raises:
-        BopError: There is no scene, no such split, more than one dataset, or a file is not as it should be.
+        BopError: There is no scene, no such split, more than one dataset, or a file is invalid.
     """
     scenes = find_scenes(path)
     holders = {dataset_of(scene): scene for scene in scenes}
@@ -229,7 +229,7 @@ def _read_targets(path: Path) -> Wanted | None:
 
 
 def _chosen(targets: Sequence[BopTarget], wanted: Counter[int]) -> list[int]:
-    """Indices of the wanted instances of each object; of too many, those of which most is visible."""
+    """Indices of the wanted instances of each object; if there are too many, the most visible ones."""
     by_visible = sorted(range(len(targets)), key=lambda index: -(targets[index].visible_px or 0))
     left, chosen = wanted.copy(), []
     for index in by_visible:
@@ -240,12 +240,12 @@ def _chosen(targets: Sequence[BopTarget], wanted: Counter[int]) -> list[int]:
 
 
 def _unseen(target: BopTarget) -> bool:
-    """Whether nothing is said of what is visible of it (a target that is said to be hidden has visible_px 0)."""
+    """Whether its visibility is unknown (a target marked as hidden has visible_px 0)."""
     return target.box_visible_xyxy_px is None and target.visible_px is None
 
 
 def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
-    """The target with a visible box from its mask, where the scene says nothing of it but has one."""
+    """The target with a visible box from its mask, if the scene has a mask but no other information on visibility."""
     target = frame.targets[index]
     if not _unseen(target):
         return target
@@ -264,7 +264,7 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
 
 def _straight(lens: Lens, box_xyxy_px: Array, frame_wh: tuple[int, int]) -> Array | None:
     straight = np.clip(lens.box_to_pinhole(box_xyxy_px), -0.5, np.tile(frame_wh, 2) - 0.5)
-    return straight if (straight[:2] < straight[2:]).all() else None  # NaN where the lens cannot be inverted
+    return straight if (straight[:2] < straight[2:]).all() else None  # NaN if the distortion cannot be inverted
 
 
 def box_of_mask(mask: Mask) -> Array | None:
@@ -276,9 +276,9 @@ def box_of_mask(mask: Mask) -> Array | None:
 
 
 def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
-    """The target with boxes from its model's vertices, or the corners of its box; as it is where neither is known.
+    """The target with boxes from its model's vertices, or its box's corners; unchanged if neither is known.
 
-    One behind the camera is hidden; of one that reaches behind it nothing is known.
+    A target behind the camera is hidden; one that extends behind it is left unchanged.
     """
     points = None if model is None else model.points_m
     if points is None:
@@ -303,7 +303,7 @@ def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame,
 
 
 def _diameters_from_boxes(scenes: Sequence[BopScene]) -> dict[int, float]:
-    """By object id, metres; 0 for one that no box or mask is known of."""
+    """By object id, metres; 0 for an object without any box or mask."""
     largest: dict[int, float] = {}
     bare: list[tuple[BopScene, BopFrame, int]] = []
     for scene in scenes:
@@ -327,7 +327,7 @@ def _widen(largest: dict[int, float], target: BopTarget, box_xyxy_px: Array | No
 
 
 def read_undistorted_bgr(path: Path, K: Array, distortion: Distortion | None) -> Image:
-    """The picture [H, W, 3] that the pinhole camera K would have taken in place of its lens. Raises BopError."""
+    """The image [H, W, 3] that the pinhole camera K would have taken without distortion. Raises BopError."""
     image_bgr = read_picture_bgr(path)
     if distortion is None:
         return image_bgr

@@ -1,4 +1,4 @@
-"""Plays a sequence for a person to watch: a live line, a summary, score.json, a picture and a video."""
+"""Plays a sequence with live output: a status line, a summary, score.json, an image and a video."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PLAIN_PERIOD_S = 1.0
 
 @dataclass
 class LiveFigures:
-    """The newest of everything a person wants to see while it runs."""
+    """The latest figures of a running replay."""
 
     sequence: PlayedSequence
     frame: int | None = None
@@ -42,7 +42,7 @@ class LiveFigures:
     captures_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RATE_WINDOW))
 
     def take(self, recording: Recording, record: Record) -> None:
-        """Read one line of a peer."""
+        """Process one record of a peer."""
         if record["event"] == "target_relative":
             self.latency_ms = latency_ms(record, recording)
         elif record["event"] == "pose":
@@ -64,13 +64,13 @@ class LiveFigures:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames with a pose a second, over the last thirty."""
+        """Frames with a pose per second, over the last thirty."""
         if len(self.captures_ns) < 2 or self.captures_ns[-1] <= self.captures_ns[0]:
             return None
         return (len(self.captures_ns) - 1) * 1e9 / (self.captures_ns[-1] - self.captures_ns[0])
 
     def cells(self) -> dict[str, str]:
-        """Column by column, as text."""
+        """Text of each column."""
         frames = len(self.sequence.scene.images)
         return {
             "frame": "waiting" if self.frame is None else f"{self.frame + 1}/{frames}",
@@ -83,7 +83,7 @@ class LiveFigures:
 
 
 class LiveView:
-    """Shows LiveFigures: a table that renews itself on a terminal, a line a second elsewhere."""
+    """Shows LiveFigures: a table that is updated in place on a terminal, otherwise a line per second."""
 
     def __init__(self, console: Console, figures: LiveFigures) -> None:
         self._console = console
@@ -122,9 +122,9 @@ class LiveView:
 
 
 def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
-    """Play a sequence, keep what the peers received in its folder, and write the report of it there.
+    """Play a sequence, store what the peers received in its folder, and write its report there.
 
-    Raises InputError, PlayError, OSError; of an earlier flight nothing is left then.
+    Raises InputError, PlayError, OSError; files of an earlier flight are then already removed.
     """
     sequence, out, loaded = settings.sequence, settings.out, load_model(model, threads=1)
     say = partial(console.print, highlight=False, soft_wrap=True)
@@ -144,7 +144,7 @@ def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
 
 
 def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, console: Console) -> dict[str, Any]:
-    """Score a flight, write the report of it into `out` and tell of both; returns the score. Raises OSError."""
+    """Score a flight, write its report into `out` and print both; returns the score. Raises OSError."""
     say = partial(console.print, highlight=False, soft_wrap=True)
     say(f"scoring {len(sequence.scene.images)} frames and rendering the report")
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -156,7 +156,7 @@ def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, c
 
 
 def summary_table(score: dict[str, Any]) -> Table:
-    """The figures of a score, as a person reads them."""
+    """The figures of a score as a readable table."""
     overall = score["overall"]
     table = Table("metric", "value", title=f"score of {score['sequence']}", title_justify="left")
     rows = {

@@ -1,6 +1,6 @@
-"""How a sequence's gimbal turns: from the camera's attitude at every frame, and as `gimbal.csv` for the autopilot.
+"""A sequence's gimbal attitude: from the camera's attitude at every frame, and as `gimbal.csv` for the autopilot.
 
-A gimbal's own axes are FRD when it looks ahead; the camera sits on it upright, looking along its x axis.
+The gimbal's axes are FRD when it looks ahead; the camera is mounted upright, looking along its x axis.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ COLUMNS = ("t_ns", "q_ned_gimbal_w", "q_ned_gimbal_x", "q_ned_gimbal_y", "q_ned_
 
 @dataclass(frozen=True, eq=False)
 class GimbalTrack:
-    """N attitudes over time; `t_ns` is on the clock of the sequence's telemetry and rises."""
+    """N attitudes over time; `t_ns` is on the clock of the sequence's telemetry and increases."""
 
     t_ns: np.ndarray  # [N] int64
     q_ned_gimbal_wxyz: Array  # [N, 4]
 
     def at(self, t_ns: int) -> Array:
-        """[4] at `t_ns`, by slerp between neighbours; at rest before the first and after the last."""
+        """[4] at `t_ns`, by slerp between neighbours; constant before the first and after the last."""
         if t_ns <= self.t_ns[0] or t_ns >= self.t_ns[-1]:
             return self.q_ned_gimbal_wxyz[0 if t_ns <= self.t_ns[0] else -1]
         i = int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
@@ -37,14 +37,14 @@ class GimbalTrack:
 
 
 def track_of(R_cam_ned: Sequence[Array], frame0_ns: int, fps: float) -> GimbalTrack:
-    """The gimbal that held the camera so at each frame; R_cam_ned [3, 3] for each, as cam_R_w2c has it."""
+    """The gimbal that gives the camera this attitude at each frame; R_cam_ned [3, 3] for each, as in cam_R_w2c."""
     t_ns = frame0_ns + np.round(np.arange(len(R_cam_ned)) * 1e9 / fps).astype(np.int64)
     q_wxyz = [q_wxyz_from_R(R.T @ R_GIMBAL_CAM.T) for R in R_cam_ned]
     return GimbalTrack(t_ns, np.array(q_wxyz))
 
 
 def looped(track: GimbalTrack, frame0_ns: int, period_s: float, rounds: int) -> GimbalTrack:
-    """The part that belongs to the frames, again and again; t_ns is 0 at the exposure of the first frame."""
+    """The part that belongs to the frames, repeated; t_ns is 0 at the exposure of the first frame."""
     t_ns, period_ns = track.t_ns - frame0_ns, round(period_s * 1e9)
     inside = (t_ns >= 0) & (t_ns < period_ns)
     times = [t_ns[inside] + turn * period_ns for turn in range(rounds)]
@@ -52,7 +52,7 @@ def looped(track: GimbalTrack, frame0_ns: int, period_s: float, rounds: int) -> 
 
 
 def write_gimbal(path: Path, track: GimbalTrack) -> None:
-    """Write what `read_gimbal` reads."""
+    """Write `gimbal.csv`."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)

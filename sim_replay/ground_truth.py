@@ -1,4 +1,4 @@
-"""What is true of a BOP scene, and of a sequence that can be flown: frames, intrinsics, target poses, own ship."""
+"""Ground truth of a BOP scene, and a sequence that can be flown: frames, intrinsics, target poses, own ship."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from sim_replay.overlay import Extents
 from sim_replay.score import Truth
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
-# How far the first and the last exposure may lie outside the telemetry: one row of the slowest that is taken.
+# How far the first and the last exposure may lie outside the telemetry: one row at the lowest accepted rate.
 UNCOVERED_NS_MAX = 110_000_000
 _FPS_LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
-    """A BOP scene; frames are counted from 0 in the order of their picture numbers.
+    """A BOP scene; frames are counted from 0 in the order of their image numbers.
 
-    A frame that was not recorded stands there with picture and camera of the one before.
+    A frame that was not recorded has the image and camera of the one before.
     """
 
     folder: Path
@@ -44,10 +44,10 @@ class SceneTruth:
     K: list[Array]  # [3, 3] for each frame
     truths: list[Truth]
     extents: dict[int, Extents]  # by object id
-    distortions: list[Distortion | None]  # of each picture on disk; None: a pinhole camera
-    cameras_world: list[tuple[Array, Array] | None]  # R_world_cam [3, 3], t_world_cam_m [3]; None: not known
-    truth_known: bool  # False: no file tells what a picture shows, so no truths does not mean that all are empty
-    unrecorded: frozenset[int] = frozenset()  # frames without a picture of their own
+    distortions: list[Distortion | None]  # of each stored image; None: a pinhole camera
+    cameras_world: list[tuple[Array, Array] | None]  # R_world_cam [3, 3], t_world_cam_m [3]; None: unknown
+    truth_known: bool  # False: no file states what an image shows, so frames without truths may still show targets
+    unrecorded: frozenset[int] = frozenset()  # frames without an image of their own
 
     @property
     def name(self) -> str:
@@ -55,33 +55,33 @@ class SceneTruth:
 
     @property
     def shows_target(self) -> bool:
-        """Whether a target is known to be seen in any frame."""
+        """Whether a target is known to be visible in any frame."""
         return any(truth.visible for truth in self.truths)
 
     @property
     def target_free(self) -> bool:
-        """Whether all frames are known to show none."""
+        """Whether all frames are known to show no target."""
         return self.truth_known and not self.shows_target
 
     def undistorted_bgr(self, index: int) -> Image:
-        """The frame's picture [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
+        """The frame's image [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
         return read_undistorted_bgr(self.images[index], self.K[index], self.distortions[index])
 
 
 @dataclass(frozen=True, eq=False)
 class PlayedSequence:
-    """A scene with all it takes to fly it: rate, mount, telemetry of the own ship."""
+    """A scene with everything needed to fly it: rate, mount, telemetry of the own ship."""
 
     scene: SceneTruth
     fps: float
     mount: Mount
     telemetry_csv: Path
     frame0_ns: int  # exposure of the first frame on the telemetry's clock
-    gimbal: GimbalTrack | None = None  # None: the camera is bolted on; else `mount` says how it sits on the gimbal
+    gimbal: GimbalTrack | None = None  # None: the camera is fixed; otherwise `mount` is its mount on the gimbal
 
     @property
     def camera_mount(self) -> str:
-        """What the daemon's [camera] mount must say."""
+        """Value of the daemon's [camera] mount."""
         return "fixed" if self.gimbal is None else "gimbal"
 
 
@@ -120,7 +120,7 @@ def _camera_world(frame: BopFrame) -> tuple[Array, Array] | None:
 
 
 def extents_of(model: Model) -> Extents:
-    """The model's box; of one whose box nobody knows, a cube as long as its diameter."""
+    """The model's box; if it is unknown, a cube as long as the diameter."""
     if model.low_m is not None and model.size_m is not None:
         return Extents(model.low_m, model.size_m)
     half = 0.5 * model.diameter_m
@@ -130,7 +130,7 @@ def extents_of(model: Model) -> Extents:
 def read_sequence(folder: Path) -> PlayedSequence:
     """Read a scene with its sequence.toml and telemetry.csv. Raises InputError, naming file and key.
 
-    Its picture numbers must be evenly spaced, unless it was made of a recording; the telemetry must span all exposures.
+    Its image numbers must be evenly spaced, unless it was made from a recording; the telemetry must span all exposures.
     """
     scene = read_scene_truth(folder)
     frames = frames_of(folder, [int(path.stem) for path in scene.images])
@@ -160,7 +160,7 @@ def read_sequence(folder: Path) -> PlayedSequence:
 
 
 def _with_unrecorded(scene: SceneTruth, frames: list[int]) -> SceneTruth:
-    """The scene over all frames of the sequence; `frames` says which of them its pictures are, and rises."""
+    """The scene over all frames of the sequence; `frames` has the frame number of each image, increasing."""
     of_frame = _newest(frames)
     return replace(
         scene,
@@ -174,7 +174,7 @@ def _with_unrecorded(scene: SceneTruth, frames: list[int]) -> SceneTruth:
 
 
 def _newest(frames: list[int]) -> list[int]:
-    """For each frame of the sequence, the place of its picture, or of the last before it, among the pictures."""
+    """For each frame of the sequence, the index of its image, or of the last image before it."""
     return [int(k) for k in np.searchsorted(frames, np.arange(frames[-1] + 1), side="right") - 1]
 
 
@@ -190,7 +190,7 @@ def check_spans(telemetry: Telemetry, path: Path, frame0_ns: int, frames: int, f
 
 
 def _check_spacing(scene: SceneTruth) -> None:
-    """Raise InputError if picture numbers are not evenly spaced: exposures are counted by order."""
+    """Raise InputError if image numbers are not evenly spaced: exposure times are counted by order."""
     numbers = [int(path.stem) for path in scene.images]
     for before, after in pairwise(numbers):
         if after - before != numbers[1] - numbers[0]:
@@ -201,9 +201,9 @@ def _check_spacing(scene: SceneTruth) -> None:
 
 
 def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> GimbalTrack:
-    """What scene_camera.json tells of a camera whose world is local NED. Raises InputError.
+    """The gimbal's attitude from scene_camera.json, whose world is local NED. Raises InputError.
 
-    `frames` says which frame of the sequence each picture is.
+    `frames` has the frame number of each image.
     """
     R_cam_ned = [frame.R_cam_world for frame in read_scene(folder).pictured]
     known = [R for R in R_cam_ned if R is not None]
@@ -215,7 +215,7 @@ def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> Gimb
 
 @contextmanager
 def _blame(path: Path) -> Iterator[Path]:
-    """Errors of reading `path` inside are told as InputError in a sentence that names it."""
+    """Convert errors while reading `path` to InputError with a sentence that names it."""
     try:
         yield path
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The `uavpose-replay` command, begun where the packages that it needs may be missing."""
+"""Entry point of the `uavpose-replay` command, which also works if its packages are missing."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from msgs.command_line import exit_code
 
 
 def main() -> int:
-    """Run `sim_replay.cli`, which needs the extra `replay` from its first line on."""
+    """Run `sim_replay.cli`, whose imports require the extra `replay`."""
     return exit_code(lambda: int(import_module("sim_replay.cli").main()), InputError, ["replay", "render"])

@@ -1,4 +1,4 @@
-"""A lock file: who holds it works alone. The lock goes with the process, however that ends."""
+"""A lock file that gives its holder exclusive access. The lock ends with the process, however that ends."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import IO
 
 
 def take_lock(path: Path) -> IO[str] | None:
-    """The file at `path`, locked until it is closed, before which its holder may remove it; None where another process
-    holds it. Raises OSError."""
+    """The file at `path`, locked until it is closed; its holder may remove it before that. None if another process
+    holds it. Raises OSError.
+    """
     while True:
         lock = path.open("w")
         try:
@@ -23,7 +24,7 @@ def take_lock(path: Path) -> IO[str] | None:
         except OSError:
             lock.close()
             raise
-        lock.close()  # its holder removed it since it was opened: it would keep nobody out
+        lock.close()  # removed by its holder since it was opened: this lock would exclude nobody
 
 
 def _is_at(path: Path, file: IO[str]) -> bool:

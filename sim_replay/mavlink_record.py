@@ -7,14 +7,14 @@ from typing import Any
 
 
 def message_record(message: Any, t_ns: int) -> dict[str, Any]:
-    """When it came, what it is, who sent it, and every field."""
+    """Arrival time, message name, sender, and every field."""
     fields = {field: _plain(getattr(message, field)) for field in message.get_fieldnames()}
     sender = {"system": message.get_srcSystem(), "component": message.get_srcComponent()}
     return {"t_ns": t_ns, "message": message.get_type(), **sender, **fields}
 
 
 def _plain(value: Any) -> Any:
-    """A field as JSON has it: text, numbers, lists; null for what is not a number."""
+    """A field as a JSON value: text, numbers, lists; null for NaN and infinities."""
     if isinstance(value, bytes | bytearray):
         return bytes(value).rstrip(b"\0").decode("utf-8", "replace")
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Scores a model on a BOP dataset frame by frame: the daemon's own estimator, with no tracker, sockets or clock."""
+"""Scores a model on a BOP dataset frame by frame: the daemon's own estimator, without tracker, sockets or clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DEFAULT_THREADS = 2
 
 
 def estimator_answers(model: Model) -> Answerer:
-    """Acquire and track on each picture alone, as the daemon does on a frame that it knows no target of.
+    """Acquire and track stage on each image alone, as in the daemon on a frame without known targets.
 
     Raises InputError if the model does not run.
     """
@@ -51,9 +51,9 @@ def estimator_answers(model: Model) -> Answerer:
 
 
 def with_score_min(model: Model, score_min: float | None) -> Model:
-    """The model with another least probability of a target, in both stages; None: as it is.
+    """The model with another minimum score (target probability) in both stages; None: unchanged.
 
-    When acquiring it is that of the whole frame and its windows together. Raises InputError outside 0..1.
+    The acquire stage applies it to the whole frame and its windows together. Raises InputError outside 0..1.
     """
     if score_min is None:
         return model
@@ -64,7 +64,7 @@ def with_score_min(model: Model, score_min: float | None) -> Model:
 
 
 def method_of(model: Model) -> dict[str, Any]:
-    """How a score names the model that was judged."""
+    """Description of the evaluated model in a score."""
     contract = model.contract
     return {
         "name": contract.name,

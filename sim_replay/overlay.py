@@ -1,4 +1,4 @@
-"""What a score looks like: true and estimated pose drawn on the frames, an inset of the target, charts over time."""
+"""Visualises a score: true and estimated pose drawn on the frames, an inset of the target, plots over time."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _PANEL_BGR: Color = (28, 24, 20)
 # Corners are numbered by bits x, y, z; an edge joins two that differ in one bit.
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 _SUBPIXEL_BITS = 4
-_PLACE_PX = 12  # of a cross, for each pixel of its lines
+_PLACE_PX = 12  # size of a cross, per pixel of line width
 _INSET_SCALE = 2.2  # window side over the target's longer projected side
 _VIDEO_WIDTH_PX = 1280
-_CODECS = ("vp09", "mp4v")  # browsers play the first; not every build of OpenCV has it
+_CODECS = ("vp09", "mp4v")  # browsers play the first; not every build of OpenCV can write it
 
 
 @dataclass(frozen=True)
 class Extents:
-    """The target's box in its own axes (FRD), metres: drawn at the true and at the estimated pose alike."""
+    """The target's box in its own axes (FRD), metres; drawn at the true and at the estimated pose."""
 
     min_m: tuple[float, float, float]
     size_m: tuple[float, float, float]
@@ -46,10 +46,10 @@ class Extents:
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """All that is drawn of one frame beside its pixels."""
+    """Everything that is drawn for one frame, except its pixels."""
 
     K: Array  # [3, 3], pixel centres at integers
-    match: Match | None  # None: the frame holds no target
+    match: Match | None  # None: the frame has no target
     extents: Extents | None  # of that target
     latency_ms: float | None
 
@@ -71,9 +71,9 @@ def window_camera(K: Array, left_top_px: ArrayLike, scale: float) -> Array:
 
 
 def draw_pose(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color: Color, thickness: int) -> None:
-    """The target's box and an arrow along its nose, in place; nothing if it reaches behind the camera.
+    """The target's box and an arrow along its nose, in place; nothing if it extends behind the camera.
 
-    Of a pose whose rotation is not known a cross marks the place.
+    For a pose of unknown rotation, a cross marks the position.
     """
     nose_m = extents.min_m[0] + extents.size_m[0]
     points_body = np.vstack([extents.corners_m(), np.zeros(3), [nose_m + 0.6 * extents.size_m[0], 0.0, 0.0]])
@@ -91,7 +91,7 @@ def draw_pose(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color
 
 
 class Overlay:
-    """Draws the frames of one replay. Layout follows the height of the frame; the inset ends where its width does."""
+    """Draws the frames of one replay. The layout scales with the frame's height; its width limits the inset."""
 
     def __init__(self, views: Sequence[FrameView], size_wh: tuple[int, int]) -> None:
         self._views = views
@@ -103,7 +103,7 @@ class Overlay:
         self._series = _series(views)
 
     def draw(self, index: int, image_bgr: Image) -> Image:
-        """The frame at `index` with everything on it; a new image [H, W, 3]."""
+        """The frame at `index` with all overlays; a new image [H, W, 3]."""
         canvas = image_bgr.copy()
         view = self._views[index]
         inset = self._inset(view, image_bgr)
@@ -121,7 +121,7 @@ class Overlay:
         return max(1, round(at_1080 * self._unit))
 
     def _targets_mostly_right(self) -> bool:
-        """Whether the targets pass through where the inset would stand if it stood on the right."""
+        """Whether the targets pass through the area of the inset at the right edge."""
         centers = [project(v.match.truth.t_cam_target_m[None], v.K) for v in self._views if v.match is not None]
         inside = [c for c in centers if c is not None and c[0, 0] > 0.7 * self._width and c[0, 1] < 0.55 * self._height]
         return len(inside) > 0.1 * max(len(centers), 1)
@@ -134,7 +134,7 @@ class Overlay:
             draw_pose(canvas, K, view.match.estimate, view.extents, ESTIMATE_BGR, thickness)
 
     def _inset(self, view: FrameView, image_bgr: Image) -> Image | None:
-        """The target's surroundings enlarged, boxes drawn at the inset's own resolution."""
+        """The target's surroundings enlarged, with boxes drawn at the inset's own resolution."""
         if view.match is None or view.extents is None:
             return None
         truth = view.match.truth
@@ -209,7 +209,7 @@ class Overlay:
         area: tuple[float, float, float, float],
         color: Color,
     ) -> None:
-        """One line up to now, broken where there is no value; `area` is left, top, width, height."""
+        """One line up to the current frame, interrupted where there is no value; `area` is left, top, width, height."""
         left, top, width, height = area
         x = left + width * np.arange(len(line)) / max(len(self._views) - 1, 1)
         y = top + height * (1.0 - (line - limits[0]) / (limits[1] - limits[0]))
@@ -222,7 +222,7 @@ class Overlay:
 
 
 def _series(views: Sequence[FrameView]) -> dict[str, Array]:
-    """What the charts and the legend show, each [frames], NaN where there is no value."""
+    """Data of the charts and the legend, each [frames], NaN where there is no value."""
     names = ("truth_m", "estimate_m", "range_error_pct", "rotation_deg", "latency_ms")
     series = {name: np.full(len(views), np.nan) for name in names}
     for i, view in enumerate(views):
@@ -245,7 +245,7 @@ def _number(value: float, form: str) -> str:
 
 
 def showcase_index(views: Sequence[FrameView]) -> int:
-    """The frame of median rotation error among those with an estimate: typical, not the best. Else the middle one."""
+    """The frame of median rotation error among those with an estimate: typical, not the best. Else the middle frame."""
     scored = [
         (view.match.rotation_error_deg, i)
         for i, view in enumerate(views)

@@ -1,4 +1,4 @@
-"""A sequence flown faster or slower than it was made for, on the real clock."""
+"""A sequence flown faster or slower than its original speed, on the real clock."""
 
 from __future__ import annotations
 

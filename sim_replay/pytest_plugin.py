@@ -1,4 +1,4 @@
-"""The pytest fixture `uavpose_replay`: a replay test of one's own flight in five lines.
+"""The pytest fixture `uavpose_replay`: a replay test of your own flight in five lines.
 
     def test_the_target_is_held(uavpose_replay):
         flight = uavpose_replay("flights/over-the-lake")
@@ -6,7 +6,7 @@
         assert flight.peer("autopilot")["age_ms"]["p99"] < 50.0
         assert flight.peer("subscriber")["continuity"]["identity_switches"] == 0
 
-pytest finds it by itself where this project is installed with its `replay` extra.
+pytest finds it automatically if this project is installed with its `replay` extra.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Replay = Callable[..., "ReplayedFlight"]
 
 @dataclass(frozen=True, eq=False)
 class ReplayedFlight:
-    """A sequence that was flown through the real daemon with a simulated autopilot and a zenoh subscriber."""
+    """A sequence flown through the real daemon with a simulated autopilot and a zenoh subscriber."""
 
     sequence: PlayedSequence
     recording: Recording  # every record of both peers, and the daemon's counters
-    score: dict[str, Any]  # score.json, as docs/reports.md tells of it
-    folder: Path  # daemon.log, config.toml, flight.json, received.jsonl; report.html if asked for
+    score: dict[str, Any]  # score.json, described in docs/reports.md
+    folder: Path  # daemon.log, config.toml, flight.json, received.jsonl; report.html if requested
 
     def peer(self, name: str) -> dict[str, Any]:
         """The figures of what `subscriber` or `autopilot` received."""
@@ -42,13 +42,13 @@ class ReplayedFlight:
 
 @pytest.fixture(scope="session")
 def uavpose_replay(tmp_path_factory: pytest.TempPathFactory) -> Replay:
-    """`uavpose_replay(sequence, model=None, speed=1.0, report=False)`: fly it, score it, hand back ReplayedFlight.
+    """`uavpose_replay(sequence, model=None, speed=1.0, report=False)`: fly and score it; returns a ReplayedFlight.
 
-    `sequence` is a scene folder with sequence.toml and telemetry.csv; `model` an ONNX file, else the shipped one;
-    `speed` below 1 gives a slow machine its time; `report` also draws overlay.mp4 and report.html. A test that looks
-    at several things keeps the flight in a fixture of its own. Raises InputError, PlayError.
+    `sequence` is a scene folder with sequence.toml and telemetry.csv; `model` an ONNX file, by default the shipped one;
+    `speed` below 1 gives a slow machine more time; `report` also creates overlay.mp4 and report.html. To test several
+    properties of one flight, keep it in a fixture of your own. Raises InputError, PlayError.
     """
-    # Only a test that asks for a flight pays for these.
+    # Imported here so that only tests that request a flight pay for it.
     from edge.config import SHIPPED_MODEL
     from edge.estimator.model import load_model
     from sim_replay.ground_truth import read_sequence

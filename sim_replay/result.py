@@ -1,4 +1,4 @@
-"""What a replay came to: the peers' records set against the truth, and score.json made of it. Pure functions."""
+"""Result of a replay: the peers' records compared with ground truth, and score.json. Pure functions."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ PEERS = ("subscriber", "autopilot")
 
 @dataclass(frozen=True, eq=False)
 class PeerResult:
-    """What one peer received, judged. Frames are indices into the sequence."""
+    """Evaluation of what one peer received. Frames are indices into the sequence."""
 
-    matches: tuple[Match, ...]  # of every visible target of every frame
-    false_poses: tuple[TargetPose, ...]  # those of a frame that belong to no target
-    strays: int  # poses of no frame of the sequence
-    ages: tuple[tuple[int, float], ...]  # of each pose of a frame, as it came: frame, ms from exposure to receipt
+    matches: tuple[Match, ...]  # for every visible target of every frame
+    false_poses: tuple[TargetPose, ...]  # poses of a frame that belong to no target
+    strays: int  # poses that belong to no frame of the sequence
+    ages: tuple[tuple[int, float], ...]  # of each pose of a frame, as they arrived: frame, ms from exposure to arrival
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """One replay, judged by what each of its peers received."""
+    """Evaluation of one replay, by what each of its peers received."""
 
     subscriber: PeerResult
     autopilot: PeerResult
@@ -47,7 +47,7 @@ class Result:
 
 
 def told_ages(peer: PeerResult, recording: Recording) -> tuple[tuple[int, float], ...]:
-    """The ages that tell something: none in lock-step, where all are zero."""
+    """The meaningful ages: none in lock-step, where all are zero."""
     return () if recording.in_lockstep else peer.ages
 
 
@@ -68,12 +68,12 @@ def frame_of_record(record: Record, recording: Recording, sequence: PlayedSequen
 
 
 def latency_ms(record: Record, recording: Recording) -> float:
-    """From capture to the autopilot's receiving a `target_relative`."""
+    """From capture to the arrival of a `target_relative` at the autopilot."""
     return float(record["received_ns"] - recording.capture_ns(record)) * 1e-6
 
 
 def judge(sequence: PlayedSequence, recording: Recording) -> Result:
-    """Set what zenoh brought, and what MAVLink brought, against the truth and the exposure."""
+    """Compare what arrived over zenoh and over MAVLink with the ground truth and the exposure times."""
     subscriber = ((record, float(record["age_ms"])) for record in recording.poses)
     autopilot = ((record, latency_ms(record, recording)) for record in recording.targets)
     truths = _told_apart(sequence.scene)
@@ -85,7 +85,7 @@ def judge(sequence: PlayedSequence, recording: Recording) -> Result:
 
 
 def _told_apart(scene: SceneTruth) -> list[Truth]:
-    """The scene's truths, each with a number that is its target's own over all frames."""
+    """The scene's truths, each with a number that identifies its target over all frames."""
     in_world = all(camera is not None for camera in scene.cameras_world)
     places_m = [_place(truth, scene.cameras_world[truth.frame] if in_world else None) for truth in scene.truths]
     numbers = instances(scene.truths, places_m)
@@ -93,7 +93,7 @@ def _told_apart(scene: SceneTruth) -> list[Truth]:
 
 
 def _place(truth: Truth, camera_world: tuple[Array, Array] | None) -> Array:
-    """[3], metres, in the world's axes; in `cam` where the camera's place in it is not known."""
+    """[3], metres, in the world's axes; in `cam` if the camera's position in the world is unknown."""
     if camera_world is None:
         return truth.t_cam_target_m
     R_world_cam, t_world_cam_m = camera_world
@@ -120,10 +120,10 @@ def _judge_peer(
 
 
 def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) -> dict[str, Any]:
-    """score.json: shares 0..1, degrees, metres, milliseconds; null where there is nothing to tell.
+    """score.json: shares 0..1, degrees, metres, milliseconds; null where there is no data.
 
-    The figures of the poses are those of `sim_replay.score.statistics`, of what the subscriber received; under "peers"
-    is what each peer received, as `sim_replay.report.peer.peer_figures` has it.
+    The figures of the poses are those of `sim_replay.score.statistics`, of what the subscriber received; "peers" has
+    what each peer received, see `sim_replay.report.peer.peer_figures`.
     """
     recording, subscriber = result.recording, result.subscriber
     frames = len(sequence.scene.images) - len(sequence.scene.unrecorded)
@@ -152,8 +152,9 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
 
 
 def _latency_ms(recording: Recording) -> dict[str, float | None]:
-    """Capture to MAVLink. Of `tracks_withheld`, which MAVLink did not tell, no percentile knows: not confirmed yet, or
-    too old. All null in lock-step."""
+    """Capture to MAVLink. `tracks_withheld` were not sent over MAVLink (not confirmed yet, or too old), so the
+    percentiles do not include them. All null in lock-step.
+    """
     if recording.in_lockstep:
         return {**latency_statistics([]), "tracks_withheld": None}
     withheld = recording.daemon_counters.get("mavlink_tracks_withheld", 0)
@@ -162,7 +163,7 @@ def _latency_ms(recording: Recording) -> dict[str, float | None]:
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
-    """What the overlay draws of each frame: its first target, as the subscriber has it."""
+    """Overlay data of each frame: its first target, as the subscriber received it."""
     by_frame: dict[int, Match] = {}
     for match in result.subscriber.matches:
         by_frame.setdefault(match.truth.frame, match)

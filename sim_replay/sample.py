@@ -1,4 +1,4 @@
-"""What the sampler yields: rendered images with exact labels, as arrays over a batch of N."""
+"""The sampler's output: rendered images with exact labels, as arrays over a batch of N."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-AcquireView = Literal["crop", "frame"]  # a window of the reduced frame, or the whole frame squashed into a square
+AcquireView = Literal["crop", "frame"]  # a window of the downscaled frame, or the whole frame scaled to a square
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class SampleBatch:
     """N rendered windows or frames of H x W pixels and their labels.
 
     Pixel centres lie at integer coordinates; a box's edges lie half a pixel outside its outermost pixel centres.
-    Where `present` is false the other labels are zeros (R the identity) and mean nothing.
+    Where `present` is false, the other labels are zeros (R the identity) without meaning.
     """
 
     image_bgr: NDArray[np.uint8]  # [N, H, W, 3]

@@ -1,4 +1,4 @@
-"""Generates the bundled sequence: one aircraft crosses and opens from an own ship whose fixed camera follows it.
+"""Generates the bundled sequence: one aircraft crosses and recedes from an own ship whose fixed camera follows it.
 
     python -m sim_replay.sequence --out sim_replay/data/crossing --seed 34
 
@@ -59,11 +59,11 @@ Profile = Callable[[Array], Array]
 class Flight:
     """A point-mass flight in coordinated turns: heading rate = g tan(bank) / V, no slip, constant climb angle."""
 
-    t_ned_start_m: tuple[float, float, float]  # where it is when the first frame is exposed
+    t_ned_start_m: tuple[float, float, float]  # its position when the first frame is exposed
     speed_mps: float
-    heading_rad: float  # at that instant
+    heading_rad: float  # at that time
     climb_rad: float
-    incidence_rad: float  # nose above the path
+    incidence_rad: float  # angle of the nose above the path
     bank_rad: Profile  # of time, s
     shake_rad: Profile  # [N] to [N, 3]: roll, pitch, yaw of the airframe in turbulence
 

@@ -1,4 +1,4 @@
-"""A picture of the fleet: each airframe from seven sides in even light, so that a person can judge its shape."""
+"""A contact sheet of the fleet: each airframe from seven sides in even light, to inspect its shape."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UPWARD_DEG = 30.0
 
 
 def _views() -> dict[str, Array]:
-    """R_level_body of each view: the body's attitude before a level camera that looks north."""
+    """R_level_body of each view: the body's attitude in front of a level camera that looks north."""
     up, north, east = np.array([0.0, 0, -1]), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])
     return {
         "front": R_from_euler(0.0, 0.0, np.pi),
@@ -60,9 +60,9 @@ def _even_light() -> Environment:
 
 
 def _scene(airframe: Airframe, R_level_body: Array, livery_seed: int, light: Environment) -> Scene:
-    """The airframe as large as its tile allows, with its outline in the middle of it.
+    """The airframe as large as its tile allows, with its outline centred.
 
-    R_level_body holds for a level camera; this one and the target are tilted alike, so that only sky is behind it.
+    R_level_body is for a level camera; camera and target are tilted equally, so that only sky is in the background.
     """
     R_ned_level = R_from_euler(0.0, np.radians(UPWARD_DEG), 0.0)
     R_ned_body = R_ned_level @ R_level_body
@@ -94,7 +94,7 @@ def _row(airframe: Airframe, tiles: Sequence[Image]) -> Image:
 
 
 def sheet_image(airframes: Sequence[Airframe], livery_seed: int = 0) -> Image:
-    """BGR picture [H, W, 3] with one row for each airframe and one column for each view."""
+    """BGR image [H, W, 3] with one row per airframe and one column per view."""
     light, views = _even_light(), _views()
     renderer = Renderer(TILE_WIDTH_PX, TILE_HEIGHT_PX, len(views), 1)
     rows = []
@@ -112,7 +112,7 @@ def sheet_image(airframes: Sequence[Airframe], livery_seed: int = 0) -> Image:
 def sheet(airframes: Sequence[Airframe], out: Path, livery_seed: int = 0) -> None:
     """Draw the airframes and write them as one JPEG of at most 400 kB.
 
-    Raises InputError where `out` is no JPEG's name or its folder is missing.
+    Raises InputError if `out` is not the name of a JPEG or its folder is missing.
     """
     if out.suffix.lower() not in (".jpg", ".jpeg"):
         raise InputError(f"--out {out}: a sheet is a JPEG; its name must end in .jpg")

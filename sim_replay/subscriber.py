@@ -2,9 +2,9 @@
 
     python -m sim_replay.subscriber --connect tcp/127.0.0.1:7448 --uav uav1
 
-Prints one JSON object a line: `ready`, each valid `pose`, each `diagnostics`, with --all each `sample` of the other
-topics that have a time, and a `summary` of samples by topic and refusals by reason when it is told to stop (SIGTERM,
-SIGINT) or the process that started it ends.
+Prints one JSON object per line: `ready`, each valid `pose`, each `diagnostics`, with --all each `sample` of the other
+topics with a timestamp, and a `summary` of samples by topic and refusals by reason when it is told to stop (SIGTERM,
+SIGINT) or its parent process ends.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _RETRY_S = 0.1
 
 
 def pose_record(pose: TargetPose) -> dict[str, Any]:
-    """The `pose` line of one that was taken."""
+    """The `pose` line of an accepted pose."""
     x, y, z, w = pose.pose.q_cam_target_xyzw.tolist()
     return {
         "event": "pose",
@@ -61,7 +61,7 @@ def _diagnostics_record(payload: bytes) -> dict[str, Any] | None:
 
 
 def sample_record(topic: topics.Topic, payload: bytes, now_utc_ns: int) -> dict[str, Any]:
-    """The `sample` line of one of TIMED: its stamp, age and content, or why it cannot be read."""
+    """The `sample` line of a topic in TIMED: its stamp, age and content, or why it cannot be read."""
     told: dict[str, Any] = {"event": "sample", "topic": topic.name.rpartition("/")[2]}
     try:
         stamp_ns, content = _content(topic, payload)
@@ -96,7 +96,7 @@ def _connect(endpoint: str, wait_s: float, stop: threading.Event) -> zenoh.Sessi
 def _listen(
     session: zenoh.Session, uav: str, stop: threading.Event, everything: bool, max_age_s: float
 ) -> dict[str, Any]:
-    """Print what arrives until `stop` is set or the parent process is gone; returns the summary."""
+    """Print what arrives until `stop` is set or the parent process has ended; returns the summary."""
     records: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     parent = os.getppid()
 

@@ -1,4 +1,4 @@
-"""Own-ship telemetry of a sequence: `telemetry.csv` beside the frames, and its state at any instant."""
+"""Own-ship telemetry of a sequence: `telemetry.csv` beside the frames, and its state at any time."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ COLUMNS = (
 )
 
 
-GAP_NS = 500_000_000  # for which own attitude is not known where rows are missing, as the daemon has it
-GAP_ROWS = 5  # or so many, where they are further apart
+GAP_NS = 500_000_000  # without rows for longer than this, own attitude is unknown, as in the daemon
+GAP_ROWS = 5  # or this many rows, if they are further apart
 
 
 class TelemetryError(ValueError):
@@ -27,7 +27,7 @@ class TelemetryError(ValueError):
 
 @dataclass(frozen=True)
 class OwnShipState:
-    """The camera's vehicle at one instant."""
+    """The state of the camera's vehicle at one time."""
 
     q_ned_body_wxyz: Array  # [4]
     rates_body_radps: Array  # [3], p q r
@@ -40,7 +40,7 @@ class OwnShipState:
 
 @dataclass(frozen=True)
 class Telemetry:
-    """N rows over time; `t_ns` counts from the exposure of the sequence's first frame and rises."""
+    """N rows over time; `t_ns` counts from the exposure of the sequence's first frame and increases."""
 
     t_ns: np.ndarray  # [N] int64
     values: Array  # [N, 16], COLUMNS[1:]
@@ -50,14 +50,14 @@ class Telemetry:
         return max(GAP_NS, GAP_ROWS * float(np.median(np.diff(self.t_ns))))
 
     def tells_of(self, t_ns: int) -> bool:
-        """False between two rows with so many missing that nobody knows how the own ship was then."""
+        """False in a gap between two rows so long that the own ship's state is unknown."""
         i = int(np.searchsorted(self.t_ns, t_ns, side="left"))
         if i == 0 or i == len(self.t_ns) or self.t_ns[i] == t_ns:
             return True
         return bool(self.t_ns[i] - self.t_ns[i - 1] <= self._gap_ns)
 
     def at(self, t_ns: int) -> OwnShipState:
-        """State at `t_ns`: slerp and linear between neighbours; at rest in the first or last row outside them."""
+        """State at `t_ns`: slerp and linear between neighbours; outside them, the first or last row without motion."""
         if t_ns <= self.t_ns[0] or t_ns >= self.t_ns[-1]:
             row = self.values[0 if t_ns <= self.t_ns[0] else -1].copy()
             row[4:7] = row[10:13] = 0.0
@@ -74,7 +74,7 @@ class Telemetry:
 def read_telemetry(path: Path) -> Telemetry:
     """Read `telemetry.csv`. Raises TelemetryError."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before UTF-8
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark before UTF-8
             reader = csv.reader(file)
             header = tuple(next(reader, ()))
             lines = [(reader.line_num, row) for row in reader if row]
@@ -106,7 +106,7 @@ def read_telemetry(path: Path) -> Telemetry:
 
 
 def write_telemetry(path: Path, telemetry: Telemetry) -> None:
-    """Write what `read_telemetry` reads: 1 µrad, 1 mm and 1e-8 degrees fine."""
+    """Write `telemetry.csv`, with a resolution of 1 µrad, 1 mm and 1e-8 degrees."""
     digits = (8,) * 7 + (3,) * 6 + (8, 8, 3)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
