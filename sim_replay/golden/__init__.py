@@ -1,1 +1,1 @@
-"""Golden files: what the daemon made of a few short sequences in lock-step, held field by field."""
+"""Golden files: the daemon's output for a few short sequences in lock-step, compared field by field."""

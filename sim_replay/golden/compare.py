@@ -1,6 +1,6 @@
-"""Two sets of lock-step outputs against each other, field by field. Pure.
+"""Compares two sets of lock-step outputs, field by field. Pure.
 
-Records are reduced to what is held: covariances to standard deviations, numbers to nine digits. Floats may differ
+Records are reduced to what is compared: covariances to standard deviations, numbers to nine digits. Floats may differ
 between machines, since processors round networks' sums differently; on one machine they are the same.
 """
 
@@ -23,14 +23,14 @@ DIGITS = 9
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far a number may be off: `least`, plus `share` of the expected one's size, or of the norm of all its list."""
+    """Allowed deviation: `least`, plus `share` of the expected number's size, or of the norm of the whole list."""
 
-    least: float | tuple[float, ...]  # of all the numbers of a list, or of each
+    least: float | tuple[float, ...]  # for all the numbers of a list, or for each
     share: float = 0.0
     of_norm: bool = False
 
     def allows(self, expected: Sequence[float]) -> list[float]:
-        """Of each number of a field."""
+        """For each number of a field."""
         least = self.least if isinstance(self.least, tuple) else (self.least,) * len(expected)
         sizes = [math.hypot(*expected)] * len(expected) if self.of_norm else [abs(value) for value in expected]
         return [one + self.share * size for one, size in zip(least, sizes, strict=True)]
@@ -40,7 +40,7 @@ POSITION = Tolerance(0.2, 0.01, of_norm=True)  # m
 ROTATION_DEG = 2.0
 DEVIATION_M, DEVIATION_MPS, DEVIATION_RAD = Tolerance(0.02, 0.1), Tolerance(0.1, 0.1), Tolerance(0.005, 0.1)
 DEVIATIONS = Tolerance((0.02, 0.02, 0.02, 0.005, 0.005, 0.005), 0.1)  # of position, m, and of rotation, rad
-# By record and field; what is not here is OTHER if it is a float, and exact if not.
+# By record and field; others are OTHER if they are floats, and otherwise exact.
 TOLERANCES = {
     ("pose", "t_cam_target_m"): POSITION,
     ("pose", "std"): DEVIATIONS,
@@ -64,17 +64,17 @@ TOLERANCES = {
 }
 OTHER = Tolerance(0.005, 0.01)
 QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
-# What is taken of a pose as it is.
+# Fields of a pose that are kept unchanged.
 POSE_FIELDS = ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
-# What a record is known by.
+# Fields that identify a record.
 POSE_NAMES = ("kind", "t_ns", "frame", "target")
 MESSAGE_NAMES = ("kind", "t_ns", "system", "component")
-TARGET_NAMES = (*MESSAGE_NAMES, "id")  # one message a target
+TARGET_NAMES = (*MESSAGE_NAMES, "id")  # one message per target
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One thing that is not as expected, in words."""
+    """One deviation from the expected records, in words."""
 
     where: str
     what: str
@@ -84,7 +84,7 @@ class Difference:
 
 
 def reduced(outputs: Outputs) -> list[Record]:
-    """The records that a golden file holds: poses first, then MAVLink messages, each in the order they came."""
+    """The records in a golden file: poses first, then MAVLink messages, each in order of arrival."""
     records = []
     for pose in outputs.poses:
         std = [math.sqrt(max(pose["covariance"][k][k], 0.0)) for k in range(6)]
@@ -100,7 +100,7 @@ def reduced(outputs: Outputs) -> list[Record]:
 
 
 def differences(expected: Iterable[Record], actual: Iterable[Record]) -> list[Difference]:
-    """All that is missing, new or off by more than its tolerance, in the order of time."""
+    """All that is missing, new or outside its tolerance, ordered by time."""
     old, new = _keyed(expected), _keyed(actual)
     found = []
     for key in sorted(old.keys() | new.keys(), key=lambda key: (key[1], str(key))):
@@ -154,7 +154,7 @@ def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
         return None
     said = f"{field} is {_short(actual)}, expected {_short(expected)}"
     if isinstance(expected, str) and isinstance(actual, str):
-        # Numbers in a sentence are rounded from fields that are held themselves.
+        # Numbers in a text are rounded from fields that are compared themselves.
         same = re.sub(r"[-\d.]+", "#", expected) == re.sub(r"[-\d.]+", "#", actual)
         return None if same else said
     old, new = _numbers(expected), _numbers(actual)
@@ -191,5 +191,5 @@ def _short(value: Any) -> str:
 
 
 def counts(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """How many records there are of each kind."""
+    """Number of records of each kind."""
     return dict(Counter(record["kind"] for record in records))

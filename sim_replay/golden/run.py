@@ -1,4 +1,4 @@
-"""`uavpose-replay golden`: play a few sequences in lock-step and hold what comes out to what was accepted."""
+"""`uavpose-replay golden`: play a few sequences in lock-step and compare the output with the accepted one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXIT_DIFFERS = 1
 
 @dataclass(frozen=True)
 class Case:
-    """A sequence, and how many of its frames are played."""
+    """A sequence, and the number of its frames that are played."""
 
     folder: Path
     frames: int
@@ -31,18 +31,18 @@ class Case:
 
 CASES = {
     "crossing": Case(BUNDLED_SEQUENCE, 60),  # one target, tracked
-    "away_and_back": Case(FOLDER / "away_and_back", 50),  # lost for longer than a track lasts, and found again
+    "away_and_back": Case(FOLDER / "away_and_back", 50),  # lost for longer than a track lasts, then re-acquired
     "two_targets": Case(FOLDER / "two_targets", 30),
 }
 
 
 def golden_file(name: str) -> Path:
-    """Where what was accepted of a case is kept."""
+    """Path of a case's accepted output."""
     return FOLDER / f"{name}.jsonl"
 
 
 def play_case(name: str, out: Path, model: Path) -> Outputs:
-    """Play a case in lock-step; its outputs are written to `out` too. Raises InputError, PlayError."""
+    """Play a case in lock-step; its outputs are also written to `out`. Raises InputError, PlayError."""
     case = CASES[name]
     settings = LockstepSettings(read_sequence(case.folder), model, stop=case.frames)
     outputs = play_lockstep(settings, lambda _: None, lambda *_: None)
@@ -51,14 +51,14 @@ def play_case(name: str, out: Path, model: Path) -> Outputs:
 
 
 def accept(name: str, outputs: Outputs, model: Path) -> None:
-    """Let these outputs be what is expected from now on: a first line on where they are from, then one a record."""
+    """Make these outputs the new reference: a first line on their origin, then one per record."""
     head = {"case": name, "model_sha256": load_model(model, threads=1).sha256}
     lines = [json.dumps(line, ensure_ascii=False) for line in (head, *reduced(outputs))]
     golden_file(name).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_golden(name: str) -> tuple[str, list[Record]]:
-    """The model's hash and the records that were accepted. Raises InputError."""
+    """The model's hash and the accepted records. Raises InputError."""
     path = golden_file(name)
     try:
         head, *records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -70,12 +70,12 @@ def read_golden(name: str) -> tuple[str, list[Record]]:
 
 
 def compare(name: str, outputs: Outputs) -> list[Difference]:
-    """What is not as it was accepted. Raises InputError."""
+    """Deviations from the accepted output. Raises InputError."""
     return differences(read_golden(name)[1], reduced(outputs))
 
 
 def report(name: str, found: list[Difference]) -> str:
-    """For a person: one line a difference, the first of them in time."""
+    """Readable: one line per difference, the first of them in time."""
     if not found:
         return f"{name}: as accepted"
     lines = [f"{name}: {len(found)} differences", *(f"  {difference}" for difference in found[:SHOWN])]
@@ -85,7 +85,7 @@ def report(name: str, found: list[Difference]) -> str:
 
 
 def register(commands: Any) -> None:
-    """Add the command to what argparse's add_subparsers() gave; it sets `run`, a function of the parsed arguments."""
+    """Add the command to what add_subparsers() returned; it sets `run`, a function of the parsed arguments."""
     parser = commands.add_parser(
         "golden",
         help="hold the daemon's outputs on a few sequences to what was accepted, field by field",
@@ -101,7 +101,7 @@ def register(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, or accept, the asked cases."""
+    """Compare, or accept, the requested cases."""
     unknown = [name for name in args.case if name not in CASES]
     if unknown:
         raise InputError(f"golden {unknown[0]}: no such case; there are {', '.join(CASES)}")

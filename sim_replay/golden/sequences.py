@@ -48,7 +48,7 @@ AWAY_FROM_S, AWAY_TO_S, SWING_S = 1.1, 3.6, 0.1
 
 @dataclass(frozen=True)
 class Plan:
-    """One sequence: the own ship and the aircraft before it, by airframe and livery."""
+    """One sequence: the own ship and the aircraft in front of it, by airframe and livery."""
 
     frames: int
     own: Flight
@@ -75,7 +75,7 @@ def _swinging(flight: Flight) -> Flight:
 
 
 def _glider() -> Flight:
-    """Level wings, slowly from the right to the left of the picture."""
+    """Wings level, slowly from the right to the left of the image."""
     return Flight(
         t_ned_start_m=(185.3, 4.9, -306.0),
         speed_mps=30.1,
@@ -122,7 +122,7 @@ def _bop_frame(scene: Scene, rendered: RenderedFrame, object_ids: Sequence[int])
         R_cam_target, t_cam_target_m = target.pose_in(camera)
         visible, whole = seen.box_visible_xyxy_px, seen.box_whole_xyxy_px
         if whole is None:
-            continue  # outside the picture
+            continue  # outside the image
         boxes = (None if visible is None else np.asarray(visible), np.asarray(whole))
         targets.append(BopTarget(object_id, R_cam_target, t_cam_target_m, *boxes, seen.visible_px, seen.whole_px))
     R_cam_ned = camera.R_ned_cam.T
@@ -139,7 +139,7 @@ def generate(folder: Path, plan: Plan) -> None:
             frame = _bop_frame(scene, rendered, list(ids.values()))
             present = [seen.mask_visib for seen in rendered.targets if seen.box_whole_xyxy_px is not None]
             writer.add(frame, rendered.image_bgr, present)
-    for name in ("mask", "mask_visib"):  # nothing that plays a sequence looks at them
+    for name in ("mask", "mask_visib"):  # not used when a sequence is played
         shutil.rmtree(folder / name)
     write_models(folder / "models", {i: AIRFRAMES[i - 1].mesh() for i in ids.values()}, {i: n for n, i in ids.items()})
     write_camera(folder / "camera.json", shown[0].camera.K, *SIZE_WH)

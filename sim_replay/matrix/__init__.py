@@ -1,1 +1,1 @@
-"""`uavpose-replay matrix`: sequences, at several speeds, with and without faults, in one table."""
+"""`uavpose-replay matrix`: sequences at several speeds, with and without faults, in one table."""

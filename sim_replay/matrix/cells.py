@@ -1,4 +1,4 @@
-"""One cell of the matrix: a sequence at a speed, flown whole and scored, or broken by a timeline and judged."""
+"""One cell of the matrix: a sequence at a speed, either flown completely and scored, or with a fault timeline."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from sim_replay.report.peer import percentiles
 from sim_replay.result import judge, score_json
 
 NO_FAULT = "none"
-RIG_FPS = 10.0  # of a rig at speed 1, as `faults` has it
+RIG_FPS = 10.0  # of a rig at speed 1, as in `faults`
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What a cell came to; None where it cannot tell. A flight with faults hovers, so its errors are not judged."""
+    """Result of a cell; None where unknown. With faults the own ship hovers, so errors are not evaluated."""
 
     sequence: str
     speed: float
     fault: str
-    wrong: tuple[str, ...]  # empty: as it should be
+    wrong: tuple[str, ...]  # empty: as expected
     poses: int = 0  # at the autopilot
-    found: float | None = None  # share of the views
+    found: float | None = None  # share of the visible targets
     rotation_error_deg: float | None = None  # median
     range_error_rel: float | None = None  # mean
     age_p50_ms: float | None = None  # at the autopilot
@@ -42,7 +42,7 @@ class Cell:
 
 
 def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) -> Cell:
-    """Play it once; what cannot be played is what is wrong. Raises InputError."""
+    """Play it once; if that fails, the reason is in `wrong`. Raises InputError."""
     name = sequence.scene.name
     out.mkdir(parents=True, exist_ok=True)
     flown = at_speed(sequence, speed, out)
@@ -72,7 +72,7 @@ def fly_cell(sequence: PlayedSequence, speed: float, model: Model, out: Path) ->
 
 
 def break_cell(sequence: PlayedSequence, speed: float, fault: str, timeline: Timeline, model: Path, out: Path) -> Cell:
-    """Play a timeline on a rig that shows the sequence's pictures; what is not as expected is what is wrong.
+    """Play a timeline on a rig that shows the sequence's images; `wrong` has what was not as expected.
 
     Timelines expect poses: the sequence must show a target. One with a volume needs a host where `can_mount`.
     Raises InputError.

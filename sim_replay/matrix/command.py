@@ -29,7 +29,7 @@ SPEEDS = (0.25, 4.0)
 
 
 def register(commands: Any) -> None:
-    """Add it to what argparse's add_subparsers() gave."""
+    """Add it to what argparse's add_subparsers() returned."""
     parser = commands.add_parser(
         "matrix",
         help="play sequences at several speeds, with and without faults, and print one table",
@@ -94,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
                 f"{name}: shows no target, which is needed to judge faults: played without them", highlight=False
             )
     cells: list[Cell] = []
-    _write(args.out, cells)  # of an earlier run nothing is left
+    _write(args.out, cells)  # discards those of an earlier run
     for cell in _cells(sequences, speeds, faults, timelines, model, args.out):
         cells.append(cell)
-        _write(args.out, cells)  # after each: what was flown for hours is kept if the next cannot be
+        _write(args.out, cells)  # after each cell, so that hours of flights are kept if the next one fails
         told = "; ".join(cell.wrong) or "passed"
         console.print(f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False)
     if args.json:
@@ -120,7 +120,7 @@ def _cells(
     model: Model,
     out: Path,
 ) -> Iterator[Cell]:
-    """Each combination of the sequences with their names, in a folder of its own; no fault without a target."""
+    """Each combination of the sequences with their names, in its own folder; no faults without a target."""
     for number, (sequence, name) in enumerate(sequences):
         for speed in speeds:
             for fault in faults:
@@ -135,7 +135,7 @@ def _cells(
 
 
 def table(cells: Sequence[Cell]) -> Table:
-    """For a person."""
+    """As a readable table."""
     shown = Table(title="matrix", title_justify="left")
     for name in ("sequence", "speed", "fault", ""):
         shown.add_column(name)

@@ -1,4 +1,4 @@
-"""Which sequences of a generated dataset the matrix flies."""
+"""Selects the sequences of a generated dataset that the matrix flies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIXED = "fixed"
 def flyable(dataset: Path, count: int) -> list[Path]:
     """Folders of the first `count` test sequences that can be flown.
 
-    Those whose camera is fixed to the own ship come first: nothing but the daemon then decides how a cell ends.
+    Those with a fixed camera come first: the result of a cell then depends on the daemon alone.
     Raises InputError if there are too few.
     """
     scenes = [scene for scene in find_scenes(dataset) if scene.split is None or scene.split.startswith(SPLIT)]

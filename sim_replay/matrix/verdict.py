@@ -1,4 +1,4 @@
-"""Whether the poses of a flight are such as its truth asks for."""
+"""Whether the poses of a flight agree with its ground truth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from sim_replay.result import PEERS, Result
 
 
 def wrong_poses(sequence: PlayedSequence, result: Result) -> tuple[str, ...]:
-    """A sentence for each peer without a pose though a target is seen, or with one though none is. Empty: all is well.
+    """A sentence for each peer without a pose though a target is visible, or with one though none is; else empty.
 
-    Of a sequence whose truth nobody knows, anything goes.
+    A sequence without ground truth is always accepted.
     """
     told = []
     for name, peer in zip(PEERS, (result.subscriber, result.autopilot), strict=True):

@@ -1,1 +1,1 @@
-"""`uavpose-replay bench-pipeline`: the daemon on a replayed camera for minutes, held to its budgets."""
+"""`uavpose-replay bench-pipeline`: measures the daemon for minutes on a replayed camera, against its budgets."""

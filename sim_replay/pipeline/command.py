@@ -27,7 +27,7 @@ FPS_MAX = 240.0
 
 
 def register(commands: Any) -> None:
-    """Add them to what argparse's add_subparsers() gave."""
+    """Add them to what argparse's add_subparsers() returned."""
     bench = commands.add_parser(
         "bench-pipeline",
         help="fly a sequence round and round through the daemon and hold it to its budgets",
@@ -57,7 +57,7 @@ def _add_arguments(parser: argparse.ArgumentParser, minutes: float, out: str) ->
 
 
 def run(args: argparse.Namespace) -> int:
-    """0 when it was measured, whatever came out. Raises InputError, PlayError."""
+    """0 if it was measured, whatever the result. Raises InputError, PlayError."""
     result, _ = _measure(args)
     _write(args.out / "pipeline.json", result)
     print(json.dumps(result) if args.json else table(result))
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_soak(args: argparse.Namespace) -> int:
-    """0 if nothing grows and poses came to the end, else EXIT_DRIFTS. Raises InputError, PlayError."""
+    """0 if nothing grows and poses arrived to the end, else EXIT_DRIFTS. Raises InputError, PlayError."""
     minutes_min = SAMPLES_MIN * SAMPLE_S / 60.0
     if args.minutes < minutes_min:
         raise InputError(f"--minutes {args.minutes:g}: must be at least {minutes_min:g} to show a trend")
@@ -79,7 +79,7 @@ def run_soak(args: argparse.Namespace) -> int:
 
 
 def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
-    """Fly, and the report of it."""
+    """Fly; returns the report and the flight."""
     if not 0.0 < args.minutes <= 24 * 60:
         raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most a day")
     model = load_model(args.model, threads=1)

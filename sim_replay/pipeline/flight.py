@@ -1,4 +1,4 @@
-"""A sequence flown round and round through the real daemon, with a simulated autopilot and a zenoh subscriber."""
+"""A sequence flown repeatedly through the real daemon, with a simulated autopilot and a zenoh subscriber."""
 
 from __future__ import annotations
 
@@ -33,37 +33,37 @@ RATES_AND_VELOCITIES = [4, 5, 6, 10, 11, 12]  # columns of Telemetry.values
 
 @dataclass(frozen=True)
 class FlightSettings:
-    """What is flown, for how long, and the folder of its files."""
+    """What is flown, for how long, and the output folder."""
 
     sequence: PlayedSequence
     out: Path
     minutes: float
     model: Path
-    fps: float  # how many pictures a second; all that flies flies faster or slower with them
+    fps: float  # images per second; all motion becomes faster or slower with it
 
     @property
     def period_s(self) -> float:
-        """One time through the sequence."""
+        """Duration of one pass through the sequence."""
         return len(self.sequence.scene.images) / self.fps
 
 
 @dataclass
 class Flight:
-    """What was seen of it. Times are monotonic unless they say UTC."""
+    """Observations of the flight. Times are monotonic unless they say UTC."""
 
     started_ns: int  # the daemon's process
     start_at_ns: int  # exposure of frame 0
     utc_minus_monotonic_ns: int
-    ready_ns: int | None = None  # the daemon said that it was warm
-    said: list[str] = field(default_factory=list)  # by the daemon
-    complaints: list[str] = field(default_factory=list)  # of its peers
+    ready_ns: int | None = None  # when the daemon reported that it had warmed up
+    said: list[str] = field(default_factory=list)  # the daemon's output
+    complaints: list[str] = field(default_factory=list)  # other output of its peers
     targets: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
     diagnostics: list[dict[str, Any]] = field(default_factory=list)  # sim_replay.subscriber's
-    poses_ns: list[int] = field(default_factory=list)  # when each was received over zenoh
-    poses_utc_ns: list[int] = field(default_factory=list)  # the exposures that they are of
+    poses_ns: list[int] = field(default_factory=list)  # arrival of each over zenoh
+    poses_utc_ns: list[int] = field(default_factory=list)  # their exposure times
     usage: list[Usage] = field(default_factory=list)  # of the daemon, from frame 0 on
-    logged: list[tuple[int, int]] = field(default_factory=list)  # when a line of its log came, and its bytes
-    ended: threading.Event = field(default_factory=threading.Event)  # a process has
+    logged: list[tuple[int, int]] = field(default_factory=list)  # arrival and bytes of each line of its log
+    ended: threading.Event = field(default_factory=threading.Event)  # set when a process has ended
     ready_or_ended: threading.Event = field(default_factory=threading.Event)
 
     def hear_end(self) -> None:
@@ -80,7 +80,7 @@ class Flight:
     def hear_peer(self, line: str, heard_ns: int) -> None:
         try:
             record = json.loads(line)
-        except ValueError:  # no record: its last words
+        except ValueError:  # not a record: its last output
             self.complaints.append(line)
             return
         if record["event"] == "target_relative":
@@ -93,9 +93,9 @@ class Flight:
 
 
 def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
-    """Fly for `minutes`; `on_second` hears how much of them is done, 0..1.
+    """Fly for `minutes`; `on_second` is called with the finished share, 0..1.
 
-    Raises InputError if the daemon refuses what it is given, PlayError if it is late or ends.
+    Raises InputError if the daemon rejects its input, PlayError if it is late or terminates.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     rounds = math.ceil(settings.minutes * 60 / settings.period_s) + 1
@@ -111,14 +111,14 @@ def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
 
 
 def sped_up(telemetry: Telemetry, frame0_ns: int, factor: float) -> Telemetry:
-    """The same way flown `factor` times as fast; the exposure of the first frame stays where it was."""
+    """The same path flown `factor` times as fast; the exposure time of the first frame is unchanged."""
     values = telemetry.values.copy()
     values[:, RATES_AND_VELOCITIES] *= factor
     return Telemetry(frame0_ns + np.round((telemetry.t_ns - frame0_ns) / factor).astype(np.int64), values)
 
 
 def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -> Telemetry:
-    """The part that belongs to the frames, again and again; t_ns is 0 at the exposure of the first frame."""
+    """The part that belongs to the frames, repeated; t_ns is 0 at the exposure of the first frame."""
     t_ns = telemetry.t_ns - frame0_ns
     period_ns = round(period_s * 1e9)
     inside = (t_ns >= 0) & (t_ns < period_ns)
@@ -131,7 +131,7 @@ def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -
 def _attempt(
     settings: FlightSettings, telemetry_csv: Path, lead_s: float, on_second: Callable[[float], None]
 ) -> Flight | None:
-    """One flight with frame 0 `lead_s` from now; None if the daemon was ready only after that."""
+    """One flight with frame 0 `lead_s` from now; None if the daemon became ready too late."""
     now_ns = time.monotonic_ns()
     flight = Flight(now_ns, now_ns + round(lead_s * 1e9), time.time_ns() - now_ns)
     mavlink_port, zenoh_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
@@ -149,7 +149,7 @@ def _attempt(
         for peer in peers:
             cleanup.callback(peer.end)
         daemon = Process([command, "run", "--config", config], flight.hear_daemon, flight.hear_end)
-        cleanup.callback(daemon.end)  # the first to end: the peers hear it out
+        cleanup.callback(daemon.end)  # ends first: the peers receive all that it sent
         if not _came(flight.ready_or_ended, flight.start_at_ns - READY_MARGIN_NS):
             return None
         _watch(settings, flight, daemon, peers, on_second)
@@ -163,7 +163,7 @@ def _watch(
     peers: Sequence[Process],
     on_second: Callable[[float], None],
 ) -> None:
-    """Note what the daemon uses until the time is over. Raises InputError, PlayError if a process ends before."""
+    """Record the daemon's usage until the time is over. Raises InputError, PlayError if a process ends early."""
     end_ns = flight.start_at_ns + round(settings.minutes * 60e9)
     next_ns = flight.start_at_ns
     while next_ns < end_ns:
@@ -177,9 +177,9 @@ def _watch(
 
 
 def _came(event: threading.Event, until_ns: int) -> bool:
-    """Wait for an event until a monotonic time; whether it came.
+    """Wait for an event until a monotonic time; returns whether it was set.
 
-    In pieces: if the kernel gave another thread a signal, this one acts on it between two of them.
+    In steps: if the kernel delivered a signal to another thread, this one handles it between two of them.
     """
     while (left_s := (until_ns - time.monotonic_ns()) * 1e-9) > 0 and not event.is_set():
         event.wait(min(left_s, SAMPLE_S))

@@ -1,4 +1,4 @@
-"""A flight set against the budgets. Pure functions."""
+"""Compares a flight with the budgets. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edge.health import WINDOW_FRAMES
 from edge.stages import STAGES
 from sim_replay.pipeline.flight import Flight
 
-SETTLE_S = 1.0  # after the sequence began again: the target has jumped and must be found anew
+SETTLE_S = 1.0  # after the sequence restarts: the target has jumped and must be re-acquired
 FLAT_FROM_MINUTES = 60.0
 FAST_ABOVE_HZ = 31.0
 SENT_MAX_HZ = MavlinkSettings().target_relative_rate_hz
@@ -23,7 +23,7 @@ PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
 
 @dataclass(frozen=True)
 class Budget:
-    """One row of the budget table; `met` is None where this flight cannot tell."""
+    """One row of the budget table; `met` is None if this flight cannot decide it."""
 
     name: str
     limit: float
@@ -33,7 +33,7 @@ class Budget:
 
 
 def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[str, Any]:
-    """JSON's types; milliseconds, 10^6 bytes, seconds; null where there is nothing to tell."""
+    """JSON's types; milliseconds, 10^6 bytes, seconds; null where there is no data."""
     latency = mavlink_latency_ms(flight, period_s)
     stages = stage_latency_ms([record["values"] for record in flight.diagnostics], fps)
     counters = last_counters(flight)
@@ -58,12 +58,12 @@ def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[
 
 
 def budgets(result: dict[str, Any]) -> list[Budget]:
-    """The design's table, for what one flight shows."""
+    """The design's budget table, filled in from one flight."""
     steady = result["capture_to_mavlink_ms"]["steady"]
     memory = result["memory_mb"]
     growth = memory.get("growth_per_hour")
     p50_ms = _budget("capture to MAVLink, tracking, p50", 15.0, steady.get("p50"), "ms")
-    fast = result["fps"] > FAST_ABOVE_HZ  # has a budget of its own, and none for the median
+    fast = result["fps"] > FAST_ABOVE_HZ  # has its own budget, and none for the median
     return [
         *([] if fast else [p50_ms]),
         _budget("capture to MAVLink, tracking, p99", 33.0 if fast else 25.0, steady.get("p99"), "ms"),
@@ -83,7 +83,7 @@ def _budget(name: str, limit: float, value: float | None, unit: str) -> Budget:
 
 
 def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, float]]:
-    """From exposure to the autopilot's receiving: `all`, and `steady` without SETTLE_S after each new begin."""
+    """From exposure to arrival at the autopilot: `all`, and `steady` without SETTLE_S after each restart."""
     captures_ns = [record["capture_utc_us"] * 1000 - flight.utc_minus_monotonic_ns for record in flight.targets]
     pairs = zip(captures_ns, flight.targets, strict=True)
     since_s = [((capture_ns - flight.start_at_ns) * 1e-9) % period_s for capture_ns in captures_ns]
@@ -93,11 +93,11 @@ def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, f
 
 
 def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
-    """Poses that the subscriber got and the autopilot did not: too old for MAVLink, whose limit is the lower one. No
-    latency tells of them.
+    """Poses that the subscriber received and the autopilot did not: too old for MAVLink, whose limit is the lower one.
+    Latencies do not include them.
 
-    Without SETTLE_S after each new begin, where what coasts is withheld too; None at more frames a second than
-    TARGET_RELATIVE is sent. The daemon's own `mavlink_tracks_withheld` counts what is not confirmed yet as well.
+    Without SETTLE_S after each restart, where coasting tracks are withheld too; None at a frame rate above that of
+    TARGET_RELATIVE. The daemon's own `mavlink_tracks_withheld` also counts unconfirmed tracks.
     """
     if fps > SENT_MAX_HZ:
         return None
@@ -106,7 +106,7 @@ def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
         Counter(round((utc_ns - flight.utc_minus_monotonic_ns - flight.start_at_ns) * 1e-9 * fps) for utc_ns in stamps)
         for stamps in (flight.poses_utc_ns, told_utc_ns)
     )
-    flown = range(min(told), max(told) + 1) if told else range(max(had, default=0) + 1)  # while both were listened to
+    flown = range(min(told), max(told) + 1) if told else range(max(had, default=0) + 1)  # while both were receiving
     missed = had - told
     return sum(count for frame, count in missed.items() if frame in flown and frame / fps % period_s >= SETTLE_S)
 
@@ -114,7 +114,7 @@ def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
 def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[str, dict[str, float]]:
     """By stage: the median of the windows' p50, the largest of their p95 and p99.
 
-    `diagnostics` come once a second and tell of the last WINDOW_FRAMES: those of windows that do not overlap count.
+    `diagnostics` arrive once per second and cover the last WINDOW_FRAMES: only non-overlapping windows count.
     """
     step = max(round(WINDOW_FRAMES / fps), 1)
     windows = list(diagnostics)[::-1][::step]
@@ -127,14 +127,14 @@ def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[
 
 
 def last_counters(flight: Flight) -> dict[str, int]:
-    """The daemon's own, as it last told them over zenoh."""
+    """The daemon's own, as last received over zenoh."""
     if not flight.diagnostics:
         return {}
     return {name: int(text) for name, text in flight.diagnostics[-1]["values"].items() if text.isdecimal()}
 
 
 def memory_mb(flight: Flight) -> dict[str, float]:
-    """Resident memory; its growth is the slope of the second half. Empty: not looked at often enough."""
+    """Resident memory; its growth is the slope of the second half. Empty: too few samples."""
     rss = np.array([usage.rss_mb for usage in flight.usage])
     if len(rss) < 4:
         return {}
@@ -146,7 +146,7 @@ def memory_mb(flight: Flight) -> dict[str, float]:
 
 def cpu(flight: Flight, captured: int | None) -> dict[str, float | None]:
     """Cores that the daemon kept busy and cores that it waited for while others had them, on average; processor time
-    of one frame. Decoding the pictures is in all of them."""
+    per frame. Image decoding is included in all of them."""
     if len(flight.usage) < 2:
         return {"cpu_cores": None, "cpu_cores_waited_for": None, "cpu_ms_per_frame": None}
     first, last = flight.usage[0], flight.usage[-1]
@@ -167,7 +167,7 @@ def first_pose_s(flight: Flight) -> float | None:
 
 
 def table(result: dict[str, Any]) -> str:
-    """For a person."""
+    """As readable text."""
     return "\n".join(_lines(result))
 
 

@@ -1,8 +1,8 @@
-"""Whether a long flight drifts: memory, descriptors, threads, log, drops, age and poses, early against late. Pure.
+"""Detects drift in a long flight: memory, descriptors, threads, log, drops, age and poses, early against late. Pure.
 
-The first quarter is left out: caches fill, allocators grow, links come up. The rest is parted into thirds, and the last
-is set against the first. Medians are compared, so that one odd sample is no trend; of memory the floor is, for what
-leaks lifts it and what comes and goes with each picture does not.
+The first quarter is left out: caches fill, allocators grow, links come up. The rest is divided into thirds, and the
+last is compared with the first. Medians are compared, so that one outlier is no trend; for memory the minimum, which
+a leak raises and a temporary allocation for an image does not.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from sim_replay.pipeline.flight import Flight
 
 WARM_UP_SHARE = 0.25
 SAMPLES_MIN = 12  # fewer show no trend
-# Three pictures of 1080p and a half: a busy machine has more of them in hand at once than an idle one, and the
-# allocator keeps the places of as many as there ever were.
+# Three and a half 1080p images: a busy machine holds more of them at once than an idle one, and the
+# allocator keeps the memory of the largest number so far.
 MEMORY_MB = 22.0
 FLOOR_QUANTILE = 0.1
 DESCRIPTORS, THREADS = 3.0, 2.0
@@ -29,20 +29,20 @@ AGE_GROWTH, AGE_MS = 0.5, 10.0
 
 @dataclass(frozen=True)
 class Trend:
-    """One quantity, early and late; `grows` is None where this flight cannot tell."""
+    """One quantity, early and late; `grows` is None if this flight cannot decide it."""
 
     name: str
     unit: str
     early: float | None
     late: float | None
-    allowed: float | None  # what `late` may be at most
+    allowed: float | None  # the maximum of `late`
     grows: bool | None
 
 
 def trends(flight: Flight, fps: float) -> list[Trend]:
-    """All of them, of SAMPLES_MIN samples or more.
+    """All of them, from SAMPLES_MIN samples or more.
 
-    Age and drops are not judged where the daemon waited longer for other work than it ran itself.
+    Age and drops are not judged if the daemon waited for other processes longer than it ran itself.
     """
     samples = flight.usage
     times_ns = np.array([sample.time_ns for sample in samples])
@@ -75,7 +75,7 @@ def trends(flight: Flight, fps: float) -> list[Trend]:
 
 
 def silences(flight: Flight) -> list[str]:
-    """A sentence for each peer that got no pose at all, or some early and none late."""
+    """A sentence for each peer that received no pose at all, or some early and none late."""
     early, late = _thirds(np.array([sample.time_ns for sample in flight.usage]))
     received = {"autopilot": [record["received_ns"] for record in flight.targets], "subscriber": flight.poses_ns}
     told = []
@@ -89,7 +89,7 @@ def silences(flight: Flight) -> list[str]:
 
 
 def table(found: Sequence[Trend], minutes: float) -> str:
-    """For a person."""
+    """As readable text."""
     words = {True: "GROWS", False: "flat", None: "not judged"}
     lines = [f"{minutes:g} minutes{'':20} {'early':>10} {'late':>10} {'allowed':>10}"]
     for trend in found:
@@ -99,7 +99,7 @@ def table(found: Sequence[Trend], minutes: float) -> str:
 
 
 def _thirds(times_ns: Array) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The first and the last third of what follows the warm-up, each (from, to)."""
+    """The first and the last third after the warm-up, each (from, to)."""
     first, last = float(times_ns[0]), float(times_ns[-1])
     first += WARM_UP_SHARE * (last - first)
     length = (last - first) / 3.0
@@ -113,7 +113,7 @@ def _floor(values: Array) -> np.floating:
 def _within(
     of: Callable[[Array], np.floating], values: Sequence[float], times: Array, part: tuple[float, float]
 ) -> float | None:
-    """`of` the values whose times lie in a part; None if none does."""
+    """`of` the values whose times lie in a part; None if there are none."""
     inside = np.array(values, dtype=np.float64)[(times >= part[0]) & (times <= part[1])] if len(values) else np.zeros(0)
     return float(of(inside)) if inside.size else None
 
@@ -129,7 +129,7 @@ def _dropped(flight: Flight, part: tuple[float, float]) -> float | None:
 
 
 def _ages_ms(flight: Flight) -> tuple[list[float], Array]:
-    """Age of each TARGET_RELATIVE on receipt, and when that was."""
+    """Age of each TARGET_RELATIVE on arrival, and its arrival time."""
     received = np.array([record["received_ns"] for record in flight.targets], dtype=np.float64)
     captured = [record["capture_utc_us"] * 1000 - flight.utc_minus_monotonic_ns for record in flight.targets]
     return [(r["received_ns"] - c) * 1e-6 for r, c in zip(flight.targets, captured, strict=True)], received

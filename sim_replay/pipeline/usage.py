@@ -1,4 +1,4 @@
-"""What a process has used so far, as Linux tells it in /proc."""
+"""Resource usage of a process so far, from Linux's /proc."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _UTIME, _STIME = 11, 12  # of /proc/PID/stat, counted after the command's closin
 class Usage:
     time_ns: int  # monotonic
     cpu_s: float  # of all its threads since it started
-    waited_s: float  # ready to run while other work had the cores, all its threads
+    waited_s: float  # runnable while other processes had the cores, all its threads
     rss_mb: float  # 10^6 bytes
     descriptors: int  # open
     threads: int
 
 
 def usage_of(pid: int) -> Usage:
-    """Raises OSError when there is no such process any more."""
+    """Raises OSError if the process no longer exists."""
     proc = Path("/proc") / str(pid)
     fields = (proc / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     pages = int((proc / "statm").read_text(encoding="utf-8").split()[1])
@@ -34,7 +34,7 @@ def usage_of(pid: int) -> Usage:
 
 
 def _waited_ns(task: Path) -> int:
-    """0 for a thread that has just ended, or where the kernel keeps no such count."""
+    """0 for a thread that has just ended, or if the kernel keeps no such count."""
     try:
         return int((task / "schedstat").read_text(encoding="utf-8").split()[1])
     except (OSError, IndexError):

@@ -1,4 +1,4 @@
-"""What a radio does to one packet: it waits for the line, takes its time to be sent, is delayed, or is lost. Pure."""
+"""A radio's effect on one packet: it queues, takes time to be sent, is delayed, or is lost. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 UDP_HEADER_BYTES = 28  # IPv4 and UDP
 TCP_HEADER_BYTES = 52  # IPv4, TCP and its timestamps
 SEGMENT_BYTES = 1400
-# What a kernel waits at least before it sends a segment again (RFC 6298 as Linux has it).
+# Minimum timeout before a kernel retransmits a segment (RFC 6298 as in Linux).
 RETRANSMIT_MIN_S = 0.2
 
 
@@ -17,16 +17,16 @@ class Channel:
     """A radio, the same in both directions."""
 
     name: str
-    rate_bps: float | None = None  # of the line, headers included; None: as fast as it comes
+    rate_bps: float | None = None  # of the line, headers included; None: unlimited
     delay_s: float = 0.0  # one way
     jitter_s: float = 0.0  # on top of the delay, uniform from 0; packets keep their order
     loss: float = 0.0  # share of packets
-    queue_s: float = 0.5  # longer a datagram does not wait for the line; it is dropped instead
+    queue_s: float = 0.5  # a datagram that would wait longer for the line is dropped
     outage_s: float = 0.0  # once, in the middle of a trial
 
     @property
     def what(self) -> str:
-        """In a person's words."""
+        """In words."""
         rate = "no limit" if self.rate_bps is None else f"{self.rate_bps / 1e3:g} kbit/s"
         jitter = f" + 0…{self.jitter_s * 1e3:g} ms" if self.jitter_s else ""
         outage = f", {self.outage_s:g} s outage" if self.outage_s else ""
@@ -41,7 +41,7 @@ CHANNELS = {one.name: one for one in (CLEAR, LOSSY, OUTAGE, NARROW)}
 
 
 class Lane:
-    """One direction of a channel. Give it packets in the order of their times (seconds of any one clock)."""
+    """One direction of a channel. Takes packets in order of time (seconds of any one clock)."""
 
     def __init__(self, channel: Channel, seed: int) -> None:
         self._channel = channel
@@ -50,16 +50,16 @@ class Lane:
         self._last_due_s = 0.0
 
     def datagram(self, size_bytes: int, now_s: float) -> float | None:
-        """When a datagram's payload comes out at the other end; None if it is lost."""
+        """Time at which a datagram's payload arrives at the other end; None if it is lost."""
         if self._line_free_s - now_s > self._channel.queue_s:
             return None
         sent_s = self._send(size_bytes + UDP_HEADER_BYTES, now_s)
         if self._chance.random() < self._channel.loss:
-            return None  # it took the line's time all the same
+            return None  # it occupied the line nevertheless
         return self._arrive(sent_s)
 
     def segment(self, size_bytes: int, now_s: float) -> float:
-        """When a piece of a TCP stream comes out: a lost one is sent again, and all behind it wait."""
+        """Time at which a piece of a TCP stream arrives: a lost one is sent again, and all behind it wait."""
         sent_s = self._send(size_bytes + TCP_HEADER_BYTES, now_s)
         timeout_s = max(RETRANSMIT_MIN_S, 2.0 * self._channel.delay_s)
         while self._chance.random() < self._channel.loss:

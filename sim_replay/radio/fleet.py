@@ -1,4 +1,4 @@
-"""Many vehicles on one router and one watcher: does each get through, how late, and at what price."""
+"""Many vehicles on one router and one watcher: whether each gets through, how late, and at what cost."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class FleetOutcome:
     transport: Transport
     fps: float
     seconds: float
-    shown_hz: float  # poses a second, all vehicles
-    delivered_min: float  # share of the poses sent, of the vehicle that fared worst
+    shown_hz: float  # poses per second, all vehicles
+    delivered_min: float  # share of the poses sent, of the worst vehicle
     delivered: float
     age_p50_s: float
     age_p95_s: float
@@ -43,7 +43,7 @@ class FleetOutcome:
 def fly_fleet(
     vehicles: int, seconds: float, fps: float = 20.0, transport: Transport = "quic", max_age_s: float = 1.0
 ) -> FleetOutcome:
-    """Start that many vehicles as processes and watch them all. Raises PlayError if one is never heard."""
+    """Start this many vehicles as processes and watch them all. Raises PlayError if nothing is received from one."""
     uavs = [f"uav{number}" for number in range(1, vehicles + 1)]
     ledgers = {uav: Ledger() for uav in uavs}
     fleet = Fleet(max_age_s=max_age_s)

@@ -13,19 +13,19 @@ from sim_replay.faults.relay import LOOPBACK, Address
 from sim_replay.radio.channel import SEGMENT_BYTES, Channel, Lane
 
 _START_S = 10.0
-_PIECES_WAITING = 8  # of a stream, so that a slow line is felt by who sends
+_PIECES_WAITING = 8  # of a stream, so that the sender notices a slow line
 _SOCKET_BYTES = 16384
 
 
 class RadioRelay:
-    """Stands between one vehicle, which talks to `port`, and a router at `upstream`; runs in a thread of its own.
+    """Connects one vehicle, which uses `port`, with a router at `upstream`; runs in its own thread.
 
-    While it is cut, datagrams are lost and streams stand still.
+    While it is cut, datagrams are lost and streams stall.
     """
 
     def __init__(self, upstream: Address, channel: Channel, kind: socket.SocketKind, seed: int = 0) -> None:
         self.port = 0
-        self.bytes_up = 0  # payload that the vehicle gave to the radio
+        self.bytes_up = 0  # payload that the vehicle sent by radio
         self._upstream = upstream
         self._channel = channel
         self._lanes = (Lane(channel, 2 * seed), Lane(channel, 2 * seed + 1))  # up, down
@@ -112,7 +112,7 @@ class RadioRelay:
         return task
 
     async def _stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, lane: Lane) -> None:
-        """One direction of a connection, until either end of it is gone."""
+        """One direction of a connection, until either end closes."""
         pieces: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_PIECES_WAITING)
         reading = self._begin(self._read(reader, lane, pieces))
         with contextlib.suppress(OSError):
@@ -137,7 +137,7 @@ class RadioRelay:
 
 
 def _send(end: asyncio.DatagramTransport, data: bytes, address: Address | None) -> None:
-    """What is under way when the relay closes goes nowhere."""
+    """Data in flight when the relay closes is discarded."""
     if not end.is_closing():
         end.sendto(data, address)
 

@@ -1,4 +1,4 @@
-"""The ground's end of a trial: a router that asks for certificates, and vehicles as processes that connect to it."""
+"""The ground side of a trial: a router that requires certificates, and vehicles as processes that connect to it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.play import PlayError
 
 START_S = 60.0
-_NO_CAP_HZ = 240.0  # of poses: all that are put are offered to the link, and the rest is thinned as on any radio
+_NO_CAP_HZ = 240.0  # of poses: every pose is offered to the link, which thins the rest as on any radio
 
 Transport = Literal["quic", "tls"]
 SOCKET_KINDS = {"quic": socket.SOCK_DGRAM, "tls": socket.SOCK_STREAM}
@@ -27,21 +27,21 @@ SOCKET_KINDS = {"quic": socket.SOCK_DGRAM, "tls": socket.SOCK_STREAM}
 
 @dataclass(frozen=True)
 class Ground:
-    """A router that runs."""
+    """A running router."""
 
     transport: Transport
     port: int  # of the vehicles' endpoint
-    loopback: str  # endpoint of the tools
+    loopback: str  # endpoint for local tools
     keys: Mapping[str, TlsFiles]
 
     def endpoint(self, port: int) -> str:
-        """What a vehicle connects to, by way of a relay's port or straight."""
+        """What a vehicle connects to, through a relay's port or directly."""
         return f"{self.transport}/{LOOPBACK}:{port}"
 
 
 @contextmanager
 def ground(folder: Path, transport: Transport, uavs: Sequence[str]) -> Iterator[Ground]:
-    """A router with a certificate of its own and one for each vehicle; tools on this machine read without."""
+    """A router with its own certificate and one for each vehicle; tools on this machine need none."""
     from msgs.ground.keys import init_authority, issue  # of the extra `ground`, which the other commands do without
 
     init_authority(folder)
@@ -82,7 +82,7 @@ class Vehicle:
         self._process.tell("begin")
 
     def end(self) -> dict[str, int]:
-        """Stop sending; what its link counted. The session stays open."""
+        """Stop sending; returns its link's counters. The session stays open."""
         self._process.tell("end")
         counters: dict[str, int] = self._wait("counters")
         return counters

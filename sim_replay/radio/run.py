@@ -19,7 +19,7 @@ EXIT_LATE = 1
 
 
 def register(commands: Any) -> None:
-    """Add the commands to what add_subparsers() gave; each sets `run`, a function of the parsed arguments."""
+    """Add the commands to what add_subparsers() returned; each sets `run`, a function of the parsed arguments."""
     radio = commands.add_parser(
         "radio",
         help="fly the daemon's zenoh link over slow, lossy and interrupted radios and look at every pose shown",
@@ -62,7 +62,7 @@ def _seconds(text: str) -> float:
 
 
 def run_radio(args: argparse.Namespace) -> int:
-    """Play every combination that was asked for. Raises InputError without the package that makes certificates."""
+    """Play every requested combination. Raises InputError without the package that makes certificates."""
     _need_certificates()
     outcomes = []
     for link in args.link or CHANNELS:

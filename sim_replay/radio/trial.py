@@ -1,4 +1,4 @@
-"""One radio link for a while: what the vehicle sent, what the ground showed, and how old that truly was."""
+"""One radio link for some time: what the vehicle sent, what the ground showed, and its true age."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sim_replay.radio.rig import SOCKET_KINDS, START_S, Transport, Vehicle, grou
 from sim_replay.radio.vehicle import content_age_s
 
 UAV = "uav1"
-# Reading one clock as another costs a little; a late pose is late by more.
+# Error of converting one clock to another; a pose that is really late exceeds it.
 CLOCK_TOLERANCE_S = 0.01
 DRAIN_S = 2.0
 _NS = 1e9
@@ -35,7 +35,7 @@ Tool = Literal["poses", "watch"]
 
 @dataclass(frozen=True)
 class Plan:
-    """`tool` is who listens on the ground: a program that takes poses alone, or what `uavpose-ground watch` takes."""
+    """`tool` receives on the ground: a program that takes poses only, or what `uavpose-ground watch` takes."""
 
     channel: Channel
     transport: Transport = "quic"
@@ -53,17 +53,17 @@ class Outcome:
     channel: str
     transport: Transport
     tool: Tool
-    sent: int  # poses put by the vehicle from the first one shown on
+    sent: int  # poses put by the vehicle since the first one shown
     shown: int
-    refused: int  # came, but too old or out of order
-    late_shown: int  # truly older than the client allows, and shown all the same: must be 0
+    refused: int  # arrived, but too old or out of order
+    late_shown: int  # truly older than the client allows, but shown: must be 0
     age_p50_s: float
     age_p95_s: float
     age_p99_s: float
     age_max_s: float
     gap_max_s: float  # the longest time without a pose
     back_s: float | None  # from the end of the outage to the next pose; None: no outage, or none came
-    up_kbps: float  # payload that the vehicle's session gave to the radio
+    up_kbps: float  # payload that the vehicle's session sent by radio
 
     @property
     def delivered(self) -> float:
@@ -73,7 +73,7 @@ class Outcome:
 
 @dataclass
 class Ledger:
-    """What was shown: when (UTC s), the publisher's sequence, and how old it truly was."""
+    """Shown poses: time (UTC s), the publisher's sequence number, and true age."""
 
     rows: list[tuple[float, int, float]] = field(default_factory=list)
     changed: threading.Condition = field(default_factory=threading.Condition)
@@ -90,14 +90,14 @@ class Ledger:
                 raise PlayError(f"no pose came within {START_S:.0f} s")
 
     def offered(self, sent: int) -> int:
-        """How many poses there were to show since the first that was, of `sent` in all."""
+        """Number of poses that could have been shown since the first one shown, of `sent` in all."""
         sequences = [row[1] for row in self.rows]
-        # The last one may have gone out after the vehicle had counted.
+        # The last one may have been sent after the vehicle had counted.
         return max(sent, *sequences) - min(sequences) + 1
 
 
 def play(plan: Plan) -> Outcome:
-    """Play a plan in real time. Raises PlayError if the vehicle does not start or nothing ever comes."""
+    """Play a plan in real time. Raises PlayError if the vehicle does not start or nothing arrives."""
     ledger = Ledger()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="uavpose-radio-")))
@@ -115,12 +115,12 @@ def play(plan: Plan) -> Outcome:
         restored_s = _wait_out(plan, relay)
         kbps = 8e-3 * (relay.bytes_up - bytes_before) / (time.monotonic() - began_s)
         sent = vehicle.end()["sent_pose"]
-        threading.Event().wait(DRAIN_S)  # what is under way counts as late or lost, not as never sent
+        threading.Event().wait(DRAIN_S)  # what is in flight counts as late or lost, not as never sent
         return outcome_of(plan, ledger, sent, refused(), restored_s, kbps)
 
 
 def _wait_out(plan: Plan, relay: RadioRelay) -> float | None:
-    """The trial's time, with its outage; when that ended (UTC s)."""
+    """Wait for the trial's duration, with its outage; returns the outage's end (UTC s)."""
     wait = threading.Event().wait
     outage_s = plan.channel.outage_s
     if not outage_s:
@@ -137,7 +137,7 @@ def _wait_out(plan: Plan, relay: RadioRelay) -> float | None:
 
 @contextmanager
 def _taking(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[Callable[[], int]]:
-    """Put what the plan's tool shows into the ledger; yields how many poses it has refused."""
+    """Record what the plan's tool shows in the ledger; yields a function that returns how many poses it has refused."""
     with _as_program(plan, session, ledger) if plan.tool == "poses" else _as_watch(plan, session, ledger) as refused:
         yield refused
 
@@ -175,7 +175,7 @@ def _as_watch(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[Ca
 
 
 def outcome_of(plan: Plan, ledger: Ledger, sent: int, refused: int, restored_s: float | None, kbps: float) -> Outcome:
-    """`sent`: poses that the vehicle put in all; `restored_s`: UTC of the end of the outage."""
+    """`sent`: number of poses put by the vehicle; `restored_s`: UTC of the end of the outage."""
     rows = list(ledger.rows)
     shown_s = np.array([row[0] for row in rows])
     ages_s = np.array([row[2] for row in rows])

@@ -25,7 +25,7 @@ from edge.links.zenoh_link import ZenohLink
 from edge.types import FrameMeta, OwnShip, Report, Track, TrackState
 
 RANGE_MIN_M = 100.0
-PERIOD_S = 600.0  # after which ranges begin again
+PERIOD_S = 600.0  # after which ranges repeat
 EVENT_S = 1.0
 _K = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])
 _R_NED_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -34,18 +34,18 @@ _NS = 1e9
 
 
 def range_m(utc_s: float) -> float:
-    """Of a target that was exposed then."""
+    """Range of a target that was exposed at that time."""
     return RANGE_MIN_M + utc_s % PERIOD_S
 
 
 def content_age_s(measured_range_m: float, utc_s: float) -> float:
-    """How old a pose is by what it says, not by its stamp; right while it is younger than half a period."""
+    """Age of a pose by its content, not by its stamp; valid while it is younger than half a period."""
     age_s = (utc_s - (measured_range_m - RANGE_MIN_M)) % PERIOD_S
     return age_s if age_s < PERIOD_S / 2 else age_s - PERIOD_S
 
 
 def report(sequence: int, targets: int, uav_number: int = 0) -> Report:
-    """A frame exposed now, with that many targets straight ahead of an own ship that flies north."""
+    """A frame exposed now, with this many targets straight ahead of an own ship that flies north."""
     now_ns, now_s = time.monotonic_ns(), time.time()
     own_m = _OWN_NED_M + np.array([0.0, 50.0 * uav_number, 0.0])
     own = OwnShip(now_ns, np.eye(3), own_m, np.array([20.0, 0.0, 0.0]), (47.0, 8.0, 400.0))
@@ -76,7 +76,7 @@ def report(sequence: int, targets: int, uav_number: int = 0) -> Report:
 
 
 def snapshot(tracks: int, fps: float) -> HealthSnapshot:
-    """Health as large as the daemon's usually is."""
+    """Health of the daemon's usual size."""
     stages = ("capture", "wait", "preprocess", "inference", "decode", "track", "publish", "total")
     condition = Condition(HealthState.TRACKING, Activity.TRACKING)
     latency = {stage: Percentiles(5.0, 6.0, 7.0) for stage in stages}
@@ -85,7 +85,7 @@ def snapshot(tracks: int, fps: float) -> HealthSnapshot:
 
 
 def fly(link: ZenohLink, fps: float, targets: int, stop: threading.Event) -> None:
-    """Publish at that rate until `stop`, health and an event each second."""
+    """Publish at this rate until `stop`, health and an event each second."""
     begun_s = time.monotonic()
     sequence, next_event_s = 0, begun_s
     while not stop.wait(max(begun_s + sequence / fps - time.monotonic(), 0.0)):

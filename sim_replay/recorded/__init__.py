@@ -1,1 +1,1 @@
-"""Flights that were filmed or recorded, made into scenes that can be flown: a video with telemetry, or MCAP."""
+"""Converts filmed or recorded flights to scenes that can be flown: a video with telemetry, or MCAP."""

@@ -1,4 +1,4 @@
-"""What `play --sequence` takes: a scene folder as it is, and what becomes one first."""
+"""Opens the argument of `play --sequence`: a scene folder, or a source that is converted to one first."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from edge.errors import InputError
 from sim_replay.ground_truth import PlayedSequence, read_sequence
 from sim_replay.recorded.scene_files import is_unpacked
 
-SCENE = "sequence"  # folder in `out` that holds what was unpacked
-UNFINISHED = "sequence.part"  # the same while pictures are unpacked into it
+SCENE = "sequence"  # folder in `out` for what was unpacked
+UNFINISHED = "sequence.part"  # the same while images are being unpacked
 WHAT = "a scene folder, an .mcap recording or a folder of them, or a .toml that names a video and its telemetry"
 
 
 def open_sequence(path: Path, out: Path, console: Console) -> PlayedSequence:
-    """The sequence at `path`; of a video or a recording a scene is made in `out`/sequence, which can be played again.
+    """The sequence at `path`; a video or recording becomes a scene in `out`/sequence, which can be played again.
 
     Raises InputError, naming file and key; OSError.
     """

@@ -1,9 +1,9 @@
-"""A recording of the daemon (`[recorder] image_max_hz`) as a scene: its pictures, and the own ship from its transforms.
+"""A recording of the daemon (`[recorder] image_max_hz`) as a scene: its images, and the own ship from its transforms.
 
-Pictures are played at a constant rate, each in the slot nearest its exposure, and the telemetry is bent so that the
-attitude at every picture's exposure is the one that was recorded. Pictures from before the first and after the last
-attitude are left out. A picture's number is its slot: one that is left out was not recorded, and is a dropped frame.
-Recorded on the ground, a file may tell of other vehicles too; they are passed over.
+Images are played at a constant rate, each in the slot nearest its exposure, and the telemetry's times are warped so
+that the attitude at every image's exposure is the recorded one. Images before the first and after the last attitude
+are left out. An image's number is its slot: a missing number was not recorded, and is a dropped frame.
+A recording made on the ground may contain other vehicles, which are ignored.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from sim_replay.ground_truth import UNCOVERED_NS_MAX
 from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, scene_distortion, write_sequence_toml
 from sim_replay.telemetry import Telemetry, write_telemetry
 
-ORIGIN_DEG_M = (0.0, 0.0, 0.0)  # of ned: recordings do not tell where on Earth it is
-GAP_S_MAX = 10.0  # between two pictures of one flight
+ORIGIN_DEG_M = (0.0, 0.0, 0.0)  # of ned: recordings do not contain its position on Earth
+GAP_S_MAX = 10.0  # between two images of one flight
 FPS_MAX = 240.0
-_FIXED_RAD = 1e-4  # a mount that moves no more is a fixed one
-_NEIGHBOURS = 5  # velocities whose middle one is taken: where the autopilot sets its place anew, nobody flew so fast
+_FIXED_RAD = 1e-4  # a mount that moves less is a fixed one
+_NEIGHBOURS = 5  # window of the median of velocities: removes jumps where the autopilot resets its position
 
 Stamped = dict[int, dict[str, TransformStamped]]  # transforms by child frame, by stamp
 
 
 @dataclass(eq=False)
 class Recorded:
-    """What a flight's files hold, in order; stamps are UTC ns of the exposure."""
+    """Contents of a flight's files, in order; stamps are UTC ns of the exposure."""
 
     uav: str | None = None
     picture_ns: list[int] = field(default_factory=list)
-    lens: list[CameraInfo] = field(default_factory=list)  # of each picture
+    lens: list[CameraInfo] = field(default_factory=list)  # of each image
     own_of: dict[str, Stamped] = field(default_factory=dict)  # by vehicle
 
     @property
     def own(self) -> Stamped:
-        """Of the vehicle whose pictures they are."""
+        """Of the vehicle whose images they are."""
         return self.own_of.get(self.uav or "", {})
 
 
 def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[[], None]) -> None:
-    """Make a scene of a flight's recordings, given in their order. Raises InputError, OSError."""
+    """Convert a flight's recordings, given in their order, to a scene. Raises InputError, OSError."""
     recorded = _read(paths, lambda _index, _image: None)
     _check(paths, recorded)
     picture_ns = np.array(recorded.picture_ns)
     fps = _rate_hz(picture_ns)
     own_ns, mounts = _own_ship(recorded)
     places_m = _places_m(recorded, own_ns)
-    within_ns = UNCOVERED_NS_MAX // 2  # bending moves times by half a picture or so
+    within_ns = UNCOVERED_NS_MAX // 2  # warping shifts times by about half an image interval
     covered = np.flatnonzero((picture_ns >= own_ns[0] - within_ns) & (picture_ns <= own_ns[-1] + within_ns))
     if len(covered) < 2:
         raise InputError(f"{paths[0]}: holds no pictures of the time in which the own ship's attitude was recorded")
@@ -86,7 +86,7 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
 
 
 def _read(paths: Sequence[Path], on_picture: Callable[[int, CompressedImage], None]) -> Recorded:
-    """Go through the files once. Raises InputError."""
+    """Read the files once. Raises InputError."""
     recorded, camera = Recorded(), dict[str, CameraInfo]()
     for path in paths:
         try:
@@ -123,14 +123,14 @@ def _check(paths: Sequence[Path], recorded: Recorded) -> None:
 
 
 def _rate_hz(picture_ns: Array) -> float:
-    """Of the camera: by the middle one of the times between two pictures."""
+    """The camera's rate, from the median interval between two images."""
     return min(round(1e9 / float(np.median(np.diff(picture_ns))), 3), FPS_MAX)
 
 
 def _add(
     writer: SceneWriter, slot: int, image: CompressedImage, lens: CameraInfo, R_ned_cam: Array, t_ned_cam_m: Array
 ) -> None:
-    """The picture as it was recorded, byte for byte, unless its lens is one that scenes do not know."""
+    """The recorded image, byte for byte, unless scenes do not support its lens model."""
     distortion = tuple(float(value) for value in lens.distortion)
     if len(distortion) > 5:
         pixels = cv2.imdecode(np.frombuffer(image.data, dtype=np.uint8), cv2.IMREAD_COLOR)
@@ -144,7 +144,7 @@ def _add(
 
 
 def _own_ship(recorded: Recorded) -> tuple[Array, list[Mount]]:
-    """Stamps [N] int64 of the transforms, rising, and how the camera sat on the body at each."""
+    """Stamps [N] int64 of the transforms, increasing, and the camera's mount at each."""
     stamps = sorted(recorded.own)
     cameras = [recorded.own[stamp][topics.FRAME_CAMERA] for stamp in stamps]
     mounts = [Mount(_R(one), np.asarray(one.t_frame_child_m)) for one in cameras]
@@ -156,9 +156,9 @@ def _R(link: TransformStamped) -> Array:
 
 
 def _places_m(recorded: Recorded, own_ns: Array) -> Array:
-    """[N, 3] of the own ship in ned; evenly from one to the next where the position was not known.
+    """[N, 3] of the own ship in ned; linearly interpolated where the position is unknown.
 
-    Before the first and after the last it stays there: from the origin it would leap, faster than anything flies.
+    Before the first and after the last it is constant: a start at the origin would be an impossibly fast jump.
     """
     told = [recorded.own[int(stamp)].get(topics.FRAME_BODY_NED) for stamp in own_ns]
     known = [k for k, place in enumerate(told) if place is not None]
@@ -170,7 +170,7 @@ def _places_m(recorded: Recorded, own_ns: Array) -> Array:
 
 
 def _camera_at(recorded: Recorded, own_ns: Array, places_m: Array, at_ns: int) -> tuple[Array, Array]:
-    """R_ned_cam [3, 3] and t_ned_cam_m [3] by the transforms nearest in time."""
+    """R_ned_cam [3, 3] and t_ned_cam_m [3] from the transforms nearest in time."""
     nearest = int(np.argmin(np.abs(own_ns - at_ns)))
     links = recorded.own[int(own_ns[nearest])]
     R_ned_body, camera = _R(links[topics.FRAME_BODY]), links[topics.FRAME_CAMERA]
@@ -178,7 +178,7 @@ def _camera_at(recorded: Recorded, own_ns: Array, places_m: Array, at_ns: int) -
 
 
 def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
-    """Stamps [N] moved as the pictures are moved into their slots; t = 0 at the first picture."""
+    """Stamps [N] warped as the images are moved into their slots; t = 0 at the first image."""
     slot_ns = slots * 1e9 / fps
     inside = np.interp(own_ns - picture_ns[0], picture_ns - picture_ns[0], slot_ns)
     inside += np.minimum(own_ns - picture_ns[0], 0) + np.maximum(own_ns - picture_ns[-1], 0)
@@ -186,7 +186,7 @@ def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
 
 
 def _telemetry(recorded: Recorded, own_ns: Array, places_m: Array, t_ns: Array) -> Telemetry:
-    """Of the attitudes and places told; rates and velocities are their differences."""
+    """From the recorded attitudes and positions; rates and velocities are their differences."""
     t_ns, kept = np.unique(t_ns, return_index=True)
     links = [recorded.own[int(stamp)] for stamp in own_ns[kept]]
     R_ned_body = np.array([_R(one[topics.FRAME_BODY]) for one in links])
@@ -200,7 +200,7 @@ def _telemetry(recorded: Recorded, own_ns: Array, places_m: Array, t_ns: Array) 
 
 
 def _middle_ones(values: Array) -> Array:
-    """[N, 3]: each the median of the _NEIGHBOURS around it."""
+    """[N, 3]: the running median over _NEIGHBOURS."""
     half = _NEIGHBOURS // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, ((half, half), (0, 0)), "edge"), _NEIGHBOURS, 0)
     return np.asarray(np.median(around, axis=-1))

@@ -1,4 +1,4 @@
-"""The files of a scene of which no truth is known: pictures, their camera, rate, mount and telemetry."""
+"""The files of a scene without ground truth: images, their camera, rate, mount and telemetry."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def add_picture(
     K: Array,
     distortion: tuple[float, ...],
 ) -> None:
-    """One picture [H, W, 3] through a lens of 0, 4, 5 or 8 plumb-bob coefficients.
+    """Write one image [H, W, 3] of a lens with 0, 4, 5 or 8 plumb-bob coefficients.
 
-    Scenes know five: a lens of eight has its distortion taken out.
+    Scenes support five: an image of a lens with eight is undistorted.
     """
     if len(distortion) > 5:
         image_bgr = np.asarray(cv2.undistort(image_bgr, K, np.array(distortion)), dtype=np.uint8)
@@ -36,7 +36,7 @@ def add_picture(
 
 
 def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
-    """What is left for the reader of the scene to take out."""
+    """The distortion that the reader of the scene must still correct."""
     if len(distortion) > 5 or not any(distortion):
         return None
     k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
@@ -44,7 +44,7 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
 
 
 def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
-    """sequence.toml of a finished scene whose labels nobody knows; `source` is where the pictures are from."""
+    """Write sequence.toml of a finished scene without labels; `source` is where the images are from."""
     entries = {
         SOURCE_KEY: str(source),
         "fps": fps,
@@ -60,7 +60,7 @@ def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, 
 
 
 def is_unpacked(folder: Path) -> bool:
-    """Whether `folder` holds a scene that was unpacked here, can be unpacked again, and was given no labels since."""
+    """Whether `folder` is a scene that was unpacked here, can be unpacked again, and has been given no labels since."""
     try:
         entries = tomllib.loads((folder / "sequence.toml").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""A video with telemetry as a scene: what it is a TOML file says."""
+"""A video with telemetry as a scene, described by a TOML file."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_seq
 from sim_replay.telemetry import TelemetryError, read_telemetry
 
 FPS_MAX = 240.0  # of the daemon's camera
-STEADY_FRAMES = 0.5  # by which a picture of a constant rate may be off it
-ROWS_HZ_MIN = 9.5  # of telemetry said to be of 10: between its rows the own ship is taken to turn evenly
+STEADY_FRAMES = 0.5  # largest deviation of an image from a constant rate
+ROWS_HZ_MIN = 9.5  # of nominally 10 Hz telemetry: between its rows the own ship is assumed to turn evenly
 
 
 class FilmedFlight(Section):
-    """A video, and how its camera was carried; paths are taken from the folder that the file lies in."""
+    """A video, and how its camera was carried; paths are relative to the file's folder."""
 
     video: ConfigPath = Field(description="what ffmpeg reads, of a constant rate")
     telemetry: ConfigPath = Field(description="CSV of the own ship, as telemetry.csv has it")
@@ -41,7 +41,7 @@ class FilmedFlight(Section):
 
 
 def read_filmed_flight(path: Path) -> FilmedFlight:
-    """Raises InputError: a line a fault, each naming file and key."""
+    """Raises InputError: one line per error, each naming file and key."""
     try:
         return FilmedFlight.model_validate(read_toml(path, InputError), context={"folder": path.parent})
     except ValidationError as error:
@@ -50,7 +50,7 @@ def read_filmed_flight(path: Path) -> FilmedFlight:
 
 
 def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> None:
-    """Make a scene of the flight that the TOML file at `path` tells of. Raises InputError, OSError."""
+    """Convert the flight described by the TOML file at `path` to a scene. Raises InputError, OSError."""
     flight = read_filmed_flight(path)
     try:
         telemetry = read_telemetry(flight.telemetry)
@@ -68,7 +68,7 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         fps = flight.fps or capture.get(cv2.CAP_PROP_FPS)
         if not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
-        frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: it does not say
+        frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: unknown
         check_spans(telemetry, flight.telemetry, flight.t0_ns, frames, fps)
         _unpack(capture, path, flight, fps, folder, on_picture)
     finally:

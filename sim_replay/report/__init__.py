@@ -1,1 +1,1 @@
-"""`uavpose-replay score DIR`: what a flight's peers received, set against the truth, as figures and as report.html."""
+"""`uavpose-replay score DIR`: compares what a flight's peers received with ground truth; figures and report.html."""

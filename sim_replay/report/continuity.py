@@ -1,7 +1,7 @@
-"""How well each target was held on to: acquired, lost, found again, under how many names. Pure functions.
+"""Continuity of each target's track: acquired, lost, re-acquired, under how many names. Pure functions.
 
-Counted as CLEAR MOT does (Bernardin & Stiefelhagen 2008): an identity switch is a frame whose pose names another track
-than the target's last one did; a fragment is each time that poses of a visible target cease and begin again.
+Counted as in CLEAR MOT (Bernardin & Stiefelhagen 2008): an identity switch is a frame whose pose names another track
+than the target's last one; a fragment is each time that poses of a visible target stop and resume.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from sim_replay.score import Match
 
 
 def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
-    """The figures over all targets, and each target's own under "targets"; seconds by the frames' own clock.
+    """The figures over all targets, and each target's own under "targets"; seconds from frame numbers.
 
     Args:
-        matches: Of all visible targets of all frames; a frame is an index that grows by one every 1 / fps.
+        matches: Of all visible targets of all frames; a frame is an index that increases by one every 1 / fps.
 
     Returns:
-        JSON's types. `time_to_acquire_s` counts from a target's first visible frame to the first that has a pose of
-        it; `time_to_reacquire_s` from the first frame without one, or from where it came into view again. One that
-        was not found (again) before it left is in `never_acquired` or `never_reacquired` and in no time.
+        JSON's types. `time_to_acquire_s` counts from a target's first visible frame to the first with a pose of it;
+        `time_to_reacquire_s` from the first frame without one, or from where it came into view again. A target that was
+        not found (again) before it left counts as `never_acquired` or `never_reacquired` and in no time.
     """
     by_target: dict[tuple[int, int], list[Match]] = {}
     for match in sorted(matches, key=lambda match: match.truth.frame):
@@ -46,7 +46,7 @@ def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
 
 
 def target_continuity(seen: Sequence[Match], fps: float) -> dict[str, Any]:
-    """The same of one target, from its matches in the order of their frames."""
+    """The same for one target, from its matches in the order of their frames."""
     tracks = [match.estimate.track for match in seen if match.estimate is not None]
     switches = sum(after != before for before, after in pairwise(tracks))
     runs = list(_missing(seen))
@@ -78,7 +78,7 @@ def target_continuity(seen: Sequence[Match], fps: float) -> dict[str, Any]:
 
 
 def _missing(seen: Sequence[Match]) -> Iterator[tuple[int, int]]:
-    """Runs [start, stop) of matches without a pose; one that leaves view in between is split there."""
+    """Runs [start, stop) of matches without a pose; split where the target is out of view in between."""
     start = None
     for k, match in enumerate(seen):
         if start is not None and (match.estimate is not None or not _follows(seen, k)):
@@ -91,7 +91,7 @@ def _missing(seen: Sequence[Match]) -> Iterator[tuple[int, int]]:
 
 
 def _follows(seen: Sequence[Match], k: int) -> bool:
-    """Whether the frame of the k-th match comes right after that of the one before."""
+    """Whether the frame of the k-th match directly follows that of the one before."""
     return k > 0 and seen[k].truth.frame == seen[k - 1].truth.frame + 1
 
 

@@ -1,4 +1,4 @@
-"""What a replay leaves behind so that it can be scored again: flight.json, and received.jsonl as the peers told it."""
+"""Files of a replay from which it can be scored again: flight.json, and received.jsonl with the peers' records."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim_replay.result import latency_ms as latency_ms_of
 from sim_replay.result import pose_of
 
 FLIGHT_JSON, RECEIVED_JSONL = "flight.json", "received.jsonl"
-# What `demo`, `play` and `score` write into a flight's folder. The daemon's recordings are its user's.
+# Files that `demo`, `play` and `score` write into a flight's folder; the daemon's recordings belong to the user.
 WRITTEN = (
     *(FLIGHT_JSON, RECEIVED_JSONL, MESSAGES_JSONL, "poses.jsonl", "config.toml", "daemon.log", "gimbal.csv"),
     *("score.json", "frames.jsonl", "report.html", "overlay.mp4", "overlay.png"),
@@ -25,27 +25,27 @@ _PEER_OF = {"target_relative": "autopilot", "pose": "subscriber", "diagnostics":
 
 @dataclass(frozen=True, eq=False)
 class RecordedFlight:
-    """A flight as it was recorded."""
+    """A recorded flight."""
 
-    sequence: Path  # folder of the scene that was flown
+    sequence: Path  # folder of the flown scene
     model: dict[str, Any]  # file, sha256, precision
     recording: Recording
-    speed: float = 1.0  # times the sequence's own frame rate
+    speed: float = 1.0  # factor on the sequence's own frame rate
 
 
 def is_flight(folder: Path) -> bool:
-    """Whether a replay left its files there."""
+    """Whether `folder` contains the files of a replay."""
     return (folder / FLIGHT_JSON).is_file()
 
 
 def remove_flight(folder: Path) -> None:
-    """Remove what an earlier replay wrote there, so that it is not taken for the one that begins now."""
+    """Remove the files of an earlier replay, so that they are not taken for those of the one that begins now."""
     for name in WRITTEN:
         (folder / name).unlink(missing_ok=True)
 
 
 def write_flight(out: Path, flight: RecordedFlight) -> None:
-    """Write both files into `out`, which exists."""
+    """Write both files into `out`, which must exist."""
     recording = flight.recording
     about = {
         "sequence": str(flight.sequence.resolve()),
@@ -68,7 +68,7 @@ def write_flight(out: Path, flight: RecordedFlight) -> None:
 
 
 def read_flight(folder: Path) -> RecordedFlight:
-    """Read what `write_flight` left in `folder`. Raises InputError, naming file and key or line."""
+    """Read what `write_flight` wrote into `folder`. Raises InputError, naming file and key or line."""
     path = folder / FLIGHT_JSON
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
@@ -108,7 +108,7 @@ def _read_received(path: Path, recording: Recording) -> None:
 
 
 def _check(record: Record, recording: Recording) -> None:
-    """Raise KeyError, ValueError or TypeError for a pose that cannot be judged."""
+    """Raise KeyError, ValueError or TypeError for a pose that cannot be evaluated."""
     if record["event"] not in ("pose", "target_relative"):
         return
     pose = pose_of(record, 0)

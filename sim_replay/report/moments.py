@@ -1,4 +1,4 @@
-"""The worst moments of a flight, with what there was to see; and stills and films as data: URLs."""
+"""The worst moments of a flight, with images; stills and videos as data: URLs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from sim_replay.score import Match
 
 SHOWN = 8
 MISSES_SHOWN_MAX = 2
-APART_S = 0.5  # the neighbours of a bad frame are as bad, and tell nothing more
+APART_S = 0.5  # neighbours of a bad frame are equally bad and add no information
 STILLS = 6
-VIDEO_MAX_BYTES = 12_000_000  # of a longer one stills are shown: a page of hundreds of megabytes opens nowhere
+VIDEO_MAX_BYTES = 12_000_000  # for a larger one, stills are shown: browsers fail on pages of hundreds of megabytes
 _PICTURE_PX = 360
 _STILL_PX = 560
 
@@ -31,19 +31,19 @@ class Moment:
     frame: int
     t_s: float
     range_m: float
-    rotation_error_deg: float | None  # None: not known
-    range_error_m: float | None  # None: nothing was received of the target
+    rotation_error_deg: float | None  # None: unknown
+    range_error_m: float | None  # None: no pose of the target was received
     picture: str  # a data: URL
 
 
 def worst_moments(sequence: PlayedSequence, matches: Sequence[Match]) -> list[Moment]:
-    """Up to SHOWN of them, in the order of the flight. Raises InputError on a picture that cannot be read."""
+    """Up to SHOWN of them, in the order of the flight. Raises InputError on an unreadable image."""
     chosen = _choose(matches, sequence.fps)
     return [_moment(sequence, match) for match in sorted(chosen, key=lambda match: match.truth.frame)]
 
 
 def _choose(matches: Sequence[Match], fps: float) -> list[Match]:
-    """The worst first, none near another of the same target; misses are alike, so few of them."""
+    """The worst first, none near another of the same target; few misses, since they look alike."""
     chosen: list[Match] = []
     misses = 0
     for match in sorted(matches, key=lambda match: (-badness(match), match.truth.frame)):
@@ -70,7 +70,7 @@ def _moment(sequence: PlayedSequence, match: Match) -> Moment:
 
 
 def film(video: Path) -> tuple[str | None, list[str]]:
-    """The overlay as a data: URL if browsers play it and it is small enough, else STILLS of it."""
+    """The overlay as a data: URL if browsers can play it and it is small enough, else STILLS of it."""
     capture = cv2.VideoCapture(str(video))
     codec = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
     if codec.lower().startswith("vp9") or codec.lower() == "vp09":
@@ -90,6 +90,6 @@ def film(video: Path) -> tuple[str | None, list[str]]:
 
 
 def jpeg_url(image_bgr: Image, quality: int = 86) -> str:
-    """The picture [H, W, 3] as a data: URL."""
+    """The image [H, W, 3] as a data: URL."""
     _, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"

@@ -1,4 +1,4 @@
-"""report.html: one file that needs nothing else, made of a flight's score and plots."""
+"""report.html: one self-contained file with a flight's score and plots."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _POSTER_WIDTH_PX = 960
 
 
 def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any], drawn: Path) -> str:
-    """The page. `drawn` holds overlay.mp4 and overlay.png. Raises InputError on a picture that cannot be read."""
+    """The page. `drawn` contains overlay.mp4 and overlay.png. Raises InputError on an unreadable image."""
     environment = Environment(
         loader=PackageLoader("sim_replay.report", "."),
         autoescape=select_autoescape(default=True),
@@ -64,7 +64,7 @@ def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any],
 
 
 def health_of(recording: Recording) -> list[HealthSample]:
-    """The daemon's diagnostics as it sent them, seconds since frame 0."""
+    """The daemon's diagnostics as received, seconds since frame 0."""
     samples = []
     for record in recording.diagnostics:
         headline, _, reasons = str(record["message"]).partition("; ")
@@ -85,14 +85,14 @@ def health_of(recording: Recording) -> list[HealthSample]:
 
 
 def spoken(health: Sequence[HealthSample]) -> list[HealthSample]:
-    """Those of which headline or reasons are not as they were a second before."""
+    """Those whose headline or reasons differ from a second before."""
     told = [(sample.headline, sample.reasons) for sample in health]
     changed = [sample for sample, (before, now) in zip(health[1:], pairwise(told), strict=True) if before != now]
     return [*health[:1], *changed]
 
 
 def _poster(path: Path) -> str | None:
-    """What is shown before the film is played; None if there is no picture."""
+    """Image shown before the video is played; None if there is none."""
     image = cv2.imread(str(path))
     if image is None:
         return None
@@ -102,5 +102,5 @@ def _poster(path: Path) -> str | None:
 
 
 def _figure(value: float | None, form: str = "{:.2f}", scale: float = 1) -> str:
-    """A number as a person reads it; a dash where there is none. A minus is a minus."""
+    """A number as text; a dash if there is none. Uses the minus sign, not a hyphen."""
     return "–" if value is None else re.sub(r"^-", "−", form.format(scale * value))

@@ -1,4 +1,4 @@
-"""The figures of what one peer received of a flight: errors, honesty of covariances, age, continuity, tracks. Pure."""
+"""Statistics of one peer's data of a flight: errors, covariance consistency, age, continuity, tracks. Pure."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sim_replay.report.continuity import continuity
 from sim_replay.score import Match, TargetPose, stacked, statistics
 
 COORDINATES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
-# 95 % of a chi-square variable with as many degrees of freedom lies below (any table of its quantiles).
+# 95 % quantiles of chi-square, by degrees of freedom (any table of its quantiles).
 CHI2_95 = {3: 7.815, 6: 12.592}
-# cam to a frame that looks along the optical axis as a pilot does: x forward, y right, z down.
+# cam to a frame with a pilot's axes along the optical axis: x forward, y right, z down.
 R_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -27,13 +27,13 @@ def peer_figures(
     false_poses: Sequence[TargetPose],
     ages: Sequence[tuple[int, float]],
 ) -> dict[str, Any]:
-    """JSON's types: shares 0..1, degrees, metres, milliseconds, seconds; None where there is nothing to tell.
+    """JSON's types: shares 0..1, degrees, metres, milliseconds, seconds; None where there is no data.
 
     Args:
-        frames: How many the sequence has.
+        frames: Number of frames of the sequence.
         matches: Of every visible target of every frame.
         false_poses: Those of a frame that belong to no target.
-        ages: Of each pose in the order of arrival: its frame, and ms from exposure to receipt.
+        ages: Of each pose in the order of arrival: its frame, and ms from exposure to arrival.
     """
     return {
         **statistics(frames, matches, false_poses),
@@ -50,8 +50,8 @@ def peer_figures(
 def coordinates(poses: Sequence[TargetPose]) -> Array:
     """[N, 6] of poses: x, y, z in `cam`, metres; roll, pitch, yaw against the camera's axes, degrees.
 
-    Roll, pitch and yaw are zero for a target that flies straight away from the camera, wings along the rows; NaN where
-    the rotation is not known.
+    Roll, pitch and yaw are zero for a target that flies straight away from the camera, wings along the rows; NaN if the
+    rotation is unknown.
     """
     R, t_m = stacked(poses)
     angles = np.rad2deg(np.column_stack(euler_from_R(R_FORWARD_CAM @ R)))
@@ -60,14 +60,14 @@ def coordinates(poses: Sequence[TargetPose]) -> Array:
 
 
 def coordinate_errors(found: Sequence[tuple[TargetPose, TargetPose]]) -> Array:
-    """[N, 6]: estimate minus truth of pairs (truth, estimate), as `coordinates` has them; angles within ±180°."""
+    """[N, 6]: estimate minus truth of pairs (truth, estimate), ordered as in `coordinates`; angles within ±180°."""
     error = coordinates([estimate for _, estimate in found]) - coordinates([truth for truth, _ in found])
     error[:, 3:] = (error[:, 3:] + 180.0) % 360.0 - 180.0
     return error
 
 
 def pairs(matches: Sequence[Match]) -> list[tuple[TargetPose, TargetPose]]:
-    """(truth, estimate) of all that was found."""
+    """(truth, estimate) of all targets that were found."""
     return [(match.truth, match.estimate) for match in matches if match.estimate is not None]
 
 
@@ -79,7 +79,7 @@ def rmse(matches: Sequence[Match]) -> dict[str, float | None]:
 
 
 def root_mean_square(errors: Array) -> float | None:
-    """Over those that are not NaN; None if there are none."""
+    """Over the values that are not NaN; None if there are none."""
     known = errors[np.isfinite(errors)]
     return float(np.sqrt((known**2).mean())) if known.size else None
 
@@ -100,10 +100,10 @@ def range_error_m(matches: Sequence[Match]) -> dict[str, float | None]:
 def nees(matches: Sequence[Match]) -> dict[str, dict[str, float] | None] | None:
     """Normalised estimation error squared, e' P^-1 e (Bar-Shalom), of the pose and of its two halves.
 
-    For an honest covariance the mean is the degrees of freedom and 95 % lie below their chi-square quantile. Errors of
-    neighbouring frames are alike, so the mean of one flight scatters more than its count says. Position is over all
-    poses, pose and rotation over those that tell a rotation. None: no covariances, or no such pose. `singular` counts
-    those that are left out because their covariance has no inverse.
+    For a consistent covariance the mean is the degrees of freedom and 95 % lie below their chi-square quantile. Errors
+    of neighbouring frames are correlated, so the mean of one flight scatters more than its count suggests. Position is
+    over all poses, pose and rotation over those of known rotation. None: no covariances, or no such pose. `singular`
+    counts those that are left out because their covariance is singular.
     """
     sure = [(truth, estimate) for truth, estimate in pairs(matches) if estimate.covariance is not None]
     if not sure:
@@ -134,7 +134,7 @@ def _honesty(told: Array, dof: int) -> dict[str, float] | None:
 
 
 def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
-    """p50, p95, p99 and the largest."""
+    """p50, p95, p99 and the maximum."""
     if not values_ms:
         return dict.fromkeys(("p50", "p95", "p99", "max"))
     found = np.percentile(values_ms, [50, 95, 99, 100])
@@ -142,7 +142,7 @@ def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
 
 
 def longest_silence_s(matches: Sequence[Match], ages: Sequence[tuple[int, float]], fps: float) -> float | None:
-    """The longest time without a pose while a target was to be seen, from the first that came on; None: none came."""
+    """The longest time without a pose while a target was visible, from the first pose on; None: there was no pose."""
     arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages)
     if not arrivals:
         return None
@@ -155,7 +155,7 @@ def longest_silence_s(matches: Sequence[Match], ages: Sequence[tuple[int, float]
 
 
 def tracks(matches: Sequence[Match], false_poses: Sequence[TargetPose]) -> dict[str, dict[str, Any]]:
-    """Each track by the name that the daemon gave it: when it lived, what it followed, how wrong it was."""
+    """Each track by the daemon's name for it: its lifetime, the target that it followed, and its errors."""
     found: dict[str, list[Match]] = {}
     for match in matches:
         if match.estimate is not None:

@@ -49,19 +49,19 @@ _STYLE: Any = {
     "lines.linewidth": 1.6,
     "svg.fonttype": "path",
 }
-MARKED_MAX = 1500  # of more poses no browser likes to draw each as an element of its own
+MARKED_MAX = 1500  # with more poses, a separate SVG element for each is too slow in browsers
 _SIGMAS = 2.0
 _JUMP_DEG = 180.0
-_BEARING_SPAN_DEG = 0.05  # at least: below it all is noise
+_BEARING_SPAN_DEG = 0.05  # minimum: smaller deviations are noise
 
 
 @dataclass(frozen=True)
 class HealthSample:
-    """What the daemon told of itself at one time, seconds since frame 0."""
+    """The daemon's diagnostics at one time, seconds since frame 0."""
 
     t_s: float
     state: str  # edge.health.HealthState's value
-    headline: str  # state, and what the daemon does all the same
+    headline: str  # state, and the daemon's activity in it
     reasons: str
     frame_rate_hz: float | None
     dropped: int | None
@@ -113,7 +113,7 @@ def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], frames: int
 
 
 def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
-    """Target and own ship in 3-D and from above, in `ned` where the scene tells the camera's place, else in `cam`."""
+    """Target and own ship in 3-D and from above, in `ned` if the scene has the camera's position, else in `cam`."""
     in_ned = all(camera is not None for camera in scene.cameras_world)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.6, 4.7), layout="constrained")
@@ -151,7 +151,7 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
 
 
 def _places(target: Sequence[Match], scene: SceneTruth, in_ned: bool) -> tuple[Array, Array]:
-    """[N, 3] true and received places, NaN where nothing came."""
+    """[N, 3] true and received positions, NaN where no pose was received."""
     true, seen = (np.full((len(target), 3), np.nan) for _ in range(2))
     for k, match in enumerate(target):
         camera = scene.cameras_world[match.truth.frame]
@@ -168,7 +168,7 @@ def _east_north_up(points: Array, in_ned: bool) -> Array:
 
 
 def ages(peers: Mapping[str, Sequence[tuple[int, float]]], fps: float) -> str:
-    """From exposure to receipt at each peer: over the flight, and how it is distributed."""
+    """From exposure to arrival at each peer: over the flight, and its distribution."""
     colors = dict(zip(peers, (ESTIMATE_COLOR, AUTOPILOT_COLOR), strict=False))
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.6, 3.1), layout="constrained")
@@ -193,7 +193,7 @@ def ages(peers: Mapping[str, Sequence[tuple[int, float]]], fps: float) -> str:
 
 
 def timeline(health: Sequence[HealthSample], matches: Sequence[Match], frames: int, fps: float) -> str:
-    """What the daemon said of itself each second, when each target was in view, and when poses of it came."""
+    """The daemon's state each second, when each target was in view, and when poses of it arrived."""
     targets = _by_target(matches)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.6, 1.5 + 0.42 * (1 + 2 * len(targets))), layout="constrained")
@@ -266,14 +266,14 @@ def _by_target(matches: Sequence[Match]) -> list[list[Match]]:
 
 
 def _runs(frames: Sequence[int], fps: float) -> list[tuple[float, float]]:
-    """(start, length) in seconds of each run of neighbouring frames."""
+    """(start, length) in seconds of each run of consecutive frames."""
     ordered = np.unique(frames)
     parts = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
     return [(float(part[0]) / fps, len(part) / fps) for part in parts if len(part)]
 
 
 def _unjoined(values: Array, wrapped: bool) -> Array:
-    """Angles with a NaN at each jump across ±180°, so that no line is drawn through it."""
+    """Angles with a NaN at each jump across ±180°, so that no line connects them."""
     if not wrapped:
         return values
     out = values.copy()
@@ -282,19 +282,19 @@ def _unjoined(values: Array, wrapped: bool) -> Array:
 
 
 def _at_least(axes: Axes, span: float) -> None:
-    """A vertical axis of at least that span, so that noise does not look like motion."""
+    """A vertical axis of at least this span, so that noise does not look like motion."""
     low, high = axes.get_ylim()
     if high - low < span:
         axes.set_ylim(0.5 * (low + high - span), 0.5 * (low + high + span))
 
 
 def _svg(figure: Figure, name: str) -> str:
-    """The figure as an <svg> element; ids are its own in a page that holds several."""
+    """The figure as an <svg> element; its ids are unique in a page with several."""
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": name}):
         figure.savefig(text, format="svg", dpi=150, transparent=True, metadata={"Date": None, "Creator": None})
     svg = text.getvalue()
     svg = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{name}-", svg[svg.index("<svg") :])
     head, rest = svg.split(">", 1)
-    head = re.sub(r' (?:width|height)="[^"]*"', "", head)  # as wide as the page lets it
+    head = re.sub(r' (?:width|height)="[^"]*"', "", head)  # as wide as the page allows
     return f'{head} data-plot="{name}">{rest}'

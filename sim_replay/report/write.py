@@ -1,4 +1,4 @@
-"""Everything that is made of a recorded flight, written into one folder."""
+"""All output made from a recorded flight, written into one folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, sco
 def write_report(
     sequence: PlayedSequence, flight: RecordedFlight, out: Path, on_frame: Callable[[], None]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Judge a flight and write score.json, frames.jsonl, overlay.mp4, overlay.png and report.html.
+    """Evaluate a flight and write score.json, frames.jsonl, overlay.mp4, overlay.png and report.html.
 
     Returns:
         The score, and the names of the files.
@@ -28,7 +28,7 @@ def write_report(
     Raises:
         InputError, OSError.
     """
-    from sim_replay.report.page import report_html  # matplotlib takes its time
+    from sim_replay.report.page import report_html  # matplotlib is slow to import
 
     out.mkdir(parents=True, exist_ok=True)
     result = judge(sequence, flight.recording)
@@ -43,7 +43,7 @@ def write_report(
 
 
 def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:
-    """One a frame: each visible target with what each peer received of it, its errors, and that pose's age."""
+    """One per frame: each visible target with what each peer received of it, its errors, and that pose's age."""
     peers = dict(zip(PEERS, (result.subscriber, result.autopilot), strict=True))
     told = {name: _by_frame(peer, told_ages(peer, result.recording)) for name, peer in peers.items()}
     for frame, image in enumerate(sequence.scene.images):
@@ -53,7 +53,7 @@ def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str
 
 
 def _by_frame(peer: PeerResult, ages: Iterable[tuple[int, float]]) -> defaultdict[int, dict[str, Any]]:
-    """What a peer had of each frame; of one that nothing is known of, empty lists."""
+    """What a peer received for each frame; empty lists for a frame without data."""
     told: defaultdict[int, dict[str, Any]] = defaultdict(lambda: {"targets": [], "false_poses": 0, "age_ms": []})
     for match in peer.matches:
         track = None if match.estimate is None else match.estimate.track
