@@ -1,4 +1,4 @@
-"""The fleet: which aircraft there are, what each stands for and where its span and length are published."""
+"""The fleet: the aircraft, the type that each represents, and where its span and length are published."""
 
 from __future__ import annotations
 

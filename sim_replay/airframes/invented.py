@@ -1,8 +1,8 @@
-"""Aircraft that nobody built: the fleet's parts exchanged, swept, stretched and resized, to learn of strangers from.
+"""Invented aircraft, for generalisation to unseen airframes: the fleet's parts exchanged, swept, stretched, resized.
 
-A network that has only seen the fleet takes every stranger for the member that looks most like it, and is as sure of
-its size; and one that has seen small wings at tails alone takes a canard's nose for its tail. Numbers from
-`len(AIRFRAMES)` on mean such aircraft.
+A network trained on the fleet alone takes every unseen airframe for the most similar member, and is as sure of its
+size; one that has seen small wings only at tails takes a canard's nose for its tail. Airframe numbers from
+`len(AIRFRAMES)` on are invented aircraft.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from numpy.typing import NDArray
 from sim_replay.airframes.fleet import AIRFRAMES, Airframe
 from sim_replay.airframes.mesh import Mesh, Part, merge, moved, scaled
 
-# Variants of each pair of members of the fleet; a renderer keeps all that it has drawn. How sure a network may be of a
-# stranger is judged by some that nothing was learnt from, and learnt from others that the network was not trained on,
-# and many: what is known by heart is no stranger.
+# Variants of each pair of members of the fleet; limited, since a renderer keeps all that it has drawn. Uncertainty
+# on unseen airframes is learnt from many aircraft that the network was not trained on, and evaluated on others that
+# nothing was learnt from: memorised aircraft would not count as unseen.
 TRAINING_VARIANTS, DATASET_VARIANTS, KEPT_BACK_VARIANTS = range(4), range(4, 8), range(8, 24)
 _NAME = "invented_"
 SIZE_SIGMA = 0.35  # of the logarithm of span and length together
-STRETCH = 0.22  # of the logarithm, either way, of length, span and height alone
+STRETCH = 0.22  # of the logarithm, either way, of length, span and height separately
 SPAN_M = (1.5, 26.0)
 EXCHANGED_SHARE = 0.6
-# Slopes of x and z over the span, outside the cabin's width: swept back (below 0) to forwards, raised (below 0) to
-# drooping.
+# Slopes of x and z over the span, outside the cabin's width: swept back (negative) to forwards, raised (negative)
+# to drooping.
 SWEEP, DIHEDRAL = (-0.35, 0.15), (-0.12, 0.08)
-CABIN_SHARE = 0.06  # of the span, either side of the middle
-NOSE_STRETCH = 0.25  # of the logarithm, either way, of what lies ahead of the wing, and of what lies behind
+CABIN_SHARE = 0.06  # of the span, on either side of the middle
+NOSE_STRETCH = 0.25  # of the logarithm, either way, of the part ahead of the wing, and of the part behind
 CANARD_SHARE = 0.2
-CANARD_SPAN, CANARD_CHORD = (0.25, 0.5), (0.3, 0.6)  # of the wing's
+CANARD_SPAN, CANARD_CHORD = (0.25, 0.5), (0.3, 0.6)  # shares of the wing's
 _EXCHANGEABLE = (Part.WING, Part.TAIL)
 
 
 class Invention(NamedTuple):
-    """How many targets are invented aircraft, and which."""
+    """How many targets are invented aircraft, and which ones."""
 
     share: float = 0.0  # 0..1
     variants: range = TRAINING_VARIANTS
@@ -49,12 +49,12 @@ FLEET_ALONE = Invention()
 
 
 def airframe_of(number: int) -> Airframe:
-    """A member of the fleet, or beyond its end an invented aircraft. Raises IndexError beyond the last of those."""
+    """A member of the fleet, or an invented aircraft for larger numbers. Raises IndexError beyond the last of those."""
     return AIRFRAMES[number] if number < len(AIRFRAMES) else _invented(number)
 
 
 def airframe_id(name: str) -> int:
-    """The number of the airframe of that name, the fleet's or invented. Raises ValueError that lists the fleet's."""
+    """The number of the named airframe, the fleet's or invented. Raises ValueError that lists the fleet's."""
     names = [airframe.name for airframe in AIRFRAMES]
     if name in names:
         return names.index(name)
@@ -65,15 +65,15 @@ def airframe_id(name: str) -> int:
 
 
 def draw_invented(rng: np.random.Generator, airframe_ids: Sequence[int], variants: range = TRAINING_VARIANTS) -> int:
-    """The number of an invented aircraft that is made of parts of these members of the fleet alone."""
+    """The number of an invented aircraft made only of parts of these members of the fleet."""
     base, donor = (int(rng.choice(np.asarray(airframe_ids))) for _ in range(2))
     return _number(int(rng.integers(variants.start, variants.stop)), donor, base)
 
 
 def dataset_names(count: int, airframe_ids: Sequence[int]) -> tuple[str, ...]:
-    """Names of `count` invented aircraft, of parts of these members of the fleet, that no network learns from.
+    """Names of `count` invented aircraft, made of parts of these members of the fleet, that no network is trained on.
 
-    Raises ValueError if there are not so many.
+    Raises ValueError if there are not enough.
     """
     pool = [_number(*made_of) for made_of in itertools.product(DATASET_VARIANTS, airframe_ids, airframe_ids)]
     if count > len(pool):
@@ -124,12 +124,12 @@ def _invented(number: int) -> Airframe:
 
 
 def _with_part_of(mesh: Mesh, other: Mesh, part: Part) -> Mesh:
-    """The mesh with the other's part in the place of its own, fitted to its span; unchanged if either has none."""
+    """The mesh with the other's part in place of its own, fitted to its span; unchanged if either has none."""
     own, theirs = _only(mesh, mesh.part == part), _only(other, other.part == part)
     if not len(own.faces) or not len(theirs.faces):
         return mesh
     ratio = np.ptp(own.vertices_m[:, 1]) / max(float(np.ptp(theirs.vertices_m[:, 1])), 1e-3)
-    # A span of next to nothing is a lone fin's: its height tells the size.
+    # A part of almost no span is a single fin: its height is the measure of size.
     if not 0.2 < ratio < 5.0:
         ratio = np.ptp(own.vertices_m[:, 2]) / max(float(np.ptp(theirs.vertices_m[:, 2])), 1e-3)
     fitted = scaled(theirs, [float(np.clip(ratio, 0.2, 5.0))] * 3)
@@ -141,12 +141,12 @@ def _with_part_of(mesh: Mesh, other: Mesh, part: Part) -> Mesh:
 
 @dataclass(frozen=True)
 class Canard:
-    """A small wing at the nose, the wing itself far back. Shares, 0..1."""
+    """A small wing at the nose, with the main wing far back. Shares, 0..1."""
 
     span: float  # of the wing's
     chord: float  # of the wing's
-    nose: float  # where it stands between the wing (0) and the nose (1)
-    tail: float  # what is left of the length behind the wing
+    nose: float  # its position between the wing (0) and the nose (1)
+    tail: float  # remaining share of the length behind the wing
     keeps_tail: bool
 
     @classmethod
@@ -156,8 +156,8 @@ class Canard:
 
 
 def _as_canard(mesh: Mesh, canard: Canard) -> Mesh:
-    """The mesh with all that lies behind its wing shortened, all ahead of it lengthened by as much, and a small copy of
-    the wing ahead; unchanged if it has no wing on a fuselage."""
+    """The mesh shortened behind its wing, lengthened ahead of it by as much, and with a small copy of the wing ahead;
+    unchanged if it has no wing on a fuselage."""
     wing = _lifting(_only(mesh, mesh.part == Part.WING))
     if not len(wing.faces) or Part.FUSELAGE not in mesh.part:
         return mesh
@@ -167,7 +167,7 @@ def _as_canard(mesh: Mesh, canard: Canard) -> Mesh:
     if nose_m - leading_m < 1e-3 or trailing_m - tail_m < 1e-3:  # a wing as long as the aircraft
         return mesh
     back_m = (1.0 - canard.tail) * (trailing_m - tail_m)
-    # The wing and what hangs on it go back as they are.
+    # The wing and what is attached to it move back unchanged.
     knots_m = np.array([tail_m, trailing_m, leading_m, nose_m])
     moved_m = np.interp(x_m, knots_m, [tail_m, trailing_m - back_m, leading_m - back_m, nose_m])
     slope = np.diff([tail_m, trailing_m - back_m, leading_m - back_m, nose_m]) / np.diff(knots_m)
@@ -186,7 +186,7 @@ def _as_canard(mesh: Mesh, canard: Canard) -> Mesh:
 
 
 def _lifting(wing: Mesh) -> Mesh:
-    """Of a wing's surfaces those alone that reach from the body to its tips, without fairings and struts."""
+    """Only those surfaces of a wing that reach from the body to its tips, without fairings and struts."""
     if not len(wing.faces):
         return wing
     surface = np.arange(len(wing.vertices_m))
@@ -197,8 +197,9 @@ def _lifting(wing: Mesh) -> Mesh:
 
 
 def bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.float64]) -> Mesh:
-    """The mesh with what lies off the middle moved by `slopes` of its distance from there along x and z, and stretched
-    ahead of the wings' middle and behind it by factors [2]. What is joined stays so, as all of it is bent alike."""
+    """The mesh with each point off the middle moved by `slopes` of its distance from there along x and z, and stretched
+    ahead of the wings' middle and behind it by factors [2]. Connected parts stay connected, as all are bent alike.
+    """
     vertices_m, normals = mesh.vertices_m.astype(np.float64), mesh.normals.astype(np.float64)
     wing = vertices_m[mesh.part == Part.WING] if Part.WING in mesh.part else vertices_m
     middle_x_m = 0.5 * (wing[:, 0].min() + wing[:, 0].max())
@@ -216,7 +217,7 @@ def bent(mesh: Mesh, slopes: tuple[float, float], ahead_behind: NDArray[np.float
 
 
 def _only(mesh: Mesh, kept: np.ndarray) -> Mesh:
-    """The vertices [V] marked, and the faces between them."""
+    """The marked vertices [V], and the faces between them."""
     number = np.cumsum(kept) - 1
     faces = mesh.faces[kept[mesh.faces].all(axis=1)]
     return Mesh(

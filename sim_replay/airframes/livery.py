@@ -1,4 +1,4 @@
-"""Liveries: how an airframe is painted, drawn from a seed so that no colour stands for a type."""
+"""Liveries: an airframe's paint, drawn from a seed so that no colour identifies a type."""
 
 from __future__ import annotations
 

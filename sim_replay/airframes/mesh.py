@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-SLIVER = 2e-5  # a triangle thinner than this share of its length is left out
+SLIVER = 2e-5  # a triangle thinner than this share of its length is dropped
 Parts = NDArray[np.uint8]
 
 
 class Part(IntEnum):
-    """What a vertex belongs to; a livery colours by it. No face joins vertices of two parts."""
+    """The part that a vertex belongs to; liveries colour by part. No face connects vertices of two parts."""
 
     FUSELAGE = 0
     WING = 1
@@ -52,7 +52,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def scaled(mesh: Mesh, factor_xyz: ArrayLike) -> Mesh:
-    """The mesh stretched along the body axes by positive factors [3]; normals stay normal."""
+    """The mesh stretched along the body axes by positive factors [3]; normals stay perpendicular."""
     factor = np.asarray(factor_xyz, dtype=np.float64)
     normals = mesh.normals / factor
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -81,7 +81,7 @@ def diameter_m(mesh: Mesh) -> float:
     """Largest distance between two vertices (BOP's `diameter`), metres."""
     points = np.unique(mesh.vertices_m.astype(np.float64), axis=0)
     radius = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    # A distance that is there bounds from below how far out either end of the largest one lies.
+    # Any known distance is a lower bound on how far out either end of the largest one is.
     reached = np.linalg.norm(points - points[np.argmax(radius)], axis=1).max()
     points = points[radius >= reached - radius.max() - 1e-9]
     squared = np.sum(points**2, axis=1)
@@ -90,13 +90,13 @@ def diameter_m(mesh: Mesh) -> float:
 
 
 def built(vertices: Array, faces: NDArray[np.int64], face_part: Part | Parts) -> Mesh:
-    """A mesh with normals smoothed by area, its faces turned outward by the sign of the volume that they enclose.
+    """A mesh with normals smoothed by area, its faces turned outward by the sign of the enclosed volume.
 
-    vertices [V, 3], faces [F, 3]; face_part one Part or [F]. Faces without area are left out. Normals run smoothly
-    over a border between parts; the vertices there are doubled, so that a flat-shaded part index is exact.
+    vertices [V, 3], faces [F, 3]; face_part one Part or [F]. Faces without area are dropped. Normals are continuous
+    across a border between parts; the vertices there are doubled, so that a flat-shaded part index is exact.
     """
     parts = np.broadcast_to(np.asarray(face_part, dtype=np.int64), len(faces))
-    # What is smaller than single precision can hold would come back from it without a direction.
+    # Faces below single precision would have no normal after conversion to it.
     vertices = vertices.astype(np.float32).astype(np.float64)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -135,8 +135,8 @@ def _zipped(points: int) -> NDArray[np.int64]:
 def loft(rings: Array, part: Part | Parts, caps: tuple[Part | None, Part | None] | None = None) -> Mesh:
     """A closed surface through rings [S, P, 3] with flat ends.
 
-    part is one Part or one for each quad [S - 1, P]; `caps` are the parts of the two ends (the surface's own unless
-    given). The ends have vertices of their own, so their edges stay sharp.
+    part is one Part or one for each quad [S - 1, P]; `caps` are the parts of the two ends (by default the surface's
+    own). The ends have their own vertices, so their edges stay sharp.
     """
     stations, points, _ = rings.shape
     quad_part = np.broadcast_to(np.asarray(part, np.uint8), (stations - 1, points))

@@ -1,4 +1,4 @@
-"""The shapes that aircraft are made of: lofted bodies, aerofoil surfaces, propellers, wheels, stores.
+"""The shapes from which aircraft are assembled: lofted bodies, aerofoil surfaces, propellers, wheels, stores.
 
 Everything is in the target's body frame (FRD: x nose, y right, z down), metres.
 """
@@ -74,7 +74,7 @@ def fuselage(
     borders = [x for patch in patches for x in patch.x_m if table[-1, 0] < x < table[0, 0]]
     at_borders = np.interp(-np.array(borders), -monotone_cubic(fine, arc, table[:, 0]), fine)
     dense = np.unique(np.round(np.concatenate([np.linspace(0.0, 1.0, rings), arc, at_borders]), 9))
-    # Stations nearer to each other than this would only make slivers.
+    # Stations closer than this would only create slivers.
     dense = dense[np.concatenate([[True], np.diff(dense) > 1e-3])]
     x, width, height, z, power = (monotone_cubic(dense, arc, table[:, k]) for k in range(5))
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False) + np.pi / points
@@ -132,11 +132,11 @@ def lifting_surface(
     span = np.gradient(table[:, 1:3], axis=0)
     span /= np.linalg.norm(span, axis=1, keepdims=True)
     up = np.stack([np.zeros(len(table)), span[:, 1], -span[:, 0]], axis=1)
-    # A fin's sections stand upright; its "up" is merely one of two sides.
+    # A fin's sections are upright; its "up" is just one of its two sides.
     up *= np.where(up[:, 2:] > 1e-9, -1.0, 1.0)
     profile = naca_four_digit(naca, points)
     chord, twist = table[:, 3][:, None], np.radians(table[:, 4])[:, None]
-    # Twist turns about the quarter chord.
+    # Twist rotates about the quarter chord.
     aft, above = profile[:, 0] - 0.25, profile[:, 1]
     along = 0.25 + aft * np.cos(twist) + above * np.sin(twist)
     across = above * np.cos(twist) - aft * np.sin(twist)

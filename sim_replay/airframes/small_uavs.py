@@ -1,4 +1,4 @@
-"""Smaller unmanned aircraft and jets without a pilot: loitering, ship-launched, hand-launched, target, stealth.
+"""Smaller unmanned aircraft and jets: loitering, ship-launched, hand-launched, target, stealth.
 
 Only span and length follow a citation; every other proportion is drawn by eye from the type's layout.
 """

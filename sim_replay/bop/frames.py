@@ -15,7 +15,7 @@ ROUNDING = 1e-6  # of values in a camera matrix that must be 0 or 1
 
 
 class Source(NamedTuple):
-    """The files that an image's entries come from, to name them in errors."""
+    """The files with an image's entries, to name them in errors."""
 
     camera: Path
     gt: Path

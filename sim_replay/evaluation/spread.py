@@ -22,7 +22,7 @@ TAILS_PERCENT = (2.5, 97.5)
 def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]] | None:
     """95 % confidence interval of each rate over all targets; None for fewer than two flights.
 
-    The resampling is the same each time.
+    The resampling is deterministic.
     """
     by_flight: dict[tuple[str, int], list[Match]] = {}
     for frame in judged:

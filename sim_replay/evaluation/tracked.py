@@ -74,7 +74,7 @@ class _Sequence:
         return FIRST_FRAME_NS + round(self.frames[self.places[image_id][0]] * 1e9 / self.fps)
 
     def own_ship(self, image_id: int) -> OwnShip | None:
-        """The camera as a vehicle of its own: nose along the optical axis, mount without rotation."""
+        """The camera as a vehicle of its own: its body axes are the camera's, the mount is the identity."""
         k, frame = self.places[image_id]
         place = _place(frame)
         if not self.in_ned or place is None:

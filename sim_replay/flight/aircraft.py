@@ -1,4 +1,4 @@
-"""JSBSim aircraft that stand in for the airframes: which flies for which, how fast, and what its controls do."""
+"""JSBSim aircraft that represent the airframes: which one for each airframe, its speed, and its control derivatives."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Dynamics:
     """
 
     jsbsim_name: str
-    speed_mps: float  # of the derivatives
+    speed_mps: float  # at which the derivatives hold
     slowest_mps: float
     fastest_mps: float
     roll_damping: float
@@ -28,7 +28,7 @@ class Dynamics:
     lift_slope: float  # 1/s: rate of the flight path for an angle of attack
     yaw_control: float
     thrust: float  # m/s² for full throttle; 0 for a sailplane
-    autopilot: bool = False  # JSBSim ships one with it that holds heading and height
+    autopilot: bool = False  # JSBSim includes one for it that holds heading and height
 
 
 DYNAMICS = {
@@ -49,7 +49,7 @@ DYNAMICS = {
 
 @dataclass(frozen=True)
 class FlightClass:
-    """How an airframe flies: the JSBSim aircraft that stands in for it, its cruise and how briskly it banks."""
+    """How an airframe flies: the JSBSim aircraft that represents it, its cruise speed and how briskly it banks."""
 
     jsbsim_name: str
     speed_mps: float
@@ -58,7 +58,7 @@ class FlightClass:
 
     @property
     def dynamics(self) -> Dynamics:
-        """The stand-in's derivatives."""
+        """The derivatives of that JSBSim aircraft."""
         return DYNAMICS[self.jsbsim_name]
 
 
@@ -94,6 +94,6 @@ _BY_SPAN = (
 
 
 def flight_class(airframe: str) -> FlightClass:
-    """How the airframe of that name flies: by name, else by its span. Raises ValueError."""
+    """How the named airframe flies: by name, otherwise by its span. Raises ValueError."""
     span_m = airframe_of(airframe_id(airframe)).span_m
     return _CLASSES.get(airframe) or next(c for limit_m, c in _BY_SPAN if span_m <= limit_m)

@@ -19,7 +19,7 @@ ORIGIN_DEG_M = (47.3977, 8.5456, 488.0)  # of the NED world, on the ground
 
 @dataclass(frozen=True)
 class EncounterPlan:
-    """What an encounter is to be; the same plan gives the same encounter, bit for bit."""
+    """Requirements for an encounter; the same plan gives the same encounter, bit for bit."""
 
     seed: int
     frames: int
@@ -30,14 +30,14 @@ class EncounterPlan:
     mount: Literal["fixed", "gimbal"] = "gimbal"
     jitter_rad: float = 0.0  # root mean square about each of the camera's axes
     gust: Gust = "light"
-    leaves: bool = False  # the main target leaves the picture for some frames and comes back
+    leaves: bool = False  # the main target leaves the image for some frames and returns
 
 
 @dataclass(frozen=True)
 class Encounter:
-    """What was flown. F frames; tracks run at 50 Hz from 1.2 s before the first frame to 1.2 s after the last."""
+    """A flown encounter of F frames; tracks run at 50 Hz from 1.2 s before the first frame to 1.2 s after the last."""
 
-    plan: EncounterPlan  # `mount` is what was used: a gimbal where a bolted camera cannot keep the target
+    plan: EncounterPlan  # `mount` is the one used: a gimbal if a fixed camera cannot keep the target in view
     frame_t_s: Array  # [F] mid exposure, from 0
     own: Track
     targets: tuple[Track, ...]  # in the order of plan.airframes

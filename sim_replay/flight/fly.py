@@ -1,4 +1,4 @@
-"""fly_encounter: own ship, targets and camera drawn from a plan's seed, redrawn until range and picture fit."""
+"""fly_encounter: own ship, targets and camera drawn from a plan's seed, redrawn until range and image fit."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ LOWEST_M, HIGHEST_M = 60.0, 3300.0
 NEAREST_M, FARTHEST_M = 90.0, 520.0
 SPANS_APART = 1.5
 LAYOUTS = 600
-ENOUGH = 12  # layouts to choose an aspect among
-CONFIRMED = 10  # layouts looked at closely before others are drawn
+ENOUGH = 12  # layouts from which one is chosen by aspect
+CONFIRMED = 10  # layouts checked in detail before others are drawn
 ATTEMPTS = 8
 
 
 def fly_encounter(plan: EncounterPlan) -> Encounter:
-    """Fly a plan. Raises ValueError for a plan that cannot be, FlightError where no flight was found for it."""
+    """Fly a plan. Raises ValueError for an impossible plan, FlightError if no flight was found for it."""
     _check(plan)
     clock = Clock(np.arange(plan.frames) / plan.fps)
     rng = np.random.default_rng([plan.seed, 0xF1])
@@ -69,13 +69,13 @@ class _Meeting:
     own: Track
     target: Track
     target_sortie: Sortie
-    R_body_cam: Array | None  # [3, 3] of a bolted camera
+    R_body_cam: Array | None  # [3, 3] of a fixed camera
 
 
 def _meet(
     plan: EncounterPlan, clock: Clock, rng: np.random.Generator, lever: Array, bolted_on: bool
 ) -> _Meeting | None:
-    """The first drawn pair of flights that can be laid against each other as planned, the aspect as drawn."""
+    """The first drawn pair of flights that can be placed relative to each other as planned, with the drawn aspect."""
     aspect = draw_aspect(rng)
     for attempt in range(ATTEMPTS):
         own_sortie, target_sortie = _draw_pair(plan, clock, rng, attempt)
@@ -99,7 +99,7 @@ def _meet(
 
 
 class _Fit:
-    """Layouts of a pair of flights, looked at at some times; the middle one is mid sequence."""
+    """Layouts of a pair of flights, evaluated at several times; the middle one is mid sequence."""
 
     def __init__(
         self, plan: EncounterPlan, own: Track, target: Track, lever: Array, times_s: Array, layouts: Layouts
@@ -122,7 +122,7 @@ class _Fit:
 
 
 def _draw_pair(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, attempt: int) -> tuple[Sortie, Sortie]:
-    """Own ship's and main target's sorties; the later the attempt, the more alike."""
+    """Own ship's and main target's sorties; later attempts draw more similar ones."""
     target_class = flight_class(plan.airframes[0])
     target = draw_sortie(rng, clock, target_class, plan.gust)
     own_class = draw_own_class(rng, target.speed_mps, clock) if attempt < 2 else target_class
@@ -135,7 +135,7 @@ def _draw_pair(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, atte
 
 
 def _into_the_world(rng: np.random.Generator, met: _Meeting) -> _Meeting:
-    """Both flights turned to any heading and height, in a steady wind, own ship over the origin at t = 0."""
+    """Both flights at a random heading and height, in a steady wind, own ship over the origin at t = 0."""
     yaw_rad, wind_rad = rng.uniform(-np.pi, np.pi, 2)
     wind = rng.uniform(0.0, 8.0) * np.array([np.cos(wind_rad), np.sin(wind_rad), 0.0])
     own, target = met.own.turned(yaw_rad), met.target.turned(yaw_rad)
@@ -166,7 +166,7 @@ def _point(plan: EncounterPlan, clock: Clock, rng: np.random.Generator, met: _Me
 def _with_others(
     plan: EncounterPlan, clock: Clock, rng: np.random.Generator, met: _Meeting, lever: Array, pointing: Pointing
 ) -> tuple[Track, ...]:
-    """The main target and those beside it, in the order of the plan."""
+    """The main target and the other targets, in the order of the plan."""
     targets: tuple[Track, ...] = (met.target,)
     if len(plan.airframes) == 1:
         return targets

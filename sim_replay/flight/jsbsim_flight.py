@@ -18,10 +18,10 @@ from sim_replay.flight.track import Track
 Gust = Literal["calm", "light", "moderate"]
 FOOT_M = 0.3048
 STEP_S = 0.01
-STEPS_PER_SAMPLE = 2  # the track's 50 Hz, at which the pilot acts too
+STEPS_PER_SAMPLE = 2  # the track is at 50 Hz, and so is the pilot
 SAMPLE_S = STEP_S * STEPS_PER_SAMPLE
 SETTLE_S = 6.0
-LEAST_AHEAD = math.cos(math.radians(25.0))  # of the flight path along the nose: beyond, it stalls or spins
+LEAST_AHEAD = math.cos(math.radians(25.0))  # of the flight path along the nose: at larger angles, it stalls or spins
 SAILPLANE_INCIDENCE_DEG = 2.0
 # MIL-F-8785C: wind at 20 ft above the ground, ft/s, and severity index (probability of exceedance).
 TURBULENCE: dict[Gust, tuple[float, int]] = {"light": (25.0, 3), "moderate": (50.0, 4)}
@@ -41,7 +41,7 @@ _RECORDED = (
 
 @dataclass(frozen=True)
 class Sortie:
-    """What is to be flown; the same sortie gives the same track, bit for bit."""
+    """A flight to be flown; the same sortie gives the same track, bit for bit."""
 
     dynamics: Dynamics
     speed_mps: float
@@ -50,15 +50,15 @@ class Sortie:
     roll_rate_limit_radps: float
     gust: Gust
     gust_seed: int
-    autopilot: bool = False  # flown by the autopilot that JSBSim ships with the aircraft
+    autopilot: bool = False  # flown by the autopilot that JSBSim includes for the aircraft
 
 
 class FlightError(RuntimeError):
-    """A flight that cannot be; the text says of what."""
+    """An impossible flight; the text names it."""
 
 
 class _Aircraft:
-    """A JSBSim aircraft in the air, trimmed."""
+    """A trimmed JSBSim aircraft in flight."""
 
     def __init__(self, sortie: Sortie) -> None:
         self._fdm = _trimmed(sortie)
@@ -105,7 +105,7 @@ class _Aircraft:
 def fly(sortie: Sortie, start_s: float, end_s: float) -> Track:
     """The flight from `start_s` to `end_s` at 50 Hz, in the flat NED axes at its first sample; the ground is z = 0.
 
-    The aircraft is trimmed heading north SETTLE_S before. Raises FlightError where it cannot be trimmed or departs.
+    The aircraft is trimmed heading north SETTLE_S before. Raises FlightError if it cannot be trimmed or departs.
     """
     aircraft = _Aircraft(sortie)
     by_hand = Pilot(

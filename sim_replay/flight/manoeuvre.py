@@ -9,12 +9,12 @@ import numpy as np
 
 Kind = Literal["straight", "turn", "climbing_turn", "s_turn", "roll_in", "roll_out", "orbit", "climb"]
 KINDS: tuple[Kind, ...] = ("straight", "turn", "climbing_turn", "s_turn", "roll_in", "roll_out", "orbit", "climb")
-OFTEN = (1, 1, 1, 2, 2, 2, 1, 1)  # how often each is drawn against the others: those that change bank show the most
+OFTEN = (1, 1, 1, 2, 2, 2, 1, 1)  # relative frequency of each: those that change bank are the most visible
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """Commands in steps: from each of `t_s` on, the bank and path angle beside it; before the first, the first."""
+    """Commands in steps: bank and path angle from each of `t_s` on; before the first, the first."""
 
     kind: Kind
     t_s: tuple[float, ...]
@@ -36,7 +36,7 @@ class Manoeuvre:
 def draw_manoeuvre(
     rng: np.random.Generator, duration_s: float, bank_limit_rad: float, path_limit_rad: float
 ) -> Manoeuvre:
-    """A manoeuvre that shows itself within 0 to `duration_s`."""
+    """A manoeuvre that is visible within 0 to `duration_s`."""
     kind = KINDS[int(rng.choice(len(KINDS), p=np.array(OFTEN) / sum(OFTEN)))]
     side = float(rng.choice([-1.0, 1.0]))
     bank = side * float(rng.uniform(0.3, 1.0)) * bank_limit_rad

@@ -1,4 +1,4 @@
-"""Where two flights are laid against each other: range at the middle exactly as planned, aspect as drawn."""
+"""Places two flights relative to each other: range at the middle exactly as planned, aspect as drawn."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ ELEVATION_LIMIT_RAD = np.radians(38.0)
 
 @dataclass(frozen=True)
 class Layouts:
-    """M ways to lay a second flight against a first: turn it about the vertical, then move it."""
+    """M ways to place a second flight relative to a first: rotate it about the vertical, then move it."""
 
-    yaw_rad: Array  # [M] turn of the second flight
+    yaw_rad: Array  # [M] rotation of the second flight
     offset_ned_m: Array  # [M, 3] from first to second at mid sequence
 
     def relative_m(self, first: Track, second: Track, middle: int) -> Array:
-        """Second minus first [M, N, 3] in NED at the tracks' common times; they are laid at sample `middle`."""
+        """Second minus first [M, N, 3] in NED at the tracks' common times; they are placed at sample `middle`."""
         along = second.t_ned_body_m - second.t_ned_body_m[middle]
         R = so3_exp(np.stack([0 * self.yaw_rad, 0 * self.yaw_rad, self.yaw_rad], axis=-1))
         passed = first.t_ned_body_m - first.t_ned_body_m[middle]
@@ -38,7 +38,7 @@ class Layouts:
 
 
 def draw_layouts(rng: np.random.Generator, count: int, range_m: float) -> Layouts:
-    """Half with any heading against the first flight's, half nearly parallel; seen in any direction."""
+    """Half with a random heading relative to the first flight's, half nearly parallel; seen from random directions."""
     parallel = rng.random(count) < 0.5
     yaw = np.where(parallel, rng.normal(0.0, 0.12, count), rng.uniform(-np.pi, np.pi, count))
     azimuth = rng.uniform(-np.pi, np.pi, count)
@@ -50,7 +50,7 @@ def draw_layouts(rng: np.random.Generator, count: int, range_m: float) -> Layout
 
 
 def flyable(relative_m: Array, near_m: float, far_m: float) -> Mask:
-    """Which layouts [M] keep range and elevation at every time of `relative_m` [M, N, 3]."""
+    """Whether layouts [M] keep within the limits of range and elevation at all times of `relative_m` [M, N, 3]."""
     range_m = np.linalg.norm(relative_m, axis=-1)
     steepest = np.abs(relative_m[..., 2]) <= np.sin(ELEVATION_LIMIT_RAD) * range_m
     kept: Mask = np.all((range_m >= near_m) & (range_m <= far_m) & steepest, axis=1)
@@ -65,7 +65,7 @@ def seen_from(layouts: Layouts, second: Track, middle: int) -> Array:
 
 
 def draw_aspect(rng: np.random.Generator) -> Array:
-    """A direction [3] in body axes to be seen from: all round, up to 40 degrees above and below."""
+    """A direction [3] in body axes to be seen from: any azimuth, up to 40 degrees above and below."""
     azimuth = rng.uniform(-np.pi, np.pi)
     elevation = np.arcsin(rng.uniform(-0.64, 0.64))
     return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)])

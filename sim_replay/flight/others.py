@@ -1,4 +1,4 @@
-"""Second and third targets: in the picture beside the main one, in loose formation or crossing."""
+"""Second and third targets: in the image beside the main one, in loose formation or crossing."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ ATTEMPTS = 8
 
 @dataclass(frozen=True)
 class View:
-    """The camera at the checked times [N], and how far from its axis things are in the picture."""
+    """The camera at the checked times [N], and half its field of view."""
 
     R_ned_cam: Array  # [N, 3, 3]
     t_ned_cam_m: Array  # [N, 3]
     half_fov_rad: tuple[float, float]
-    counted: Mask  # [N], times at which the main target is in the picture
+    counted: Mask  # [N], times at which the main target is in the image
 
 
 def fly_beside(
@@ -41,9 +41,9 @@ def fly_beside(
     lowest_m: float,
     view: View,
 ) -> Track:
-    """A flight that stays `apart_m` from the `taken` ones and is in the picture for as long as drawing finds.
+    """A flight that stays `apart_m` from the `taken` ones and is in the image as long as random search achieves.
 
-    Early attempts fly as the airframe does, later ones copy the main target's sortie. Raises FlightError.
+    Early attempts fly like the airframe, later ones copy the main target's sortie. Raises FlightError.
     """
     best: tuple[float, Track] | None = None
     for attempt in range(ATTEMPTS):
@@ -75,7 +75,7 @@ def _best_layout(
     lowest_m: float,
     view: View,
 ) -> tuple[float, Track]:
-    """(share of the counted times wholly in the picture, the flight in the world) of the best of many layouts."""
+    """(share of the counted times fully in the image, the flight in the world) of the best of many layouts."""
     times, middle = clock.checked_s, len(clock.checked_s) // 2
     first, second = own.at(times), flown.at(times)
     layouts = _draw(rng, first, second, taken[0].at(times), middle, view)
@@ -94,11 +94,11 @@ def _best_layout(
 
 
 def _draw(rng: np.random.Generator, own: Track, flown: Track, main: Track, middle: int, view: View) -> Layouts:
-    """Layouts within the picture at mid sequence, two in three nearly parallel to the main target."""
+    """Layouts inside the image at mid sequence, two in three nearly parallel to the main target."""
     heading = [float(euler_from_R(track.R_ned_body[middle])[2]) for track in (main, flown)]
     parallel = rng.random(LAYOUTS) < 0.67
     turn = np.where(parallel, rng.normal(0.0, 0.1, LAYOUTS), rng.uniform(-np.pi, np.pi, LAYOUTS))
-    # Where the main target is away at mid sequence, the camera looks aside: draw around the target instead.
+    # If the main target is out of the image at mid sequence, the camera looks elsewhere: draw around the target.
     to_main = main.t_ned_body_m[middle] - view.t_ned_cam_m[middle]
     main_cam = view.R_ned_cam[middle].T @ to_main
     angles = rng.uniform(-0.9, 0.9, (LAYOUTS, 2)) * np.asarray(view.half_fov_rad)

@@ -1,4 +1,4 @@
-"""Who flies a manoeuvre: a pilot on stick, pedals and throttle, or the autopilot that JSBSim ships with an aircraft."""
+"""Flies a manoeuvre: a pilot with stick, pedals and throttle, or the autopilot that JSBSim includes for an aircraft."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from sim_replay.flight.aircraft import Dynamics
 from sim_replay.flight.manoeuvre import Manoeuvre
 
 GRAVITY_MPS2 = 9.80665
-GLIDE_RAD = -0.05  # a sailplane's path at its cruise
-GLIDE_PER_MPS = 0.04  # rad of path for each m/s too fast: a sailplane trades height for speed
-PATH_BANDWIDTH = 0.7  # rad/s, flight path angle
+GLIDE_RAD = -0.05  # a sailplane's path angle at its cruise speed
+GLIDE_PER_MPS = 0.04  # rad of path angle per m/s of excess speed: a sailplane exchanges height for speed
+PATH_BANDWIDTH = 0.7  # rad/s, of the control of the flight path angle
 QUARTER_RAD = math.pi / 2.0
-ROLL_BANDWIDTH = 1.6  # rad/s, bank angle
+ROLL_BANDWIDTH = 1.6  # rad/s, of the control of the bank angle
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the pilot's instruments show."""
+    """Instrument readings of the pilot."""
 
     bank_rad: float
     pitch_rad: float
@@ -26,7 +26,7 @@ class Seen:
     q_radps: float
     r_radps: float
     slip_rad: float  # sideslip; positive with the wind from the right
-    speed_mps: float  # through the air
+    speed_mps: float  # airspeed
     path_rad: float  # flight path above the horizon
     heading_rad: float
     height_m: float
@@ -40,12 +40,12 @@ class Controls:
     elevator: float
     rudder: float
     throttle: float
-    autopilot: Setpoints | None = None  # what JSBSim's own autopilot is to hold beside the stick
+    autopilot: Setpoints | None = None  # what JSBSim's own autopilot is to hold in addition to the stick
 
 
 @dataclass(frozen=True)
 class Setpoints:
-    """What an autopilot with heading and height hold is set to."""
+    """Set points of an autopilot with heading and height hold."""
 
     heading_rad: float
     height_m: float
@@ -91,7 +91,7 @@ class Pilot:
         error = wanted - seen.q_radps
         self._sum("pitch", error, 0.6)
         d, faster = self.dynamics, seen.speed_mps / self.dynamics.speed_mps
-        # The angle of attack that a turn needs beyond level flight's is held against the aircraft's stiffness.
+        # The additional angle of attack of a turn must be held against the aircraft's static stability.
         incidence_rad = (1.0 / math.cos(seen.bank_rad) - 1.0) * GRAVITY_MPS2 / (seen.speed_mps * d.lift_slope)
         held = d.pitch_stiffness * incidence_rad * pressure / faster + d.pitch_damping * wanted * faster
         moment = held + 2.5 * error + 6.0 * self._sums["pitch"]
@@ -118,7 +118,7 @@ class Pilot:
 
 @dataclass
 class AutopilotOperator:
-    """Sets the shipped autopilot, which banks as it sees fit; the pilot keeps rudder and throttle."""
+    """Operates JSBSim's autopilot, which chooses its own bank; the pilot keeps rudder and throttle."""
 
     pilot: Pilot
     _heading_rad: float | None = None
@@ -126,7 +126,7 @@ class AutopilotOperator:
     _bank_rad: float | None = None
 
     def fly(self, t_s: float, seen: Seen) -> Controls:
-        """The controls for the next step: a turn is a new heading a quarter circle on, a climb a height that rises."""
+        """The controls for the next step: a turn is a heading a quarter circle ahead, a climb an increasing height."""
         bank_rad, path_rad = self.pilot.manoeuvre.bank_rad(t_s), self.pilot.manoeuvre.path_rad(t_s)
         if self._heading_rad is None or bank_rad != self._bank_rad:
             self._heading_rad = seen.heading_rad + math.copysign(QUARTER_RAD, bank_rad) * (bank_rad != 0.0)

@@ -1,4 +1,4 @@
-"""The camera on its own ship: bolted on, or on a gimbal that follows a target with lag, wander and jitter."""
+"""The camera on its own ship: fixed, or on a gimbal that follows a target with lag, wander and jitter."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def draw_jitter(rng: np.random.Generator, rms_rad: float) -> Jitter:
 
 @dataclass(frozen=True)
 class Pointing:
-    """Where the camera points on its own ship: samples [N] over time, and the jitter on top."""
+    """Where the camera points on its own ship: samples [N] over time, plus jitter."""
 
     t_s: Array  # [N]
     R_body_cam: Array  # [N, 3, 3] without jitter
@@ -58,9 +58,9 @@ def look(direction_ned: Array) -> Array:
 
 
 def aside(angles_rad: Array) -> Array:
-    """Turns [N, 3, 3] by the shortest way, to be put after a camera that looks at a point.
+    """Shortest rotations [N, 3, 3], to be applied after a camera that looks at a point.
 
-    The point then lies `angles_rad` [N, 2] to the right of and below the turned camera's axis: its direction in that
+    The point then lies `angles_rad` [N, 2] to the right of and below the rotated camera's axis: its direction in that
     camera is (tan a, tan b, 1).
     """
     direction = np.concatenate([np.tan(angles_rad), np.ones((len(angles_rad), 1))], axis=-1)
@@ -71,19 +71,19 @@ def aside(angles_rad: Array) -> Array:
 
 
 def bearing_rad(direction_cam: Array) -> Array:
-    """Angles [..., 2] right of and below the axis of directions [..., 3] in a camera; pi where it lies behind."""
+    """Angles [..., 2] to the right of and below the axis of directions [..., 3] in a camera; pi if behind it."""
     ahead = direction_cam[..., 2:]
     angles = np.arctan2(direction_cam[..., :2], np.maximum(ahead, 1e-9))
     return np.where(ahead > 0.0, angles, np.pi)
 
 
 def within(angles_rad: Array, limit_rad: Array) -> Array:
-    """Angles [N, 2] pressed smoothly into plus and minus `limit_rad` [N, 2]; small ones stay as they are."""
+    """Angles [N, 2] smoothly limited to plus and minus `limit_rad` [N, 2]; small ones are unchanged."""
     return limit_rad * np.tanh(angles_rad / np.maximum(limit_rad, 1e-6))
 
 
 def draw_wander(rng: np.random.Generator, t_s: Array, reach_rad: tuple[float, float]) -> Array:
-    """A slow walk [N, 2] of the target through the picture, around a place drawn within `reach_rad`."""
+    """A slow random walk [N, 2] of the target through the image, around a place drawn within `reach_rad`."""
     place = rng.uniform(-1.2, 1.2, 2)
     period_s = rng.uniform(4.0, 15.0, (3, 2))
     phase = rng.uniform(0.0, 2.0 * np.pi, (3, 2))
@@ -105,14 +105,14 @@ def lag(direction_ned: Array, step_s: float, time_constant_s: float) -> Array:
 
 @dataclass(frozen=True)
 class Excursion:
-    """When the target is out of the picture, and which way it left."""
+    """When the target is out of the image, and in which direction it left."""
 
-    out_s: tuple[float, float]  # wholly outside between these
+    out_s: tuple[float, float]  # completely outside between these times
     ramp_s: float
     towards: tuple[float, float]  # unit, right and down
 
     def share(self, t_s: Array) -> Array:
-        """0 inside, 1 outside, smooth between, at times [N]."""
+        """0 inside, 1 outside, with a smooth transition, at times [N]."""
         before = (t_s - (self.out_s[0] - self.ramp_s)) / self.ramp_s
         after = ((self.out_s[1] + self.ramp_s) - t_s) / self.ramp_s
         u = np.clip(np.minimum(before, after), 0.0, 1.0)
@@ -138,13 +138,13 @@ def gimbal(
     jitter: Jitter,
     excursion: Excursion | None,
 ) -> Pointing:
-    """A gimbal that keeps the target [same times as own] wholly in the picture, but for an excursion."""
+    """A gimbal that keeps the target [same times as own] fully in the image, except during an excursion."""
     camera_m = own.t_ned_body_m + np.einsum("nij,j->ni", own.R_ned_body, t_body_cam_m)
     sight = target.t_ned_body_m - camera_m
     range_m = np.linalg.norm(sight, axis=-1, keepdims=True)
     sight /= range_m
     R_ned_look = look(sight)
-    if rng.random() < 0.4:  # the gimbal has no roll axis: the picture leans with the own ship
+    if rng.random() < 0.4:  # the gimbal has no roll axis: the image tilts with the own ship
         R_ned_look = R_ned_look @ _lean(own, sight)
     step_s = float(own.t_s[1] - own.t_s[0])
     behind = lag(sight, step_s, float(rng.uniform(0.05, 0.25)))
@@ -164,7 +164,7 @@ def gimbal(
 
 
 def _lean(own: Track, sight_ned: Array) -> Array:
-    """Turns [N, 3, 3] about the axis of an upright camera by the own ship's bank as seen along the sight line."""
+    """Rotations [N, 3, 3] about an upright camera's axis by the own ship's bank as seen along the line of sight."""
     forward = own.R_ned_body[:, :, 0]
     bank = np.arctan2(own.R_ned_body[:, 2, 1], own.R_ned_body[:, 2, 2])
     along = np.einsum("ni,ni->n", forward, sight_ned)

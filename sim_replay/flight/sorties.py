@@ -1,4 +1,4 @@
-"""Sorties drawn from a seed: who flies, how fast, which manoeuvre, in which gusts."""
+"""Sorties drawn from a seed: aircraft, speed, manoeuvre and gusts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim_replay.flight.manoeuvre import draw_manoeuvre
 from sim_replay.flight.track import Array
 
 LEAD_S = 1.2  # of track before the first frame and after the last
-FLOWN_AT_M = (900.0, 1300.0)  # every stand-in trims here; the encounter is lifted to its own height afterwards
+FLOWN_AT_M = (900.0, 1300.0)  # all JSBSim aircraft trim here; the encounter is moved to its own height afterwards
 STEEPEST_PATH_RAD = 0.07
 OWN_CLASSES = (
     FlightClass("J3Cub", 29.0, 0.6, 0.7),
@@ -33,12 +33,12 @@ class Clock:
 
     @property
     def start_s(self) -> float:
-        """Where the tracks begin."""
+        """Start of the tracks."""
         return -LEAD_S
 
     @property
     def end_s(self) -> float:
-        """Where the tracks end: a whole number of samples later."""
+        """End of the tracks: a whole number of samples later."""
         return self.start_s + float(np.ceil((self.frame_t_s[-1] + 2.0 * LEAD_S) / SAMPLE_S)) * SAMPLE_S
 
     @property
@@ -48,7 +48,7 @@ class Clock:
 
     @property
     def checked_s(self) -> Array:
-        """Times [N] at which an encounter is checked, a little more than the frames; N is odd, the middle in it."""
+        """Times [N] at which an encounter is checked, slightly beyond the frames; N is odd and includes the middle."""
         return np.linspace(-0.1, 2.0 * self.middle_s + 0.1, 29)
 
     @property
@@ -58,7 +58,7 @@ class Clock:
 
 
 def draw_sortie(rng: np.random.Generator, clock: Clock, how: FlightClass, gust: Gust) -> Sortie:
-    """A flight of that class near its cruise, with a manoeuvre that shows within the frames."""
+    """A flight of that class near its cruise, with a manoeuvre that is visible within the frames."""
     speed_mps = how.speed_mps * float(rng.uniform(0.9, 1.1))
     manoeuvre = draw_manoeuvre(rng, max(2.0 * clock.middle_s, 1.0), how.bank_limit_rad, STEEPEST_PATH_RAD)
     return Sortie(
@@ -74,7 +74,7 @@ def draw_sortie(rng: np.random.Generator, clock: Clock, how: FlightClass, gust: 
 
 
 def draw_own_class(rng: np.random.Generator, target_speed_mps: float, clock: Clock) -> FlightClass:
-    """An own ship that stays about: nearly any for a short encounter, as fast as the target for a long one."""
+    """An own ship that stays near: almost any for a short encounter, one as fast as the target for a long one."""
     spare_mps = 120.0 / max(clock.middle_s, 1.0)
     close = [c for c in OWN_CLASSES if abs(c.speed_mps - target_speed_mps) <= spare_mps]
     nearest = min(OWN_CLASSES, key=lambda c: abs(c.speed_mps - target_speed_mps))

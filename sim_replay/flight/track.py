@@ -1,4 +1,4 @@
-"""A flown path: attitude, position, velocity and rates over time, and its state at any instant between samples."""
+"""A flown path: attitude, position, velocity and rates over time, interpolated at any time between samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Track:
-    """N states of one body (FRD) in local NED; `t_s` rises."""
+    """N states of one body (FRD) in local NED; `t_s` increases."""
 
     t_s: Array  # [N]
     R_ned_body: Array  # [N, 3, 3]
@@ -43,7 +43,7 @@ class Track:
         return Track(wanted, slerp(self.R_ned_body, i, share), position, velocity, rates)
 
     def turned(self, yaw_rad: float) -> Track:
-        """The same flight with the world turned by `yaw_rad` about down: gravity and height stay as they are."""
+        """The same flight with the world rotated by `yaw_rad` about down: gravity and height are unchanged."""
         R = so3_exp([0.0, 0.0, yaw_rad])
         return Track(
             self.t_s, R @ self.R_ned_body, self.t_ned_body_m @ R.T, self.v_ned_body_mps @ R.T, self.rates_body_radps
@@ -57,13 +57,13 @@ class Track:
 
 
 def spans(grid: Array, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """For times [M] on a rising grid [N]: index of the sample before, share of the way to the next, step; each [M]."""
+    """For times [M] on an increasing grid [N]: index of the sample before, fraction to the next, step; each [M]."""
     i = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
     step = grid[i + 1] - grid[i]
     return i, np.clip((t - grid[i]) / step, 0.0, 1.0), step
 
 
 def slerp(R: Array, i: NDArray[np.intp], share: Array) -> Array:
-    """Rotations [M, 3, 3] the given share [M] of the way from R[i] to R[i + 1], R [N, 3, 3]."""
+    """Rotations [M, 3, 3] at the given fraction [M] from R[i] to R[i + 1], R [N, 3, 3]."""
     turn = so3_log(np.swapaxes(R[i], -1, -2) @ R[i + 1])
     return R[i] @ so3_exp(share[:, None] * turn)
