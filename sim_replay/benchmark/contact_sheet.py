@@ -49,7 +49,7 @@ def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
         corners = np.round((box.reshape(2, 2) + 0.5) * scale - 0.5 + [[-2, -2], [2, 2]]).astype(int)
         cv2.rectangle(out, [int(v) for v in corners[0]], [int(v) for v in corners[1]], BOX_BGR, 1)
     if boxes:
-        # In a corner where the target is not.
+        # In the corner opposite the target.
         middle = 0.5 * (boxes[0][:2] + boxes[0][2:]) * scale
         left = TILE_WH_PX[0] - INSET_PX if middle[0] < 0.5 * TILE_WH_PX[0] else 0
         top = TILE_WH_PX[1] - INSET_PX if middle[1] < 0.5 * TILE_WH_PX[1] else 0

@@ -44,7 +44,7 @@ def read_scene(folder: Path) -> BopScene:
 
 
 def find_root(folder: Path) -> Path | None:
-    """The dataset that a folder belongs to: the nearest parent with models, model_frame.toml or a list of targets."""
+    """The dataset that a folder belongs to: the nearest one up with models, model_frame.toml or a list of targets."""
     here = _absolute(folder)
     for candidate in (here, *here.parents[:_LEVELS_UP]):
         named = (candidate / name for name in (MODEL_FRAME_FILE, TARGETS_FILE))

@@ -148,7 +148,7 @@ class Subscriber:
         return {"frame": frame, "t_ns": taken.stamp_ns - self._frame0_ns, **dict(sorted(values.items()))}
 
     def _wait_until_known(self, uav: str) -> None:
-        # Queries are ordered after declarations: an answer shows that those have reached the daemon.
+        # An answer to a query sent after the declarations shows that those have reached the daemon.
         deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
         while not any(reply.ok for reply in self._session.get(key_of(uav, "info"), timeout=2.0)):
             if time.monotonic() > deadline_s:

@@ -57,7 +57,7 @@ def _filled(points: NDArray[np.float64], width: int, height: int) -> NDArray[np.
 def _bird(
     rng: np.random.Generator, side: int, decoy: Decoy | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Opacity [side, side] in 0..1 and colour [3] of a bird; without a `decoy` of random size and place.
+    """Opacity [side, side] in 0..1 and colour [3] of a bird; without a `decoy`, of random size and place.
 
     Every shape is different, so that a network cannot learn to recognise birds by one fixed drawing.
     """
