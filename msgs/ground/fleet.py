@@ -25,9 +25,9 @@ from msgs.wire import Array, PayloadError, Refusal
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
-# A larger change of range than flight can explain means another aircraft under the same number, or a track whose
-# position was reset to the measurements. Two small aircraft approach each other at less than 150 m/s; noise changes a
-# track's range by up to 5 m from frame to frame, a reset by tens of metres.
+# A larger change of range than flight can explain means another aircraft under the same number, or a track whose range
+# was moved to that of its last frames. Two small aircraft approach each other at less than 150 m/s; noise changes a
+# track's range by up to 5 m from frame to frame, such a move by tens of metres.
 FLIGHT_MPS = 150.0
 RANGE_NOISE_M = 5.0
 FORGET_TARGET_NS = 10_000_000_000
