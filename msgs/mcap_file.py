@@ -119,7 +119,8 @@ def is_written(path: Path) -> bool:
 
 
 def finish_unfinished(path: Path) -> bool:
-    """Repair a file left unfinished by a crash: cut off the incomplete record and write the footer; True if it did.
+    """Repair a file left unfinished by a crash: cut off the incomplete record and write the footer. Returns whether it
+    was unfinished.
 
     There is no index, so readers scan the whole file. A file being written is left alone, one without any complete
     record is removed. Raises OSError.

@@ -80,7 +80,7 @@ def datasets_in(benchmark: Path) -> list[Path]:
 def measure(
     models: Sequence[Path | None], datasets: Sequence[Path], say: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Scores of each model on each dataset: on single frames and, if its sequences are complete, through the tracker.
+    """Scores of each model on each dataset: on single frames, and also through the tracker if sequences are complete.
 
     None stands for the shipped INT8 file.
     """
