@@ -24,7 +24,7 @@ from msgs.receive import PoseReceiver, TargetPose
 from msgs.session import TlsFiles, client_config
 from msgs.wire import Refusal
 
-FAILURES_MAX = 64  # different messages of exceptions
+FAILURES_MAX = 64  # distinct exception messages that are counted separately
 
 
 def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:

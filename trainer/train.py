@@ -174,7 +174,7 @@ class Trainer:
         self.samples_before = samples_behind(content.get("training", {}))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the state of an earlier run with the same network."""
+        """Restore the state of an earlier run with the same network."""
         self.model.load_state_dict(state["model"])
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])

@@ -275,7 +275,7 @@ def log_event(rec: rr.RecordingStream, uav: str, level: int, text: str) -> None:
 
 
 def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, news: bool) -> None:
-    """Health as a table, its latencies as plots; with `news` as an event too."""
+    """Health as text, its latencies as plots; with `news` as an event too."""
     status = message.status[0]
     values = dict(status.values)
     rec.log(f"{uav}/health", rr.TextDocument(health_text(status), media_type="text/markdown"))
