@@ -1,4 +1,4 @@
-"""A typed client for whoever uses the poses. Needs zenoh, numpy and xxhash, nothing else.
+"""Typed client for receiving poses in your own program. Needs zenoh, numpy and xxhash, nothing else.
 
 from msgs.client import connect, subscribe
 
@@ -24,24 +24,24 @@ from msgs.receive import PoseReceiver, TargetPose
 from msgs.session import TlsFiles, client_config
 from msgs.wire import Refusal
 
-FAILURES_MAX = 64  # different messages of exceptions
+FAILURES_MAX = 64  # distinct exception messages that are counted separately
 
 
 def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
     """Open a session with a router or daemon, e.g. `tcp/127.0.0.1:7447`; close it, or use it as a context.
 
-    Raises ConnectionError if the endpoint is malformed or nothing answers there: at once where the machine is there,
-    after about four seconds where it is not, after ten over `quic/`.
+    Raises ConnectionError if the endpoint is malformed or nothing answers there: immediately if the host is reachable,
+    after about four seconds if it is not, after ten over `quic/`.
     """
     try:
         return zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0].strip()  # what follows is a line of zenoh's source
+        reason = str(error).partition(" at /")[0].strip()  # cuts off the location in zenoh's source
         raise ConnectionError(f"no zenoh session with {endpoint}: {reason}") from error
 
 
 class PoseSubscription:
-    """Iterates over validated poses, newest kept when the reader is slow; ends when it or the session is closed."""
+    """Iterates over validated poses; a slow reader loses the oldest. Ends when it or the session is closed."""
 
     def __init__(self, subscriber: zenoh.Subscriber, receiver: PoseReceiver) -> None:
         self._subscriber = subscriber
@@ -50,7 +50,7 @@ class PoseSubscription:
 
     @property
     def accepted(self) -> int:
-        """Samples taken."""
+        """Number of samples accepted."""
         return self._receiver.accepted
 
     @property
@@ -65,7 +65,7 @@ class PoseSubscription:
                 yield pose
 
     def poll(self) -> TargetPose | None:
-        """The oldest pose waiting, without blocking; None if there is none, or it or the session is closed."""
+        """The oldest buffered pose, without blocking; None if there is none, or this or the session is closed."""
         while not self._closed:
             try:
                 sample = self._subscriber.try_recv()
@@ -79,7 +79,7 @@ class PoseSubscription:
         return None
 
     def close(self) -> None:
-        """May be called twice, or after the session's."""
+        """May be called more than once, and after the session was closed."""
         self._closed = True
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()
@@ -100,9 +100,10 @@ def subscribe(
     max_age_s: float = 1.0,
     depth: int = 8,
 ) -> PoseSubscription:
-    """Poses of a UAV's targets, or of one of them (`t0`, …); `depth` poses wait for a slow reader, older ones go.
+    """Subscribe to the poses of all targets of a UAV, or of one (`t0`, …); at most `depth` poses are buffered, the
+    oldest are dropped.
 
-    Raises ValueError for a name that none can have.
+    Raises ValueError for an invalid name.
     """
     key = topics.subscription_key(topics.POSE, uav, target, domain=domain)
     subscriber = session.declare_subscriber(key, handlers.RingChannel(depth))
@@ -110,7 +111,7 @@ def subscribe(
 
 
 class TopicCounts:
-    """Counts the samples of every topic of one UAV, and judges its poses; made by `subscribe_all`."""
+    """Counts the samples of every topic of one UAV and validates its poses; created by `subscribe_all`."""
 
     def __init__(self, uav: str, domain: int, max_age_s: float, on_pose: Callable[[TargetPose], None]) -> None:
         self._uav = uav
@@ -133,8 +134,8 @@ class TopicCounts:
             return dict(self._receiver.refused)
 
     def failures(self) -> dict[str, int]:
-        """Exceptions that `on_pose` let out, by message, and by type alone where messages are many: they are counted
-        here and stop nothing."""
+        """Number of exceptions raised by `on_pose`, which interrupt nothing: by message, or by type alone once there
+        are FAILURES_MAX different messages."""
         with self._lock:
             return dict(self._failures)
 
@@ -159,7 +160,7 @@ class TopicCounts:
             pose = _receive(self._receiver, sample) if topic is topics.POSE else None
         if pose is None:
             return
-        # zenoh would print an exception and forget it.
+        # zenoh would only print an exception.
         try:
             self._on_pose(pose)
         except Exception as error:
@@ -169,7 +170,7 @@ class TopicCounts:
                 self._failures[type(error).__name__ if crowded else text] += 1
 
     def _declare(self, session: zenoh.Session) -> None:
-        # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
+        # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
         handler = handlers.Callback(self._on_sample, indirect=False)
         for topic in topics.TOPICS:
             if topic is topics.IMAGE:
@@ -192,10 +193,11 @@ def subscribe_all(
     domain: int = 0,
     max_age_s: float = 1.0,
 ) -> TopicCounts:
-    """Every topic of the table for one UAV but pictures, which are made only while somebody looks; what is cached comes
-    with its history.
+    """Subscribe to every topic of one UAV except images, which the daemon encodes only while somebody subscribes;
+    cached topics deliver their history first.
 
-    `on_pose` gets each validated pose on zenoh's receiving thread: let it be quick. Close it, or use it as a context.
+    `on_pose` is called with each validated pose on zenoh's receiving thread and must return quickly. Close the result,
+    or use it as a context.
     """
     counts = TopicCounts(uav, domain, max_age_s, on_pose)
     counts._declare(session)
@@ -209,5 +211,5 @@ def _receive(receiver: PoseReceiver, sample: zenoh.Sample) -> TargetPose | None:
 
 
 def sender_of(sample: zenoh.Sample) -> str:
-    """The id of the session that a sample is from, which stamps what it sends; empty where nothing is stamped."""
+    """Id of the zenoh session that sent a sample, taken from its timestamp; empty if it has none."""
     return "" if sample.timestamp is None else str(sample.timestamp.get_id())

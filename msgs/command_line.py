@@ -1,4 +1,4 @@
-"""How a command ends when a person must correct something (a sentence on standard error, exit code 2) or stops it."""
+"""How commands exit on invalid input (a message on standard error, exit code 2) or when interrupted."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from importlib.metadata import PackageNotFoundError, requires
 
 EXIT_BAD_INPUT = 2
 PROJECT = "mf-uavpose6d-edge"
-_DISTRIBUTIONS = {"rerun": "rerun-sdk"}  # whose name is not its package's
-# What a shell says of a command that Ctrl-C or a closed pipe ended.
+_DISTRIBUTIONS = {"rerun": "rerun-sdk"}  # where the distribution is not named like the package
+# What a shell reports for a command that Ctrl-C or a closed pipe ended.
 EXIT_INTERRUPTED, EXIT_UNREAD = 130, 141
 
 
 def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequence[str] = ()) -> int:
-    """What `act` returns; 2 after it raised `bad_input`, whose text names file and key, or wants a package that one of
-    the `extras` brings; 130 after Ctrl-C; 141 where nobody reads what it prints, as behind `| head`."""
+    """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or needs a missing
+    package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as by `| head`."""
     try:
         code = act()
         sys.stdout.flush()
@@ -36,8 +36,8 @@ def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequen
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         if _stdout_is_read():
-            raise  # it was another pipe or socket
-        # What is still in its buffer would be complained of at the end.
+            raise  # another pipe or socket broke
+        # Otherwise Python would report an error at exit when flushing the buffer.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_UNREAD
     return code
@@ -50,7 +50,7 @@ def _stdout_is_read() -> bool:
 
 
 def _brings(extra: str, package: str) -> bool:
-    """Whether an extra of this project brings a package, by what the installed project says of itself."""
+    """Whether an extra of this project installs a package, according to the installed project's metadata."""
     name = _DISTRIBUTIONS.get(package, package).replace("_", "-")
     try:
         wanted = requires(PROJECT) or []

@@ -1,11 +1,11 @@
 """The contract between the trainer, which exports a model, and the daemon, which flies it.
 
-It travels inside the ONNX file (metadata key `uavpose_contract`, JSON), so a file says by itself what it takes,
-what it returns and what it was made from. The graph's interface:
+It is stored inside the ONNX file (metadata key `uavpose_contract`, JSON), so that a file documents its own inputs,
+outputs and origin. The graph's interface:
 
     inputs   image  uint8   [N, H, W, 3]  BGR pixels, as OpenCV decodes them; normalisation is inside the graph
              K      float32 [N, 3, 3]     intrinsics of exactly these pixels (pixel centres at integers)
-    outputs  score        float32 [N, M]        heatmap peak, 0..1, falling
+    outputs  score        float32 [N, M]        heatmap peak, 0..1, descending
              center_px    float32 [N, M, 2]     centre of the visible box, pixels of `image`
              size_px      float32 [N, M, 2]     width and height of the visible box
              origin_px    float32 [N, M, 2]     projection of the target's body origin
@@ -13,7 +13,7 @@ what it returns and what it was made from. The graph's interface:
              R_cam_target    float32 [N, M, 3, 3]
              sigma        float32 [N, M, 6]     1-sigma of (u px, v px, log Z, rotation x, y, z rad in `cam`)
 
-H and W are free multiples of 32; M = `max_peaks`.
+H and W are any multiples of 32; M = `max_peaks`.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ OUTPUT_NAMES = ("score", "center_px", "size_px", "origin_px", "t_cam_target_m", 
 
 
 class ScoreCalibration(BaseModel):
-    """From a heatmap peak to the probability that it is a target: one peak says more of a large box than of a speck.
+    """Maps a heatmap peak to the probability that it is a target, which also depends on the target's apparent size.
 
     logit p = offset + slope logit(peak) + size_slope ln(min(shown, size_cap)), where `shown` is the geometric mean of
-    the box's sides in pixels that show the target: the network's, or the frame's where those are fewer. As it stands
-    it leaves the peak as it is.
+    the box's sides, in pixels of the network or of the frame, whichever are fewer. The defaults leave the peak
+    unchanged.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -46,7 +46,7 @@ class ScoreCalibration(BaseModel):
     size_cap_px: float = Field(default=1.0, gt=0)
 
     def probability(self, peak: float, shown_px: float) -> float:
-        """Of a peak in 0..1 of a box of `shown_px`; 0 for one that is not finite."""
+        """Probability for a peak in 0..1 with a box of `shown_px`; 0 if either is not finite."""
         if not (math.isfinite(peak) and math.isfinite(shown_px)):
             return 0.0
         peak = min(max(peak, _PEAK_LEAST), 1.0 - _PEAK_LEAST)
@@ -60,7 +60,7 @@ _LOGIT_MOST = 30.0
 
 
 def samples_behind(training: Mapping[str, str | int | float]) -> int | None:
-    """Training samples behind weights, of all runs; None where their file does not tell, as older ones did not."""
+    """Training samples behind weights, summed over all runs; None if their file does not record it (older files)."""
     begun = str(training.get("started_from", ""))
     before = training.get("samples_before", None if begun.startswith("weights ") else 0)
     return None if before is None or "samples" not in training else int(training["samples"]) + int(before)
@@ -80,7 +80,7 @@ Span = Annotated[tuple[float, float], AfterValidator(_span)]
 
 
 class ModelContract(BaseModel):
-    """Everything the daemon must know of a model, and everything a person asks of one."""
+    """Everything that the daemon, or a user, needs to know about a model."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -110,7 +110,7 @@ class ModelContract(BaseModel):
         (50.0, 600.0), description="the graph keeps its depths within; one told at a limit may lie beyond it"
     )
     trained_range_m: Span
-    # One fixed camera whose frames are shown whole has one focal length.
+    # May be a single value: whole frames of one fixed camera have one focal length.
     trained_focal_px: Annotated[tuple[float, float], AfterValidator(_span_or_point)]
     trained_box_px: Span = Field(description="longer side of the visible box in network pixels, as trained")
     airframes: list[str] = Field(description="airframe classes in the training data")

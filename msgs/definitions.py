@@ -1,4 +1,4 @@
-"""The interface definitions that recordings carry, so that readers need no ROS: ROS 2's concatenated .msg text.
+"""Interface definitions embedded in recordings so that readers need no ROS: ROS 2's concatenated .msg text.
 
 https://mcap.dev/spec/registry, schema encoding `ros2msg`.
 """
@@ -11,9 +11,10 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def definition(ros_type: str) -> str:
-    """The interface `pkg/msg/Name` and, each once, all those within it, a line of 80 `=` and `MSG: pkg/Name` between.
+    """The interface `pkg/msg/Name` and all interfaces nested in it, each once, separated by a line of 80 `=` and
+    `MSG: pkg/Name`.
 
-    Raises KeyError for a type that no topic has.
+    Raises KeyError for a type that no topic uses.
     """
     name = ros_type.replace("/msg/", "/")
     names = dict.fromkeys([name, *_nested(name)])
@@ -22,6 +23,6 @@ def definition(ros_type: str) -> str:
 
 
 def _nested(name: str) -> list[str]:
-    """What the interface holds, depth first, with repetitions."""
+    """Interfaces nested in this one, depth first, with repetitions."""
     held = (line.split()[0].partition("[")[0] for line in INTERFACES[name].splitlines())
     return [inner for kind in held if "/" in kind for inner in (kind, *_nested(kind))]

@@ -1,6 +1,6 @@
 """Rotations and quaternions, pure NumPy, broadcasting over leading axes.
 
-`R_a_b` turns vectors of frame b into frame a. Quaternions are Hamilton; their order stands in the name.
+`R_a_b` transforms vectors from frame b to frame a. Quaternions are Hamilton; the name gives their component order.
 Angles are radians.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-# A variance that says that nothing is known: ROS has no other way to say so.
+# Variance that stands for "unknown"; ROS has no other representation for it.
 NOT_ESTIMATED = 1e6
 
 
@@ -111,5 +111,5 @@ def euler_from_R(R_ned_body: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def rotation_estimated(covariance: Array) -> bool:
-    """Whether a pose's covariance [6, 6] (position, rotation) says that its rotation is known at all."""
+    """Whether, according to a pose's covariance [6, 6] (position, rotation), its rotation was estimated at all."""
     return bool(np.trace(covariance[3:, 3:]) < NOT_ESTIMATED)

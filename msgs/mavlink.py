@@ -1,6 +1,6 @@
-"""MAVLink 2: pymavlink's `common` dialect plus the messages of dialect/uavpose.xml, and packing that checks.
+"""MAVLink 2: pymavlink's `common` dialect plus the messages of dialect/uavpose.xml, and packing with validation.
 
-Only `MAVLink` (pack and parse) is used of pymavlink; sockets, addresses and signatures belong to the link.
+Of pymavlink only `MAVLink` (pack and parse) is used; sockets, addresses and signatures are handled by the link.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-# Any text in it, "0" too, would switch CRC checks off.
+# Any value, even "0", would switch CRC checks off.
 os.environ.pop("MAV_IGNORE_CRC", None)
 
 from pymavlink.dialects.v20 import common as dialect
 
-# pymavlink may have been imported, and have read the variable, before this module.
+# pymavlink may have been imported, and the variable read, before this module.
 dialect.MAVLINK_IGNORE_CRC = 0
 
 DIALECT_XML = Path(__file__).parent / "dialect" / "uavpose.xml"
@@ -28,7 +28,7 @@ MAVLinkMessage = dialect.MAVLink_message
 MAVError = dialect.MAVError
 
 TARGET_OBS_FRAME_OTHER = 3
-CANDIDATES_MAX = 256  # places in one piece of bytes that look like a frame and are none: more is a flood, not a link
+CANDIDATES_MAX = 256  # false frame starts in the bytes of one `feed`: with more, the rest is discarded as a flood
 _Q_UNKNOWN = (0.0, 0.0, 0.0, 0.0)
 _TYPES = {
     "uint64_t": ("Q", 8), "int64_t": ("q", 8), "double": ("d", 8),
@@ -41,8 +41,8 @@ _TYPES = {
 def _message_class(definition: ET.Element) -> type[Any]:
     """A pymavlink message class from a `<message>` without extensions or text fields.
 
-    The wire order is by size of the element, largest first, and stable; CRC_EXTRA is the published checksum of the
-    name and the fields in that order (MAVLink guide, "Serialization").
+    Fields are ordered on the wire by element size, largest first, stable; CRC_EXTRA is the checksum of the name and
+    the fields in that order (MAVLink guide, "Serialization").
     """
     name = definition.attrib["name"]
     fields = []
@@ -102,10 +102,10 @@ MAVLink_target_relative_message = _register()["TARGET_RELATIVE"]
 
 
 def pack(mav: Any, message: Any, *, unknown: Collection[str] = ()) -> bytes:
-    """Pack a message as MAVLink 2 with `mav`'s ids and signing, and count its sequence on.
+    """Pack a message as MAVLink 2 with `mav`'s ids and signing, and advance its sequence number.
 
     Raises ValueError, naming message and field, for a number that is not finite, unless the field is in `unknown`
-    (those whose definition gives NaN that meaning), and for a value that does not fit its field.
+    (fields whose definition uses NaN for "unknown"), and for a value that does not fit its field.
     """
     for field in message.get_fieldnames():
         value = getattr(message, field)
@@ -132,9 +132,9 @@ def target_relative(
 ) -> Any:
     """TARGET_RELATIVE (511) with the target's full pose in `cam` (frame OTHER), for `pack`.
 
-    Vectors are [3], quaternions [4] of unit length; `q_cam_target_wxyz` None: the target's attitude is not known,
-    `q_ned_cam_wxyz` None: the own one; all zeros say so. `utc_us` is the exposure time. Raises ValueError for what is
-    no vector or no rotation; `pack` does for a value that is not finite or does not fit its field.
+    Vectors are [3], quaternions [4] of unit length; `q_cam_target_wxyz` None: the target's attitude is unknown,
+    `q_ned_cam_wxyz` None: the own attitude is; both are sent as all zeros. `utc_us` is the exposure time. Raises
+    ValueError for an invalid vector or rotation; `pack` does for a value that is not finite or does not fit its field.
     """
     q_target = _Q_UNKNOWN if q_cam_target_wxyz is None else _unit_quaternion("q_target", q_cam_target_wxyz)
     q_sensor = _Q_UNKNOWN if q_ned_cam_wxyz is None else _unit_quaternion("q_sensor", q_ned_cam_wxyz)
@@ -152,7 +152,7 @@ def target_relative(
 
 
 def pack_target_relative(mav: Any, **pose: Any) -> bytes:
-    """`target_relative` of a pose, as one MAVLink 2 packet. Raises ValueError as it and `pack` do."""
+    """`target_relative` of a pose as one MAVLink 2 packet. Raises ValueError as both functions do."""
     return pack(mav, target_relative(**pose))
 
 
@@ -170,23 +170,23 @@ def _unit_quaternion(field: str, q_wxyz: Sequence[float]) -> tuple[float, ...]:
 
 
 class FrameReader:
-    """Messages out of bytes, whatever lies between them.
+    """Extracts MAVLink messages from bytes, skipping garbage between them.
 
-    A candidate that is no frame costs one byte, not the length it claims: a truncated header swallows nothing that
-    follows. Media of datagrams use `datagram=True`, where no frame goes on in the next; byte streams one reader for
-    each connection.
+    After a false frame start it skips one byte, not the length claimed there, so a truncated header hides nothing that
+    follows. Use `datagram=True` for datagram transports, where no frame continues in the next datagram; for byte
+    streams use one reader per connection.
     """
 
     def __init__(self, datagram: bool) -> None:
-        self.bad_runs = 0  # stretches of bytes that are no frame
-        self.unknown_ids = 0  # frames whose id no dialect of ours has: neither checksum nor signature can be judged
+        self.bad_runs = 0  # contiguous runs of bytes that belong to no frame
+        self.unknown_ids = 0  # frames with an id not in our dialects: neither checksum nor signature can be verified
         self.datagram = datagram
         self._buffer = bytearray()
         self._decoder = dialect.MAVLink(None)
         self._in_bad_run = False
 
     def feed(self, data: bytes) -> list[Any]:
-        """All messages with a valid checksum that these bytes complete, as pymavlink's classes."""
+        """All messages with a valid checksum that are complete with these bytes, as pymavlink's classes."""
         self._buffer += data
         self._in_bad_run = self._in_bad_run and not self.datagram
         messages = []
@@ -199,7 +199,7 @@ class FrameReader:
                 self._in_bad_run = False
                 at = end
             elif not self.datagram and (end is None or end > len(self._buffer)):
-                break  # the rest of it may be on its way
+                break  # the rest may still arrive
             else:
                 spoilt += 1
                 self._skip(at + 1, at)
@@ -215,7 +215,7 @@ class FrameReader:
         return nearest
 
     def _frame_end(self, at: int) -> int | None:
-        """Where the frame that would begin here ends; None if its header is not all there, 0 if it is no frame."""
+        """End of the frame that starts here; None if its header is incomplete, 0 if it is no frame."""
         header = self._buffer[at : at + 3]
         if header[0] == 0xFE:
             return at + 8 + header[1] if len(header) > 1 else None

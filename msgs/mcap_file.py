@@ -1,4 +1,4 @@
-"""One MCAP file that is readable up to its last flush, however the program ends."""
+"""An MCAP file that stays readable up to its last flush, even if the program crashes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PROFILE = "ros2"
 
 
 class McapFile:
-    """A file being written; every method may raise OSError. Nothing is compressed: CDR floats hardly shrink."""
+    """A file being written; every method may raise OSError. Not compressed: CDR floats hardly compress."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -39,7 +39,7 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes in the file, without the chunk that is gathered."""
+        """Bytes in the file, without the chunk still in memory."""
         return self._stream.tell()
 
     def write(self, name: str, ros_type: str, payload: bytes, log_ns: int, publish_ns: int) -> None:
@@ -50,7 +50,7 @@ class McapFile:
         self._writer.add_message(channel, log_ns, payload, publish_ns)
 
     def flush(self) -> None:
-        """Put all that was written on the disk as a chunk."""
+        """Write everything so far to disk as a chunk."""
         self._writer.flush()
         self._stream.sync()
 
@@ -63,7 +63,7 @@ class McapFile:
             self._stream.close()
 
     def abandon(self) -> None:
-        """Close with what is whole: for when writing has failed. Raises nothing."""
+        """Close after a write error, keeping the complete part. Raises nothing."""
         with contextlib.suppress(OSError):
             self._stream.close()
         with contextlib.suppress(OSError):
@@ -77,12 +77,12 @@ class McapFile:
 
 
 class _Stream:
-    """What mcap's writer writes to. Unlike Python's files it holds nothing back, so a full disk is told where it is
-    met, and closing it does not try again."""
+    """Unbuffered output for mcap's writer. Unlike with Python's files, a full disk raises in the call that hits it,
+    and closing does not try to write again."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        # While it is held, no other recorder takes the file for one that a crash left.
+        # The lock tells other recorders that this file was not left by a crash.
         fcntl.flock(self._fd, fcntl.LOCK_EX)
         self._at = 0
 
@@ -98,7 +98,7 @@ class _Stream:
         return self._at
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing is buffered."""
 
     def sync(self) -> None:
         os.fdatasync(self._fd)
@@ -108,10 +108,10 @@ class _Stream:
 
 
 def is_written(path: Path) -> bool:
-    """Whether somebody writes to it at present. Raises OSError."""
+    """Whether a recorder is currently writing to it. Raises OSError."""
     with open(path, "rb") as file:
         try:
-            # Shared, so that two who only ask do not take each other for a writer.
+            # Shared, so that two concurrent checks do not mistake each other for a writer.
             fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
@@ -119,10 +119,11 @@ def is_written(path: Path) -> bool:
 
 
 def finish_unfinished(path: Path) -> bool:
-    """Make a file that a crash left unfinished whole: cut the torn record off and write the end; whether it was one.
+    """Repair a file left unfinished by a crash: cut off the incomplete record and write the footer. Returns whether it
+    was unfinished.
 
-    Readers without an index read all. A file that somebody writes to is left alone; one without any record is
-    removed. Raises OSError.
+    There is no index, so readers scan the whole file. A file being written is left alone, one without any complete
+    record is removed. Raises OSError.
     """
     with open(path, "r+b") as file:
         try:
@@ -154,15 +155,15 @@ def _is_whole(opcode: int, record: bytes) -> bool:
             Header.read(stream)
             return True
         chunk = Chunk.read(stream)
-    except Exception:  # whatever the reader makes of bytes that are not what they say
+    except Exception:  # the reader may raise anything on corrupt bytes
         return False
-    # Zeros are a chunk with nothing in it, whose checksum is right.
+    # The length check is for zeros: they parse as an empty chunk with a correct checksum.
     return stream.count == len(record) and zlib.crc32(chunk.data) == chunk.uncompressed_crc
 
 
 def _whole_bytes(file: BinaryIO, size: int) -> int:
-    """Where the last whole chunk, or else the header, ends; 0 without one. A file system may have left zeros in the
-    place of what was never written."""
+    """End of the last complete chunk, or else of the header; 0 without either. After a crash, the file system may have
+    left zeros in place of data that was never written."""
     file.seek(0)
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         return 0

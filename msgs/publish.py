@@ -1,4 +1,4 @@
-"""Publishing rows of the topic table on a zenoh session, as a ROS 2 node would."""
+"""Publishing the topics of the topic table on a zenoh session, as a ROS 2 node would."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HEARTBEAT_S = 1.0
 
 
 class TopicPublisher:
-    """One publisher and its liveliness token. Use it from one thread; made by `Node.publisher`."""
+    """One publisher and its liveliness token. Not thread-safe; created by `Node.publisher`."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class TopicPublisher:
         self._publisher.put(payload, attachment=topics.attachment(self.sequence, time.time_ns(), self._gid))
 
     def matching(self) -> bool:
-        """Whether anybody subscribes; one with a cache cannot tell. Raises zenoh.ZError once the session is closed."""
+        """Whether anybody subscribes; always True with a cache. Raises zenoh.ZError once the session is closed."""
         if not isinstance(self._publisher, zenoh.Publisher):
             return True
         status: Any = self._publisher.matching_status
@@ -51,9 +51,9 @@ class TopicPublisher:
 
 
 class Node:
-    """The ROS 2 node `/<uav>/<name>` on a session; its publishers go when it is closed.
+    """The ROS 2 node `/<uav>/<name>` on a session; closing it closes its publishers.
 
-    With the distribution "off" nothing is announced to ROS and keys end after the topic.
+    With the distribution "off" nothing is announced to ROS, and keys end after the topic.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Node:
         self._token = self._announce(topics.node_token(self._zid, _NODE_ID, uav, domain=domain, node=name))
 
     def publisher(self, topic: Topic, target: str | None = None) -> TopicPublisher:
-        """Declare a publisher for a row with its quality of service; `target` (`t0`, …) where each has its own."""
+        """Declare a publisher for a topic with its quality of service; `target` (`t0`, …) for per-target topics."""
         self._entity_id += 1
         names = {"domain": self._domain, "distribution": self._distribution}
         key = topics.publication_key(topic, self._uav, target, **names)  # type: ignore[arg-type]
@@ -114,9 +114,9 @@ class Node:
 
 
 def declare(session: zenoh.Session, topic: Topic, key: str) -> zenoh.Publisher | ext.AdvancedPublisher:
-    """A zenoh publisher on `key` with the row's quality of service; with a cache for late joiners if the row says."""
-    # Never "express": each sample would be a batch of its own, and the queue has room for few. With eight targets it
-    # waited for room and lost some even on loopback, and arrived no sooner.
+    """A zenoh publisher on `key` with the topic's quality of service and, if it has one, its cache."""
+    # Never "express": each sample would be its own batch, and the queue holds few. With eight targets, samples waited
+    # for room, some were lost even on loopback, and latency was no lower.
     quality = {
         "encoding": topics.encoding(topic),
         "congestion_control": topic.congestion,

@@ -1,5 +1,5 @@
-"""Judging poses as they arrive: decode, then refuse what is old, repeated, out of order or of a second publisher, and
-count why."""
+"""Validating received poses: decodes them, refuses those that are old, repeated, out of order or from a second
+publisher, and counts refusals by reason."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from msgs.wire import PayloadError, Refusal
 
 _NS = 1_000_000_000
 _PUBLISHERS_REMEMBERED = 16
-_SILENT_NS = _NS  # of one publisher, until another is taken for its successor
+_SILENT_NS = _NS  # silence of a publisher after which another is accepted as its successor
 
 
 @dataclass(frozen=True, eq=False)
 class TargetPose:
-    """A pose that was taken: target `target` (`t0`, …) of `uav`, in `cam`."""
+    """An accepted pose: target `target` (`t0`, …) of `uav`, in `cam`."""
 
     uav: str
     target: str
     pose: PoseWithCovarianceStamped
     sequence: int
-    arrival_ns: int  # UTC, when it was judged
+    arrival_ns: int  # UTC of reception
 
     @property
     def stamp_ns(self) -> int:
@@ -33,18 +33,18 @@ class TargetPose:
 
     @property
     def rotation_known(self) -> bool:
-        """False: the quaternion is a placeholder; how the target is turned is not known."""
+        """False: the quaternion is a placeholder, the target's attitude is unknown."""
         return rotation_estimated(self.pose.covariance)
 
     @property
     def age_s(self) -> float:
-        """Time from exposure to arrival, as far as the two clocks agree."""
+        """Time from exposure to arrival, including the offset between the two clocks."""
         return (self.arrival_ns - self.pose.stamp_ns) / _NS
 
 
 @dataclass(frozen=True)
 class _Last:
-    """The newest pose taken of a target."""
+    """The newest accepted pose of a target."""
 
     stamp_ns: int
     arrival_ns: int
@@ -52,12 +52,12 @@ class _Last:
 
 
 class PoseReceiver:
-    """Takes the poses of one UAV's targets and counts what it refuses, by reason.
+    """Validates the poses of one UAV's targets and counts refusals by reason.
 
-    A vehicle has one daemon at a time: of two under one name the first that was heard is believed, until nothing of it
-    was taken for a second, as when it was restarted. They are told apart by their zenoh sessions (`sender`), and where
-    those are not known by the publisher of each target.
-    Ages compare the sender's clock with ours: `max_age_s` and `max_future_s` must allow for their difference.
+    A vehicle has one daemon at a time. If two publish under one name, the first one received is accepted until none of
+    its poses has been accepted for one second (as after a restart). They are distinguished by their zenoh session
+    (`sender`) or, where that is unknown, by the publisher gid of each target.
+    Ages compare the sender's clock with ours: `max_age_s` and `max_future_s` must allow for their offset.
     """
 
     def __init__(self, uav: str, *, domain: int = 0, max_age_s: float = 1.0, max_future_s: float = 0.5) -> None:
@@ -69,13 +69,13 @@ class PoseReceiver:
         self._max_future_ns = round(max_future_s * _NS)
         self._sequences: dict[tuple[str, bytes], int] = {}
         self._last: dict[str, _Last] = {}
-        self._sender: tuple[str, int] | None = None  # whose poses are taken, and when one last was
+        self._sender: tuple[str, int] | None = None  # accepted session, and UTC ns of its last accepted pose
 
     def believes(self, sender: str, now_ns: int) -> bool:
-        """Whether what that session sends, of whatever kind, goes with the poses that are taken; '' may be."""
+        """Whether messages of that session, of any topic, belong to the accepted daemon; True for '' (unknown)."""
         if not sender or self._sender is None or self._sender[0] == sender:
             return True
-        # Set back, our clock tells nothing of how long the other has been silent.
+        # A negative difference means that our clock was set back, so the silence cannot be measured.
         return not 0 <= now_ns - self._sender[1] <= _SILENT_NS
 
     def receive(self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str = "") -> TargetPose | None:
@@ -109,7 +109,7 @@ class PoseReceiver:
             raise PayloadError(Refusal.SEQUENCE)
         if pose.stamp_ns - now_ns > self._max_future_ns:
             raise PayloadError(Refusal.FUTURE)
-        # One that lies ahead is of a clock that was set back since: it must not keep poses out until that time comes.
+        # If the last stamp lies in the future, a clock was set back since: do not refuse all poses until then.
         overtakes = last is None or pose.stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > self._max_future_ns
         if now_ns - pose.stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
@@ -118,7 +118,7 @@ class PoseReceiver:
         return TargetPose(self._uav, target, pose, sequence, now_ns)
 
     def _remember(self, target: str, gid: bytes, sequence: int) -> None:
-        # The newest goes last, so that a flood of made-up publishers cannot grow this without bound.
+        # Bounded, newest last, so that a flood of fake publishers cannot exhaust memory.
         self._sequences.pop((target, gid), None)
         self._sequences[target, gid] = sequence
         while len(self._sequences) > _PUBLISHERS_REMEMBERED:

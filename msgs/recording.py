@@ -1,7 +1,8 @@
 """Recording samples as MCAP with the ROS 2 profile: the same CDR bytes as on the wire, under the same topic names.
 
-A thread of its own writes; `record` never waits. Each second what came is a chunk on disk, so a crash loses at most
-that; files left unfinished are closed at the next start. A full disk ends the recording, never the program.
+A separate thread writes; `record` never blocks. New samples are written to disk as a chunk every second, so a crash
+loses at most one second; files left unfinished are repaired at the next start. A full disk stops the recording, never
+the program.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from msgs.topics import Topic
 
 log = logging.getLogger(__name__)
 
-WAITING_MAX = 4096  # samples, for a disk that stalls
-WAITING_BYTES_MAX = 64 * 1024**2  # pictures are large
-STANDING_MAX = 256  # so that made-up names cannot grow it without bound
+WAITING_MAX = 4096  # samples buffered while the disk stalls
+WAITING_BYTES_MAX = 64 * 1024**2  # images are large
+STANDING_MAX = 256  # bounds memory against fake names
 FLUSH_S = 1.0
 RETRY_S = 3.0
-CLOCK_STEP_NS = 500_000_000  # a larger one, as when the time comes from the network, begins another file
-GAPS_S = 10.0  # between two words on a disk that does not keep up
+CLOCK_STEP_NS = 500_000_000  # a larger step of UTC, as by network time, starts a new file
+GAPS_S = 10.0  # between two warnings about a disk that is too slow
 STOP_TIMEOUT_S = 10.0
 
 WhenFull = Literal["oldest", "stop"]
@@ -40,36 +41,36 @@ Tell = Callable[[int, str], None]
 
 @dataclass(frozen=True)
 class RecordingLimits:
-    """When a file ends and the next begins, and how much of the disk all of them may take."""
+    """When to start a new file, and how much disk space all files may use."""
 
     file_bytes_max: int = 256 * 1024**2
     file_seconds_max: float = 600.0
-    total_bytes_max: int | None = None  # of all files of this recorder; None: only the disk's end counts
-    free_bytes_min: int = 1024**3  # left on the disk for others
+    total_bytes_max: int | None = None  # of all files of this recorder; None: limited only by free_bytes_min
+    free_bytes_min: int = 1024**3  # to be left free on the disk
     when_full: WhenFull = "oldest"  # remove the oldest recordings, or stop
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What is to be written."""
+    """A sample to be written."""
 
     topic: Topic
-    name: str  # with vehicle and target
+    name: str  # topic name with vehicle and target
     payload: bytes
     log_ns: int  # UTC, when it was recorded
     publish_ns: int  # UTC, when it was put
-    clock_ns: int  # how far UTC was ahead of the monotonic clock when it was recorded
+    clock_ns: int  # UTC minus monotonic clock at the time of recording
 
     @property
     def monotonic_ns(self) -> int:
-        """When it was recorded, by the clock that nobody sets."""
+        """Time of recording on the monotonic clock."""
         return self.log_ns - self.clock_ns
 
 
 class Recorder:
-    """Writes `<stem>_<number>_<UTC>.mcap` files into a folder; used from any thread.
+    """Writes `<stem>_<number>_<UTC>.mcap` files into a folder; thread-safe.
 
-    `tell(level, text)` hears what an operator should know (levels as in rcl_interfaces/Log), on the recorder's thread.
+    `tell(level, text)` receives messages for the operator (levels as in rcl_interfaces/Log), on the recorder's thread.
     """
 
     def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell, *, on: bool = True) -> None:
@@ -79,7 +80,7 @@ class Recorder:
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
         self._waiting_bytes = 0
-        self._overflowed = 0  # lost since it was last told, as too many waited
+        self._overflowed = 0  # lost to a full buffer since the last warning
         self._gaps_due_s = 0.0
         self._standing: dict[str, Sample] = {}
         self._counters: Counter[str] = Counter()
@@ -90,14 +91,14 @@ class Recorder:
         self._opened_s = 0.0
         self._clock_ns = 0  # of the file's first sample
         self._retry_s = 0.0
-        self._failure: str | None = None  # while it is there what comes is lost
-        self._stopped = False  # as it was told: from a failure until something is on the disk again
-        self._holds_samples = False  # the file, on the disk
+        self._failure: str | None = None  # while set, new samples are lost
+        self._stopped = False  # as reported: from a failure until samples are written again
+        self._holds_samples = False  # whether the file on disk contains samples
         self._thread: threading.Thread | None = None
 
     @property
     def recording(self) -> bool:
-        """Whether what comes is written: wanted, and the disk lets it."""
+        """Whether samples are being recorded: switched on, and the disk works."""
         with self._changed:
             return self._wanted and self._failure is None and not self._stopping
 
@@ -106,7 +107,7 @@ class Recorder:
         self._thread.start()
 
     def record(self, topic: Topic, uav: str, target: str | None, payload: bytes, publish_ns: int) -> None:
-        """Take a sample to be written, if it is switched on; never waits. Lost, and counted, when the disk fails."""
+        """Queue a sample for writing if recording is on; never blocks. Dropped and counted if the disk fails."""
         log_ns, clock_ns = time.time_ns(), _utc_ahead_ns()
         sample = Sample(topic, topics.topic_name(topic, uav, target), payload, log_ns, publish_ns, clock_ns)
         with self._changed:
@@ -119,19 +120,19 @@ class Recorder:
                 self._counters["lost"] += 1
                 self._overflowed += self._failure is None
             else:
-                # Nobody is woken: the writer comes by each second.
+                # No notify: the writer polls every second.
                 self._waiting.append(sample)
                 self._waiting_bytes += len(payload)
 
     def switch(self, on: bool) -> None:
-        """Go on with a new file, or end the present one; returns at once."""
+        """Start a new file, or end the current one; returns immediately."""
         with self._changed:
             self._wanted = on
             self._woken = True
             self._changed.notify()
 
     def stop(self) -> None:
-        """Write what waits and close the file. May be called twice, or without start."""
+        """Write queued samples and close the file. May be called more than once, and without start."""
         with self._changed:
             self._stopping = self._woken = True
             self._changed.notify()
@@ -156,7 +157,7 @@ class Recorder:
                 try:
                     self._turn(runs[0], go_on or len(runs) > 1)
                 except Exception as error:
-                    # A full disk as a rule; but whatever it is, it must not silently end the recorder.
+                    # Usually a full disk; but no error may silently end the recorder thread.
                     self._fail(error, sum(map(len, runs)))
                     break
                 with self._changed:
@@ -176,7 +177,7 @@ class Recorder:
         self._tell(logging.WARNING, text)
 
     def _turn(self, samples: Sequence[Sample], go_on: bool) -> None:
-        """One second's work: write, put it on the disk, and begin another file where the limits or the clock say."""
+        """Write the samples and flush them to disk; start a new file if limits or a clock step require it."""
         if samples and abs(samples[0].clock_ns - self._clock_ns) > CLOCK_STEP_NS:
             self._end_file()
         if samples or (self._failure is not None and go_on):
@@ -211,7 +212,7 @@ class Recorder:
         self._clock_ns = samples[0].clock_ns if samples else _utc_ahead_ns()
         with self._changed:
             standing = list(self._standing.values())
-        # What is told on change alone is repeated, so that each file can be read without those before it.
+        # Repeat the latest samples of topics that are sent on change only, so that each file is self-contained.
         began_ns = min((one.log_ns for one in samples), default=time.time_ns())
         for one in standing:
             if one not in samples and (not samples or one.monotonic_ns <= samples[-1].monotonic_ns):
@@ -220,7 +221,7 @@ class Recorder:
             self._set_failure(None)
 
     def _tell_going(self) -> None:
-        """A file that could be begun is not enough: a disk may have room for its first bytes and no more."""
+        """Report recovery only after samples were written: a disk may have room for a file's first bytes only."""
         if not self._stopped:
             return
         self._stopped = False
@@ -228,7 +229,7 @@ class Recorder:
         self._tell(logging.INFO, "recording again")
 
     def _fail(self, error: Exception, lost: int) -> None:
-        """Leave what is whole on the disk, say so once, and try again later."""
+        """Keep the complete part of the file, report the failure once, and retry later."""
         if self._file is not None:
             file, self._file = self._file, None
             file.abandon()
@@ -258,7 +259,7 @@ def _utc_ahead_ns() -> int:
 
 
 def _between_clock_steps(samples: Iterable[Sample]) -> list[list[Sample]]:
-    """The samples, in runs within which the clock was not set: of two sides of a step a file would show both as one."""
+    """The samples split at clock steps: in one file, both sides of a step would appear on one timeline."""
     runs: list[list[Sample]] = []
     for sample in samples:
         if not runs or abs(sample.clock_ns - runs[-1][0].clock_ns) > CLOCK_STEP_NS:
@@ -268,9 +269,9 @@ def _between_clock_steps(samples: Iterable[Sample]) -> list[list[Sample]]:
 
 
 class Store:
-    """The folder: numbered files, the oldest first to go. Numbers, since a clock may be wrong or be set back.
+    """The folder of numbered files, the oldest removed first. Numbered, since a clock may be wrong or be set back.
 
-    Other recorders may write into it at the same time: their files count, and stay until they are closed.
+    Other recorders may write into it at the same time: their files count, but are not removed until they are closed.
     """
 
     def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell) -> None:
@@ -293,7 +294,7 @@ class Store:
             try:
                 finish_unfinished(path)
             except OSError as error:
-                # What cannot be mended is no reason to record no more.
+                # A file that cannot be repaired must not prevent recording.
                 log.warning("%s is left unfinished: %s", path, error)
 
     def new_file(self) -> McapFile:
@@ -304,9 +305,9 @@ class Store:
         return McapFile(self._folder / f"{self._stem}_{number:06d}_{began}.mcap")
 
     def make_room(self) -> None:
-        """Keep to the limits, by removing the oldest if they may go. Raises OSError when there is no room.
+        """Enforce the limits, by removing the oldest files if allowed. Raises OSError if there is no room.
 
-        Nothing is removed where even all that may go would not do, as on a disk that others have filled.
+        Nothing is removed if removing all files would not suffice, as on a disk filled by other data.
         """
         if (short := self._bytes_short()) <= 0:
             return
@@ -317,7 +318,7 @@ class Store:
                 if sum(map(_size_of, files)) < short:
                     raise OSError("no room left for recordings")
                 path = files.popleft()
-                with suppress(OSError):  # of what cannot be removed the next may be
+                with suppress(OSError):  # if it cannot be removed, the next may be
                     path.unlink()
                     removed.append(path.name)
                 short = self._bytes_short()
@@ -328,7 +329,7 @@ class Store:
                 self._tell(logging.INFO, text)
 
     def _removable(self) -> list[Path]:
-        """Oldest first."""
+        """This recorder's closed files, oldest first."""
         removable = []
         for path in self.files():
             with suppress(OSError):
@@ -337,7 +338,7 @@ class Store:
         return removable
 
     def _bytes_short(self) -> int:
-        """How much must go until all limits are kept."""
+        """Bytes that must be removed to meet all limits."""
         short = self._limits.free_bytes_min - shutil.disk_usage(self._folder).free
         if (total_max := self._limits.total_bytes_max) is not None:
             short = max(short, sum(map(_size_of, self.files())) - total_max)
@@ -345,7 +346,7 @@ class Store:
 
 
 def _size_of(path: Path) -> int:
-    """Bytes; 0 for what cannot be looked at."""
+    """Size in bytes; 0 if it cannot be read."""
     with suppress(OSError):
         return path.lstat().st_size
     return 0

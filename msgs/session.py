@@ -1,7 +1,7 @@
-"""zenoh session settings: the UAV is a peer, the ground a router, its tools are clients.
+"""zenoh session settings: the UAV is a peer, the ground station a router, its tools are clients.
 
-No discovery unless asked for, timestamps on (cached topics need them), and a lease short enough that an outage is
-noticed within seconds.
+Discovery is off unless requested, timestamps are on (cached topics need them), and the lease is short enough that an
+outage is detected within seconds.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from typing import Any
 import zenoh
 
 LEASE_MS = 2000
-# Whoever accepts a connection and then says nothing holds up an opening, or a closing meanwhile, for so long.
+# How long a peer that accepts a connection and then stays silent can block opening (or closing) a session.
 OPEN_TIMEOUT_MS = 4000
-# QUIC sends what was lost again after 1, 3 and 7 s. A router takes one QUIC handshake at a time and waits 30 s for one
-# that was given up and whose farewell was lost, so on a bad radio who gives up sooner keeps it from hearing anyone.
+# QUIC retransmits after 1, 3 and 7 s. A router handles one QUIC handshake at a time, and waits 30 s for one that the
+# other end abandoned if the close packet was lost. On a bad radio, giving up sooner would therefore block the router.
 QUIC_OPEN_TIMEOUT_MS = 10_000
 RETRY_PERIOD_MS = 200
 RETRY_PERIOD_MAX_MS = 500
-# zenoh's own 2 are not enough: while a busy machine sends those, poses of the same frame find no room and are lost.
+# zenoh's default of 2 is too small: on a busy machine both may still be being sent, and poses of the same frame are
+# then dropped.
 POSE_BATCHES = 4
-# On a link whose poses are capped: what a person needs beside them, and no more.
+# Rates on a link whose poses are capped: enough for a human operator.
 TF_RATE_MAX_HZ = 5.0
 DETECTIONS_RATE_MAX_HZ = 2.0
 SECURE = ("tls", "quic")
-CALLING = "calling"  # name of the thread that opens a session which its caller may not wait for
-_NO_CHECK_TIME = 0x200000  # OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which ssl has no name for
+CALLING = "calling"  # name of the thread that opens a session for a caller that must not block
+_NO_CHECK_TIME = 0x200000  # OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which the ssl module does not define
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/((\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+):(\d{1,5}))([?#].*)?")
 
 
 @dataclass(frozen=True)
 class TlsFiles:
-    """Mutual TLS for `tls/` and `quic/` endpoints: PEM files; the certificate serves for listening and connecting."""
+    """PEM files for mutual TLS on `tls/` and `quic/` endpoints; one certificate for listening and connecting."""
 
     root_ca: Path
     certificate: Path
     private_key: Path
 
     def check(self) -> None:
-        """Raises ValueError, a sentence that names the file, if they would not do: zenoh says so late or never."""
+        """Raises ValueError, naming the file, if they are unusable: zenoh reports that late or never."""
         for path in (self.root_ca, self.certificate, self.private_key):
             try:
                 path.read_bytes()
@@ -66,16 +67,16 @@ class TlsFiles:
             raise ValueError(f"{self.private_key} is not the PEM key of {self.certificate}") from error
 
     def doubt(self) -> str | None:
-        """Why others may well refuse files that pass `check`: another authority, or another day; a sentence.
+        """Why peers may refuse files that pass `check`, as a sentence: issued by another CA, or not valid today.
 
-        Either may be right all the same, where the two ends have authorities of their own, or our clock is wrong.
+        Only a warning: the two ends may use different CAs, or our clock may be wrong.
         """
         try:
             own = self._vouched_for()
         except ssl.SSLError as error:
             why = error.verify_message if isinstance(error, ssl.SSLCertVerificationError) else error.reason
             return f"{self.certificate} is refused by whoever trusts {self.root_ca}: {why}"
-        # The authority's own dates are left alone: zenoh takes it for what it is told to trust, whatever they say.
+        # The CA's own dates are not checked: zenoh trusts the configured CA whatever its dates.
         begins_s, ends_s = (ssl.cert_time_to_seconds(own[key]) for key in ("notBefore", "notAfter"))
         now_s = time.time()
         if now_s < begins_s:
@@ -85,10 +86,10 @@ class TlsFiles:
         return None
 
     def _vouched_for(self) -> Mapping[str, Any]:
-        """The certificate, as whoever trusts root_ca sees it. Raises ssl.SSLError if that end would not take it, of
-        neither a server nor a client.
+        """The certificate as seen by a peer that trusts root_ca. Raises ssl.SSLError if that peer would accept it
+        neither from a server nor from a client.
 
-        ssl verifies in a handshake alone, so that one is held in memory.
+        The ssl module verifies only during a handshake, so one is performed in memory.
         """
         try:
             return self._handshake(own_is_server=True)
@@ -98,14 +99,14 @@ class TlsFiles:
             raise refused from None
 
     def _handshake(self, *, own_is_server: bool) -> Mapping[str, Any]:
-        """The own certificate as the other end sees it."""
+        """The own certificate as verified by the other end."""
         server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         client.check_hostname = False
         client.verify_mode = ssl.CERT_NONE
         verifier = client if own_is_server else server
         verifier.verify_mode = ssl.CERT_REQUIRED
         verifier.load_verify_locations(self.root_ca)
-        # As zenoh does, take an intermediate authority's certificate for root_ca.
+        # Like zenoh, accept an intermediate CA's certificate as root_ca.
         verifier.verify_flags |= ssl.VerifyFlags.VERIFY_X509_PARTIAL_CHAIN | _NO_CHECK_TIME
         for context in (server, client):
             context.load_cert_chain(self.certificate, self.private_key)
@@ -126,9 +127,9 @@ def _day(utc_s: float) -> str:
 
 
 def check_endpoint(endpoint: str, *, tls: bool) -> str:
-    """Return a zenoh endpoint that will do; raises ValueError, a sentence, for one that will not.
+    """Return a valid zenoh endpoint; raises ValueError with a complete message for any other.
 
-    Plain UDP is left out: it loses declarations for good.
+    Plain UDP is not allowed: a declaration lost on it is never repeated.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or int(match[4]) > 65535:
@@ -139,10 +140,10 @@ def check_endpoint(endpoint: str, *, tls: bool) -> str:
 
 
 def with_datagrams(endpoint: str) -> str:
-    """The endpoint, if it is `quic/`, with zenoh's `mixed_rel=1`: poses go as datagrams, commands as a stream.
+    """Adds zenoh's `mixed_rel=1` to a `quic/` endpoint: poses travel as datagrams, commands as a stream.
 
-    One end that has it and one that has not never link, and neither says why; so all ends of ours have it, and
-    `mixed_rel=0` is there for a router of others that has not.
+    Both ends must agree, or they never connect and neither reports why. All our endpoints therefore set it; specify
+    `mixed_rel=0` to connect to a foreign router that does not.
     """
     if not endpoint.startswith("quic/") or "mixed_rel=" in endpoint:
         return endpoint
@@ -158,11 +159,11 @@ def peer_config(
     tls: TlsFiles | None = None,
     pose_rate_max_hz: float | None = None,
 ) -> zenoh.Config:
-    """The daemon's session: opens whether or not anything listens at `connect`, and goes on trying.
+    """The daemon's session: opens whether or not anything listens at `connect`, and keeps retrying.
 
-    `pose_rate_max_hz` thins poses and odometry on quic, tls and udp links, and more than those the own ship's
-    transforms and detections, which come with each frame too; plain tcp, for tools on board, keeps all.
-    Raises zenoh.ZError for an endpoint that is no endpoint.
+    `pose_rate_max_hz` limits the rate of poses and odometry on quic, tls and udp links; the own ship's transforms and
+    the detections, also sent with each frame, are limited further. Plain tcp, for tools on board, is not limited.
+    Raises zenoh.ZError for a malformed endpoint.
     """
     config = _config("peer", listen, connect, discovery, tls)
     _insert(config, "connect/timeout_ms", -1)
@@ -186,7 +187,8 @@ def peer_config(
 def router_config(
     listen: Sequence[str], *, tls: TlsFiles | None = None, access_control: Mapping[str, Any] | None = None
 ) -> zenoh.Config:
-    """The ground's session, which UAVs and tools connect to; `access_control` is zenoh's section of that name."""
+    """The ground station's session, to which UAVs and tools connect; `access_control` is zenoh's section of that
+    name."""
     config = _config("router", listen, [], False, tls)
     if access_control is not None:
         _insert(config, "access_control", access_control)
@@ -194,13 +196,13 @@ def router_config(
 
 
 def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
-    """A tool's session. Opening it raises zenoh.ZError if none of the endpoints answers: at once where nobody listens,
+    """A tool's session. Opening it raises zenoh.ZError if no endpoint answers: immediately if nothing listens there,
     over QUIC after QUIC_OPEN_TIMEOUT_MS."""
     return _config("client", [], connect, False, tls)
 
 
 def _no_pictures_by_radio() -> dict[str, Any]:
-    """zenoh's section that keeps pictures off tls and quic links; all else passes."""
+    """zenoh's access control section that denies images on tls and quic links and allows everything else."""
     rule = {
         "id": "pictures",
         "permission": "deny",
@@ -225,7 +227,7 @@ def _config(
     listen, connect = [with_datagrams(one) for one in listen], [with_datagrams(one) for one in connect]
     config = zenoh.Config()
     _insert(config, "mode", mode)
-    # An empty list would keep the built-in default of listening everywhere.
+    # An empty list instead of this table would keep zenoh's default of listening on all interfaces.
     _insert(config, "listen/endpoints", {"router": listen, "peer": listen, "client": []})
     _insert(config, "connect/endpoints", connect)
     _insert(config, "scouting/multicast/enabled", discovery)

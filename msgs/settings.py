@@ -1,7 +1,7 @@
-"""Settings in TOML: read, held against a pydantic model, faults told by file and key to the person who wrote them.
+"""Settings in TOML: reads them, validates them with a pydantic model, and reports errors by file and key.
 
-Each package raises an error of its own, so every reader here takes the type to raise: one made from one sentence.
-Subscribers need none of this: msgs.client works without pydantic.
+Each package has its own exception type, so every reader here takes the type to raise; it is called with one message.
+Not needed by subscribers: msgs.client works without pydantic.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _KNOWN = {
 
 
 class Section(BaseModel):
-    """A table of settings: unknown keys are refused, `true` or "5" is no number, and what was read stays as it is."""
+    """A table of settings, frozen: unknown keys are refused and types are strict (`true` or "5" is no number)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -31,22 +31,22 @@ class Section(BaseModel):
 SomeSection = TypeVar("SomeSection", bound=BaseModel)
 Item = TypeVar("Item")
 
-# TOML has no paths and no tuples, so a section takes them of strings and of lists.
+# TOML has no paths and no tuples, so these accept strings and lists in spite of strict types.
 WrittenPath = Annotated[Path, Strict(False)]
 Pair = Annotated[tuple[Item, Item], Strict(False)]
 
 
 class Fault(NamedTuple):
-    """What is wrong at one key."""
+    """A validation error at one key."""
 
-    location: tuple[str | int, ...]  # keys and indices from the root; empty: the whole
+    location: tuple[str | int, ...]  # keys and indices from the root; empty: the whole file
     reason: str
     type: str  # pydantic's name for this kind of error
-    context: dict[str, Any]  # what pydantic adds to it
+    context: dict[str, Any]  # pydantic's parameters of the error
 
 
 def faults_of(error: ValidationError) -> list[Fault]:
-    """All that pydantic found, with reasons worded for a person."""
+    """All errors that pydantic found, with readable reasons."""
     return [
         Fault(
             item["loc"],
@@ -59,15 +59,15 @@ def faults_of(error: ValidationError) -> list[Fault]:
 
 
 def dotted(location: tuple[str | int, ...]) -> str:
-    """`splits.test.frames` for a key of a file; empty for the whole of it."""
-    # "[key]" is pydantic's way of telling a mapping's key from its value.
+    """A location as a dotted key, e.g. `splits.test.frames`; empty for the whole file."""
+    # pydantic adds "[key]" where a mapping's key, not its value, is wrong.
     return ".".join(str(part) for part in location if part != "[key]")
 
 
 def read_text(path: Path, raising: type[Exception]) -> str:
-    """The file's text. Raises `raising`, with the path and the reason."""
+    """The file's text. Raises `raising`, naming the path and the reason."""
     try:
-        return path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
+        return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise raising(f"{path}: cannot be read: {reason}") from error
@@ -93,7 +93,7 @@ def parse_settings(
     raising: type[Exception],
     name_key: Callable[[tuple[str | int, ...]], str] = dotted,
 ) -> SomeSection:
-    """TOML text, which lies at `place`, as `model`. Raises `raising`: a line a fault, each naming place and key."""
+    """TOML text from `place` as `model`. Raises `raising` with one line per error, each naming place and key."""
     tree = parse_toml(text, place, raising)
     try:
         return model.model_validate(tree)
@@ -108,10 +108,10 @@ def load_settings(
     raising: type[Exception],
     name_key: Callable[[tuple[str | int, ...]], str] = dotted,
 ) -> SomeSection:
-    """A TOML file as `model`. Raises `raising`, as `parse_settings` does and where the file cannot be read."""
+    """A TOML file as `model`. Raises `raising` like `parse_settings`, and if the file cannot be read."""
     return parse_settings(read_text(path, raising), path, model, raising, name_key)
 
 
 def toml_value(value: object) -> str:
-    """A string, number, boolean or list of these as TOML of one line: JSON writes them as TOML does."""
+    """A string, number, boolean or list of these as one line of TOML, whose syntax for them is JSON's."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""Signals heard by a thread of their own, so that a process obeys whatever its main thread is waiting for."""
+"""Signal handling in a separate thread, so that a process reacts whatever its main thread is blocked on."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from collections.abc import Callable, Mapping
 def on_signals(actions: Mapping[signal.Signals, Callable[[], object]]) -> None:
     """From now on call an action for each of these signals, in the thread `signals`, in the order of their arrival.
 
-    Python runs a handler in the main thread alone. When the kernel gives the signal to another thread, as it may to
-    any of zenoh's, a main thread that sleeps in a lock never wakes to run it; the wake-up descriptor is written at
-    once, by whichever thread it was. An action may take locks, which a handler must not.
+    Python runs signal handlers in the main thread only. If the kernel delivers the signal to another thread, e.g. one
+    of zenoh's, a main thread that waits for a lock never wakes up to run the handler; the wake-up descriptor, however,
+    is written immediately by whichever thread received it. Unlike a handler, an action may take locks.
 
-    For the main thread of a process, once; raises ValueError in another.
+    Call once, in the main thread; raises ValueError in another.
     """
     heard, told = os.pipe()
     os.set_blocking(told, False)
     signal.set_wakeup_fd(told, warn_on_full_buffer=False)
     for number in actions:
-        signal.signal(number, lambda *_: None)  # without a handler nothing is written
+        signal.signal(number, lambda *_: None)  # without a handler, the wake-up descriptor is not written
     threading.Thread(target=_obey, args=(heard, dict(actions)), name="signals", daemon=True).start()
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and SIGINT (Ctrl-C) set. As `on_signals`: in the main thread, once."""
+    """An event that SIGTERM and SIGINT (Ctrl-C) set. Like `on_signals`, call once, in the main thread."""
     stop = threading.Event()
     on_signals(dict.fromkeys((signal.SIGTERM, signal.SIGINT), stop.set))
     return stop
@@ -35,5 +35,5 @@ def stop_on_signals() -> threading.Event:
 def _obey(heard: int, actions: Mapping[signal.Signals, Callable[[], object]]) -> None:
     while numbers := os.read(heard, 64):
         for number in numbers:
-            if number in actions:  # other code of the process may have handlers of its own
+            if number in actions:  # other code in the process may have installed handlers too
                 actions[signal.Signals(number)]()

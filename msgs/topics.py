@@ -1,4 +1,4 @@
-"""The topic table, and how its rows are named on zenoh so that ROS 2 with rmw_zenoh_cpp sees them as its own.
+"""The topic table, and the zenoh names of its topics, chosen so that ROS 2 with rmw_zenoh_cpp sees native topics.
 
 Key     `<domain>/<topic>/<pkg>::msg::dds_::<Type>_/<hash>`
 Tokens  `@ros2_lv/<domain>/<zid>/<nid>/<nid>/NN/%/<namespace>/<node>` and
@@ -6,7 +6,7 @@ Tokens  `@ros2_lv/<domain>/<zid>/<nid>/<nid>/NN/%/<namespace>/<node>` and
 Sample  encoding `application/cdr;<pkg>/msg/<Type>`, attachment (sequence from 1, UTC ns, 16, gid)
 
 On Humble the hash is `TypeHashNotSupported`; with the distribution "off" the key ends after the topic.
-A subscription to `subscription_key` finds a topic under every distribution.
+`subscription_key` matches a topic under every distribution.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FRAME_CAMERA = "camera_optical_frame"  # cam: x right, y down, z forward
 FRAME_TARGET = "target_frd"
 FRAME_BODY = "base_link_frd"
 FRAME_NED = "ned"
-# ned axes at the own ship: where targets are told when its position is not known, moving with it.
+# NED axes with the origin at the own ship, moving with it: the targets' frame while the own position is unknown.
 FRAME_BODY_NED = "base_link_ned"
 
 _ROS_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -38,16 +38,16 @@ HASH_UNSUPPORTED = "TypeHashNotSupported"
 
 @dataclass(frozen=True)
 class Topic:
-    """One row: what is published, as which ROS 2 interface, and with which quality of service."""
+    """One row of the table: topic name, ROS 2 interface type and quality of service."""
 
-    name: str  # below `<uav>/`; `{target}` where each target has its own
+    name: str  # below `<uav>/`; contains `{target}` if each target has its own topic
     ros_type: str
     type_hash: str  # RIHS01 of the interface (REP 2011)
     reliability: Reliability
     congestion: CongestionControl
     priority: Priority
     rate: str
-    cache: int  # samples kept for who joins late; 0: none
+    cache: int  # samples kept for late joiners; 0: none
     recorded: bool
 
     @property
@@ -122,7 +122,7 @@ def _check_target_name(target: str) -> None:
 
 
 def topic_name(topic: Topic, uav: str, target: str | None = None) -> str:
-    """`<uav>/<topic>` without a leading slash. `target` is `t0`, `t1`, … and given exactly for per-target topics."""
+    """`<uav>/<topic>` without a leading slash. `target` (`t0`, `t1`, …) is required for per-target topics only."""
     check_uav_name(uav)
     if topic.per_target != (target is not None):
         raise ValueError(f"topic {topic.name!r} {'needs a' if topic.per_target else 'takes no'} target")
@@ -132,20 +132,20 @@ def topic_name(topic: Topic, uav: str, target: str | None = None) -> str:
 
 
 def dds_type(topic: Topic) -> str:
-    """The DDS spelling of the ROS type, e.g. `nav_msgs::msg::dds_::Odometry_`."""
+    """The ROS type in DDS notation, e.g. `nav_msgs::msg::dds_::Odometry_`."""
     package, _, name = topic.ros_type.split("/")
     return f"{package}::msg::dds_::{name}_"
 
 
 def type_hash(topic: Topic, distribution: Distribution) -> str:
-    """The hash chunk of key and token."""
+    """The type hash part of key and token."""
     return topic.type_hash if distribution == "jazzy" else HASH_UNSUPPORTED
 
 
 def publication_key(
     topic: Topic, uav: str, target: str | None = None, *, domain: int = 0, distribution: Distribution = "jazzy"
 ) -> str:
-    """The zenoh key a sample is put on. Raises ValueError for an illegal name."""
+    """The zenoh key on which samples are published. Raises ValueError for an invalid name."""
     stem = f"{domain}/{topic_name(topic, uav, target)}"
     if distribution == "off":
         return stem
@@ -153,9 +153,9 @@ def publication_key(
 
 
 def subscription_key(topic: Topic, uav: str, target: str | None = None, *, domain: int = 0) -> str:
-    """A key expression for the topic under every distribution; `target` None takes every target, `uav` "*" all.
+    """A key expression for the topic under every distribution; `target` None matches all targets, `uav` "*" all UAVs.
 
-    Raises ValueError for an illegal name: on its key nothing would ever come.
+    Raises ValueError for an invalid name: its key would never match anything.
     """
     if uav != "*":
         check_uav_name(uav)
@@ -164,9 +164,9 @@ def subscription_key(topic: Topic, uav: str, target: str | None = None, *, domai
     return f"{domain}/{uav}/{topic.name.format(target=target or '*')}/**"
 
 
-@lru_cache(maxsize=1024)  # the same few keys come at frame rate
+@lru_cache(maxsize=1024)  # called at frame rate with the same few keys
 def parse_key(key: str, uav: str, *, domain: int = 0) -> tuple[Topic, str | None] | None:
-    """(topic, target) that a sample's key belongs to, or None if it is no topic of this table."""
+    """(topic, target) of a sample's key, or None if it is not in this table."""
     prefix = f"{domain}/{uav}/"
     if not key.startswith(prefix):
         return None
@@ -185,7 +185,7 @@ def parse_key(key: str, uav: str, *, domain: int = 0) -> tuple[Topic, str | None
 
 
 def parse_any_key(key: str, *, domain: int = 0) -> tuple[str, Topic, str | None] | None:
-    """(uav, topic, target) of a sample's key, whoever's it is; None if it is no topic of this table."""
+    """(uav, topic, target) of a sample's key, of any UAV; None if it is not in this table."""
     first, _, rest = key.partition("/")
     uav = rest.partition("/")[0]
     if first != str(domain) or not _ROS_NAME.fullmatch(uav):
@@ -224,14 +224,14 @@ def node_token(zid: str, node_id: int, uav: str, *, domain: int = 0, node: str =
 
 
 def alive_token(uav: str) -> str:
-    """Liveliness token of the UAV's daemon, there while its link is, with or without ROS."""
+    """Liveliness token of the UAV's daemon, present while its zenoh link is up, with or without ROS."""
     return f"uavpose/@v1/{check_uav_name(uav)}/alive"
 
 
 def qos_chunk(topic: Topic) -> str:
-    """rmw_zenoh's shorthand: reliability, durability, history and depth, deadline, lifespan, liveliness.
+    """rmw_zenoh's QoS notation: reliability, durability, history and depth, deadline, lifespan, liveliness.
 
-    What equals the default profile is left empty: 2 is best effort, 1 is transient local.
+    Values of the default profile are left empty; reliability 2 is best effort, durability 1 is transient local.
     """
     reliability = "2" if topic.reliability == Reliability.BEST_EFFORT else ""
     durability = "1" if topic.cache else ""
@@ -250,7 +250,7 @@ def publisher_token(
     distribution: Distribution = "jazzy",
     node: str = NODE_NAME,
 ) -> str:
-    """Liveliness token of one publisher: what `ros2 topic list` and a ROS subscriber find it by."""
+    """Liveliness token of one publisher, by which `ros2 topic list` and ROS subscribers discover it."""
     return (
         f"@ros2_lv/{domain}/{zid}/{node_id}/{entity_id}/MP/%/{_mangle('/' + uav)}/{node}/"
         f"{_mangle('/' + topic_name(topic, uav, target))}/{dds_type(topic)}/{type_hash(topic, distribution)}/"
@@ -264,12 +264,12 @@ def gid(token: str) -> bytes:
 
 
 def attachment(sequence: int, time_ns: int, publisher_gid: bytes) -> bytes:
-    """What rides on each sample: sequence from 1, UTC ns of the put, the publisher's gid."""
+    """Attachment of each sample: sequence number from 1, UTC ns of the put, the publisher's gid."""
     return _ATTACHMENT.pack(sequence, time_ns, 16, publisher_gid)
 
 
 def parse_attachment(data: bytes) -> tuple[int, int, bytes] | None:
-    """(sequence, time_ns, gid), or None if the bytes are not such an attachment."""
+    """(sequence, time_ns, gid), or None if malformed."""
     if len(data) != _ATTACHMENT.size:
         return None
     sequence, time_ns, gid_length, publisher_gid = _ATTACHMENT.unpack(data)

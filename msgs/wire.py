@@ -1,4 +1,4 @@
-"""CDR as ROS 2 writes it (XCDR1, little-endian): the primitives, and the reasons to refuse a payload."""
+"""CDR as used by ROS 2 (XCDR1, little-endian): primitive types, and the reasons for refusing a payload."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HUGE = 1e150  # variances above it overflow when multiplied
 
 
 class Refusal(Enum):
-    """Why a sample from the wire was not taken."""
+    """Why a received sample was refused."""
 
     ENCAPSULATION = "not little-endian CDR"
     TRUNCATED = "ends before its last field"
@@ -99,7 +99,7 @@ class Writer:
 
 
 class Reader:
-    """Takes CDR fields off untrusted bytes. Every method raises PayloadError and nothing else."""
+    """Parses CDR fields from untrusted bytes. Methods raise PayloadError and nothing else."""
 
     def __init__(self, payload: bytes) -> None:
         if payload[:2] != _ENCAPSULATION[:2] or len(payload) < 4:
@@ -137,11 +137,11 @@ class Reader:
     def pose(self) -> tuple[Array, Array, Array]:
         """Position [3], unit quaternion [4] and covariance [6, 6] of a geometry_msgs/PoseWithCovariance.
 
-        It arrives at frame rate and is judged as plain floats: numpy takes longer to begin than 43 numbers are worth.
+        Called at frame rate, so it is validated in plain floats: for 43 numbers numpy's call overhead is larger.
         """
         start = self._take(_POSE.size, 8)
         numbers = _POSE.unpack_from(self._data, start)
-        # A sum tells of any inf or nan, and may overflow where all are finite.
+        # Any inf or nan makes the sum non-finite; so may an overflow of finite numbers, hence the second test.
         if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
             raise PayloadError(Refusal.NOT_FINITE)
         if not _is_unit(*numbers[3:7]):
@@ -153,7 +153,7 @@ class Reader:
         return values[:3], values[3:7], matrix
 
     def length(self, element_size_min: int) -> int:
-        """A sequence's length, refused if the bytes left cannot hold that many elements."""
+        """A sequence's length, refused if the remaining bytes cannot hold that many elements."""
         count = self.u32()
         if count * element_size_min > len(self._data) - self._at:
             raise PayloadError(Refusal.LENGTH)
@@ -221,7 +221,7 @@ class Reader:
 def is_covariance(matrix: Array) -> bool:
     """Whether a finite square [n, n] is symmetric positive semi-definite, up to rounding.
 
-    Judged on the correlation matrix, so that metres and radians weigh alike.
+    Tested on the correlation matrix, so that the tolerance does not depend on units (metres, radians).
     """
     variance = np.diagonal(matrix)
     if (variance < 0.0).any():
@@ -241,11 +241,11 @@ def _is_unit(x: float, y: float, z: float, w: float) -> bool:
 
 
 def _is_plainly_covariance(p: Sequence[float]) -> bool:
-    """Whether 36 finite numbers, row-major, are an exactly symmetric matrix that is positive definite once each
-    variance is raised by the tolerance: what nearly every sender sends. False leaves the verdict to `is_covariance`.
+    """Fast path of `is_covariance`: whether 36 finite numbers, row-major, are an exactly symmetric matrix that is
+    positive definite once each variance is raised by the tolerance, as nearly all are. If False, ask `is_covariance`.
 
-    L D L^T written out, since loops over six cost three times the arithmetic. Raising the variances of the matrix
-    raises the eigenvalues of its correlations, so metres and radians weigh alike here too.
+    L D L^T decomposition, unrolled: loops over six would take three times as long. Raising the variances raises the
+    eigenvalues of the correlation matrix, so the tolerance does not depend on units here either.
     """
     a, ab, ac, ad, ae, af, ba, b, bc, bd, be, bf, ca, cb, c, cd, ce, cf = p[:18]
     da, db, dc, d, de, df, ea, eb, ec, ed, e, ef, fa, fb, fc, fd, fe, f = p[18:]
@@ -256,7 +256,7 @@ def _is_plainly_covariance(p: Sequence[float]) -> bool:
     if not 0.0 < a < _HUGE:
         return False
     a *= raised
-    # From here lower-triangle names hold L D of their column, upper ones L.
+    # From here on, names of the lower triangle (ba, ca, ...) hold L D of their column, those of the upper one L.
     ab, ac, ad, ae, af = ba / a, ca / a, da / a, ea / a, fa / a
     b = b * raised - ab * ba
     if not 0.0 < b < _HUGE:

@@ -2,5 +2,5 @@
 
 import os
 
-# ONNX Runtime would tell its maker of every session; it reads this when it is loaded.
+# Disables ONNX Runtime's telemetry; read when it is loaded.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

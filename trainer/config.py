@@ -12,13 +12,13 @@ from msgs.contract import Span
 from msgs.settings import Pair, Section, WrittenPath, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
-Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a picture that the network sees, pixels
-Z_RANGE_M = (50.0, 600.0)  # what depth a network can tell at all
+Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a network input, pixels
+Z_RANGE_M = (50.0, 600.0)  # depths that a network can predict
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
 
 class ConfigError(ValueError):
-    """A configuration that a person must correct; the message names the file and the key."""
+    """An invalid configuration; the message names the file and the key."""
 
 
 class RenderingError(RuntimeError):
@@ -26,7 +26,7 @@ class RenderingError(RuntimeError):
 
 
 def made_folder(path: Path) -> Path:
-    """The folder, made if need be. Raises ConfigError if it cannot be."""
+    """Create the folder if it does not exist, and return it. Raises ConfigError if it cannot be created."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -35,7 +35,7 @@ def made_folder(path: Path) -> Path:
 
 
 def refuse_no_folder(path: Path) -> None:
-    """Raises ConfigError if made_folder could make none that can be written to: to be asked before long work."""
+    """Raises ConfigError if made_folder could not create a writable folder; a check before a long computation."""
     there = next(p for p in (path, *path.absolute().parents) if p.exists())
     if not there.is_dir():
         raise ConfigError(f"{path}: cannot be made a folder: {there} is a file")
@@ -69,7 +69,7 @@ class ModelConfig(Section):
     max_peaks: int = Field(4, ge=1, description="M: targets decoded for each image")
 
     def deployed(self) -> ModelConfig:
-        """The network that flies: without the heads that only training has, its weights those that it is given."""
+        """Configuration for inference: without training-only heads, and without loading pretrained weights."""
         return self.model_copy(update={"pretrained": False, "dense": False})
 
     @model_validator(mode="after")
@@ -100,7 +100,7 @@ class LossConfig(Section):
 
 
 class DatasetSource(Section):
-    """A BOP dataset whose pictures are trained on beside rendered windows."""
+    """A BOP dataset whose images are trained on in addition to rendered windows."""
 
     path: WrittenPath
     split: str = Field("train", description="folder of the dataset that is trained on")
@@ -135,7 +135,7 @@ class DataConfig(Section):
 
     @property
     def rendered_share(self) -> float:
-        """Of every batch: what the datasets leave."""
+        """Share of rendered windows in every batch: the remainder after the datasets."""
         rest = 1.0 - sum(source.share for source in self.datasets)
         return rest if rest > 1e-6 else 0.0
 
@@ -197,7 +197,7 @@ class RunConfig(Section):
 
 
 class ContractConfig(Section):
-    """What export writes into the model file and measurement cannot find out."""
+    """Parts of the model's contract that export cannot measure."""
 
     name: str
     acquire_size_wh: Pair[Side]
@@ -238,10 +238,10 @@ class TrainerConfig(Section):
 
 
 def parse_config(text: str, source: str) -> TrainerConfig:
-    """TOML text to a configuration. Raises ConfigError naming `source` and every wrong key."""
+    """TOML text to a configuration. Raises ConfigError naming `source` and every invalid key."""
     return parse_settings(text, source, TrainerConfig, ConfigError)
 
 
 def load_config(path: Path) -> TrainerConfig:
-    """Read a TOML file. Raises ConfigError when it is missing or wrong."""
+    """Read a TOML file. Raises ConfigError if it is missing or invalid."""
     return load_settings(path, TrainerConfig, ConfigError)

@@ -1,8 +1,8 @@
-"""The data feed: rendering processes make sampler batches ahead of training and deliver them in index order.
+"""The data feed: rendering processes prepare batches ahead of training and deliver them in index order.
 
-Sample i is a pure function of (seed, i, size), so the place in the stream is one integer and a resumed run sees
-exactly the samples that an unbroken one would have. Neither this nor `sources.py` imports torch: each rendering process
-would spend seconds on it and hold it in memory.
+Sample i is a pure function of (seed, i, size), so the position in the stream is one integer, and a resumed run sees
+exactly the samples of an uninterrupted one. Neither this nor `sources.py` imports torch, which would cost each
+rendering process seconds and memory.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Sampler(Protocol):
-    """What a feed needs: sim_replay.sampler.WindowSampler, or windows of a dataset, made ready to travel."""
+    """Source of a feed's batches: sim_replay.sampler.WindowSampler, or a DatasetSampler (returns TrainingBatch)."""
 
     def batch(self, first_index: int, count: int) -> SampleBatch | TrainingBatch: ...
 
 
 class TrainingBatch(NamedTuple):
-    """A sampler's batch made small to travel: dense labels at stride 4, boxes as centre and size."""
+    """A sampler's batch in compact form for transfer: dense labels at stride 4, boxes as centre and size."""
 
     image_bgr: NDArray[np.uint8]  # [N, H, W, 3]
     K: NDArray[np.float32]
@@ -47,15 +47,15 @@ class TrainingBatch(NamedTuple):
     t_cam_target_m: NDArray[np.float32]
     center_px: NDArray[np.float32]
     size_px: NDArray[np.float32]
-    coverage: NDArray[np.float32]  # [N, H/4, W/4]; NaN where the mask is not known
-    noc: NDArray[np.float32]  # [N, 3, H/4, W/4]; NaN where not known
-    others: NDArray[np.bool_]  # [N, H/4, W/4], where aircraft lie that are not the labelled one
+    coverage: NDArray[np.float32]  # [N, H/4, W/4]; NaN where the mask is unknown
+    noc: NDArray[np.float32]  # [N, 3, H/4, W/4]; NaN where unknown
+    others: NDArray[np.bool_]  # [N, H/4, W/4], aircraft other than the labelled one
     diameter_m: NDArray[np.float32]
-    airframe_id: NDArray[np.int32]  # [N], as in SampleBatch; -1 where not known
+    airframe_id: NDArray[np.int32]  # [N], as in SampleBatch; -1: unknown
 
 
 def training_batch(sample: SampleBatch) -> TrainingBatch:
-    """Pool the dense labels over 4x4 pixels (object coordinates over visible ones only) and split the boxes."""
+    """Pool the dense labels over 4x4 pixels (object coordinates over visible ones only) and convert the boxes."""
     visible = np.stack([_pooled(mask.astype(np.float32)) for mask in sample.mask])
     seen = [np.where(mask[..., None], noc, 0) for mask, noc in zip(sample.mask, sample.noc, strict=True)]
     noc = np.stack([_pooled(coordinates.astype(np.float32)) for coordinates in seen])
@@ -78,7 +78,7 @@ def training_batch(sample: SampleBatch) -> TrainingBatch:
 
 
 def _pooled(dense: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means [H/4, W/4, ...] over tiles of 4x4 pixels; OpenCV takes a third of NumPy's time."""
+    """Means [H/4, W/4, ...] over tiles of 4x4 pixels; OpenCV needs a third of NumPy's time."""
     rows, columns = dense.shape[:2]
     tiles_wh = (columns // DENSE_STRIDE, rows // DENSE_STRIDE)
     return np.asarray(cv2.resize(dense, tiles_wh, interpolation=cv2.INTER_AREA), np.float32)
@@ -87,8 +87,8 @@ def _pooled(dense: NDArray[np.float32]) -> NDArray[np.float32]:
 def _serve(
     open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, prefetch: int, out: Connection
 ) -> None:
-    """Body of a rendering process: batches first, first + stride, ... until the trainer is gone."""
-    # The trainer ends it: a signal to the whole group must not end it before the trainer has saved.
+    """Body of a rendering process: renders batches first, first + stride, ... until the trainer is gone."""
+    # The trainer terminates it: a signal to the whole process group must not end it before the trainer has saved.
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
@@ -117,10 +117,10 @@ def _send(made: queue.Queue[TrainingBatch | ConfigError | str | None], out: Conn
         try:
             out.send(batch)
         except ConnectionError:
-            os._exit(0)  # the trainer is gone, and nobody would ever empty the queue
+            os._exit(0)  # the trainer is gone, and the queue would never be emptied
         except BaseException:
             traceback.print_exc()
-            os._exit(1)  # or the trainer would wait for ever
+            os._exit(1)  # otherwise the trainer would wait for ever
 
 
 def _kill(processes: list[BaseProcess]) -> None:
@@ -141,31 +141,31 @@ class Feed:
         rank: int = 0,
         ranks: int = 1,
     ) -> None:
-        """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ...: each trains in one process."""
+        """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ..., those of one training process."""
         context = mp.get_context("spawn")
         self._turn = 0
         self._readers: list[Connection] = []
         self._processes: list[BaseProcess] = []
-        # Where nobody closes it: what multiprocessing waits for at the end of Python does not heed its signal.
+        # In case nobody closes it: at exit, multiprocessing waits for processes that ignore its SIGTERM.
         weakref.finalize(self, _kill, self._processes)
-        resource_tracker.ensure_running()  # it unblocks signals
+        resource_tracker.ensure_running()  # now, because starting it unblocks signals
         for worker in range(workers):
             reader, writer = context.Pipe(duplex=False)
             first = first_index + (worker * ranks + rank) * batch_size
             arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, prefetch, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
-            # Until it ignores them: it first imports for seconds.
+            # Blocked until the process ignores them itself, after seconds of imports.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
             try:
                 process.start()
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
             self._processes.append(process)
-            writer.close()  # or the end of one that is killed in the middle of a batch would not be seen
+            writer.close()  # otherwise the death of a renderer in the middle of a batch would go unnoticed
             self._readers.append(reader)
 
     def next(self) -> TrainingBatch:
-        """The next batch in index order. Raises RenderingError when its renderer failed, ConfigError for bad input."""
+        """The next batch in index order. Raises RenderingError if its renderer failed, ConfigError for bad input."""
         process = self._processes[self._turn]
         try:
             batch = self._readers[self._turn].recv()
@@ -197,9 +197,9 @@ class Feed:
 def render_once(
     open_sampler: Callable[[], Sampler], count: int, chunk: int = 16, rendered: Callable[[int], None] | None = None
 ) -> list[TrainingBatch]:
-    """Samples 0..count-1 (rounded up to whole chunks) through a renderer of their own, kept in memory.
+    """Samples 0..count-1 (rounded up to whole chunks) from a separate renderer, as a list in memory.
 
-    `rendered` hears how many there are after each chunk.
+    `rendered` is called with the number of samples after each chunk.
     """
     batches = []
     with Feed(open_sampler, chunk, 0) as feed:

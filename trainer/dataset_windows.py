@@ -1,6 +1,6 @@
-"""Training windows cut from the pictures of a BOP dataset, as the daemon cuts them, mixed with rendered ones.
+"""Training windows cut from the images of a BOP dataset as the daemon cuts them, mixed with rendered ones.
 
-What a picture does not tell is NaN: object coordinates always, the mask where the dataset has none.
+Missing labels are NaN: object coordinates always, the mask where the dataset has none.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
 TRACK_ZOOM = (0.75, 1.33)
 ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame when the acquire stage sees it
-VISIBLE_MIN = 0.35  # of the box inside the window, below which nothing is asked of the target
+VISIBLE_MIN = 0.35  # least share of the box inside the window for the target to be trained on
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 class DatasetSampler:
     """Window i is a pure function of (seed, i, size) and the dataset.
 
-    Raises ConfigError where that is unreadable, does not tell where a target is seen, or has all of them out of range.
+    Raises ConfigError if the dataset is unreadable, lacks visible boxes, or has all targets out of range.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class DatasetSampler:
 
     @property
     def shows_targets(self) -> bool:
-        """Whether any picture does."""
+        """Whether any image shows a target."""
         return any(target.box_visible_xyxy_px is not None for frame in self._frames for target in frame.targets)
 
     def batch(self, first_index: int, count: int) -> TrainingBatch:
@@ -76,7 +76,7 @@ class DatasetSampler:
         seen = [k for k, box in enumerate(boxes) if box is not None]
         chosen = int(rng.choice(seen)) if seen else None
         box = None if chosen is None else boxes[chosen]
-        # Where pixels are not square, windows are: an aircraft must not look longer or higher than it is.
+        # If the image's pixels are not square, the window's are nevertheless, so that the aircraft is not distorted.
         aspect = np.array([1.0, frame.K[0, 0] / frame.K[1, 1]])
         low, sides = self._cut(rng, None if box is None else box * np.tile(aspect, 2), np.array(frame_wh) * aspect)
         low, scale = low / aspect, self.size_px * aspect / sides
@@ -91,7 +91,7 @@ class DatasetSampler:
         return out
 
     def _cut(self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array) -> tuple[Array, Array]:
-        """First pixel's place [2] and sides [2], in the unit of the box and of the frame, of what the window shows."""
+        """Position of the first pixel [2] and sides [2] of the window, in the units of the box and the frame."""
         if box_xyxy_px is not None and rng.random() >= self.acquire_share:
             low, side = _track_square(rng, box_xyxy_px)
         elif self.acquire_view == "frame":
@@ -107,7 +107,7 @@ class DatasetSampler:
         corners = box_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
         inside = np.clip(corners, -0.5, self.size_px - 0.5)
         if np.prod(inside[1] - inside[0]) < VISIBLE_MIN * np.prod(corners[1] - corners[0]):
-            _mark(out.others[0], box_xyxy_px, to_window)  # too little to learn a pose from, and yet no background
+            _mark(out.others[0], box_xyxy_px, to_window)  # too little visible for a pose, but not background
             return
         out.present[0] = True
         out.R_cam_target[0], out.t_cam_target_m[0] = target.R_cam_target, target.t_cam_target_m
@@ -118,7 +118,7 @@ class DatasetSampler:
 
 
 def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:
-    """Warn of targets whose depth the network cannot tell; raises ConfigError if all are such."""
+    """Warn about targets whose depth the network cannot predict; raises ConfigError if that applies to all."""
     seen = [target for frame in frames for target in frame.targets if target.box_visible_xyxy_px is not None]
     Z_m = np.array([target.t_cam_target_m[2] for target in seen])
     beyond = (Z_m < Z_RANGE_M[0]) | (Z_m > Z_RANGE_M[1])
@@ -132,7 +132,7 @@ def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:
 
 
 def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, float]:
-    """First pixel's place [2] and side, frame pixels, of a jittered window around the box."""
+    """Position of the first pixel [2] and side, in frame pixels, of a jittered window around the box."""
     low, high = box_xyxy_px[:2], box_xyxy_px[2:]
     side = TRACK_SCALE * float((high - low).max()) * float(np.exp(rng.uniform(*np.log(TRACK_ZOOM))))
     centre = 0.5 * (low + high) + side * rng.uniform(-TRACK_JITTER, TRACK_JITTER, 2)
@@ -142,7 +142,7 @@ def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, 
 def _acquire_square(
     rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array, size_px: int
 ) -> tuple[Array, float]:
-    """The same of a window of the reduced frame, anywhere around the box, or anywhere at all."""
+    """The same for a window of the reduced frame: at random around the box, or anywhere if there is none."""
     side = size_px * frame_wh[0] / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
     around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
     low = around - rng.uniform(0.0, 1.0, 2) * side
@@ -150,7 +150,7 @@ def _acquire_square(
 
 
 def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int) -> NDArray[np.uint8]:
-    """Averages where it shrinks: the picture is blurred to the window's pixel before it is sampled."""
+    """Resample with anti-aliasing: when shrinking, the image is blurred to the window's pixel size first."""
     scale = np.diag(to_window)
     if (scale < 1.0).any():
         margin = 2.0 / scale
@@ -177,7 +177,7 @@ def _coverage(mask: NDArray[np.bool_], to_window: Array, size_px: int) -> NDArra
 
 
 def _mark(others: NDArray[np.bool_], box_xyxy_px: Array, to_window: Array) -> None:
-    """Set the cells [S/4, S/4] that a box on the frame touches."""
+    """Set the cells [S/4, S/4] that a box, in frame pixels, touches."""
     corners = box_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
     first = np.floor((corners[0] + 0.5) / DENSE_STRIDE).astype(int).clip(min=0)
     stop = np.ceil((corners[1] + 0.5) / DENSE_STRIDE).astype(int).clip(min=0)
@@ -203,17 +203,17 @@ def _blank(image_bgr: NDArray[np.uint8], K: Array) -> TrainingBatch:
 
 
 def joined(batches: Sequence[TrainingBatch]) -> TrainingBatch:
-    """One batch of all."""
+    """All batches concatenated."""
     return TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
 
 
 class MixedSampler:
-    """Samples of several samplers, each to its share of the stream; what the shares leave comes from the last."""
+    """Mixes several samplers, each with its share of the stream; the last one gets the remainder."""
 
     def __init__(self, samplers: Sequence[Sampler], shares: Sequence[float]) -> None:
         self._samplers = tuple(samplers)
         left = Fraction(1)
-        self._shares = []  # of what the samplers before leave
+        self._shares = []  # of the remainder after the preceding samplers
         for share in shares[:-1]:
             exact = Fraction(share).limit_denominator(10**6)
             self._shares.append(min(exact / left, Fraction(1)))
@@ -222,8 +222,8 @@ class MixedSampler:
     def batch(self, first_index: int, count: int) -> TrainingBatch:
         """Samples first_index .. first_index + count - 1 of the stream, sampler by sampler.
 
-        Every sampler's own are consecutive, so batches that do not overlap share none; a share that is less than a
-        sample of each batch comes in some of them.
+        Each sampler's own samples are consecutive, so batches that do not overlap share none. A share of less than one
+        sample per batch appears in some batches only.
         """
         drawn = []
         for sampler, (first, stop) in zip(self._samplers, self._spans(first_index, first_index + count), strict=True):
@@ -233,7 +233,7 @@ class MixedSampler:
         return joined(drawn)
 
     def _spans(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """What each sampler gives, of its own samples, to the stream's first .. stop - 1."""
+        """Range of each sampler's own samples that the stream's first .. stop - 1 consists of."""
         spans = []
         for share in self._shares:
             spans.append((int(share * first), int(share * stop)))

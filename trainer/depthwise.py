@@ -1,8 +1,8 @@
-"""Depthwise convolution whose gradients are quick on a CPU.
+"""Depthwise convolution with fast gradients on a CPU.
 
-oneDNN is quick with gradients of depthwise 3x3 convolutions of stride 1 and up to 200 times slower with the others,
-which then take more than half of a training step. Those are here put in terms of the quick one: gradients of stride s
-are gradients of stride 1 with zeros between, and a 5x5 kernel's weight gradient is four overlapping 3x3 ones.
+oneDNN is fast for gradients of depthwise 3x3 convolutions of stride 1, and up to 200 times slower for others, which
+then take more than half of a training step. Here they are reduced to the fast case: the gradient of stride s is that of
+stride 1 with zeros inserted, and a 5x5 kernel's weight gradient consists of four overlapping 3x3 ones.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class _Depthwise(torch.autograd.Function):
 
 
 def _at_every_pixel(g: Tensor, x: Tensor, stride: int, first: int) -> Tensor:
-    """The gradient of the convolution of stride 1 that keeps the size of x: g at first, first + stride, ..., else 0."""
+    """The output gradient g of an equivalent stride-1 convolution that keeps the size of x: g at first, first + stride,
+    ..., 0 elsewhere."""
     if stride == 1 and first == 0:
         return g.contiguous(memory_format=torch.channels_last)
     count, channels, rows, columns = x.shape
@@ -43,7 +44,7 @@ def _at_every_pixel(g: Tensor, x: Tensor, stride: int, first: int) -> Tensor:
 
 
 def _weight_gradient(g: Tensor, weight: Tensor, x: Tensor) -> Tensor:
-    """The sum over images and pixels of g times the input that each tap saw, 3x3 taps at a time."""
+    """The sum over images and pixels of g times each tap's input, 3x3 taps at a time."""
     kernel, rows, columns = weight.shape[-1], g.shape[2] + 2, g.shape[3] + 2
     if kernel == 3:
         return _gradient_3x3(g, x, weight, padding=1)
@@ -57,14 +58,14 @@ def _weight_gradient(g: Tensor, weight: Tensor, x: Tensor) -> Tensor:
 
 
 def _gradient_3x3(g: Tensor, x: Tensor, weight: Tensor, padding: int) -> Tensor:
-    """oneDNN's own weight gradient of a depthwise 3x3 convolution of stride 1; `weight` gives only its shape."""
+    """oneDNN's weight gradient of a depthwise 3x3 convolution of stride 1; only the shape of `weight` matters."""
     ones, pads = [1, 1], [padding, padding]
     dims = (g, x, weight.to(g.dtype), None, ones, pads, ones, False, [0, 0], weight.shape[0], [False, True, False])
     return torch.ops.aten.convolution_backward(*dims)[1].to(weight.dtype)
 
 
 class DepthwiseConv2d(nn.Conv2d):
-    """nn.Conv2d with groups = channels and a 3x3 or 5x5 kernel: the same parameters, values and export."""
+    """nn.Conv2d with groups = channels and a 3x3 or 5x5 kernel: same parameters, values and export."""
 
     def __init__(self, channels: int, kernel: int, stride: int, padding: int) -> None:
         super().__init__(channels, channels, kernel, stride, padding, groups=channels, bias=False)

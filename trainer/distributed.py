@@ -1,6 +1,6 @@
-"""Data-parallel training under `torchrun`: every process takes its own samples and all take the same step.
+"""Data-parallel training under `torchrun`: every process has its own samples, and all take the same step.
 
-Gradients are averaged by hand, because a step calls several methods of the network and no single forward.
+Gradients are averaged explicitly, because a step calls several methods of the network instead of one forward.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Group:
-    """The processes that train one network together; alone, it has one member and does nothing."""
+    """The processes that train one network together. With a single process, all methods do nothing."""
 
     rank: int = 0
     size: int = 1
@@ -40,7 +40,7 @@ class Group:
             tensor.detach().copy_(mean.view_as(tensor))
 
     def agreed(self, *values: float) -> tuple[float, ...]:
-        """The first process's values, in all of them."""
+        """The first process's values, returned in all processes."""
         if self.size == 1:
             return values
         told = torch.tensor(values, dtype=torch.float64, device=self.device)

@@ -1,4 +1,4 @@
-"""PyTorch eager as an engine of `uavpose-edge bench`: what the network takes before any export."""
+"""PyTorch eager mode as an engine of `uavpose-edge bench`: inference time of the network before export."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from trainer.model import PoseNet
 def engine(
     path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
 ) -> Callable[[], object] | None:
-    """`edge.bench.engines.Engine`: the float network of the file's configuration as the configs of this package build
-    it. Its weights are random, since they change nothing of the time. None for an INT8 file, and for a file of another
-    backbone than that configuration's.
+    """`edge.bench.engines.Engine`: the float network built from this package's config of the file's configuration, with
+    random weights, which do not affect the time. None for an INT8 file, and for a file with another backbone than that
+    configuration.
     """
     if contract.precision != "fp32":
         return None
@@ -32,7 +32,7 @@ def engine(
     inputs = torch.from_numpy(image), torch.from_numpy(K)
 
     def infer() -> object:
-        # The number is the process's, and rows of other numbers take turns with this one.
+        # Set on every call: the number is global to the process, and benchmarks with other numbers are interleaved.
         torch.set_num_threads(threads)
         with torch.inference_mode():
             return model(*inputs)

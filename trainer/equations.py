@@ -34,12 +34,12 @@ def image_plane_point(point_px: Tensor, K: Tensor) -> Tensor:
 
 
 def _focal_lengths(K: Tensor) -> Tensor:
-    """(f_x, f_y) [..., 2] of K [..., 3, 3]; a skew is nobody's focal length."""
+    """(f_x, f_y) [..., 2] of K [..., 3, 3]; ignores skew."""
     return (K[..., :2, :2] * torch.eye(2).to(K)).sum(-1)
 
 
 def _unit(vector: Tensor) -> Tensor:
-    """Vectors [..., 3] made one long; F.normalize exports twice the nodes."""
+    """Vectors [..., 3] normalised to unit length; F.normalize exports twice the nodes."""
     return vector / torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp(min=1e-12)
 
 
@@ -73,14 +73,14 @@ def gram_schmidt(r_6d: Tensor) -> Tensor:
 
 
 def heading_anchors(count: int) -> Tensor:
-    """r_6D [count, 6] of a level aircraft at evenly spaced headings, as seen along the ray: z is image down."""
+    """r_6D [count, 6] of a level aircraft at evenly spaced headings, in the ray's frame: z is image down."""
     heading = 2 * torch.pi * torch.arange(count) / count
     zero = torch.zeros(count)
     return torch.stack([zero, zero + 1, zero, torch.sin(heading), zero, torch.cos(heading)], dim=-1)
 
 
 def focal_length(K: Tensor, kind: str) -> Tensor:
-    """f [...] in pixels: the paper's "mean", or "geometric", with which APDD survives an anisotropic resize."""
+    """f [...] in pixels: the paper's "mean", or "geometric", which keeps APDD exact under an anisotropic resize."""
     f = _focal_lengths(K)
     return f.mean(-1) if kind == "mean" else torch.sqrt(f.prod(-1))
 
@@ -118,7 +118,7 @@ def rotation_angle(R_a: Tensor, R_b: Tensor) -> Tensor:
 
 
 def heatmap_peaks(P: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The `count` highest local maxima of P [N, H_f, W_f]: falling values [N, count], cells (x, y) [N, count, 2]."""
+    """Values [N, count], descending, and cells (x, y) [N, count, 2] of the highest local maxima of P [N, H_f, W_f]."""
     highest = F.max_pool2d(P[:, None], 3, stride=1, padding=1)[:, 0]
     kept = torch.where(highest == P, P, torch.zeros_like(P))
     values, index = torch.topk(kept.flatten(1), count, dim=1)
@@ -127,6 +127,6 @@ def heatmap_peaks(P: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _cells_xy(index: Tensor, columns: int) -> Tensor:
-    """Cells (x, y) [..., 2] of places [...], zero or more, in a flattened map."""
-    # To floor the division as well, which changes nothing of such numbers, exports as eight nodes.
+    """Cells (x, y) [..., 2] of non-negative indices [...] into a flattened map."""
+    # Same as floor division for these numbers, which would export as eight nodes.
     return torch.stack([index % columns, torch.div(index, columns, rounding_mode="trunc")], dim=-1)

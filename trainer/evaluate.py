@@ -1,4 +1,4 @@
-"""What a model does on labelled images: pose errors, boxes, detection. Pure functions of predictions and labels."""
+"""Metrics of a model on labelled images: pose errors, boxes, detection. Pure functions of predictions and labels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCORE_THRESHOLD = 0.3
 
 
 class Predictions(NamedTuple):
-    """The highest peak of each image, as msgs.contract names it."""
+    """Outputs for the highest peak of each image, named as in msgs.contract."""
 
     score: NDArray[np.float32]  # [N]
     center_px: NDArray[np.float32]  # [N, 2]
@@ -52,7 +52,7 @@ def predict_all(predict: Predictor, batches: Iterable[TrainingBatch]) -> Predict
 
 
 def calibrated(predicted: Predictions, calibration: ScoreCalibration) -> Predictions:
-    """The same with the peaks' probabilities for scores, of boxes that show all their pixels."""
+    """The predictions with scores converted to probabilities, for windows that are not enlarged."""
     shown_px = np.sqrt(np.prod(np.maximum(predicted.size_px, 0.0), axis=-1))
     told = [calibration.probability(float(p), float(s)) for p, s in zip(predicted.score, shown_px, strict=True)]
     return predicted._replace(score=np.array(told, dtype=np.float32))
@@ -67,7 +67,7 @@ def box_iou(center_a: NDArray, size_a: NDArray, center_b: NDArray, size_b: NDArr
 
 
 def ranking_auc(positive: NDArray, negative: NDArray) -> float:
-    """Probability that a positive outranks a negative (ties count half); NaN when either is missing."""
+    """Probability that a positive outranks a negative (ties count half); NaN if either is missing."""
     if len(positive) == 0 or len(negative) == 0:
         return float("nan")
     difference = positive[:, None] - negative[None, :]
@@ -75,31 +75,31 @@ def ranking_auc(positive: NDArray, negative: NDArray) -> float:
 
 
 def _judged(batches: Sequence[TrainingBatch]) -> NDArray[np.bool_]:
-    """Windows [N] whose highest peak can be the labelled target's alone."""
+    """Mask [N] of windows without other aircraft, whose highest peak can only be the labelled target's."""
     return np.concatenate([~batch.others.any(axis=(1, 2)) for batch in batches])
 
 
 def tell_of_poses(batches: Sequence[TrainingBatch]) -> bool:
-    """Whether any window shows a target whose pose `measure` can judge."""
+    """Whether any window shows a target whose pose `measure` can evaluate."""
     return bool((_judged(batches) & np.concatenate([batch.present for batch in batches])).any())
 
 
 def _mean(values: NDArray) -> float:
-    """NaN of none."""
+    """NaN if empty."""
     return float(values.mean()) if len(values) else math.nan
 
 
 def _median(values: NDArray) -> float:
-    """NaN of none."""
+    """NaN if empty."""
     return float(np.median(values)) if len(values) else math.nan
 
 
 def measure(
     predicted: Predictions, batches: list[TrainingBatch], threshold: float = SCORE_THRESHOLD
 ) -> dict[str, float]:
-    """Metrics of one set of windows. Pose metrics are over every window with a target, found or not.
+    """Metrics of one set of windows. Pose metrics are over all windows with a target, detected or not.
 
-    Windows with a second aircraft are left out: the highest peak may be its own. What none is left for is NaN.
+    Windows with a second aircraft are left out, as the highest peak may be that one's. NaN where no windows remain.
     """
     judged = _judged(batches)
     labels = TrainingBatch(*(np.concatenate(values)[judged] for values in zip(*batches, strict=True)))
@@ -137,12 +137,12 @@ def measure(
 
 
 def null_where_unknown(measured: Mapping[str, float]) -> dict[str, float | None]:
-    """The same for JSON, which has no NaN: None where there was nothing to measure on."""
+    """The metrics for JSON, which has no NaN: None instead."""
     return {name: value if math.isfinite(value) else None for name, value in measured.items()}
 
 
 def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:
-    """Errors of the best answer that looks at no picture: one rotation and one depth, chosen on these very windows."""
+    """Baseline errors of the best constant prediction: one rotation and one depth, fitted to these windows."""
     labels = TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
     R, Z = labels.R_cam_target[labels.present].astype(np.float64), labels.t_cam_target_m[labels.present, 2]
     u, _, vt = np.linalg.svd(R.mean(axis=0))
@@ -154,9 +154,9 @@ def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:
 
 
 def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> float:
-    """Score below which a peak is no target: the middle of where recall less false alarms is highest, of 0.05..0.95.
+    """Detection threshold in 0.05..0.95: the median of those with the highest recall minus false alarm rate.
 
-    SCORE_THRESHOLD where all windows or none hold a target: they tell of no threshold.
+    SCORE_THRESHOLD if all windows or none contain a target.
     """
     judged = _judged(batches)
     present = np.concatenate([batch.present for batch in batches])[judged]
@@ -171,14 +171,14 @@ def choose_threshold(predicted: Predictions, batches: list[TrainingBatch]) -> fl
 
 
 def sigma_shortfall(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> float:
-    """By what share `a` tells smaller sigmas than `b`, in the median of windows with a target: of the sigma of which it
-    is most; below 0 where it tells larger ones."""
+    """Relative decrease of sigma from `b` to `a`: median over windows with a target, of the component where it is
+    largest; negative if all are larger."""
     ratio = np.median(a.sigma[present] / b.sigma[present], axis=0)
     return float(1.0 - ratio.min())
 
 
 def difference(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> dict[str, float]:
-    """How far two predictors are apart on the same windows: medians and 95th percentiles over those with a target."""
+    """Differences of two predictors on the same windows: medians and 95th percentiles over those with a target."""
     rotation_deg = metrics.rotation_error_deg(a.R_cam_target, b.R_cam_target)[present]
     depth_rel = np.abs(a.t_cam_target_m[present, 2] / b.t_cam_target_m[present, 2] - 1.0)
     center_px = np.linalg.norm(a.center_px - b.center_px, axis=-1)[present]

@@ -80,7 +80,7 @@ def register(commands: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluate as asked. Raises ConfigError, RenderingError."""
+    """Evaluate as requested. Raises ConfigError, RenderingError."""
     if arguments.windows is not None:
         _on_windows(arguments)
     else:

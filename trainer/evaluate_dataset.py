@@ -1,6 +1,7 @@
-"""Evaluate a checkpoint, a model file or another method's results file on the pictures of a BOP dataset.
+"""Evaluate a checkpoint, a model file or another method's results file on the images of a BOP dataset.
 
-Models run in the daemon's own estimator, so what is scored is what flies; a checkpoint is exported to FP32 for it.
+Models run in the daemon's own estimator, so the scores are those of the deployed code; a checkpoint is exported to FP32
+first.
 """
 
 from __future__ import annotations
@@ -34,20 +35,20 @@ from trainer.config import ConfigError
 
 
 class DatasetRequest(NamedTuple):
-    """What to hold against which pictures."""
+    """What to evaluate, and on which images."""
 
     model: Path | None = None  # ONNX file or checkpoint; None: the shipped INT8 file, unless there are results
     results: Path | None = None  # BOP results file of any method
     dataset: Path | None = None  # None: the bundled scene
     split: str | None = None
-    every: int = 1  # score every n-th picture
-    mode: Literal["frames", "track"] = "frames"  # each picture alone, or sequences through the tracker
-    own_ship: OwnShipTold = "usual"  # in mode track: its attitude and place as told to the tracker
-    score_min: float | None = None  # below it a peak is no target; None: the model file's own
+    every: int = 1  # score every n-th image
+    mode: Literal["frames", "track"] = "frames"  # each image alone, or sequences through the tracker
+    own_ship: OwnShipTold = "usual"  # in mode track: accuracy of the own-ship pose given to the tracker
+    score_min: float | None = None  # detection threshold; None: the model file's own
 
 
 class Evaluation(NamedTuple):
-    """What came of it: `score` has the keys of sim_replay.score.statistics and says what was judged."""
+    """The result: `score` has the keys of sim_replay.score.statistics and describes what was evaluated."""
 
     score: dict[str, Any]
     method: str  # name for the results file
@@ -57,7 +58,7 @@ class Evaluation(NamedTuple):
 
     def write(self, out: Path) -> list[Path]:
         """metrics.json, frames.jsonl, the BOP results file and the figures into `out`. Raises ConfigError."""
-        from sim_replay.evaluation.figures import write_figures  # matplotlib takes its time
+        from sim_replay.evaluation.figures import write_figures  # matplotlib is slow to import
 
         try:
             files = write_files(out, self.method, self.dataset, self.score, self.judged)
@@ -74,13 +75,13 @@ def evaluate_dataset(
     on_start: Callable[[int], None] = lambda _: None,
     on_frame: Callable[[JudgedFrame], None] = lambda _: None,
 ) -> Evaluation:
-    """Judge every picture asked for; `on_start` hears how many there are. Raises ConfigError, naming file and key."""
+    """Evaluate the requested images; `on_start` receives their number. Raises ConfigError, naming file and key."""
     if request.every < 1:
         raise ConfigError(f"--every {request.every}: must be at least 1")
     try:
         dataset = open_dataset(request.dataset or BUNDLED_SEQUENCE, request.split)
         pictures = dataset.labelled_frames()
-        if request.mode == "frames":  # a tracker must see them all
+        if request.mode == "frames":  # the tracker needs all of them
             pictures = pictures[:: request.every]
         if not pictures:
             raise ConfigError(f"{request.dataset}: contains no image to evaluate")
@@ -105,7 +106,7 @@ def evaluate_dataset(
 
 
 def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any], Answerer]:
-    """How the score names what is judged, and what answers for it."""
+    """Description of the method for the score, and the function that returns its poses."""
     if request.results is not None:
         if request.mode == "track":
             raise ConfigError("--mode track: needs a model; a results file already contains poses")
@@ -118,7 +119,7 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
     if path.suffix == ".onnx":
         model = with_score_min(load_model(path, DEFAULT_THREADS), request.score_min)
         return method_of(model), answers(model)
-    from trainer.evaluate import SCORE_THRESHOLD  # torch takes its time
+    from trainer.evaluate import SCORE_THRESHOLD  # torch is slow to import
     from trainer.export import export_unmeasured
 
     with tempfile.TemporaryDirectory() as folder:

@@ -1,6 +1,6 @@
-"""Export: a checkpoint to FP32 and INT8 model files that carry their contract, measured on windows of their own.
+"""Export: a checkpoint to FP32 and INT8 model files with embedded contract, evaluated on held-out windows.
 
-`export_models` reads top-down: render, write FP32, measure, quantise, measure again, refuse if INT8 strayed.
+`export_models` reads top-down: render, write FP32, evaluate, quantise, evaluate again, refuse if INT8 deviates.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from trainer.sources import window_sampler
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
 ACQUIRE_CROP_PX = 384
-RENDERED_RANGE_M = (100.0, 500.0)  # what rendered windows show well
-ANY_SIZE_PX = (1e-3, 1e6)  # of what nobody has measured: nothing is untrained
+RENDERED_RANGE_M = (100.0, 500.0)  # well covered by rendered windows
+ANY_SIZE_PX = (1e-3, 1e6)  # for an unmeasured file: no size counts as untrained
 UNREACHABLE_SCORE = 1.0
 EMPTY_SHARE = 0.12
 
@@ -43,19 +43,19 @@ OpenView = Callable[[int, int, float], Callable[[], Sampler]]  # (seed, size_px,
 
 
 class Views(NamedTuple):
-    """Rendered windows as the two stages see them; `track` is empty for a model without that stage."""
+    """Rendered windows of the kind each stage processes; `track` is empty for a model without that stage."""
 
     track: list[TrainingBatch]
     acquire: list[TrainingBatch]
 
 
 class Tolerance(NamedTuple):
-    """How far INT8 may be from FP32 on the comparison windows of either stage."""
+    """Largest allowed deviation of INT8 from FP32 on the comparison windows of either stage."""
 
     rotation_deg: float = 2.0  # median angle between the two
     depth_percent: float = 2.0  # median
-    pose_points: float = 5.0  # loss of Pose@10°/5 %; two stages of a few hundred windows tell it to a few points
-    sigma_percent: float = 10.0  # by which sigma is smaller, median
+    pose_points: float = 5.0  # loss of Pose@10°/5 %; a few hundred windows measure it to within a few points
+    sigma_percent: float = 10.0  # decrease of sigma, median
 
 
 class Measured(NamedTuple):
@@ -68,10 +68,10 @@ class Measured(NamedTuple):
 def stage_sampler(
     data: DataConfig, seed: int, size_px: int, acquire_share: float, held_out: bool = True
 ) -> Callable[[], Sampler]:
-    """An opener of windows as one stage sees them: 0 for track, 1 for acquire.
+    """An opener of windows of the kind one stage processes; `acquire_share` is 0 for track, 1 for acquire.
 
-    Some hold no target, whatever was trained on: without them no score means anything. The shares of `held_out`
-    ones do not follow those trained on, so that what is measured on them can be compared.
+    Some contain no target, even if training had none: scores cannot be evaluated without them. The share in `held_out`
+    windows is independent of training, so that metrics are comparable.
     """
     empty_share = EMPTY_SHARE if held_out else max(data.empty_share, EMPTY_SHARE)
     shares = {"acquire_share": acquire_share, "empty_share": empty_share}
@@ -79,7 +79,7 @@ def stage_sampler(
 
 
 def acquire_window_px(contract: ContractConfig | ModelContract) -> int:
-    """Side of the windows that the acquire stage is measured on: whole frames where it was trained on such."""
+    """Side of the windows on which the acquire stage is evaluated; whole frames if it was trained on those."""
     smaller_px = min(contract.acquire_size_wh)
     return smaller_px if contract.acquire_fit == "squash" else min(ACQUIRE_CROP_PX, smaller_px)
 
@@ -97,7 +97,7 @@ def _predict(predict: Predictor, views: Views) -> Measured:
 
 
 def _metrics(measured: Measured, views: Views, thresholds: tuple[float, float]) -> dict[str, float]:
-    """Contract metrics: `track_*` and `acquire_*`, those that could be measured."""
+    """Contract metrics `track_*` and `acquire_*`, without those that could not be measured."""
     found = {f"acquire_{k}": v for k, v in measure(measured.acquire, views.acquire, thresholds[0]).items()}
     if measured.track is not None:
         found.update({f"track_{k}": v for k, v in measure(measured.track, views.track, thresholds[1]).items()})
@@ -115,8 +115,8 @@ def make_contract(
     views: Views,
     thresholds: tuple[float, float],
 ) -> ModelContract:
-    """The contract of the FP32 file, without metrics; what was trained on (focal length, box, depths of datasets) is
-    read from `views`, windows of such. Raises ConfigError if they show no target."""
+    """The contract of the FP32 file, without metrics; the trained ranges (focal length, box, depths of datasets) are
+    measured on `views`, windows like those in training. Raises ConfigError if they show no target."""
     batches = [*views.track, *views.acquire]
     on = np.concatenate([batch.present for batch in batches])
     focal_px = np.concatenate([batch.K[:, 0, 0] for batch in batches])
@@ -128,12 +128,12 @@ def make_contract(
 
 
 def _trained_range_m(data: DataConfig, batches: Sequence[TrainingBatch]) -> tuple[float, float]:
-    """Depths, whole metres, between which targets were seen in training."""
+    """Range of target depths in training, in whole metres."""
     of_datasets = [batch.t_cam_target_m[batch.present & (batch.airframe_id < 0), 2] for batch in batches]
     Z_m = np.clip(np.concatenate(of_datasets), *Z_RANGE_M)
     spans = [] if data.rendered_share == 0.0 else [RENDERED_RANGE_M]
     if len(Z_m):
-        low_m = min(math.floor(Z_m.min()), Z_RANGE_M[1] - 1.0)  # all may be of one depth
+        low_m = min(math.floor(Z_m.min()), Z_RANGE_M[1] - 1.0)  # all depths may be equal
         spans.append((low_m, max(math.ceil(Z_m.max()), low_m + 1.0)))
     low_m, high_m = zip(*spans, strict=True)
     return min(low_m), max(high_m)
@@ -177,7 +177,7 @@ def _contract(
 
 
 def data_told(data: DataConfig) -> str:
-    """What a configuration trains on, for a person."""
+    """Description of a configuration's training data."""
     rendered = data.rendered_share
     parts = [f"{source.path.name}, split {source.split}: {source.share:.0%}" for source in data.datasets]
     if rendered > 0.0:
@@ -195,7 +195,7 @@ def airframe_names(ids: list[int] | None) -> list[str]:
 
 
 class Strayed(NamedTuple):
-    """The worse stage's differences: medians, points of Pose@10°/5 % lost, and how much smaller sigma is told."""
+    """Differences in the worse stage: medians, loss of Pose@10°/5 % in points, and decrease of sigma."""
 
     rotation_deg: float = 0.0
     depth_percent: float = 0.0
@@ -203,7 +203,7 @@ class Strayed(NamedTuple):
     sigma_percent: float = 0.0
 
     def refusal(self, tolerance: Tolerance) -> str | None:
-        """Which difference is beyond the tolerance, as a sentence's part; None if none is."""
+        """Text for the first difference that exceeds its tolerance; None if none does."""
         told = (
             ("median rotation differs from FP32's by {:.4g} degrees, more than --tolerance {:g}"),
             ("median depth differs from FP32's by {:.4g} %, more than --tolerance-depth {:g}"),
@@ -215,7 +215,7 @@ class Strayed(NamedTuple):
 
 
 def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tuple[str, Strayed]:
-    """Differences of `a` from `b` as text, and the larger of the stages'."""
+    """Differences of `a` from `b` as text, and the larger of both stages."""
     columns = ("rotation deg", "depth %", "centre px", "sigma %", "score", "Pose@10°/5 %")
     lines = [f"{title:24}" + "".join(f"{column:>18}" for column in columns)]
     worst = Strayed()
@@ -251,9 +251,9 @@ def export_models(
 ) -> tuple[Path, Path]:
     """Write NAME-fp32.onnx into `float_out` (default `out`) and NAME-int8.onnx into `out`; returns their paths.
 
-    `contract` replaces the [contract] section that the checkpoint was trained with. Raises ConfigError, and writes no
-    INT8 file (one from before stays), when INT8's poses differ from FP32's by more than the tolerance on windows not
-    calibrated on.
+    `contract` replaces the [contract] section of the checkpoint's configuration. If INT8's poses differ from FP32's by
+    more than the tolerance, on windows not used for calibration, it raises ConfigError and writes no INT8 file (an
+    existing one is kept).
     """
     model, config, training, sha256 = load_model(checkpoint)
     if contract is not None:
@@ -302,7 +302,7 @@ def export_unmeasured(
 
     `source` is a checkpoint, or with `untrained` a configuration whose network gets random weights; `contract` as in
     `export_models`. Nothing is rendered or measured: the file has no metrics, and `score_min` is the threshold of both
-    stages: as it stands one that no peak reaches, so that the file can be timed and not flown. Raises ConfigError.
+    stages. By default no peak reaches it, so that the file can be timed but not flown. Raises ConfigError.
     """
     if untrained:
         config = load_config(source)
@@ -337,9 +337,9 @@ def write_int8(
     tolerance: Tolerance,
     say: Callable[[str], None],
 ) -> None:
-    """Write the INT8 file beside its place, compare it with FP32 on `comparison`, and only then move it there.
+    """Write a temporary INT8 file, compare it with FP32 on `comparison`, and rename it only if it is accepted.
 
-    `promise` is the FP32 file's contract, `floats` its predictions. Raises ConfigError when INT8 strays too far.
+    `promise` is the FP32 file's contract, `floats` its predictions. Raises ConfigError if INT8 deviates too far.
     """
     unproved = int8_path.with_suffix(".part")
     try:

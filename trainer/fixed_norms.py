@@ -1,7 +1,7 @@
-"""Training with norm statistics that stay: each norm folded into the convolution before it, as in the exported graph.
+"""Training with fixed norm statistics: each norm is folded into the convolution before it, as in the exported graph.
 
-A batch norm over a batch's own statistics reads and writes every feature map several times, a quarter of a training
-step on a CPU. Weights that are trained already need no new statistics.
+Batch norm with batch statistics reads and writes every feature map several times, a quarter of a training step on a
+CPU. Weights that are already trained need no new statistics.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 
 def _pairs(model: nn.Module) -> list[tuple[nn.Conv2d, nn.BatchNorm2d]]:
-    """Convolutions without bias and the norm that their parent declares, and so applies, right after each."""
+    """Convolutions without bias, each with the norm that its parent declares, and therefore applies, right after it."""
     return [
         (conv, norm)
         for parent in model.modules()
@@ -30,7 +30,7 @@ def _same(input: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def folded_norms(model: nn.Module) -> Iterator[None]:
-    """While it lasts, no norm's statistics move, and those after a convolution are part of its weights and bias.
+    """In this context, norm statistics are fixed, and norms after a convolution are folded into its weights and bias.
 
     Values are those of evaluation mode, and gradients reach the same parameters.
     """
@@ -43,7 +43,7 @@ def folded_norms(model: nn.Module) -> Iterator[None]:
         assert norm.running_mean is not None
         assert norm.running_var is not None
         scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-        # In the parameters' places, so that their order stays.
+        # Replaced in `_parameters`, which keeps the order of parameters.
         conv._parameters["weight"] = conv.weight * scale[:, None, None, None]  # type: ignore[assignment]
         conv._parameters["bias"] = norm.bias - norm.running_mean * scale  # type: ignore[assignment]
         norm.forward = _same  # type: ignore[method-assign]

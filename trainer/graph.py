@@ -1,4 +1,4 @@
-"""ONNX graphs: write a network as one, quantise it, run it, and read and write the contract it carries."""
+"""ONNX graphs: export a network, quantise it, run it, and read and write the embedded contract."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from trainer.pixel_quads import take_quads
 
 OPSET = 17
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
-# Soft-argmax, ray, sampling, depth and rotation stay in float, and so does the last layer of each head.
+# Soft-argmax, ray, sampling, depth and rotation remain in float, and so does the last layer of each head.
 QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/", "/head_refine/convs/")
 
 
 def write_graph(model: PoseNet, path: Path) -> None:
-    """The network as ONNX with msgs.contract's inputs and outputs; N, H and W are free. Raises ConfigError."""
+    """Write the network as ONNX with msgs.contract's inputs and outputs; N, H and W are dynamic. Raises ConfigError."""
     image = torch.randint(0, 255, (2, 128, 192, 3), dtype=torch.uint8)
     K = torch.tensor([[900.0, 0, 96], [0, 900, 64], [0, 0, 1]]).repeat(2, 1, 1)
     free = {"image": {0: "N", 1: "H", 2: "W"}, "K": {0: "N"}, **{name: {0: "N"} for name in OUTPUT_NAMES}}
     with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # the tracer warns of shapes that it does trace
+        warnings.simplefilter("ignore")  # the tracer warns about shapes that it traces correctly
         try:
             torch.onnx.export(
                 fuse_branches(model),
@@ -71,7 +71,7 @@ class _Batches(CalibrationDataReader):
 
 
 def fold_pads(graph: onnx.GraphProto) -> None:
-    """Give each convolution the zero padding of the Pad before it: between INT8 layers a Pad would stay in float."""
+    """Merge each zero Pad into the convolution after it: between INT8 layers, a Pad would remain in float."""
     constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
     users = Counter(name for node in graph.node for name in node.input)
     pads = {node.output[0]: node for node in graph.node if node.op_type == "Pad" and users[node.output[0]] == 1}
@@ -89,9 +89,9 @@ def fold_pads(graph: onnx.GraphProto) -> None:
 
 
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
-    """Static INT8: QDQ, U8 activations, S8 weights for each channel, calibrated on `calibration`.
+    """Static INT8: QDQ, U8 activations, S8 weights per channel, calibrated on `calibration`.
 
-    The layers that stay in float keep their weights in half precision.
+    Layers that remain in float have their weights stored in half precision.
     """
     with tempfile.TemporaryDirectory() as folder:
         prepared = Path(folder) / "prepared.onnx"
@@ -126,8 +126,8 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
 
 
 def write_contract(path: Path, contract: ModelContract) -> None:
-    """Put the contract into the model file's metadata. Raises ConfigError, the file as it was, where that fails."""
-    path = path.resolve()  # of a link, the file that it leads to
+    """Write the contract into the model file's metadata. Raises ConfigError on failure, with the file unchanged."""
+    path = path.resolve()  # replaces the target of a symbolic link, not the link
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
     part = path.with_name(f"{path.name}.part")
@@ -145,7 +145,7 @@ def write_contract(path: Path, contract: ModelContract) -> None:
 
 
 def read_contract(path: Path) -> ModelContract:
-    """The contract a model file carries. Raises ConfigError naming the file."""
+    """The contract in a model file. Raises ConfigError naming the file."""
     metadata = open_session(path).get_modelmeta().custom_metadata_map
     if METADATA_KEY not in metadata:
         raise ConfigError(f"{path}: has no {METADATA_KEY} metadata: not a model of this program")
@@ -156,7 +156,7 @@ def read_contract(path: Path) -> ModelContract:
 
 
 def open_session(path: Path, threads: int = 2) -> ort.InferenceSession:
-    """An ONNX Runtime session on the CPU. Raises ConfigError when the file is no model."""
+    """An ONNX Runtime session on the CPU. Raises ConfigError if the file is no model."""
     if not path.is_file():
         raise ConfigError(f"{path}: no such model file")
     options = ort.SessionOptions()

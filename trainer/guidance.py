@@ -1,4 +1,4 @@
-"""Which peak and which box each training window is decoded with: the true ones at first, then the network's own."""
+"""Peak and box with which each training window is decoded: the true ones at first, later the network's own."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from trainer.losses import SMALLEST_SIZE_PX, Labels, center_cell
 def guided_peaks(
     heat_logits: Tensor, labels: Labels, teacher: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Which peak and which box each image is decoded with: cells [N, 1, 2] and sizes [N, 1, 2] px, 0 for predicted.
+    """Peaks (cells [N, 1, 2]) and box sizes ([N, 1, 2] px, 0: use the predicted one) to decode the images with.
 
-    With probability `teacher` the true centre's cell, sometimes one off, and the true box, jittered; otherwise the
-    highest cell of the heatmap inside the true box and the predicted box.
+    With probability `teacher` the true centre's cell, sometimes off by one, and the true box, jittered; otherwise the
+    highest heatmap cell near the true centre, and the predicted box.
     """
     count, rows, columns = heat_logits.shape
     cell = center_cell(labels.center_px, rows, columns)

@@ -1,7 +1,7 @@
-"""Weights of a float graph's layers stored in half precision: the file shrinks, the arithmetic stays in float32.
+"""Stores the float weights of a graph in half precision: the file shrinks, computation stays in float32.
 
-A Cast turns each back; ONNX Runtime does that once, when it loads the file. A checkpoint keeps half precision too, so
-the weights of layers that nothing was folded into lose nothing.
+A Cast converts each back; ONNX Runtime evaluates it once, on loading. Checkpoints use half precision too, so weights
+lose nothing unless something was folded into them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ STORED_LEAST = 4096  # values; fewer are not worth a node
 
 
 def store_halved(graph: onnx.GraphProto) -> None:
-    """Keep the large float32 weights as float16, each with a Cast before its readers; what half cannot hold stays."""
+    """Store large float32 weights as float16, each followed by a Cast; those out of float16's range are unchanged."""
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type != onnx.TensorProto.FLOAT or int(np.prod(tensor.dims)) < STORED_LEAST:

@@ -1,4 +1,4 @@
-"""Evaluate a checkpoint or a model file on windows of a seed that training did not use."""
+"""Evaluate a checkpoint or a model file on rendered windows of a seed that training did not use."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from trainer.graph import onnx_predictor, read_contract
 
 
 class Request(NamedTuple):
-    """What to measure, on which windows."""
+    """The model to evaluate, and on which windows."""
 
-    model: Path  # ONNX file, else a checkpoint: run folder or weights.pt
+    model: Path  # ONNX file, or a checkpoint: run folder or weights.pt
     samples: int
     seed: int
     stage: Literal["track", "acquire"]
@@ -34,7 +34,7 @@ class Request(NamedTuple):
 
 
 class _Subject(NamedTuple):
-    """A network with what its file says of itself."""
+    """A network with the metadata of its file."""
 
     predict: Predictor
     data: DataConfig
@@ -46,7 +46,7 @@ class _Subject(NamedTuple):
 
 
 def _seeds(training: Mapping[str, object]) -> tuple[object, ...]:
-    """Of the windows that the last run learnt from, and of those that refining did."""
+    """Seeds of the last training run's windows and of the refinement head's."""
     return tuple(training[key] for key in ("seed", "refined_seed") if key in training)
 
 
@@ -76,7 +76,7 @@ def _model_file(path: Path, seed: int) -> _Subject:
 def evaluate_file(
     request: Request, *, open_view: OpenView | None = None, rendered: Callable[[int], None] | None = None
 ) -> dict[str, float]:
-    """Metrics of trainer.evaluate.measure at the file's own threshold. Raises ConfigError when asked the impossible."""
+    """Metrics of trainer.evaluate.measure at the file's own threshold. Raises ConfigError for an invalid request."""
     is_onnx = request.model.suffix == ".onnx"
     subject = _model_file(request.model, request.seed) if is_onnx else _checkpoint(request.model)
     if request.seed in subject.training_seeds:

@@ -1,7 +1,7 @@
-"""The first convolution, of three channels, whose weight gradient is quick on a CPU.
+"""The first convolution, with three input channels and a fast weight gradient on a CPU.
 
-oneDNN is about thirty times slower with it in the channels-last layout, in which all else is quicker, than in the
-channels-first one: there it took a quarter of a training step.
+For this gradient oneDNN is about thirty times slower in the channels-last layout, which is faster for everything else,
+than in channels-first: it took a quarter of a training step.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _ImageConvolution(torch.autograd.Function):
 
 
 class ImageConv2d(nn.Conv2d):
-    """nn.Conv2d without bias or padding over a picture, which needs no gradient: same parameters, values and export."""
+    """nn.Conv2d without bias or padding for images, which need no gradient: same parameters, values and export."""
 
     def __init__(self, channels: int, kernel: int, stride: int) -> None:
         super().__init__(3, channels, kernel, stride, bias=False)

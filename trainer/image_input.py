@@ -1,7 +1,7 @@
-"""An INT8 graph that reads the camera's bytes as they are: no float copy of the picture is ever made.
+"""Makes an INT8 graph read the camera's bytes directly, without a float copy of the image.
 
-A uint8 pixel is itself a quantised value, of scale 1 and a zero point of our choice. So the normalisation goes into
-the first convolution, and its input is quantised by that rule: then nothing is left to compute before it.
+A uint8 pixel is itself a quantised value, with scale 1 and a zero point of our choice. So the normalisation is folded
+into the first convolution, and its input is quantised with these parameters: nothing remains to be computed before it.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
-# Zero padding pads with this: close to the mean of each channel, which is what the float network pads with.
+# The pixel value that zero padding represents: close to each channel's mean, which it represents in the float network.
 PIXEL_ZERO = 114
 
 
 class _Entry(NamedTuple):
-    """The way of the picture into its first convolution."""
+    """The nodes from the image to the first convolution."""
 
     before: list[onnx.NodeProto]  # Cast, Transpose, Sub, Div, in this or another order
     conv: onnx.NodeProto
 
 
 def fold_normalisation(graph: onnx.GraphProto, image: str) -> str:
-    """Leave of (pixel - mean) / std only pixel - PIXEL_ZERO; the first convolution takes the rest.
+    """Reduce (pixel - mean) / std to pixel - PIXEL_ZERO by folding the rest into the first convolution.
 
-    Returns the name of the convolution's input. Raises ValueError if the graph does not begin so.
+    Returns the name of the convolution's input. Raises ValueError if the graph does not start with these nodes.
     """
     constants = {tensor.name: tensor for tensor in graph.initializer}
     entry = _entry(graph, image, constants)
@@ -47,12 +47,12 @@ def fold_normalisation(graph: onnx.GraphProto, image: str) -> str:
 
 
 def quantised_as_pixels(tensor: str) -> dict[str, list[dict[str, object]]]:
-    """ONNX Runtime's TensorQuantOverrides that make a uint8 pixel its own quantised value."""
+    """ONNX Runtime's TensorQuantOverrides with which a uint8 pixel is its own quantised value."""
     return {tensor: [{"scale": np.array(1.0, np.float32), "zero_point": np.array(PIXEL_ZERO, np.uint8)}]}
 
 
 def feed_pixels(graph: onnx.GraphProto, image: str) -> None:
-    """Put the uint8 picture where a graph quantised with `quantised_as_pixels` computes the same bytes from it."""
+    """Feed the uint8 image directly to where a graph quantised with `quantised_as_pixels` computes the same bytes."""
     node, path = reader(graph, image), []
     while node.op_type != "QuantizeLinear":
         path.append(node)
@@ -74,7 +74,7 @@ def feed_pixels(graph: onnx.GraphProto, image: str) -> None:
 
 
 def drop_unread(graph: onnx.GraphProto) -> None:
-    """Remove the constants that no node reads any more."""
+    """Remove constants that no node reads any more."""
     still_read = {name for node in graph.node for name in node.input}
     for tensor in [tensor for tensor in graph.initializer if tensor.name not in still_read]:
         graph.initializer.remove(tensor)
@@ -93,7 +93,7 @@ def _entry(graph: onnx.GraphProto, image: str, constants: dict[str, onnx.TensorP
 
 
 def reader(graph: onnx.GraphProto, tensor: str) -> onnx.NodeProto:
-    """The only node that computes with a tensor; its shape may be asked for by others."""
+    """The only node that reads a tensor, not counting Shape nodes. Raises ValueError unless there is exactly one."""
     readers = [node for node in graph.node if tensor in node.input and node.op_type != "Shape"]
     if len(readers) != 1:
         raise ValueError(f"{tensor} is read by {len(readers)} nodes")
@@ -101,5 +101,5 @@ def reader(graph: onnx.GraphProto, tensor: str) -> onnx.NodeProto:
 
 
 def _per_channel(constant: NDArray) -> NDArray[np.float64]:
-    """Three values of a constant that is broadcast over pixels."""
+    """The three values of a constant that is broadcast over pixels."""
     return np.asarray(constant, np.float64).reshape(3)

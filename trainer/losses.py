@@ -1,8 +1,8 @@
-"""The joint loss and what edge adds to it.
+"""The paper's joint loss, and the terms that the edge configuration adds.
 
 Paper: L_total = lambda_1 L_hm + lambda_2 L_wh + lambda_3 L_trans + lambda_4 L_rot.
 
-Every term is a mean over the windows that hold a target, but the heatmap's, which all windows train.
+Terms are means over the windows that contain a target; heatmap and mask are trained on all windows.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trainer.model import Decoded
 from trainer.refinement import RANGE
 
 SMALLEST_SIZE_PX = 2.0
-UNJUDGED = 1.0 - 1e-3  # of the heatmap's target: the focal loss asks next to nothing there
+UNJUDGED = 1.0 - 1e-3  # heatmap target where the focal loss shall be close to zero whatever is predicted
 HYPOTHESIS_SPREAD_RAD = 0.35
 
 
@@ -37,8 +37,8 @@ class Labels(NamedTuple):
     size_px: Tensor  # [N, 2]
     coverage: Tensor  # [N, H/4, W/4], share of visible target pixels
     noc: Tensor  # [N, 3, H/4, W/4]
-    others: Tensor  # [N, H/4, W/4], bool: other aircraft, of which nothing is asked
-    airframe_id: Tensor  # [N], -1 where not known
+    others: Tensor  # [N, H/4, W/4], bool: other aircraft, excluded from the loss
+    airframe_id: Tensor  # [N], -1: unknown
 
 
 def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[Tensor, Labels]:
@@ -60,7 +60,7 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[Tensor, Labe
 
 
 def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
-    """CenterNet's radius [...]: corners moved by it keep IoU >= overlap with a box [..., 2]; at least one cell."""
+    """CenterNet's radius [...]: a box [..., 2] whose corners move by it keeps IoU >= overlap; at least one cell."""
     w, h = size_cells[..., 0], size_cells[..., 1]
     total, area = w + h, w * h
     solve = lambda a, b, c: (b - torch.sqrt(torch.clamp(b * b - 4 * a * c, min=0.0))) / (2 * a)  # noqa: E731
@@ -72,7 +72,7 @@ def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
 
 
 def center_cell(center_px: Tensor, rows: int, columns: int) -> Tensor:
-    """The stride-8 cell [..., 2] (x, y) that holds a pixel [..., 2], kept inside the map."""
+    """The stride-8 cell [..., 2] (x, y) that contains a pixel [..., 2], clamped to the map."""
     cell = torch.floor((center_px + 0.5) / eq.STRIDE)
     return torch.stack([cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)], dim=-1)
 
@@ -80,7 +80,7 @@ def center_cell(center_px: Tensor, rows: int, columns: int) -> Tensor:
 def heatmap_target(labels: Labels, rows: int, columns: int) -> Tensor:
     """P [N, rows, columns]: a Gaussian with a peak of exactly 1 at the centre's cell, zeros without a target.
 
-    Where another aircraft lies it is UNJUDGED, so that a peak there is neither asked for nor held to be wrong.
+    On other aircraft it is UNJUDGED, so that a peak there is neither required nor penalised.
     """
     cell = center_cell(labels.center_px, rows, columns)
     sigma = (2 * gaussian_radius(labels.size_px / eq.STRIDE) + 1) / 6
@@ -109,21 +109,21 @@ def rotation_residual(R_est: Tensor, R_true: Tensor) -> Tensor:
 
 
 def hypothesis_share(R_allo_true: Tensor, count: int) -> Tensor:
-    """How much each hypothesis answers for a true rotation [N, 3, 3]: [N, count], near 1 at its own heading."""
+    """Soft assignment [N, count] of a true rotation [N, 3, 3] to hypotheses: near 1 for the one of its heading."""
     anchors = eq.gram_schmidt(eq.heading_anchors(count)).to(R_allo_true)
     angle = eq.rotation_angle(R_allo_true[:, None], anchors)
     return torch.softmax(-0.5 * (angle / HYPOTHESIS_SPREAD_RAD) ** 2, dim=-1)
 
 
 def _error_6d(R_allo: Tensor, R_allo_true: Tensor) -> Tensor:
-    """L_6D [...]: mean over the two columns that Gram-Schmidt takes."""
+    """L_6D [...]: mean over the two columns that Gram-Schmidt starts from."""
     return F.smooth_l1_loss(R_allo[..., ::2], R_allo_true[..., ::2].expand_as(R_allo[..., ::2]), reduction="none").mean(
         (-1, -2)
     )
 
 
 def pose_residual(out: Decoded, labels: Labels) -> Tensor:
-    """What the one decoded peak of each image is off by, uncorrected: [N, 6] in the units of Decoded.log_sigma."""
+    """Error of each image's one decoded peak, before correction: [N, 6] in the units of Decoded.log_sigma."""
     side_px = torch.exp(0.5 * out.log_size[:, 0].sum(-1, keepdim=True))
     log_Z = torch.log(torch.clamp(labels.t_cam_target_m[:, 2:], min=1.0))
     off_px = out.origin_px[:, 0] - _origin_px(labels)
@@ -133,9 +133,9 @@ def pose_residual(out: Decoded, labels: Labels) -> Tensor:
 
 
 def refinement_nll(residual: Tensor, correction: Tensor, log_sigma: Tensor) -> Tensor:
-    """Negative log likelihood [N, 6], but for a constant, of residuals [N, 6] of Laplace laws.
+    """Laplace negative log-likelihood [N, 6], up to a constant, of residuals [N, 6].
 
-    `correction` [N] is of their log Z.
+    `correction` [N] is added to the residual of log Z.
     """
     left = torch.cat(
         [residual[:, :RANGE], (residual[:, RANGE] + correction)[:, None], residual[:, RANGE + 1 :]], dim=-1
@@ -144,7 +144,7 @@ def refinement_nll(residual: Tensor, correction: Tensor, log_sigma: Tensor) -> T
 
 
 def _origin_px(labels: Labels) -> Tensor:
-    """Where the body's origin lies in each image: [N, 2]."""
+    """Projection of the body's origin in each image: [N, 2]."""
     K, t = labels.K, labels.t_cam_target_m
     f_xy, c_xy = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=-1), K[:, :2, 2]
     return f_xy * t[:, :2] / torch.clamp(t[:, 2:], min=1.0) + c_xy
@@ -153,7 +153,7 @@ def _origin_px(labels: Labels) -> Tensor:
 def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = True) -> dict[str, Tensor]:
     """The terms that need a target, unweighted, each [N]: the one decoded peak of each image against its labels.
 
-    Paper: size is L_wh, on log sizes; depth and planar make L_trans, geodesic (L_geo) and rotation_6d (L_6D) L_rot.
+    Paper: size is L_wh, on log sizes; depth and planar form L_trans, geodesic (L_geo) and rotation_6d (L_6D) L_rot.
     Without `ray` the network's allocentric rotation is the one in `cam`.
     """
     one = (value[:, 0] for value in out)
@@ -180,22 +180,22 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
         "origin": F.smooth_l1_loss(origin / longer, true_origin / longer, reduction="none", beta=0.02).sum(-1),
     }
     if weights.uncertainty > 0:
-        # The head that it teaches reads detached features, and here what is left of the poses is no pull at them.
+        # Trains the refinement head alone: the head's inputs are detached, and so is the residual here.
         terms["uncertainty"] = refinement_nll(pose_residual(out, labels).detach(), correction, log_sigma).sum(-1)
     return terms
 
 
 def dense_terms(dense: Tensor, labels: Labels) -> dict[str, Tensor]:
-    """Training-only heads [N, 4, H/4, W/4]: mask over all windows, object coordinates where the target is seen.
+    """Training-only heads [N, 4, H/4, W/4]: mask in all windows, object coordinates where the target is visible.
 
-    Where a label is NaN, not known, nothing is asked, nor where another aircraft lies.
+    Cells without a label (NaN) are ignored, and so are other aircraft.
     """
     known = labels.coverage.isfinite() & ~labels.others
     coverage = torch.where(known, labels.coverage, 0.0)
     mask = F.binary_cross_entropy_with_logits(dense[:, 0], coverage, reduction="none") * known
     seen = (coverage > 0.3) & labels.noc.isfinite().all(dim=1)
     true_noc = torch.where(seen[:, None], labels.noc, 0.0)
-    # Object coordinates lie within half a diameter: 10 brings their errors to the size of the other terms.
+    # Object coordinates lie within half a diameter: a factor of 10 scales their errors to the other terms.
     error = F.smooth_l1_loss(10 * dense[:, 1:], 10 * true_noc, reduction="none").mean(1)
     noc = (error * seen).sum((1, 2)) / seen.sum((1, 2)).clamp(min=1)
     return {"mask": mask.mean((1, 2)), "noc": noc}

@@ -1,7 +1,7 @@
 """MF-UAVPose6D: one image and its intrinsics to the 6-DoF poses of the aircraft in it.
 
 Read `PoseNet.forward` first: backbone and neck, heatmap peaks, then `decode` takes each peak through the paper's
-modules in the paper's order. Training decodes one guided peak (`forward_guided`), inference the highest M.
+modules in the paper's order. Training decodes one guided peak per image (trainer.guidance), inference the M highest.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ IMAGENET_STD_BGR = (57.375, 57.12, 58.395)
 
 
 class Decoded(NamedTuple):
-    """What one pass says of M peaks in N images. Pixels of the input image; `cam` frame; metres."""
+    """Predictions for M peaks in each of N images. Pixels of the input image; `cam` frame; metres."""
 
     center_px: Tensor  # [N, M, 2]
     log_size: Tensor  # [N, M, 2], log (w, h) in log pixels
     origin_px: Tensor  # [N, M, 2]
-    log_Z: Tensor  # [N, M], not clamped, before its correction
+    log_Z: Tensor  # [N, M], not clamped, without the refinement head's correction
     hypothesis_logits: Tensor  # [N, M, K]
     R_allo_k: Tensor  # [N, M, K, 3, 3], every hypothesis
     R_ego_k: Tensor  # [N, M, K, 3, 3]
-    R_ego: Tensor  # [N, M, 3, 3], the likeliest
+    R_ego: Tensor  # [N, M, 3, 3], the most likely hypothesis
     correction: Tensor  # [N, M], to be added to log Z
     log_sigma: Tensor  # [N, M, 6], Laplace scale: (u, v) in box sides sqrt(w h), corrected log Z, rotation x y z in rad
 
@@ -49,7 +49,7 @@ class Perception(NamedTuple):
 
 
 class PerspectiveAwareModule(nn.Module):
-    """PAM: f_pam = Proj(f_c) * sigmoid(gamma) + beta, with [gamma, beta] = MLP_ray(x/z, y/z); Proj(f_c) without ray."""
+    """PAM: f_pam = Proj(f_c) * sigmoid(gamma) + beta, [gamma, beta] = MLP_ray(x/z, y/z); without `ray`: Proj(f_c)."""
 
     def __init__(self, channels: int, hidden: int, ray: bool) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class DynamicTopologicalSampling(nn.Module):
         self, F_global: Tensor, center_px: Tensor, size_px: Tensor, extent_px: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """F_global [N, C, H_f, W_f], centre and size [N, M, 2] px in an image of `extent_px` [2], to f_oct [N M, 8 C],
-        f_reg [N M, hidden] and the grid [N M, C, 7, 7] that it is made of."""
+        f_reg [N M, hidden] and the grid [N M, C, 7, 7] that f_reg is computed from."""
         # align_corners=False puts -1 and 1 on the outer edges of the border pixels.
         center, size = (2.0 * center_px + 1.0) / extent_px - 1.0, size_px / extent_px
         points = center[:, :, None] + size[:, :, None] * self.get_buffer("offsets")
@@ -93,7 +93,7 @@ class DynamicTopologicalSampling(nn.Module):
 
 
 class GatedFusion(nn.Module):
-    """Gamma(f_reg, Phi(f_geo)) with a gate of its own: f_reg + sigmoid(g) * Phi(f_geo)."""
+    """Gamma(f_reg, Phi(f_geo)) as gated addition: f_reg + sigmoid(g) * Phi(f_geo), g from both."""
 
     def __init__(self, geo: int, hidden: int) -> None:
         super().__init__()
@@ -106,14 +106,15 @@ class GatedFusion(nn.Module):
 
 
 class RegionOnly(nn.Module):
-    """What the decoders get without DTS's context: f_reg."""
+    """Replaces GatedFusion when DTS's context is switched off: passes f_reg through."""
 
     def forward(self, f_reg: Tensor, f_geo: Tensor) -> Tensor:
         return f_reg
 
 
 class PoseNet(nn.Module):
-    """The network. `forward` is the exported graph (see msgs.contract); a train step calls `forward_guided`."""
+    """The network. `forward` is the exported graph (see msgs.contract); a training step calls `perceive`, `dense` and
+    `decode`."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -136,13 +137,13 @@ class PoseNet(nn.Module):
         self.head_hypothesis = nn.Linear(hidden, config.hypotheses) if config.hypotheses > 1 else None
         self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
         self.head_refine = RefinementHead(C, hidden, config.hypotheses) if config.uncertainty else None
-        # Linear but for one small layer, so that object coordinates must be written into F_global itself.
+        # Shallow on purpose, so that F_global itself must encode the object coordinates.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
         self._init_priors()
 
     @torch.no_grad()
     def _init_priors(self) -> None:
-        """Start where an aircraft is likely: heatmap at 0.01, S near 8 m, body down near image down."""
+        """Initial outputs near a typical aircraft: heatmap at 0.01, S near 8 m, body down near image down."""
         last = self.head_hm[-1]
         assert isinstance(last, nn.Conv2d)
         assert last.bias is not None
@@ -174,10 +175,11 @@ class PoseNet(nn.Module):
         return F.pixel_shuffle(self.head_dense(F_global), 2)
 
     def decode(self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None) -> Decoded:
-        """Each peak [N, M, 2] (cells) to a pose; `guide_size_px` [N, M, 2], where positive, is DTS's box.
+        """Each peak [N, M, 2] (cells) to a pose. K [N, 3, 3]; `guide_size_px` [N, M, 2], where positive, replaces the
+        predicted box size in DTS.
 
-        K [N, 3, 3]. Inside, the peaks of all images are rows: a linear layer over a matrix exports as one node, over
-        three dimensions as several.
+        Internally the peaks of all images are the rows of one matrix: a linear layer over two dimensions exports as
+        one node, over three as several.
         """
         F_global, log_P = seen.F_global, F.logsigmoid(seen.heat_logits)
         M = int(peaks_xy.shape[1])
@@ -192,7 +194,7 @@ class PoseNet(nn.Module):
             grid_size = torch.where(guide_size_px > 0, guide_size_px, grid_size)
         boxes = (center_px.detach().reshape(-1, M, 2), grid_size.reshape(-1, M, 2))
         f_oct, f_reg, grid = self.dts(F_global, *boxes, _extent_px(log_P))
-        # The grid is normalised by the box, so the context says which box it was.
+        # The grid is normalised by the box, so its size must be passed separately.
         f_geo = torch.cat([f_c, f_oct, f_pam, torch.log(grid_size / 32.0)], dim=-1)
         f_trans = self.mlp_t(self.fuse_t(f_reg, f_geo))
         f_rot = self.mlp_r(self.fuse_r(f_reg, f_geo))
@@ -241,7 +243,7 @@ class PoseNet(nn.Module):
         return f_c, 0.5 * (extent_px - 1) + 0.5 * extent_px * torch.tanh(self.head_center(f_c))
 
     def _likeliest(self, f_rot: Tensor, r_6d: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits [P, K] and the rotation [P, 3, 3] of the highest: one mode, never a mean of two."""
+        """Logits [P, K] and the rotation [P, 3, 3] of the highest: one mode, never the mean of several."""
         if self.head_hypothesis is None:
             return torch.zeros_like(r_6d[:, :1]), eq.gram_schmidt(r_6d)
         logits = self.head_hypothesis(f_rot)
@@ -259,7 +261,7 @@ class PoseNet(nn.Module):
         return cells if cells is not None else _float(log_P.shape[-1], log_P) / 32.0
 
     def _anchor(self, log_P: Tensor) -> Tensor:
-        """Sides in pixels, [1] or [2], of the box that sizes are told as multiples of."""
+        """Sides in pixels, [1] or [2], of the reference box; sizes are predicted as multiples of it."""
         if self.config.box_anchor_px is not None:
             return torch.tensor([self.config.box_anchor_px], device=log_P.device)
         return 0.1 * _extent_px(log_P)
@@ -274,17 +276,17 @@ class PoseNet(nn.Module):
         Z = torch.clamp(torch.exp(out.log_Z + out.correction), *Z_RANGE_M)
         t_cam_target_m = eq.back_project(eq.image_plane_point(out.origin_px, K[:, None]), Z)
         side_px = torch.sqrt(size_px.prod(-1, keepdim=True))
-        # A Laplace law of scale b has the standard deviation sqrt(2) b.
+        # A Laplace distribution of scale b has the standard deviation sqrt(2) b.
         sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
         sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
         return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
 
 
 def _extent_px(log_P: Tensor) -> Tensor:
-    """Width and height [2] of the image in pixels, from its heatmap [N, H_f, W_f]: export keeps them dynamic."""
+    """Width and height [2] of the image in pixels, from its heatmap [N, H_f, W_f]; stays dynamic on export."""
     return eq.STRIDE * torch.stack([_float(log_P.shape[2], log_P), _float(log_P.shape[1], log_P)])
 
 
 def _float(length: int, like: Tensor) -> Tensor:
-    """A dimension as a scalar tensor, so that export keeps it dynamic."""
+    """A dimension as a scalar tensor, so that it stays dynamic on export."""
     return torch.as_tensor(length, device=like.device).to(like.dtype)

@@ -1,4 +1,4 @@
-"""Pictures of what a network says: windows with the body axes of the truth and of the estimate drawn in."""
+"""Example images of a network's predictions: windows with the body axes of ground truth and estimate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trainer.evaluate import Predictions
 TRUTH_BGR, ESTIMATE_BGR = (60, 220, 60), (40, 60, 255)
 COLUMNS, ROWS = 4, 2
 SIDE_PX = 192
-# Nose, wing tips and belly as shares of half the diameter, body FRD: enough to see which way it flies.
+# Nose, wing tips and belly in units of half the diameter, body FRD: enough to see the attitude.
 STICKS = np.array([[[-0.7, 0, 0], [1.0, 0, 0]], [[0, -1.0, 0], [0, 1.0, 0]], [[0, 0, 0], [0, 0, 0.4]]])
 
 

@@ -1,10 +1,10 @@
 """The first convolution of an INT8 graph, over four pixels at a time.
 
-ONNX Runtime gathers the pixels under a window one by one, and of three channels each that takes longer than multiplying
-them. Four neighbours of a row are one pixel of twelve channels, as the picture's bytes lie in memory anyway. From those
-a convolution makes two columns of the output at once, its weights being the first ones twice, two pixels apart, and
-zeros elsewhere: the same bytes, sooner. (Where a processor has no 8-bit dot products ONNX Runtime's sums may overflow,
-in either graph.)
+ONNX Runtime gathers a kernel's pixels one by one; with only three channels that takes longer than the arithmetic. Here
+four neighbouring pixels of a row are treated as one pixel of twelve channels, which is their memory layout anyway. A
+convolution over those computes two output columns at once: its weights are the original ones twice, shifted by two
+pixels, and zeros elsewhere. The output bytes are the same. (On a processor without 8-bit dot products ONNX Runtime's
+sums may overflow, in either graph.)
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from onnx import helper, numpy_helper
 
 from trainer.image_input import reader
 
-PIXELS = 4  # of a row, taken together
+PIXELS = 4  # of a row, grouped together
 STRIDE = 2
 
 
 class WideWeights(NamedTuple):
-    """What a convolution with stride (2, 1) over quads takes in place of one with stride (2, 2) over pixels."""
+    """Parameters of a convolution with stride (2, 1) over quads, equivalent to one with stride (2, 2) over pixels."""
 
     weights: NDArray[np.int8]  # [2 O, 12, rows, quads]
     quads_left: int  # of padding
@@ -31,13 +31,13 @@ class WideWeights(NamedTuple):
 
 
 def wide_weights(weights: NDArray[np.int8], pixels_left: int) -> WideWeights:
-    """From weights [O, 3, rows, columns] of a convolution that is padded by `pixels_left`.
+    """Converts weights [O, 3, rows, columns] of a convolution with left padding `pixels_left`.
 
-    The first O outputs are the even columns, the last O the odd ones.
+    The first O output channels are the even columns, the last O the odd ones.
     """
     outputs, channels, rows, columns = weights.shape
     made = PIXELS // STRIDE
-    first, last = -pixels_left, STRIDE * (made - 1) + columns - 1 - pixels_left  # pixels that the two columns see
+    first, last = -pixels_left, STRIDE * (made - 1) + columns - 1 - pixels_left  # pixels that both columns need
     quads_left, quads_right = -(first // PIXELS), last // PIXELS
     wide = np.zeros((made * outputs, PIXELS * channels, rows, quads_left + 1 + quads_right), weights.dtype)
     for k in range(made):
@@ -49,10 +49,10 @@ def wide_weights(weights: NDArray[np.int8], pixels_left: int) -> WideWeights:
 
 
 def take_quads(graph: onnx.GraphProto, image: str) -> None:
-    """Let the first convolution of a QDQ graph that `image_input.feed_pixels` was applied to take quads of pixels.
+    """Rewrite the first convolution of a QDQ graph, after `image_input.feed_pixels`, to read quads of pixels.
 
-    The picture's width must then be a multiple of four; rows stay as they are. Raises ValueError, the graph as it was,
-    if the convolution's output has not half the picture's width or is not bytes again.
+    The image width must then be a multiple of four; rows are unaffected. Raises ValueError, with the graph unchanged,
+    if the convolution's output is not half the image's width or is not quantised.
     """
     turn = reader(graph, image)
     conv = reader(graph, reader(graph, turn.output[0]).output[0])
@@ -82,7 +82,7 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     turn.input[0] = "quads"
     quads = helper.make_node("Reshape", [image, "quads_shape"], ["quads"], "/pixels/Reshape")
     graph.node.insert(list(graph.node).index(turn), quads)
-    # The bytes of the output, channels last: there too the two columns lie side by side.
+    # In the channels-last output, too, the two columns are adjacent in memory.
     output, quantise.output[0] = quantise.output[0], "column_pairs"
     steps = [
         helper.make_node("Transpose", ["column_pairs"], ["pairs_last"], "/pixels/Transpose_pairs", perm=[0, 2, 3, 1]),
@@ -92,4 +92,4 @@ def take_quads(graph: onnx.GraphProto, image: str) -> None:
     at = list(graph.node).index(quantise) + 1
     for k, step in enumerate(steps):
         graph.node.insert(at + k, step)
-    del graph.value_info[:]  # shapes that were inferred of the graph as it was
+    del graph.value_info[:]  # shapes inferred for the original graph

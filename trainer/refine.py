@@ -1,6 +1,6 @@
-"""`uavpose-trainer refine`: teach a trained network's refinement head by itself, all else as it is.
+"""`uavpose-trainer refine`: train the refinement head of a trained network alone, all other weights fixed.
 
-What the head reads of each window is kept, so that a window is rendered and seen once and learnt from many times.
+The head's inputs are cached: each window is rendered and evaluated once, and used in every epoch.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ LEARNING_RATE, WEIGHT_DECAY, DROPOUT = 2e-3, 0.2, 0.3
 
 
 class RefinePlan(NamedTuple):
-    """How much to render and how long to learn from it. The seed must be one that training did not have."""
+    """How much to render and how long to train on it. The seed must differ from the network's training seeds."""
 
     seed: int
     windows: int = 100_000
     epochs: int = 8
-    strangers: float = 0.35  # share of targets that are aircraft new to the network
+    strangers: float = 0.35  # share of targets that are generated airframes, unseen by the network
 
 
 class Kept(NamedTuple):
-    """What is learnt from: N targets that the network found, in half precision but for the residual."""
+    """Training data: N targets that the network detected, in half precision except for the residual."""
 
     evidence: Evidence
     residual: Tensor  # [N, 6]
-    strange: Tensor  # [N], bool: no member of the fleet
+    strange: Tensor  # [N], bool: a generated airframe, not one of the fleet
 
     def rows(self, which: Tensor | slice) -> Kept:
-        """Some of them, in single precision."""
+        """The selected rows, in single precision."""
         evidence = Evidence(*(value[which].float() for value in self.evidence))
         return Kept(evidence, self.residual[which], self.strange[which])
 
@@ -60,7 +60,7 @@ def refine(
     open_sampler: Callable[[DataConfig, int, int, float], Callable[[], Sampler]] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Write weights.pt with a refinement head learnt anew into `out`; returns its path. Raises ConfigError."""
+    """Write weights.pt with a newly trained refinement head into `out`; returns its path. Raises ConfigError."""
     content = load_file(checkpoint)
     if not {"weights", "config", "training"} <= content.keys():
         raise ConfigError(f"{checkpoint}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
@@ -93,8 +93,8 @@ def refine(
 
 
 def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:
-    """The network as trained, but for its refinement head. Raises ConfigError if it has none, or lacks weights."""
-    dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # what was made to fly has none
+    """The trained network with an untrained refinement head. Raises ConfigError if it has none, or lacks weights."""
+    dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # deployed weights have none
     model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}))
     if model.head_refine is None:
         raise ConfigError(f"{named}: [model] uncertainty is false: the network has no refinement head")
@@ -110,11 +110,11 @@ def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: 
 def look(
     model: PoseNet, config: TrainerConfig, opener: Callable[[], Sampler], windows: int, say: Callable[[str], None]
 ) -> Kept:
-    """Show the network windows, decode the highest peak of each as in flight, and keep those whose target it found."""
+    """Evaluate the network on windows, decode the highest peak as in flight, keep those whose peak hits the target."""
     seen: list[Evidence] = []
     assert model.head_refine is not None
     handle = model.head_refine.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    found: list[Tensor] = []  # all that is kept, once the first windows tell how large it is
+    found: list[Tensor] = []  # the kept rows; allocated when the first batch gives their shapes
     count = 0
     try:
         with Feed(opener, RENDERED_AT_ONCE, 0, config.data.workers, config.data.prefetch) as feed, torch.no_grad():
@@ -154,20 +154,20 @@ def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: li
 
 
 def fleet_size() -> int:
-    """How many airframes have a name; invented ones are numbered from there."""
+    """Number of named airframes; ids of generated ones start there."""
     from sim_replay.airframes import AIRFRAMES
 
     return len(AIRFRAMES)
 
 
 def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callable[[str], None]) -> None:
-    """Learn from the first `learnt` rows and tell of the others, each epoch."""
+    """Train on the first `learnt` rows; report the loss on the others after each epoch."""
     head.requires_grad_(True)
     head.dropout.p = DROPOUT
     optimizer = torch.optim.AdamW(head.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     batch = min(BATCH, learnt)
     steps = learnt // batch
-    # Of fewer steps than this it cannot make a cycle.
+    # OneCycleLR needs a minimum number of steps.
     total = max(epochs * steps + 1, 20)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=total, pct_start=0.1)
     for epoch in range(epochs):
@@ -188,7 +188,7 @@ def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callabl
 
 @torch.no_grad()
 def told(head: RefinementHead, kept: Kept, first: int) -> str:
-    """In words, what the head makes of the rows from `first` on."""
+    """Metrics of the head on the rows from `first` on, as text."""
     head.eval()
     refined, residual, strange = [], kept.residual[first:], kept.strange[first:]
     for start in range(first, len(kept.residual), BATCH):

@@ -1,7 +1,7 @@
-"""The last look at a pose: what its range is to be corrected by, and how sure all of it is.
+"""The refinement head: predicts a correction of the range, and the uncertainty (sigma) of the whole pose.
 
-It reads all that the decoders had and answered, and teaches none of them: how well they know an aircraft is another
-question than where it is, and a network that is taught both at once answers the second worse.
+It reads the decoders' features and outputs, detached: training the shared features for uncertainty as well made the
+pose itself less accurate (docs/ablation.md).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from trainer.layers import conv_bn_relu, mlp
 SIGMAS = 6  # origin u, v in box sides sqrt(w h), log Z, rotation x, y, z in `cam`, rad
 RANGE = 2  # of these
 LOG_SIGMA_RANGE = (-7.0, 1.5)
-# What it reads of a picture like none before may be far off all that it learnt from; its correction shall not be.
+# Limits the correction when the inputs lie far outside the training distribution.
 CORRECTION_MAX = 0.7
 
 
 class Evidence(NamedTuple):
-    """What is known of P peaks before it."""
+    """Inputs of the refinement head for P peaks."""
 
     grid: Tensor  # [P, C, 7, 7], F_global over the box
     f_trans: Tensor  # [P, hidden]
@@ -30,21 +30,21 @@ class Evidence(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """What is to be added to log Z, and the Laplace scales after that."""
+    """The correction to add to log Z, and the Laplace scales of the corrected pose."""
 
     correction: Tensor  # [P]
     log_sigma: Tensor  # [P, 6], in SIGMAS' units
 
 
 def answer_count(hypotheses: int) -> int:
-    """How many numbers `answers_of` makes of a peak."""
+    """Numbers per peak that `answers_of` returns."""
     return 2 + 1 + 1 + 1 + 2 + hypotheses + 9
 
 
 def answers_of(
     log_size: Tensor, log_f: Tensor, log_Z: Tensor, plane_xy: Tensor, hypothesis_logits: Tensor, R_ego: Tensor
 ) -> Tensor:
-    """What the network answers, brought to about one: log sizes [P, 2] px, their ratio, log focal length [P] px, log Z
+    """The decoders' outputs, scaled to about one: log sizes [P, 2] px, their ratio, log focal length [P] px, log Z
     [P] m, ray [P, 2], probabilities of the hypotheses from logits [P, K], and rotation [P, 3, 3]."""
     ratio = log_size[:, :1] - log_size[:, 1:]
     scalars = [log_size - 3.5, ratio, log_f[:, None] - 7.0, log_Z[:, None] - 5.5, 5.0 * plane_xy]
@@ -60,7 +60,7 @@ class RefinementHead(nn.Module):
         self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, narrow, 3, stride=2))
         told = 2 * hidden + answer_count(hypotheses)
         self.norm = nn.BatchNorm1d(16 * narrow + told)
-        # Only a fit by itself drops any: see trainer.refine.
+        # Non-zero only while trainer.refine trains this head alone.
         self.dropout = nn.Dropout(0.0)
         self.decide = nn.Sequential(mlp(16 * narrow + told, hidden, hidden), nn.ReLU(inplace=True))
         self.range = nn.Linear(hidden, 1)

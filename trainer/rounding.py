@@ -1,7 +1,7 @@
-"""Quantisation-aware training: convolutions that see the rounding of INT8 while gradients pass it by.
+"""Quantisation-aware training: convolutions with INT8 rounding and straight-through gradients.
 
-The grid is export's (trainer.graph): S8 weights for each channel and U8 inputs over the range that a batch shows. A
-norm after a convolution scales each channel's weights as a whole, so folding it later leaves that rounding as it was.
+The grid is that of export (trainer.graph): S8 weights per channel, and U8 inputs over the range of the batch. Folding a
+norm into the convolution before it scales each channel's weights uniformly, so it does not change their rounding.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-# Where trainer.graph quantises, as submodules but for the refinement head: not every network has one.
+# The submodules that trainer.graph quantises, except the refinement head, which not every network has.
 ROUNDED_PARTS = ("backbone", "neck", "head_hm.0", "dts.convs")
 IMAGE_CHANNELS = 3
 _SMALLEST_SCALE = 1e-8
@@ -27,13 +27,13 @@ def rounded_weights(weight: Tensor) -> Tensor:
 
 
 class _Rounded(torch.autograd.Function):
-    """Multiples of the grid's step. Its ends are the tensor's own, so nothing is cut and every gradient passes."""
+    """Rounds to the grid, whose range is the tensor's own: nothing is clipped, so all gradients pass unchanged."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         low, high = torch.aminmax(x)
         scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE)
-        # 0 .. 255 steps are whole numbers in bfloat16 too, and zero is one of the grid's points.
+        # 0 .. 255 steps are exact in bfloat16 too, and zero is a grid point.
         return (x * (1.0 / scale)).round_().mul_(scale)
 
     @staticmethod
@@ -42,15 +42,15 @@ class _Rounded(torch.autograd.Function):
 
 
 def rounded_activations(x: Tensor) -> Tensor:
-    """A tensor on the U8 grid between its least and largest value and zero; the gradient is that of `x`."""
+    """A tensor on the U8 grid that spans its values and zero; the gradient is that of `x`."""
     return _Rounded.apply(x)
 
 
 @contextlib.contextmanager
 def rounded(model: nn.Module) -> Iterator[None]:
-    """While it lasts, the convolutions of ROUNDED_PARTS compute with rounded weights and inputs.
+    """In this context, the convolutions of ROUNDED_PARTS compute with rounded weights and inputs.
 
-    A picture's bytes are whole numbers already, so the first convolution's input stays as it is.
+    The first convolution's input is not rounded, as the image's bytes are integers already.
     """
     parts = (model.get_submodule(name) for name in ROUNDED_PARTS)
     convolutions = [module for part in parts for module in part.modules() if isinstance(module, nn.Conv2d)]
@@ -60,7 +60,7 @@ def rounded(model: nn.Module) -> Iterator[None]:
         weight = conv._parameters["weight"]
         assert weight is not None
         floats[conv] = weight
-        # In the parameter's place, so that their order stays.
+        # Replaced in `_parameters`, which keeps the order of parameters.
         conv._parameters["weight"] = rounded_weights(weight)  # type: ignore[assignment]
         return None if conv.in_channels == IMAGE_CHANNELS else (rounded_activations(inputs[0]),)
 

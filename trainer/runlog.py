@@ -1,4 +1,4 @@
-"""The record of a training run: a readable line, JSON lines, TensorBoard scalars, and where everything came from."""
+"""The log of a training run: printed lines, JSON lines, TensorBoard scalars, and provenance."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from trainer.evaluate import null_where_unknown
 
 RUN_NAME = "run.json"
 LOCK_NAME = ".lock"
-# What makes the windows and what learns from them.
+# Code that affects the rendered windows and the training.
 SOURCES = ("trainer", "sim_replay", "msgs")
 
 
 @contextmanager
 def run_folder(out: Path, resume: bool, hold: bool = True) -> Iterator[None]:
-    """A run's folder, which `hold` keeps from a second run until this one ends, however that is.
+    """A run's folder; `hold` locks it against a second run until this one ends.
 
-    Raises ConfigError where another run is at work there, or where a new one would take the place of what is there.
+    Raises ConfigError if another run is using it, or if a new one would overwrite a run or weights.
     """
     with _alone_in(out) if hold and (not resume or out.is_dir()) else nullcontext():
         if not resume and (out / RESUME_NAME).exists():
@@ -60,7 +60,7 @@ def _alone_in(out: Path) -> Iterator[None]:
 
 
 def commit_of(tree: Path) -> str:
-    """The commit of a source tree, with `+` where one of SOURCES is not as committed; "unknown" outside of git."""
+    """The commit of a source tree, with `+` if SOURCES have uncommitted changes; "unknown" outside of git."""
     try:
         ask = lambda *words: subprocess.check_output(["git", *words], cwd=tree, stderr=subprocess.DEVNULL, text=True)  # noqa: E731
         head, changed = ask("rev-parse", "HEAD").strip(), ask("status", "--porcelain", "--", *SOURCES).strip()
@@ -70,7 +70,7 @@ def commit_of(tree: Path) -> str:
 
 
 def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
-    """What is needed to make the run again, beside its configuration."""
+    """What is needed to reproduce the run, apart from its configuration."""
     return {
         "seed": config.data.seed,
         "commit": commit_of(Path(__file__).parent.parent),
@@ -82,9 +82,9 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
 
 
 def starts_of(out: Path) -> list[dict[str, Any]]:
-    """What run.json in a run folder tells of each start of the run, the first first; none without the file.
+    """The records of each start of the run in a run folder's run.json, in order; empty without the file.
 
-    Raises ConfigError for a file that was damaged.
+    Raises ConfigError for a damaged file.
     """
     path = out / RUN_NAME
     if not path.exists():
@@ -93,18 +93,18 @@ def starts_of(out: Path) -> list[dict[str, Any]]:
         told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from None
-    return list(told.get("starts", [told]))  # older files are the record of one start
+    return list(told.get("starts", [told]))  # older files contain the record of one start
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Write beside it and rename, so that a crash leaves the last whole file."""
+    """Write to a temporary file and rename, so that a crash leaves the last complete file."""
     part = path.with_suffix(".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
 
 
 def _is_of_the_past(line: str, samples: int) -> bool:
-    """Whether a line of log.jsonl is whole and tells of so many samples at most."""
+    """Whether a line of log.jsonl is complete and belongs to at most this number of samples."""
     try:
         return bool(json.loads(line)["samples"] <= samples)
     except ValueError:
@@ -115,10 +115,10 @@ class RunLog:
     """Writes into a run folder; every line is on disk when its call returns."""
 
     def __init__(self, out: Path, config_text: str, start: Mapping[str, str | int | float | None]) -> None:
-        """`start` says how this start of the run was asked for; run.json keeps one record for each.
+        """`start` describes this start of the run; run.json keeps one record per start.
 
-        What a run that crashed had told of samples beyond "from_samples" goes: they come again. Raises ConfigError if
-        the folder cannot be written.
+        After a crash, log entries beyond "from_samples" are removed, since those samples are repeated. Raises
+        ConfigError if the folder cannot be written.
         """
         made_folder(out)
         (out / "config.toml").write_text(config_text, encoding="utf-8")
@@ -142,13 +142,13 @@ class RunLog:
         self._since_s = time.monotonic()
 
     def add(self, loss: float, terms: dict[str, float], rotation_deg: float, depth_rel: float) -> None:
-        """One step's values; `report` means them."""
+        """Add one step's values; `report` averages them."""
         for name, value in {"loss": loss, **terms, "rotation_deg": rotation_deg, "depth_rel": depth_rel}.items():
             self._sums[name] = self._sums.get(name, 0.0) + value
         self._count += 1
 
     def report(self, step: int, samples: int, progress: float, rate: float) -> None:
-        """One line for a person and one for a machine: means since the last report."""
+        """Print a line and write a JSON record with the means since the last report."""
         means = {name: value / self._count for name, value in self._sums.items()}
         done = self._count * samples / step
         per_s = done / max(time.monotonic() - self._since_s, 1e-6)

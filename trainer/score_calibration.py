@@ -1,4 +1,4 @@
-"""From peaks to probabilities: a logistic regression on whole frames, one for each stage. Pure."""
+"""Calibrates heatmap peaks as probabilities: logistic regression on whole frames, separately for each stage. Pure."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from sim_replay.evaluation.candidates import Candidate
 
 SIZE_CAPS_PX = (20.0, 30.0, 45.0, 70.0, 100.0)
 LEAST_OF_EACH = 20
-_PRIOR = 1e-3  # so that peaks that part perfectly have an answer
+_PRIOR = 1e-3  # regularisation, so that a solution exists for perfectly separable peaks
 _STEPS = 50
 
 
 class TooFewCandidates(ValueError):
-    """Not enough peaks on or off targets to tell them apart by."""
+    """Too few peaks on targets, or elsewhere, for a fit."""
 
 
 class ScoresTellNothing(ValueError):
-    """A higher peak is no more often on a target than a lower one."""
+    """Higher peaks are not on targets more often than lower ones."""
 
 
 def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
-    """The calibration of highest likelihood. Raises TooFewCandidates, ScoresTellNothing."""
+    """The maximum-likelihood calibration. Raises TooFewCandidates, ScoresTellNothing."""
     seen = list(candidates)
     on = np.array([candidate.is_target for candidate in seen], dtype=bool)
     if min(on.sum(), (~on).sum()) < LEAST_OF_EACH:
@@ -58,7 +58,7 @@ def _logistic(X: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[NDArray[np.
 
 
 def expected_calibration_error(calibration: ScoreCalibration, candidates: Sequence[Candidate], bins: int = 10) -> float:
-    """Mean distance between told probability and the share that were targets, over bins of told probability."""
+    """Mean difference between predicted probability and share of actual targets, over bins of that probability."""
     told = np.array([calibration.probability(one.peak, one.shown_px) for one in candidates])
     on = np.array([one.is_target for one in candidates], dtype=float)
     which = np.minimum((told * bins).astype(int), bins - 1)

@@ -1,4 +1,4 @@
-"""`uavpose-trainer calibrate-score`: make a model file's scores probabilities, by whole frames it is shown."""
+"""`uavpose-trainer calibrate-score`: calibrate a model file's scores as probabilities, on whole frames."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 from msgs.contract import ModelContract
 from trainer.config import ConfigError
 
-# A target that is none costs more than one met a few frames later, so much must speak for a new one; one in hand is let
-# go only when little does.
+# A false target costs more than a target found a few frames later, so the threshold for a new one is high; a target
+# being tracked is given up only at a low probability.
 ACQUIRE_PROBABILITY_MIN, TRACK_PROBABILITY_MIN = 0.7, 0.3
-THRESHOLD_METRICS = ("recall", "false_alarms")  # of windows at the thresholds that were
+THRESHOLD_METRICS = ("recall", "false_alarms")  # measured at the old thresholds, hence dropped
 
 
 def register(commands: argparse._SubParsersAction) -> None:
@@ -36,7 +36,7 @@ def register(commands: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Calibrate as asked and say what came of it. Raises ConfigError."""
+    """Calibrate as requested and print the result. Raises ConfigError."""
     from rich.console import Console
     from rich.progress import Progress
 

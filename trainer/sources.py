@@ -1,4 +1,4 @@
-"""What a run is trained and measured on: rendered windows, windows of datasets, or both, as its configuration says."""
+"""Training and evaluation data as configured: rendered windows, windows from datasets, or both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
             shares.append(source.share)
     if not samplers or config.rendered_share > 0.0:
-        # What is measured on holds the fleet alone, however many invented aircraft are trained on.
+        # Evaluation windows show the fleet only, whatever the share of generated aircraft in training.
         invention = Invention(0.0 if validating or held_out else config.invented_share)
         samplers.append(
             WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invention, view)
@@ -34,8 +34,8 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
 
 
 def refuse_unreadable(config: DataConfig) -> None:
-    """Raises ConfigError where datasets to train or to validate on cannot be used: before hours of training."""
-    size_px = 32  # whatever the windows' size, the labels are the same
+    """Raises ConfigError if a dataset for training or validation is unusable; a check before hours of training."""
+    size_px = 32  # any: the labels do not depend on it
     show_targets: dict[str, list[bool]] = {"train": [], "validate": []}
     for source in config.datasets:
         if source.split == source.validation_split:
@@ -58,7 +58,7 @@ def refuse_unreadable(config: DataConfig) -> None:
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:
     """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it.
 
-    `held_out` windows come from no picture that is trained on; those of the validation seed are always so.
+    `held_out` windows come from images that are not trained on, as those of the validation seed always do.
     """
     return partial(_open_window_sampler, config, seed, size_px, held_out)
 
@@ -73,7 +73,7 @@ def _open_refinement_sampler(config: DataConfig, seed: int, size_px: int, strang
 
 
 def refinement_sampler(config: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], Sampler]:
-    """As `window_sampler`, for learning how far a trained network may be trusted: a target in each window, a share of
-    `strangers` among them that no training draws. Of rendered windows alone: a dataset's pictures are few, and the
-    network's errors on those that it was trained on too small."""
+    """Like `window_sampler`, for the refinement head: a target in each window, a share of `strangers` being generated
+    aircraft that training never uses. Rendered windows only: a dataset has few images, and the network's errors on
+    those it was trained on are too small."""
     return partial(_open_refinement_sampler, config, seed, size_px, strangers)

@@ -1,4 +1,4 @@
-"""Training: `run_training` is the loop, top-down; `Trainer` is its state, which a checkpoint carries whole."""
+"""Training: `run_training` is the entry point, top-down; `Trainer` is the state, which a checkpoint saves in full."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ def learning_rate(schedule: ScheduleConfig, samples_done: int, progress: float) 
 
 
 def size_at(schedule: ScheduleConfig, progress: float) -> int:
-    """Side of the training windows at that progress, pixels."""
+    """Side of the training windows at this progress, pixels."""
     return [stage.size_px for stage in schedule.sizes if stage.from_progress <= progress][-1]
 
 
 class Diverged(ArithmeticError):
-    """A step whose loss has no finite gradient; it was not taken, but norm statistics may be spoilt."""
+    """The gradient is not finite. The optimiser step was skipped, but norm statistics may be corrupted."""
 
 
 class StepResult(NamedTuple):
@@ -80,11 +80,11 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr, fused=True)
         self.steps = 0
         self.samples = 0
-        self.samples_before: int | None = 0  # of the runs whose weights this one began with; None: not known
+        self.samples_before: int | None = 0  # of the runs behind the initial weights; None: unknown
         self.started_from = "public ImageNet weights" if config.model.pretrained else "scratch"
 
     def _parameter_groups(self) -> list[dict[str, Any]]:
-        """Vectors (norms, biases) do not decay; a pretrained backbone learns at its own share of the rate."""
+        """No weight decay for vectors (norms, biases); the backbone's learning rate is scaled."""
         schedule = self.config.schedule
         groups: dict[tuple[float, float], list[nn.Parameter]] = {}
         for name, parameter in self.model.named_parameters():
@@ -96,10 +96,10 @@ class Trainer:
         return [{"params": p, "lr_scale": scale, "weight_decay": decay} for (scale, decay), p in groups.items()]
 
     def step(self, batch: TrainingBatch, progress: float) -> StepResult:
-        """One optimiser step over the group's batches. Its only randomness is drawn from (seed, step, rank).
+        """One optimiser step over the batches of all processes; gradients and norm statistics are averaged over them.
 
-        So a resumed run repeats it. Gradients and norm statistics are means over the group. Raises Diverged, in all
-        processes of the group.
+        All randomness derives from (seed, step, rank), so a resumed run repeats the step exactly. Raises Diverged, in
+        all processes.
         """
         schedule = self.config.schedule
         image, labels = to_tensors(batch, self.device)
@@ -107,7 +107,7 @@ class Trainer:
         generator = torch.Generator().manual_seed(draw_of)
         self.model.train()
         for layer in self.frozen:
-            layer.eval()  # nor may its norm statistics move
+            layer.eval()  # keeps its norm statistics too
         with contextlib.ExitStack() as views:
             if schedule.fixed_norms:
                 views.enter_context(folded_norms(self.model))
@@ -140,7 +140,7 @@ class Trainer:
 
     @torch.no_grad()
     def _update_average(self) -> None:
-        """Exponential moving average of weights and norm statistics, shorter while young."""
+        """Exponential moving average of weights and norm statistics; the first steps use a smaller decay."""
         decay = min(self.config.schedule.ema_decay, (1 + self.steps) / (10 + self.steps))
         for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
             if mean.dtype.is_floating_point:
@@ -161,7 +161,7 @@ class Trainer:
         }
 
     def start_from(self, weights: Path) -> None:
-        """Begin with another run's weights where name and shape agree. Raises ConfigError if none does."""
+        """Load another run's weights where name and shape match. Raises ConfigError if none do."""
         content = load_file(weights)
         given = content.get("weights", {})
         self.started_from = f"weights {weights_sha256(given)[:16]}"
@@ -174,7 +174,7 @@ class Trainer:
         self.samples_before = samples_behind(content.get("training", {}))
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the state of an earlier run with the same network."""
+        """Restore the state of an earlier run with the same network."""
         self.model.load_state_dict(state["model"])
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -204,18 +204,18 @@ def stop_on_signals() -> Iterator[list[int]]:
 
 
 class Plan(NamedTuple):
-    """How far a run is to go and how far it has come."""
+    """Planned length of a run, and the time already used."""
 
-    samples: int  # planned, in all
-    used_s: float = 0.0  # wall-clock seconds of the starts before this one
+    samples: int  # planned, in total
+    used_s: float = 0.0  # wall-clock seconds before this start
 
 
 def resume_run(out: Path, trainer: Trainer) -> Plan:
     """Restore `trainer` from the run folder and return its plan. Raises ConfigError.
 
-    Of the checkpoint's configuration only [contract] and [run] may differ, of the latter not the arithmetic. As many
-    processes as before repeat what an unbroken run would have done; another number goes on with batches of another
-    size, and run.json tells of it.
+    The configuration may differ from the checkpoint's only in [contract] and [run] (except [run] bf16). With the same
+    number of processes the run continues exactly as if it had not been interrupted; with another number the effective
+    batch size changes, which run.json records.
     """
     path = out / RESUME_NAME
     state = load_file(path)
@@ -228,7 +228,7 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     if earlier.run.bf16 != trainer.config.run.bf16:
         raise ConfigError(f"{path}: [run] bf16 differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
-    # Files written before the plan was kept had the configuration's.
+    # Older files lack the plan: theirs was the configuration's.
     return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]))
 
 
@@ -244,9 +244,9 @@ def run_training(
     max_steps: int | None = None,
     start_from: Path | None = None,
 ) -> Trainer:
-    """Train until the planned samples, the budget, `max_steps` of this start, or a signal; leave a checkpoint.
+    """Train until the planned samples, the time budget, `max_steps` of this start, or a signal; save a checkpoint.
 
-    Progress, which drives the schedule, is the larger of samples done over planned and time used over budget.
+    Progress, which drives the schedule, is the larger of samples done / planned and time used / budget.
     A resumed run keeps its planned `samples` unless others are given. Raises ConfigError.
     """
     torch.set_num_threads(config.run.threads)
@@ -270,7 +270,7 @@ def run_training(
 
 
 class _Loop:
-    """Feeds, clock, log and checkpoints around a Trainer."""
+    """Data feeds, time budget, log and checkpoints around a Trainer."""
 
     def __init__(
         self, trainer: Trainer, config_text: str, out: Path, budget: Budget, planned: int, opener: OpenSampler
@@ -286,7 +286,7 @@ class _Loop:
         self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}
-        self.validated: tuple[int, int] | None = None  # samples and size of the last time
+        self.validated: tuple[int, int] | None = None  # samples and size at the last validation
 
     def used_s(self) -> float:
         return self.budget.used_before_s + time.monotonic() - self.started_s
@@ -294,7 +294,7 @@ class _Loop:
     def progress(self) -> float:
         by_samples = self.trainer.samples / self.planned
         by_time = self.used_s() / self.budget.total_s if self.budget.total_s else 0.0
-        return self.group.agreed(max(by_samples, by_time))[0]  # a message: all processes must ask together
+        return self.group.agreed(max(by_samples, by_time))[0]  # collective: all processes must call it
 
     def note(self, text: str) -> None:
         if self.log is not None:
@@ -305,7 +305,7 @@ class _Loop:
         reason = "planned number of samples reached"
         worth_saving = True
         try:
-            self.size_px = size_at(self.config.schedule, self.progress())  # a run may be resumed at its end
+            self.size_px = size_at(self.config.schedule, self.progress())  # a resumed run may already be complete
             while (progress := self.progress()) < 1.0:
                 size_px = size_at(self.config.schedule, progress)
                 if self._train_at(size_px, stopped, last_step):
@@ -317,7 +317,7 @@ class _Loop:
             worth_saving = False
             raise ConfigError(self._divergence()) from None
         finally:
-            if self.trainer.steps > 0 and worth_saving:  # what failed before it began is no run to go on with
+            if self.trainer.steps > 0 and worth_saving:  # a run that failed before its first step cannot be resumed
                 self.save()
         self.validate(self.size_px)
         self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
@@ -325,7 +325,7 @@ class _Loop:
             self.log.close()
 
     def _divergence(self) -> str:
-        """What became of the run, and how to get by it: the same steps would end it again."""
+        """Error message with a remedy; resuming would not help, as the same steps would diverge again."""
         told = (
             f"{self.out}: training stopped after {self.trainer.samples} samples: the gradient of the loss is not "
             "finite; the most frequent cause is a too high [schedule] lr"
@@ -336,7 +336,7 @@ class _Loop:
         return f"{told}. {WEIGHTS_NAME} was saved before that: start another run with --start-from {weights}"
 
     def _train_at(self, size_px: int, stopped: list[int], last_step: int | None) -> bool:
-        """Train with windows of one size until the schedule changes it or ends. True: told to stop."""
+        """Train with windows of one size until the schedule changes it or ends. True: stopped before that."""
         trainer, data, run = self.trainer, self.config.data, self.config.run
         self.size_px = size_px
         self.note(f"from sample {trainer.samples} on: windows of {size_px} px")
@@ -364,7 +364,7 @@ class _Loop:
             self.log.report(trainer.steps, trainer.samples, progress, trainer.optimizer.param_groups[-1]["lr"])
 
     def validate(self, size_px: int) -> None:
-        """Measure the averaged network on held-out windows of this size, rendered once, and show some."""
+        """Evaluate the averaged network on held-out windows of this size, rendered once; log metrics and examples."""
         if self.log is None or self.validated == (self.trainer.samples, size_px):
             return
         self.validated = (self.trainer.samples, size_px)
@@ -377,7 +377,7 @@ class _Loop:
         self.log.picture("held out", self.trainer.samples, example_sheet(batches[0], predicted))
 
     def save(self) -> None:
-        """Both files; the weights first, so that resume.pt never knows more than weights.pt."""
+        """Write both files, weights.pt first, so that resume.pt is never newer than weights.pt."""
         self.saved_s = time.monotonic()
         if self.log is None:
             return

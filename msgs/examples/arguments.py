@@ -1,4 +1,4 @@
-"""What every example has in common: its arguments, and how it ends."""
+"""Shared by all examples: command-line arguments and exit codes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from msgs.topics import check_uav_name
 
 
 class NoSessionError(Exception):
-    """Nobody answers at the endpoint; the text is for a person."""
+    """Nothing answers at the endpoint; the text is shown to the user."""
 
 
 def parse(description: str, count: int | None = None) -> argparse.Namespace:
-    """`endpoint`, `uav` and `count`, from the command line; `count` is what holds where none is given."""
+    """`endpoint`, `uav` and `count` from the command line; the argument `count` is the default."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("-e", "--endpoint", default="tcp/127.0.0.1:7447", help="router or daemon (default %(default)s)")
     parser.add_argument("-u", "--uav", type=_uav, default="uav1", help="vehicle (default %(default)s)")
@@ -26,7 +26,7 @@ def parse(description: str, count: int | None = None) -> argparse.Namespace:
 
 
 def run(example: Callable[[], None]) -> NoReturn:
-    """End the process when the example is done: 2 with a sentence where nobody answers, 141 where nobody reads."""
+    """Run an example and exit: 2 with a message if nothing answers, 141 if the output pipe is closed."""
 
     def act() -> int:
         try:

@@ -1,4 +1,4 @@
-"""Plot range over time in the terminal, one line a pose: a stand-in for whatever plots better."""
+"""Plot range over time in the terminal, one line per pose; replace with a real plotting library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Print each pose as it comes: target, age, place in the camera's frame, range and how sure it is."""
+"""Print each pose on arrival: target, age, position in the camera frame, range and its standard deviation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gather poses into arrays and write them as .npz: stamps, positions, rotation matrices, covariances."""
+"""Collect poses in arrays and write them as .npz: stamps, positions, rotation matrices, covariances."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OUT = "poses.npz"
 
 def main() -> None:
     options, taken = parse(f"Gather the poses of a vehicle's targets into {OUT}.", count=100), list[TargetPose]()
-    # Who grows tired of waiting keeps what has come.
+    # Ctrl-C ends early and keeps the poses received so far.
     with (
         suppress(KeyboardInterrupt),
         connect(options.endpoint) as session,

@@ -1,7 +1,7 @@
-"""Who may do what on the router, as zenoh's access control spells it: by the certificate's common name. Pure.
+"""The router's permissions as a zenoh access control section, by the certificate's common name. Pure.
 
-Deny is the default. A vehicle writes below its own name only; a reader reads; an operator also commands. `**` never
-matches a chunk that begins with `@`, so what zenoh and ROS keep there is listed apart.
+The default is deny. A vehicle writes below its own name only; a reader reads; an operator also commands. `**` never
+matches a key chunk that begins with `@`, so such keys of zenoh and ROS are listed separately.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _GIVES = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
 
 @dataclass(frozen=True)
 class Access:
-    """Common names by what they may do. `loopback_reads`: plain TCP on this machine reads without a certificate."""
+    """Common names by role. `loopback_reads`: clients on this machine may read over plain TCP, without certificate."""
 
     vehicles: Sequence[str]
     readers: Sequence[str] = ()
@@ -65,7 +65,7 @@ def access_control(access: Access, domain: int) -> dict[str, Any]:
 
 
 def vehicle_keys(vehicle: str, domain: int) -> list[str]:
-    """What a vehicle may give: its topics with their caches, its own part of our keys, its ROS node and publishers."""
+    """Keys a vehicle may publish on: its topics and their caches, its own uavpose keys, its ROS node and publishers."""
     return [
         f"{domain}/{vehicle}/**",
         f"{domain}/{vehicle}/**/@adv/**",

@@ -1,4 +1,4 @@
-"""`uavpose-ground bench`: how long a pose takes to encode and to decode with all its checks, beside other codecs."""
+"""`uavpose-ground bench`: time to encode a pose, and to decode it with validation, compared with other codecs."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ _ROUNDS = 7
 
 @dataclass(frozen=True)
 class Timing:
-    """Microseconds of processor time a call, the best of several rounds; None where it does no such thing."""
+    """CPU microseconds per call, best of several rounds; None: not applicable."""
 
     codec: str
     size_bytes: int
     encode_us: float
     decode_us: float
-    take_us: float | None = None  # a sample as it comes: key, attachment, decode, judge
+    take_us: float | None = None  # receiving a whole sample: key, attachment, decoding, validation
 
 
 def bench(calls: int) -> list[Timing]:
-    """Time `calls` calls a round, ours first. The others check nothing on decoding; ours refuses what is no pose."""
+    """Time `calls` calls per round, our codec first. Unlike ours, the others do not validate on decoding."""
     message = pose()
     payload = message.encode()
     ours = Codec("ours", message.encode, lambda: PoseWithCovarianceStamped.decode(payload))
     codecs = [ours, *installed(message)]
     encode_us, decode_us = ({codec.name: float("inf") for codec in codecs} for _ in range(2))
     for _ in range(_ROUNDS):
-        # Round about, so that what else the machine does meets all.
+        # Interleaved, so that other load on the machine affects all codecs.
         for codec in codecs:
             encode_us[codec.name] = min(encode_us[codec.name], _us(codec.encode, calls))
             decode_us[codec.name] = min(decode_us[codec.name], _us(codec.decode, calls))
@@ -51,7 +51,7 @@ def bench(calls: int) -> list[Timing]:
 
 
 def pose() -> PoseWithCovarianceStamped:
-    """What is encoded: no number of it is round."""
+    """The pose that is encoded; its covariance has no round numbers."""
     root = np.random.default_rng(0).normal(size=(6, 6))
     t_m, q = np.array([10.0, -4.0, 260.0]), np.array([0.5, -0.5, 0.5, 0.5])
     return PoseWithCovarianceStamped(_STAMP_NS, topics.FRAME_CAMERA, t_m, q, root @ root.T)
@@ -62,7 +62,7 @@ def _us(call: Callable[[], object], calls: int) -> float:
 
 
 def _receive_us(message: PoseWithCovarianceStamped, calls: int) -> float:
-    """Each sample must be newer than the last, so they are made beforehand."""
+    """Time to receive a sample. Each must be newer than the last, so they are prepared in advance."""
     key = topics.publication_key(topics.POSE, "uav1", "t0")
     payload = bytearray(message.encode())
     samples = []

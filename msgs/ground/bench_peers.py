@@ -1,7 +1,6 @@
-"""The same pose in other codecs: rosbags and pycdr2 write the same CDR, protobuf a schema of its own
-with the same fields.
+"""The same pose in other codecs: rosbags and pycdr2 write the same CDR, protobuf its own format with the same fields.
 
-pycdr2 reads annotations, so they must not be strings here.
+pycdr2 evaluates annotations, so this module must not turn them into strings.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Codec:
-    """`encode` gives the bytes of one pose, `decode` reads them again."""
+    """`encode` returns one pose as bytes, `decode` parses them."""
 
     name: str
     encode: Callable[[], bytes]
@@ -24,7 +23,7 @@ class Codec:
 
 
 def installed(message: PoseWithCovarianceStamped) -> Iterator[Codec]:
-    """The codecs that are here, each with this pose."""
+    """The installed codecs, each with this pose."""
     for package, make in (("rosbags", rosbags), ("pycdr2", pycdr2), ("google.protobuf", protobuf)):
         if find_spec(package.partition(".")[0]) is not None and find_spec(package) is not None:
             yield make(message)

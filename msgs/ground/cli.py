@@ -16,16 +16,16 @@ from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
 
 DOMAIN_MAX = 232  # of any daemon and router
-HANGING_UP_S = 0.5  # within which a call ends where nobody listens
+HANGING_UP_S = 0.5  # time for a pending connection attempt to end if nothing listens
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
+    """Exit codes: 0 done, 2 bad input (the message names file and key), 130 interrupted, 141 output pipe closed."""
     options = _parser().parse_args(arguments)
     code = exit_code(lambda: int(options.act(options)), InputError, ["ground"])
     if _still_calls():
-        # It would come back from zenoh while the interpreter is taken down, and abort the process.
+        # A connection attempt that returns from zenoh during interpreter shutdown would abort the process.
         os._exit(code)
     return code
 
@@ -298,7 +298,7 @@ def _say_aside(text: str) -> None:
 
 
 def _stop_on_signal(after_s: float | None = None) -> threading.Event:
-    """Set by SIGTERM and Ctrl-C, or when the time is over."""
+    """An event set by SIGTERM and Ctrl-C, or after `after_s`."""
     stop = stop_on_signals()
     if after_s is not None:
         timer = threading.Timer(after_s, stop.set)

@@ -1,4 +1,4 @@
-"""`uavpose-ground command`: tell one vehicle what to track, to stop, reload, record or send less; prints its answer."""
+"""`uavpose-ground command`: commands one vehicle (track, stop, reload, record, limit the rate); prints its answer."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from msgs.ground.feed import session
 from msgs.session import TlsFiles
 
 ANSWER_S = 5.0
-RELOAD_ANSWER_S = 60.0  # a model is loaded and warmed up first
+RELOAD_ANSWER_S = 60.0  # the model is loaded and warmed up before the answer
 LINK_S = 10.0
 LOOK_EVERY_S = 0.02
 EXIT_REFUSED = 1
 
 
 def body(name: str, words: Sequence[str]) -> dict[str, Any]:
-    """A command's JSON object from words: `track LEFT TOP RIGHT BOTTOM`, `select TARGET`, `stop`, `reload`,
+    """A command's JSON object from its arguments: `track LEFT TOP RIGHT BOTTOM`, `select TARGET`, `stop`, `reload`,
     `record on|off`, `rate HZ|all`.
 
     Raises InputError.
@@ -52,16 +52,16 @@ def ask(
     timeout_s: float = ANSWER_S,
     stop: threading.Event | None = None,
 ) -> dict[str, Any]:
-    """The vehicle's answer, waited for until `stop` is set; `ok` is false, with an `error`, where it refuses or none
-    comes."""
+    """Send a command and wait for the answer, or until `stop` is set; `ok` is false, with an `error`, if the vehicle
+    refuses or does not answer."""
     stop = stop or threading.Event()
     key, why = f"uavpose/@v1/{uav}/cmd/{name}", f"{uav} does not answer: not there, or not for you to command"
     replies = opened.get(key, payload=json.dumps(asked), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s)
-    # Waiting inside zenoh would hear no signal.
+    # Polling, because a blocking wait inside zenoh cannot be interrupted by signals.
     while not stop.is_set():
         try:
             reply = replies.try_recv()
-        except zenoh.ZError:  # no more will come
+        except zenoh.ZError:  # no further replies
             return {"ok": False, "command": name, "error": why}
         if reply is None:
             stop.wait(LOOK_EVERY_S)
@@ -74,7 +74,7 @@ def ask(
 
 
 def _answer(reply: zenoh.Reply) -> dict[str, Any] | None:
-    """None for what zenoh says itself, as that the time is over."""
+    """The vehicle's answer; None for replies by zenoh itself, such as a timeout."""
     said = reply.ok if reply.ok is not None else reply.err
     try:
         answer = json.loads(said.payload.to_bytes()) if said is not None else None
@@ -92,8 +92,8 @@ def command(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send one command and print the answer as JSON; 0, or 1 if it is refused or `stop` was set before it came. Raises
-    InputError for words that are no command."""
+    """Send one command and print the answer as JSON; returns 0, or 1 if it was refused, not answered, or `stop` was set
+    first. Raises InputError for an invalid command."""
     asked = body(name, words)
     giving_up = threading.Timer(LINK_S, stop.set)
     giving_up.daemon = True

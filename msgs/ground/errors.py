@@ -1,7 +1,7 @@
-"""The one error a person can mend: the command line prints it as a sentence and leaves with exit code 2."""
+"""The error for invalid user input: the command line prints its message and exits with code 2."""
 
 from __future__ import annotations
 
 
 class InputError(Exception):
-    """A file, key or endpoint that a person named does not do; the text is a whole sentence."""
+    """A file, key or endpoint given by the user is invalid; the text is a complete message."""

@@ -1,4 +1,4 @@
-"""All that vehicles tell, from one session: samples of every topic, and who is there."""
+"""Receives everything the vehicles send over one session: samples of all topics, and liveliness."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALIVE = "uavpose/@v1/*/alive"
 
 @dataclass(frozen=True)
 class Incoming:
-    """One sample as it came."""
+    """One received sample, not validated."""
 
     uav: str
     topic: Topic
@@ -32,7 +32,7 @@ class Incoming:
     key: str
     payload: bytes
     attachment: bytes
-    sender: str = ""  # the zenoh session that it is from; empty: not known
+    sender: str = ""  # id of the sending zenoh session; empty: unknown
 
 
 OnSample = Callable[[Incoming], None]
@@ -43,8 +43,8 @@ OnAlive = Callable[[str, bool], None]
 def session(
     endpoint: str, tls: TlsFiles | None, stop: threading.Event, say: Callable[[str], None]
 ) -> Iterator[zenoh.Session | None]:
-    """A session with a router or daemon, waited for until `stop` is set (then None). Raises InputError for an endpoint
-    or certificates that cannot do."""
+    """A session with a router or daemon; retries until `stop` is set (then None). Raises InputError for an invalid
+    endpoint or unusable certificates."""
     try:
         check_endpoint(endpoint, tls=tls is not None)
         if tls is not None:
@@ -61,7 +61,7 @@ def session(
                 yield opened
             return
         if not waiting and not stop.is_set():
-            # zenoh does not say why there is no link.
+            # zenoh does not report why there is no link.
             why = ": not there, or one end refuses the other's certificate" if endpoint.startswith(SECURE) else ""
             say(f"waiting for {endpoint}{why}")
             waiting = True
@@ -70,7 +70,7 @@ def session(
 
 
 def _connected(endpoint: str, tls: TlsFiles | None, stop: threading.Event) -> zenoh.Session | None:
-    """None where nobody answers, and at once when `stop` is set: a call, of ten seconds over QUIC, hears of nothing."""
+    """A session; None if nothing answers or `stop` is set. In a thread: opening blocks, over QUIC for ten seconds."""
     answer: SimpleQueue[zenoh.Session | None] = SimpleQueue()
 
     def call() -> None:
@@ -90,12 +90,12 @@ def _connected(endpoint: str, tls: TlsFiles | None, stop: threading.Event) -> ze
 
 
 def linked(opened: zenoh.Session) -> bool:
-    """Whether the other end is there just now; zenoh goes on connecting while it is not."""
+    """Whether the session is currently connected; zenoh keeps reconnecting while it is not."""
     return bool(opened.info.routers_zid() or opened.info.peers_zid())
 
 
 def alive_uav(key: str) -> str | None:
-    """Whose token a key below `ALIVE` is; None if no vehicle can be called so."""
+    """Vehicle of a liveliness token that matches `ALIVE`; None if its name is invalid."""
     try:
         return topics.check_uav_name(key.split("/")[2])
     except ValueError:
@@ -113,7 +113,7 @@ def listening(
 ) -> Iterator[None]:
     """Call `on_sample` and `on_alive` for these vehicles, all if none is named, on zenoh's receiving threads.
 
-    What is cached (intrinsics, events) comes with its history. A topic that nobody wants does not leave the vehicle.
+    Cached topics (intrinsics, events) deliver their history. Topics not in `wanted` are not sent by the vehicle.
     """
 
     def sample(one: zenoh.Sample) -> None:
@@ -128,7 +128,7 @@ def listening(
         if uav is not None and (not uavs or uav in uavs):
             on_alive(uav, one.kind == zenoh.SampleKind.PUT)
 
-    # An indirect callback runs in a Python thread that keeps the process alive if the session is left open.
+    # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
     handler = handlers.Callback(sample, indirect=False)
     declared: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
     for uav in uavs or ("*",):

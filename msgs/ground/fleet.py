@@ -1,8 +1,8 @@
-"""What is known of each vehicle and its targets, from what came so far. No sockets; safe to use from several threads.
+"""State of each vehicle and its targets, from the samples received so far. No sockets; thread-safe.
 
-Range and closing speed are from the camera. Bearing (clockwise from north), elevation and attitude are in ned while
-the vehicle tells its own attitude; else bearing and elevation are to the right of and above the optical axis. Its own
-attitude comes after the pose and, on a radio, with fewer of them: a row waits for that of its instant.
+Range and closing speed are relative to the camera. Bearing (clockwise from north), elevation and attitude are in NED
+while the vehicle sends its own attitude; otherwise bearing and elevation are measured to the right of and above the
+optical axis. The own attitude arrives after the pose and, over radio, less often: a row waits for the one of its time.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ from msgs.wire import Array, PayloadError, Refusal
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
-# A range that differs from the one before by more than flight makes of it is of another aircraft under the same number,
-# or of a track that was moved to where its frames are. Two small aircraft near each other by less than 150 m/s; with a
-# frame's noise a track's range goes up to 5 m from frame to frame, and by tens of metres where it is moved.
+# A larger change of range than flight can explain means another aircraft under the same number, or a track whose range
+# was moved to that of its last frames. Two small aircraft approach each other at less than 150 m/s; noise changes a
+# track's range by up to 5 m from frame to frame, such a move by tens of metres.
 FLIGHT_MPS = 150.0
 RANGE_NOISE_M = 5.0
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
-HEALTH_STALE_NS = 3_000_000_000  # it is told each second
-SET_BACK_NS = 500_000_000  # so far in the future nothing comes, but by a clock that was set back since
+HEALTH_STALE_NS = 3_000_000_000  # health is sent every second
+SET_BACK_NS = 500_000_000  # reception times further in the future mean that our clock was set back since
 _KEPT_MAX = 256
-TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # what a fleet looks at
-VEHICLES_MAX = 64  # so that made-up names cannot grow this without bound
+TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # topics that a Fleet evaluates
+VEHICLES_MAX = 64  # bounds memory against fake names
 
 
 @dataclass(frozen=True)
 class TargetRow:
-    """One target at its last pose."""
+    """One target at its latest pose."""
 
     uav: str
     target: str
     stamp_ns: int  # UTC of the exposure
-    heard_ns: int  # UTC by our clock
+    heard_ns: int  # UTC of reception by our clock
     range_m: float
     bearing_deg: float
     elevation_deg: float
     frame: Literal["ned", "cam"]  # of bearing and elevation
-    closing_mps: float | None  # positive: comes nearer
-    attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in ned; None: own or its own not known
+    closing_mps: float | None  # positive: approaching
+    attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in NED; None: own or target's unknown
     score: float | None
     sigma_range_m: float
-    sigma_rotation_deg: float | None  # None: how it is turned is not known
+    sigma_rotation_deg: float | None  # None: target's attitude unknown
     t_cam_target_m: tuple[float, float, float]
     q_cam_target_xyzw: tuple[float, float, float, float]
 
@@ -65,10 +65,10 @@ class VehicleRow:
     """One vehicle."""
 
     uav: str
-    alive: bool  # its daemon's token is there
+    alive: bool  # its daemon's liveliness token is present
     level: int  # as in diagnostic_msgs: 0 ok, 1 warn, 2 error
     health: str
-    health_heard_ns: int  # UTC by our clock; 0: never
+    health_heard_ns: int  # UTC of reception by our clock; 0: never
     event: str
     pose_rate_hz: float
     refused: int
@@ -77,21 +77,21 @@ class VehicleRow:
 
 @dataclass
 class _Target:
-    newest: TargetRow  # by the own attitude that was known when it came
+    newest: TargetRow  # with the own attitude known at its reception
     seen_ns: int
     ranges: deque[tuple[int, float]]  # stamp, m
-    # The newest whose own attitude has come, and those after it, which still wait for theirs.
+    # The newest row whose own attitude has arrived, and later ones that still wait for theirs.
     settled: TargetRow | None = None
     waiting: deque[tuple[TargetPose, TargetRow]] = field(default_factory=lambda: deque(maxlen=_KEPT_MAX))
 
     def row(self) -> TargetRow:
-        """What to show: the newest that is sure, unless the vehicle has ceased to tell its attitude."""
+        """The row to show: the newest settled one, unless the vehicle no longer sends its attitude."""
         if self.settled is not None and self.newest.stamp_ns - self.settled.stamp_ns <= GAP_NS:
             return self.settled
         return self.newest
 
     def settle(self, own: OwnShipHistory) -> None:
-        """Make the row anew of the newest pose whose own attitude has come."""
+        """Recompute the row of the newest pose whose own attitude has arrived."""
         for index in reversed(range(len(self.waiting))):
             pose, row = self.waiting[index]
             ship = own.at(pose.stamp_ns)
@@ -110,7 +110,7 @@ class _Vehicle:
     health: str = ""
     health_heard_ns: int = 0
     event: str = ""
-    event_number: tuple[bytes, int] = (b"", 0)  # publisher, and its number of the newest event
+    event_number: tuple[bytes, int] = (b"", 0)  # publisher and sequence number of the newest event
     own: OwnShipHistory = field(default_factory=OwnShipHistory)
     scores: dict[str, float] = field(default_factory=dict)
     targets: dict[str, _Target] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class _Vehicle:
 
 
 class Fleet:
-    """Takes what comes and says how things stand. `max_age_s` must allow for the clocks' difference."""
+    """Collects samples and provides the current state. `max_age_s` must allow for the offset between the clocks."""
 
     def __init__(self, *, domain: int = 0, max_age_s: float = 2.0) -> None:
         self._domain = domain
@@ -133,7 +133,8 @@ class Fleet:
                 vehicle.alive = alive
 
     def take(self, incoming: Incoming, now_ns: int) -> TargetRow | Log | DiagnosticArray | None:
-        """Note a sample at `now_ns` (UTC); what is new in it for a person, or None. Malformed ones are counted."""
+        """Process a sample received at `now_ns` (UTC); returns what is new for the operator, or None. Counts malformed
+        ones."""
         with self._lock:
             vehicle = self._vehicle(incoming.uav)
             if vehicle is None:
@@ -150,20 +151,20 @@ class Fleet:
             except PayloadError as error:
                 vehicle.receiver.refused[error.reason] += 1
                 return None
-            # Of events history comes, late, of daemons that are gone.
+            # Events are exempt: their history includes those of earlier daemons.
             if incoming.topic is not topics.EVENTS and not vehicle.receiver.believes(incoming.sender, now_ns):
                 vehicle.receiver.refused[Refusal.PUBLISHER] += 1
                 return None
             return _note(vehicle, message, topics.parse_attachment(incoming.attachment), now_ns)
 
     def believes(self, incoming: Incoming, now_ns: int) -> bool:
-        """Whether a sample is of the vehicle's own daemon, and not of a second one under its name."""
+        """Whether a sample is from the vehicle's accepted daemon, not from a second one under its name."""
         with self._lock:
             vehicle = self._vehicles.get(incoming.uav)
             return vehicle is None or vehicle.receiver.believes(incoming.sender, now_ns)
 
     def rows(self, now_ns: int) -> list[VehicleRow]:
-        """Every vehicle that was heard, by name; targets not seen for ten seconds are left out."""
+        """All known vehicles, by name; targets not seen for ten seconds are left out."""
         with self._lock:
             return [self._row(uav, vehicle, now_ns) for uav, vehicle in sorted(self._vehicles.items())]
 
@@ -197,7 +198,7 @@ class Fleet:
         return row
 
     def _row(self, uav: str, vehicle: _Vehicle, now_ns: int) -> VehicleRow:
-        # What was seen in the future was seen before our clock was set back, who knows when.
+        # A time in the future means that our clock was set back since: the true age is unknown.
         kept = {
             name: one
             for name, one in vehicle.targets.items()
@@ -222,7 +223,7 @@ class Fleet:
 def _note(
     vehicle: _Vehicle, message: object, sent_as: tuple[int, int, bytes] | None, now_ns: int
 ) -> Log | DiagnosticArray | None:
-    """`sent_as`: number, time and publisher of the sample, as its attachment has them."""
+    """Update the vehicle; returns what is new. `sent_as`: the attachment's sequence number, time and publisher."""
     match message:
         case Detection3DArray():
             vehicle.scores = {one.id: one.hypotheses[0].score for one in message.detections if one.hypotheses}
@@ -241,7 +242,7 @@ def _note(
 
 
 def _is_news(vehicle: _Vehicle, sent_as: tuple[int, int, bytes] | None) -> bool:
-    """Whether an event is newer than those before, by its publisher's count: clocks are set, and history comes late."""
+    """Whether an event is new, by its publisher's sequence number: clocks may be set, and history arrives late."""
     if sent_as is None:
         return False
     number, _, publisher = sent_as
@@ -253,12 +254,12 @@ def _is_news(vehicle: _Vehicle, sent_as: tuple[int, int, bytes] | None) -> bool:
 
 
 def _flown(before_ns: int, before_m: float, stamp_ns: int, range_m: float) -> bool:
-    """Whether flight may have brought a target from one range to another."""
+    """Whether flight can explain a change of range."""
     return abs(range_m - before_m) <= FLIGHT_MPS * (stamp_ns - before_ns) / 1e9 + RANGE_NOISE_M
 
 
 def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
-    """How fast a target comes nearer, by a line through (stamp ns, range m); None before there is enough."""
+    """Closing speed from a line fitted to (stamp ns, range m); None if there are too few points."""
     if len(ranges) < 4 or ranges[-1][0] - ranges[0][0] < CLOSING_SPAN_NS:
         return None
     points = np.array(ranges, dtype=np.float64)
@@ -266,7 +267,7 @@ def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
 
 
 def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None, score: float | None) -> TargetRow:
-    """What a person wants to know of a pose; `R_ned_cam` [3, 3] if own attitude is known."""
+    """Row for a pose; `R_ned_cam` [3, 3], or None if the own attitude is unknown."""
     t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
     range_m = float(np.linalg.norm(t_m))
     along = t_m / max(range_m, 1e-9)

@@ -1,6 +1,6 @@
-"""A small certificate authority for zenoh over TLS and QUIC: EC P-256, one certificate an identity.
+"""A small certificate authority for zenoh over TLS and QUIC: EC P-256, one certificate per identity.
 
-The common name is the identity that the router's access rules know. One certificate serves both ends of a link
+The common name is the identity used by the router's access rules. Certificates are valid for both ends of a link
 (extended key usage: server and client), since a zenoh peer both listens and connects.
 """
 
@@ -30,9 +30,9 @@ _BACKDATED = timedelta(days=1)
 
 
 def init_authority(folder: Path, days: int = 3650) -> tuple[Path, Path]:
-    """Make `ca.pem` and `ca.key` (mode 0600) in `folder`; (certificate, key).
+    """Create `ca.pem` and `ca.key` (mode 0600) in `folder`; returns (certificate, key).
 
-    Raises InputError if one is there already or cannot be written.
+    Raises InputError if one exists already or cannot be written.
     """
     certificate_path, key_path = folder / f"{AUTHORITY}.pem", folder / f"{AUTHORITY}.key"
     _require_new(key_path, certificate_path)
@@ -54,10 +54,10 @@ def init_authority(folder: Path, days: int = 3650) -> tuple[Path, Path]:
 
 
 def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 825) -> TlsFiles:
-    """Make `<identity>.pem` and `.key` (mode 0600) in `folder`, signed by the authority there.
+    """Create `<identity>.pem` and `.key` (mode 0600) in `folder`, signed by the authority there.
 
     `hosts` are the DNS names and IP addresses under which others will reach it. Raises InputError if the authority is
-    missing, the identity exists, or a name is none.
+    missing, the identity exists, or a name is invalid.
     """
     if not _IDENTITY.fullmatch(identity) or identity == AUTHORITY:
         raise InputError(f"'{identity}' is no identity: a letter, then letters, digits, '_', '-' or '.'")
@@ -131,7 +131,7 @@ def _alternative_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         pass
-    # All digits and dots it is an address mistyped, which no certificate would ever match.
+    # Only digits and dots: a mistyped address, which no certificate would ever match.
     if not re.fullmatch(rf"{_LABEL}(\.{_LABEL})*", host) or not re.search(r"[A-Za-z_]", host):
         raise InputError(f"'{host}' is neither an IP address nor a host name")
     return x509.DNSName(host)
@@ -159,12 +159,12 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _require_new(*paths: Path) -> None:
     for path in paths:
-        if os.path.lexists(path):  # what cannot be looked at is told when it is written
+        if os.path.lexists(path):  # an inaccessible path is reported on writing
             raise InputError(f"{path}: is there already; move it away first, so that no key is lost")
 
 
 def _write_new(path: Path, data: bytes, mode: int = 0o644) -> None:
-    """The mode holds from the first byte on: a key must not be readable even for a moment."""
+    """Create the file with its mode: a key must not be readable to others even for a moment."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

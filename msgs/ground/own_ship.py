@@ -1,4 +1,4 @@
-"""How the own ship's camera was turned, and where it was, at any instant of the last seconds. Pure."""
+"""Attitude of the own ship's camera, and position of the own ship, at any time within the last seconds. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from msgs.cdr import TFMessage
 from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
 from msgs.wire import Array
 
-GAP_NS = 500_000_000  # wider apart, the own ship may have done anything in between; a lost one of five a second is not
+GAP_NS = 500_000_000  # longest gap to interpolate over; at five messages a second, one may be lost
 NEAR_NS = 100_000_000
 KEPT_NS = 2_000_000_000
 KEPT_MAX = 512
@@ -25,24 +25,24 @@ class OwnShip:
     """The own ship at one instant."""
 
     stamp_ns: int
-    root: str  # the frame that is told of: ned axes, at a place on Earth or at the own ship
+    root: str  # reference frame: NED axes at a fixed origin or at the own ship
     R_ned_cam: Array
     t_ned_own_m: Array
 
 
 class OwnShipHistory:
-    """What a vehicle's transforms told of late."""
+    """Recent own-ship states from a vehicle's transforms."""
 
     def __init__(self) -> None:
         self._told: list[OwnShip] = []
 
     def take(self, message: TFMessage) -> OwnShip | None:
-        """Keep what it tells; None if it does not lead from the camera to ned axes."""
+        """Store and return the state; None if the transforms do not connect the camera to NED axes."""
         own = own_ship(message)
         if own is None:
             return None
         newest = self._told[-1] if self._told else own
-        # Of another place on Earth, or of a clock that was set back: no way leads from there to here.
+        # With another origin, or after a clock was set back, older states cannot be used for interpolation.
         if own.root != newest.root or own.stamp_ns < newest.stamp_ns - KEPT_NS:
             self._told.clear()
         insort(self._told, own, key=_stamp_ns)
@@ -51,7 +51,7 @@ class OwnShipHistory:
         return own
 
     def at(self, stamp_ns: int) -> OwnShip | None:
-        """The own ship at an instant, between what was told right before and after; None while that has not come."""
+        """The state at a time, interpolated between its neighbours; None without both, or if too far apart."""
         index = bisect_left(self._told, stamp_ns, key=_stamp_ns)
         if index < len(self._told) and self._told[index].stamp_ns == stamp_ns:
             return self._told[index]
@@ -66,7 +66,7 @@ class OwnShipHistory:
         return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), t_m)
 
     def near(self, stamp_ns: int) -> OwnShip | None:
-        """The same, or where that cannot be said what was told nearest to it, no further off than `NEAR_NS`."""
+        """The state at a time or, if it cannot be interpolated, the nearest one within `NEAR_NS`."""
         own = self.at(stamp_ns)
         if own is not None or not self._told:
             return own
@@ -75,7 +75,7 @@ class OwnShipHistory:
 
 
 def own_ship(message: TFMessage) -> OwnShip | None:
-    """Up the chain of frames from the camera; None if it does not end at ned axes."""
+    """Own-ship state from the chain of frames above the camera; None if it does not end at NED axes."""
     links = {one.child_frame_id: one for one in message.transforms}
     if topics.FRAME_CAMERA not in links:
         return None

@@ -1,4 +1,4 @@
-"""`uavpose-ground record`: what vehicles tell, as MCAP on the ground's disk."""
+"""`uavpose-ground record`: records the vehicles' messages as MCAP on the ground station."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def record(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Record these vehicles, all if none is named, until `stop` is set; 0. Samples are kept as they came, sound or not.
+    """Record these vehicles, all if none is named, until `stop` is set; returns 0. Samples are not validated.
 
     Raises InputError for a bad endpoint, and for a folder that cannot be written.
     """
@@ -61,12 +61,12 @@ def record(
 
 
 def _check_writable(folder: Path) -> None:
-    """The recorder writes nothing until a vehicle is heard: who starts it before a flight is to know then."""
+    """Fail at the start: the recorder itself writes nothing until the first sample, which may be in flight."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        # A disk that is full may have room when it is needed; the recorder makes some, or says so.
+        # Not on a full disk: the recorder will remove old recordings or report it.
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise InputError(f"--dir {folder}: cannot be written: {error.strerror}") from error

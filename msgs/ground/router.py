@@ -1,4 +1,4 @@
-"""The ground's router in a Python process: TLS or QUIC with certificates on both sides, and rules for each identity.
+"""The ground station's zenoh router: mutual TLS or QUIC, and access rules for each identity. Its settings:
 
 listen = ["quic/0.0.0.0:7447", "tcp/127.0.0.1:7447"]
 
@@ -67,13 +67,13 @@ class RouterSettings(Section):
 
 
 def load_router(path: Path) -> RouterSettings:
-    """Read a router's TOML; its paths are taken from its folder. Raises InputError naming file and key."""
+    """Read a router's TOML; paths are relative to its folder. Raises InputError naming file and key."""
     return load_settings(path, RouterSettings, InputError)
 
 
 @contextmanager
 def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Session]:
-    """The router, running until the context ends. Raises InputError for files and endpoints that do not do."""
+    """The router, running until the context ends. Raises InputError for invalid files and endpoints."""
     tls = _tls_files(settings, folder)
     try:
         if tls is not None:
@@ -86,7 +86,7 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
     try:
         session = zenoh.open(router_config(settings.listen, tls=tls, access_control=rules))
     except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+        reason = str(error).partition(" at /")[0]  # cuts off the location in zenoh's source
         raise InputError(f"the router cannot listen on {', '.join(settings.listen)}: {reason}") from error
     with session:
         yield session
@@ -101,12 +101,12 @@ def _tls_files(settings: RouterSettings, folder: Path) -> TlsFiles | None:
 def _from_folder(folder: Path, path: Path) -> Path:
     try:
         return folder / path.expanduser()
-    except RuntimeError as error:  # nobody's home
+    except RuntimeError as error:  # home folder unknown
         raise InputError(f"[tls] '{path}' leads nowhere: {error}") from error
 
 
 def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
-    """Run the router of a TOML file until `stop` is set, saying which vehicles come and go; 0."""
+    """Run the router of a TOML file until `stop` is set, reporting vehicles that appear and leave; returns 0."""
     settings = load_router(path)
     folder = path.resolve().parent
     with open_router(settings, folder) as session:

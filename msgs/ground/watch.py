@@ -1,4 +1,4 @@
-"""`uavpose-ground watch`: who is there, how they are, and where their targets are, live."""
+"""`uavpose-ground watch`: live table of vehicles, their health and their targets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class WatchOptions:
-    """Whom to watch, and how."""
+    """Which vehicles to show, and how."""
 
     endpoint: str
     tls: TlsFiles | None = None
@@ -39,7 +39,7 @@ class WatchOptions:
 
 
 def watch(options: WatchOptions, stop: threading.Event, console: Console, say: Callable[[str], None]) -> int:
-    """Show what comes until `stop` is set; 0. Raises InputError for a bad endpoint."""
+    """Show the vehicles until `stop` is set; returns 0. Raises InputError for a bad endpoint."""
     fleet = Fleet(domain=options.domain, max_age_s=options.max_age_s)
     show = _watch_json if options.as_json else _watch_table
     with session(options.endpoint, options.tls, stop, say) as opened:
@@ -70,7 +70,7 @@ def _watch_table(
 def _watch_json(
     options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
 ) -> None:
-    """One JSON object a line: `pose`, `health`, `event`, `vehicle` (here or gone) and `link` (up or down)."""
+    """One JSON object per line: `pose`, `health`, `event`, `vehicle` (present or gone) and `link` (up or down)."""
     lock = threading.Lock()
 
     def tell(**values: object) -> None:
@@ -116,14 +116,14 @@ def _watch_json(
 
 
 def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) -> Group:
-    """The picture at `now_ns` (UTC): a line for each vehicle, and one for each of its targets.
+    """The tables at `now_ns` (UTC): one row per vehicle, and one per target.
 
-    A bearing with a `c` is to the right of the optical axis, for want of the vehicle's attitude.
+    A bearing with a `c` is measured from the optical axis to the right, as the vehicle's attitude is unknown.
     """
     link = Text(f"{endpoint}: up" if up else f"{endpoint}: no link", style="green" if up else "bold red")
     fleet = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     found = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    # Eighty columns are enough for short names; else what is too long goes on below: cut, 1218.2 m would read 12….
+    # Eighty columns suffice for short names; longer cells wrap: truncated, 1218.2 m would read 12….
     for name in ("vehicle", "link", "health", "poses/s", "refused", "last event"):
         fleet.add_column(name, overflow="fold")
     found.add_column("target", overflow="fold")
@@ -140,7 +140,7 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) 
 
 
 def _health(row: VehicleRow, now_ns: int) -> Text:
-    """Dim, with its age, once it is no longer told; none that was told before our clock was set back."""
+    """Dimmed, with its age, once it is stale; omitted if it was received before our clock was set back."""
     age_s = (now_ns - row.health_heard_ns) / _NS
     if not row.health_heard_ns or age_s < -SET_BACK_NS / _NS:
         return Text("–", style="dim")
@@ -151,7 +151,7 @@ def _health(row: VehicleRow, now_ns: int) -> Text:
 
 
 def _printable(text: str) -> str:
-    """What a vehicle says must not steer the terminal."""
+    """Removes control characters, so that received text cannot control the terminal."""
     return "".join(one if one.isprintable() else " " for one in text)
 
 

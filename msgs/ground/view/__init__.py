@@ -1,5 +1,5 @@
-"""`uavpose-ground view`: what vehicles tell, drawn by Rerun.
+"""`uavpose-ground view`: shows the vehicles' messages in Rerun.
 
-`drawing` is the geometry, `scene` turns samples into Rerun entities, `layout` says where they are shown, `recorded`
-reads MCAP files, `viewer` opens a window or serves browsers, `saving` writes a file, `command` puts them together.
+`drawing` has the geometry, `scene` turns samples into Rerun entities, `layout` arranges the views, `recorded` reads
+MCAP files, `viewer` opens a window or serves browsers, `saving` writes a file, `command` combines them.
 """

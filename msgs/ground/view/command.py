@@ -1,4 +1,4 @@
-"""`uavpose-ground view`: a viewer's window, a page for a browser, or a file; from vehicles or from recordings."""
+"""`uavpose-ground view`: shows vehicles or recordings in a viewer's window, a browser page, or saves them to a file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ViewOptions:
 
 
 def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]) -> int:
-    """Show until `stop` is set, or all of the recordings and end; 0. Raises InputError for bad input."""
+    """Show vehicles until `stop` is set, or recordings to their end; returns 0. Raises InputError for bad input."""
     _check_recordings(options)
     rec = rr.RecordingStream(APPLICATION)
     rec.set_log_tick_enabled(False)
@@ -57,7 +57,7 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
     scene = Scene(rec, fleet, options.size_m, arrange)
 
     def complete() -> bool:
-        # A live view is whole whenever it is ended.
+        # A live view is complete whenever it is stopped.
         return not scene.empty() and not (options.recordings and stop.is_set())
 
     with _opened(rec, options, complete, stop, say):
@@ -88,7 +88,7 @@ def _opened(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> Iterator[None]:
-    """Where the recording goes: a file, a server for browsers on this machine, or a window that stays."""
+    """Open the output: a file, a server for browsers on this machine, or a window that stays open."""
     if options.save is not None:
         with saved(rec, options.save, stop, complete):
             yield

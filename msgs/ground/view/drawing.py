@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from msgs.geometry import q_wxyz_from_R
 from msgs.wire import Array
 
-NEAR_M = 0.5  # nearer than this to the camera's plane nothing is projected
+NEAR_M = 0.5  # near plane: closer points are not projected
 SIGMAS = 2.0  # of every ellipse and ellipsoid drawn
 _ELLIPSE_POINTS = 48
-_OPENCV_LENSES = (0, 4, 5, 8, 12, 14)  # numbers of coefficients that its camera model has
-_OPENCV_MODELS = ("", "plumb_bob", "rational_polynomial")  # its names in ROS; some tell none
+_OPENCV_LENSES = (0, 4, 5, 8, 12, 14)  # possible numbers of coefficients of OpenCV's camera model
+_OPENCV_MODELS = ("", "plumb_bob", "rational_polynomial")  # its names in ROS; some drivers send none
 # Corners are numbered by their signs: bit 0 x, bit 1 y, bit 2 z.
 _EDGES = tuple((a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit)
 
@@ -27,14 +27,14 @@ def box_edges_m(size_m: ArrayLike) -> Array:
 
 
 def posed(points_m: ArrayLike, R_cam_target: ArrayLike, t_cam_target_m: ArrayLike) -> Array:
-    """Points [..., 3] of the target's body in `cam`."""
+    """Points [..., 3] from the target's body frame to `cam`."""
     return np.asarray(points_m) @ np.asarray(R_cam_target).T + np.asarray(t_cam_target_m)
 
 
 def project(points_cam_m: ArrayLike, K: ArrayLike, distortion: ArrayLike = (), model: str = "") -> Array | None:
-    """Pixels [..., 2] of points [..., 3], by OpenCV's camera model; None if any is not before the camera.
+    """Pixels [..., 2] of points [..., 3], by OpenCV's camera model; None if any is not in front of the camera.
 
-    None too for a lens of another model: drawn without it a box would stand in a wrong place.
+    Also None for another distortion model: drawn without distortion, a box would be in the wrong place.
     """
     points = np.asarray(points_cam_m, dtype=np.float64)
     lens = np.asarray(distortion, dtype=np.float64)
@@ -46,7 +46,7 @@ def project(points_cam_m: ArrayLike, K: ArrayLike, distortion: ArrayLike = (), m
 
 
 def pixel_covariance(t_cam_m: Array, covariance_m2: Array, K: ArrayLike) -> Array:
-    """[2, 2] of the projection of a point [3] with covariance [3, 3] in `cam`, to first order, lens left aside."""
+    """[2, 2] of the projection of a point [3] with covariance [3, 3] in `cam`, to first order, without distortion."""
     x, y, z = t_cam_m
     K = np.asarray(K, dtype=np.float64)
     slopes = K[:2, :2] @ np.array([[1.0 / z, 0.0, -x / z**2], [0.0, 1.0 / z, -y / z**2]])
@@ -62,7 +62,7 @@ def ellipse(center: ArrayLike, covariance: Array) -> Array:
 
 
 def ellipsoid(covariance: Array) -> tuple[Array, Array]:
-    """Half axes [3] at `SIGMAS` and their attitude (q_xyzw, [4]) of a covariance [3, 3]."""
+    """Half axes [3] at `SIGMAS` and their orientation (q_xyzw, [4]) of a covariance [3, 3]."""
     values, vectors = np.linalg.eigh(covariance)
     if np.linalg.det(vectors) < 0.0:
         vectors[:, 0] *= -1.0

@@ -1,6 +1,6 @@
-"""What one vehicle looks like in Rerun: each function logs one thing at the time that was set on the recording.
+"""Rerun entities of one vehicle: each function logs one thing at the time that was set on the recording.
 
-Entities of `<uav>`: `ned` (3-D, north, east, down), with `ned/camera` the picture; `map` (from above), `zoom` (targets
+Entities of `<uav>`: `ned` (3-D, north, east, down), with `ned/camera` the image; `map` (from above), `zoom` (targets
 as seen, enlarged), `plots`, `health`, `events`.
 """
 
@@ -23,15 +23,15 @@ from msgs.wire import Array
 OWN_RGB = (90, 200, 250)
 TARGET_RGB = ((255, 90, 180), (255, 190, 60), (140, 230, 90), (190, 140, 255))
 DOUBT_RGB = (150, 150, 160)
-NAMES_RGB = (245, 245, 250)  # the viewer writes on grey labels
+NAMES_RGB = (245, 245, 250)  # the viewer's labels have a grey background
 GRID_RGB = (70, 74, 82)
 AXES_RGB = ((240, 70, 70), (80, 220, 80), (90, 140, 255))  # nose, right, down
 RINGS_M = (100, 200, 300, 400, 500)
 SHIP_SIZE_M = (3.0, 3.0, 0.8)
 FRUSTUM_M = 40.0
 LABEL_BELOW_PX = 25.0
-RING_NAMES_TOWARDS = np.array([-0.707, 0.707])  # north, east; a target's name often stands ahead: not there
-VALUE_CHARS_MAX = 24  # hashes are told by their beginning
+RING_NAMES_TOWARDS = np.array([-0.707, 0.707])  # north, east; away from the targets' labels, which are mostly ahead
+VALUE_CHARS_MAX = 24  # enough to recognise a hash
 _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 _ANGLES = ("roll", "pitch", "heading")
 _HEALTH_LEVELS = {0: "INFO", 1: "WARN", 2: "ERROR"}
@@ -43,17 +43,17 @@ _LATENCIES = {
 
 
 def rgb(target: str) -> tuple[int, int, int]:
-    """Of `t0`, `t1`, …"""
+    """Colour of target `t0`, `t1`, …"""
     return TARGET_RGB[int(target[1:]) % len(TARGET_RGB)]
 
 
 def target_paths(uav: str, target: str) -> tuple[str, ...]:
-    """Everything that stands for one target now; trails and plots go on."""
+    """Entities of one target's current pose, without its trails and plots."""
     return tuple(f"{uav}/{where}/target/{target}" for where in ("ned", "ned/camera", "map", "zoom"))
 
 
 def prepare(rec: rr.RecordingStream, uav: str) -> None:
-    """What does not change."""
+    """Log the static entities."""
     for where in ("ned", "ned/place"):
         rec.log(f"{uav}/{where}", rr.ViewCoordinates.FRD, static=True)
     ship = f"{uav}/ned/place/ship"
@@ -73,7 +73,7 @@ def prepare(rec: rr.RecordingStream, uav: str) -> None:
 
 
 def prepare_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
-    """The lines of one target's plots."""
+    """Name and colour the lines of one target's plots."""
     color = rgb(target)
     lines = {
         "range": (target, color),
@@ -89,14 +89,14 @@ def prepare_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
 
 
 def plot_path(uav: str, target: str, path: str) -> str:
-    """Of one line: `range`, `range/plus_2_sigma`, `attitude/roll`, …"""
+    """Entity path of one line: `range`, `range/plus_2_sigma`, `attitude/roll`, …"""
     plot, _, line = path.partition("/")
     within = {"age": "latency"}.get(plot, plot)
     return f"{uav}/plots/{within}/{target}" + (f"/{line}" if line else "")
 
 
 def log_camera(rec: rr.RecordingStream, uav: str, info: CameraInfo) -> None:
-    """The camera and the edge of its pictures."""
+    """The camera and the border of its image."""
     width, height = info.width_px, info.height_px
     pinhole = rr.Pinhole(
         image_from_camera=info.K, resolution=[width, height], camera_xyz=rr.ViewCoordinates.RDF,
@@ -112,7 +112,7 @@ def log_image(rec: rr.RecordingStream, uav: str, image: CompressedImage) -> None
 
 
 def log_ship(rec: rr.RecordingStream, uav: str, R_ned_body: Array, t_ned_m: Array, R_ned_cam: Array) -> None:
-    """The own ship and its camera, which is drawn at the ship's place; on the map it is in the middle."""
+    """The own ship and its camera, drawn at the ship's position; on the map the ship is at the centre."""
     rec.log(f"{uav}/ned/place", rr.Transform3D(translation=t_ned_m))
     rec.log(f"{uav}/ned/place/ship", rr.Transform3D(mat3x3=R_ned_body))
     rec.log(f"{uav}/ned/camera", rr.Transform3D(translation=t_ned_m, mat3x3=R_ned_cam))
@@ -124,7 +124,7 @@ def log_ship(rec: rr.RecordingStream, uav: str, R_ned_body: Array, t_ned_m: Arra
 def log_seen(
     rec: rr.RecordingStream, row: TargetRow, pose: TargetPose, camera: CameraInfo | None, size_m: Sequence[float]
 ) -> None:
-    """The target on the picture: its box, that box one sigma nearer and farther, and where its centre may be."""
+    """The target in the image: its box, the box one sigma nearer and farther, and the error ellipse of its centre."""
     R = _R_cam_target(pose)
     _log_zoom(rec, row, R, size_m)
     if camera is None:
@@ -159,7 +159,7 @@ def _log_boxes(
     rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array, t_m: Array, camera: CameraInfo,
     size_m: Sequence[float],
 ) -> Array | None:  # fmt: skip
-    """The pixels of the box; None if it is not all before the camera."""
+    """Log the boxes; returns the pixels of the box, None if it is not completely in front of the camera."""
     where = f"{row.uav}/ned/camera/target/{row.target}"
     edges = box_edges_m(size_m)
     box = project(posed(edges, R_cam_target, t_m), *_lens(camera))
@@ -177,7 +177,7 @@ def _log_boxes(
 
 
 def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array | None, size_m: Sequence[float]) -> None:
-    """The box as the camera sees it, without perspective, one unit long; targets stand side by side."""
+    """The box as seen by the camera, without perspective, scaled to unit length; targets side by side."""
     aside = np.array([2.0 * int(row.target[1:]), 0.0])
     where = f"{row.uav}/zoom/target/{row.target}"
     if R_cam_target is None:
@@ -231,7 +231,7 @@ def log_placed(
 def _log_turned(
     rec: rr.RecordingStream, row: TargetRow, R_ned_target: Array, t_m: Array, above_m: Array, size_m: Sequence[float]
 ) -> None:
-    """How the target is turned: in space, from above and as plots."""
+    """The target's attitude: in space, from above and as plots."""
     color, uav, name = rgb(row.target), row.uav, row.target
     body = f"{uav}/ned/target/{name}/body"
     rec.log(body, rr.Transform3D(translation=t_m, mat3x3=R_ned_target))
@@ -245,7 +245,7 @@ def _log_turned(
 
 
 def _R_cam_target(pose: TargetPose) -> Array | None:
-    """None where the pose's quaternion only stands for one: it must not be drawn."""
+    """None if the pose's quaternion is only a placeholder, which must not be drawn."""
     return R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1)) if pose.rotation_known else None
 
 
@@ -255,7 +255,7 @@ def _clear(rec: rr.RecordingStream, *paths: str) -> None:
 
 
 def log_plots(rec: rr.RecordingStream, row: TargetRow, age_s: float) -> None:
-    """Range with its doubt, closing speed, score, and the age when it came."""
+    """Range with its uncertainty, closing speed, score, and age at reception."""
     values = {
         "range": row.range_m,
         "range/minus_2_sigma": row.range_m - SIGMAS * row.sigma_range_m,
@@ -275,7 +275,7 @@ def log_event(rec: rr.RecordingStream, uav: str, level: int, text: str) -> None:
 
 
 def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, news: bool) -> None:
-    """Health as a table, its latencies as plots; with `news` as an event too."""
+    """Health as text, its latencies as plots; with `news` as an event too."""
     status = message.status[0]
     values = dict(status.values)
     rec.log(f"{uav}/health", rr.TextDocument(health_text(status), media_type="text/markdown"))
@@ -288,7 +288,7 @@ def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, n
 
 
 def log_silence(rec: rr.RecordingStream, uav: str, last: DiagnosticArray) -> None:
-    """In health's place, that none came after `last`."""
+    """In place of health: the time since which none was received, and the last state."""
     status = last.status[0]
     since = datetime.fromtimestamp(last.stamp_ns // 1_000_000_000, UTC).strftime("%H:%M:%S UTC")
     text = f"## No word since {since}\n\nThe last was: {status.message.replace('|', '¦')}"
@@ -296,7 +296,7 @@ def log_silence(rec: rr.RecordingStream, uav: str, last: DiagnosticArray) -> Non
 
 
 def health_text(status: DiagnosticStatus) -> str:
-    """Markdown: state first, then what is not a latency, then latencies."""
+    """Markdown: state first, then other values, then latencies."""
     safe = [(key.replace("|", "¦"), value.replace("|", "¦")) for key, value in status.values]
     rest = [pair for pair in safe if not pair[0].startswith("latency_ms/")]
     latencies: dict[str, dict[str, str]] = {}
@@ -304,7 +304,7 @@ def health_text(status: DiagnosticStatus) -> str:
         if key.startswith("latency_ms/") and key.count("/") == 2:
             _, stage, percentile = key.split("/")
             latencies.setdefault(stage, {})[percentile] = value
-    # No table: in a narrow panel a long value pushes all of its column out of sight.
+    # A list, not a table: in a narrow panel one long value would push the whole column out of view.
     lines = [f"## {status.message.replace('|', '¦')}", ""]
     lines += [f"- {key}: **{value[:VALUE_CHARS_MAX]}**" for key, value in rest]
     if latencies:
@@ -317,7 +317,7 @@ def health_text(status: DiagnosticStatus) -> str:
 
 
 def _on_map(ned: Array) -> Array:
-    """East to the right, north up: 2-D views have y downwards."""
+    """NED to map coordinates, east right and north up: 2-D views have y downwards."""
     return np.array([ned[1], -ned[0]])
 
 

@@ -1,4 +1,4 @@
-"""Where things are shown, saved with the data as a blueprint: it opens right the first time."""
+"""Layout of the views, stored with the data as a Rerun blueprint."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PLOTS = {
 
 
 def blueprint(uavs: Sequence[str], *, live: bool) -> rrb.Blueprint:
-    """A tab for each vehicle; time follows what comes if it is `live`, else it runs from the beginning."""
+    """One tab per vehicle; time follows new data if `live`, otherwise it plays from the beginning."""
     tabs = [_vehicle(uav) for uav in uavs]
     root = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs)
     return rrb.Blueprint(
@@ -59,7 +59,7 @@ def _vehicle(uav: str) -> rrb.Horizontal:
     )
     space = rrb.Vertical(
         rrb.Spatial3DView(
-            # The eye stays where it is to the own ship, with axes that do not turn with it.
+            # The view follows the own ship's position, but does not rotate with it.
             origin=f"{uav}/ned/place",
             contents=[f"+ /{uav}/ned/**", f"- /{uav}/ned/camera/target/**", f"- /{uav}/ned/camera/frame"],
             name="Scene: own ship blue",

@@ -1,4 +1,4 @@
-"""Samples of MCAP recordings in the order in which they were recorded, as if they came just then."""
+"""Reads samples from MCAP recordings, in the order of recording, as if they were received live."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming
 
-# Recordings keep no attachments: all that is read is of one publisher, who counts on from file to file.
+# Recordings contain no attachments: everything gets one publisher, with sequence numbers continuing across files.
 _GID, _numbers = bytes(16), count(1)
-_TIME_MAX_NS = 2**63 - 1  # of numpy's and Rerun's times; MCAP's go on for as long again
+_TIME_MAX_NS = 2**63 - 1  # largest time of numpy and Rerun; MCAP's times are unsigned
 
 
 def check_opens(path: Path) -> None:
-    """Raise InputError if `path` is not there or does not begin as a recording does."""
+    """Raise InputError if `path` is missing or does not start like a recording."""
     with _blame(path), path.open("rb") as stream:
         make_reader(stream).get_header()
 
 
 def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
-    """Each sample of a topic of ours, and when it was recorded (UTC ns). Others are passed over.
+    """Each sample of our topics with its recording time (UTC ns); other topics are skipped.
 
-    Raises InputError if the file cannot be read, is damaged or ends in the middle, after what comes before that.
+    Raises InputError if the file cannot be read, is damaged or truncated, after yielding the samples before that.
     """
     with _blame(path), path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
@@ -44,7 +44,7 @@ def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
 
 @contextmanager
 def _blame(path: Path) -> Iterator[None]:
-    """What goes wrong while `path` is read inside is told as InputError in a sentence that names it."""
+    """Turns errors while reading `path` into InputError with a message that names it."""
     try:
         yield
     except OSError as error:
@@ -52,5 +52,5 @@ def _blame(path: Path) -> Iterator[None]:
     except McapError as error:
         why = str(error) or "it ends early"
         raise InputError(f"{path}: is no whole MCAP file ({why}); `mcap recover` may help") from error
-    except Exception as error:  # whatever the reader makes of bytes that are not what they say
+    except Exception as error:  # the reader may raise anything on corrupt bytes
         raise InputError(f"{path}: is damaged, not all of it can be read; `mcap recover` may help") from error

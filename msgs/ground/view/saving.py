@@ -1,4 +1,4 @@
-"""`--save`: a file for Rerun's viewer that is there whole or not at all."""
+"""`--save`: writes a file for Rerun's viewer atomically."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHUNK_BYTES = 1 << 20
 
 
 class _Writer(threading.Thread):
-    """Writes what comes out of a pipe to `path`. Once that fails, `error` says why and the rest goes nowhere."""
+    """Copies a pipe to `path`. If writing fails, it stores the `error` and discards the rest."""
 
     def __init__(self, source: int, path: Path, stop: threading.Event) -> None:
         super().__init__(name="save", daemon=True)
@@ -38,12 +38,12 @@ class _Writer(threading.Thread):
 
 @contextmanager
 def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: Callable[[], bool]) -> Iterator[None]:
-    """What is logged inside goes to `path`, put there when all is written: until then, what was there stays.
+    """Save what is logged inside to `path`, which is replaced only when everything is written.
 
-    What ends in the middle, by an exception or as not `complete`, is put there if nothing was. Sets `stop` as soon as
-    no more can be written. Raises InputError, and leaves nothing behind then.
+    An incomplete recording (an exception, or not `complete`) is kept only if no file was there before. Sets `stop` on a
+    write error. Raises InputError, leaving no temporary file behind.
     """
-    whole = Path(os.path.realpath(path))  # a link stays one
+    whole = Path(os.path.realpath(path))  # keeps a symbolic link
     if os.path.exists(whole) and not whole.is_file():
         raise InputError(f"--save {path}: is there and is no file")
     unfinished, replaces = whole.with_name(f".{whole.name}.part"), os.path.exists(whole)
@@ -51,7 +51,7 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: 
         unfinished.touch()
     except OSError as error:
         raise _unwritable(path, error) from error
-    # Rerun's own file never says that the disk is full, and then waits for ever: it gets a pipe, the file is ours.
+    # Rerun does not report a full disk and then hangs; so it writes to a pipe, and we write the file.
     read_end, write_end = os.pipe()
     writer = _Writer(read_end, unfinished, stop)
     writer.start()

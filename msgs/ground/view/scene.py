@@ -1,5 +1,5 @@
-"""Turns samples into Rerun entities, live or from a recording alike: what the fleet refuses is not drawn, and what is
-not told again for a second is taken away."""
+"""Turns samples into Rerun entities, live or from a recording: refused samples are not drawn, and a target without a
+new pose for one second is removed."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ _R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 class _Vehicle:
     camera: CameraInfo | None = None
     own: OwnShipHistory = field(default_factory=OwnShipHistory)
-    waiting: deque[tuple[TargetRow, TargetPose]] = field(  # for the own ship at their stamps
+    waiting: deque[tuple[TargetRow, TargetPose]] = field(  # for the own-ship state at their stamps
         default_factory=lambda: deque(maxlen=_WAITING_MAX)
     )
-    seen_ns: dict[str, tuple[int, int]] = field(default_factory=dict)  # of each target drawn: stamp, and when it came
-    prepared: set[str] = field(default_factory=set)  # targets whose plots have their names
-    health: DiagnosticArray | None = None  # the last that was told, and when it came
+    seen_ns: dict[str, tuple[int, int]] = field(default_factory=dict)  # stamp and reception time of each drawn target
+    prepared: set[str] = field(default_factory=set)  # targets whose plots are named
+    health: DiagnosticArray | None = None  # the latest, and its reception time
     health_came_ns: int = 0
     health_silent: bool = False
     told_no_attitude: bool = False
 
 
 class Scene:
-    """Draws on a recording; used from any thread. `size_m` is the length, width and height of the box that is drawn for
-    a target: its true size is not known. `on_vehicles` hears all names whenever there is a new one."""
+    """Draws into a Rerun recording; thread-safe. `size_m` is the length, width and height of the box drawn for a
+    target, as its true size is unknown. `on_vehicles` is called with all names whenever there is a new one."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Scene:
         self._vehicles: dict[str, _Vehicle] = {}
 
     def take(self, incoming: Incoming, now_ns: int) -> None:
-        """Draw one sample that came at `now_ns` (UTC)."""
+        """Draw one sample received at `now_ns` (UTC)."""
         with self._lock:
             believed = self._fleet.believes(incoming, now_ns)
             news = self._fleet.take(incoming, now_ns)
@@ -77,10 +77,10 @@ class Scene:
             try:
                 self._take_other(incoming, news, now_ns)
             except PayloadError:
-                return  # the fleet has counted those it looks at; the rest is only not drawn
+                return  # counted by the fleet if it is one of its topics; otherwise just not drawn
 
     def alive(self, uav: str, here: bool, now_ns: int) -> None:
-        """A daemon came or went."""
+        """A daemon appeared or disappeared."""
         with self._lock:
             self._fleet.alive(uav, here)
             if self._vehicle(uav) is not None:
@@ -88,17 +88,17 @@ class Scene:
                 entities.log_event(self._rec, uav, 20 if here else 30, "here" if here else "gone")
 
     def empty(self) -> bool:
-        """Whether nothing is drawn, as nothing came."""
+        """Whether nothing was received, hence nothing drawn."""
         with self._lock:
             return not self._vehicles
 
     def tick(self, now_ns: int) -> None:
-        """Take away the targets that were not told again, say where health was not; call it now and then."""
+        """Remove targets without new poses and mark stale health; call periodically."""
         with self._lock:
             for uav, vehicle in self._vehicles.items():
                 self._tell_silence(uav, vehicle, now_ns)
                 for target, (stamp_ns, came_ns) in list(vehicle.seen_ns.items()):
-                    # What came in the future came before our clock was set back, who knows when.
+                    # A time in the future means that our clock was set back since: the true age is unknown.
                     if not -SET_BACK_NS <= now_ns - came_ns <= GONE_NS:
                         self._place(uav, vehicle, stamp_ns)
                         self._at(stamp_ns + GONE_NS)
@@ -115,13 +115,13 @@ class Scene:
         entities.log_silence(self._rec, uav, vehicle.health)
 
     def finish(self) -> None:
-        """Draw what still waits: no more will come."""
+        """Draw the poses that still wait, at the end of the data."""
         with self._lock:
             for uav, vehicle in self._vehicles.items():
                 self._place(uav, vehicle, None)
 
     def _vehicle(self, uav: str) -> _Vehicle | None:
-        """None for the names, made up no doubt, that are one too many."""
+        """The vehicle's state; None for new names beyond VEHICLES_MAX, which are presumably fake."""
         if uav not in self._vehicles:
             if len(self._vehicles) >= VEHICLES_MAX:
                 return None
@@ -137,7 +137,7 @@ class Scene:
         vehicle = self._vehicle(incoming.uav)
         if vehicle is None:
             return
-        # The own ship of so long before will not come any more.
+        # Own-ship states of before that time will not arrive any more.
         self._place(row.uav, vehicle, row.stamp_ns - GAP_NS)
         message = PoseWithCovarianceStamped.decode(incoming.payload)
         pose = TargetPose(row.uav, row.target, message, 0, now_ns)
@@ -160,7 +160,7 @@ class Scene:
             return
         if incoming.topic is topics.CAMERA_INFO:
             vehicle.camera = CameraInfo.decode(incoming.payload)
-            self._at(now_ns)  # its stamp may be from long before, when it last changed
+            self._at(now_ns)  # its stamp is of its last change, possibly long ago
             entities.log_camera(self._rec, uav, vehicle.camera)
         elif incoming.topic is topics.IMAGE:
             image = CompressedImage.decode(incoming.payload)
@@ -188,7 +188,7 @@ class Scene:
         self._place(uav, vehicle, ship.stamp_ns)
 
     def _place(self, uav: str, vehicle: _Vehicle, until_ns: int | None) -> None:
-        """Draw in space what waits, as far as `until_ns`: the own ship at its stamp has come, or will not."""
+        """Draw waiting poses up to `until_ns` in space: their own-ship state has arrived, or will not."""
         for _ in range(len(vehicle.waiting)):
             row, pose = vehicle.waiting.popleft()
             if until_ns is not None and row.stamp_ns > until_ns:

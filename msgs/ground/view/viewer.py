@@ -1,4 +1,4 @@
-"""Rerun's viewer as a process of its own, a window or a page for browsers: when it ends, what is drawn into it does."""
+"""Runs Rerun's viewer as a separate process, as a window or a server for browsers, and stops drawing when it ends."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ import rerun as rr
 
 from msgs.ground.errors import InputError
 
-WINDOW_PORT = 9876  # Rerun's own; a window that is open already is drawn into
+WINDOW_PORT = 9876  # Rerun's default, so that a window that is already open is reused
 _LOOPBACK = "127.0.0.1"
 _START_S = 60.0
 _LOOK_EVERY_S = 0.05
 _LOOK_AGAIN_S = 0.5
-_SETTLE_S = 1.0  # a viewer without a display takes calls for a moment before it ends
-_SERVER_MEMORY = "1GiB"  # older data goes first when a browser joins a long flight
+_SETTLE_S = 1.0  # a viewer without a display accepts connections for a moment before it exits
+_SERVER_MEMORY = "1GiB"  # kept for browsers that join later; the oldest data is dropped first
 _NO_WINDOW = "Rerun's viewer has no window here: view with --web for a browser, or with --save for another machine"
 
 
 @contextmanager
 def window(rec: rr.RecordingStream, stop: threading.Event, say: Callable[[str], None]) -> Iterator[None]:
-    """A window, which stays afterwards; sets `stop` when it is closed. Raises InputError if none opens, or it fails."""
+    """A window, which stays open afterwards; sets `stop` when it is closed. Raises InputError if it fails to open or
+    crashes."""
     viewer: subprocess.Popen[bytes] | None = None
     if not answers(WINDOW_PORT):
         viewer = subprocess.Popen(
@@ -53,8 +54,8 @@ def window(rec: rr.RecordingStream, stop: threading.Event, say: Callable[[str], 
 def page(
     rec: rr.RecordingStream, web_port: int, stays: bool, stop: threading.Event, say: Callable[[str], None]
 ) -> Iterator[None]:
-    """A page for browsers on this machine; `stays`: until `stop` is set, though all is drawn. Raises InputError if the
-    ports are not to be had, or its server ends."""
+    """A page for browsers on this machine; `stays`: even after all is drawn, until `stop` is set. Raises InputError if
+    the ports are not available, or the server exits."""
     ended = f"--web {web_port}: Rerun's server ended by itself"
     with (
         server(web_port) as process,
@@ -68,7 +69,7 @@ def page(
 
 @contextmanager
 def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """Rerun's server; it takes data at the port after `web_port`. Raises InputError if the ports are not to be had."""
+    """Rerun's server; it receives data at port `web_port` + 1. Raises InputError if the ports are not available."""
     ports = (web_port, web_port + 1)
     for port in ports:
         if answers(port):
@@ -77,20 +78,20 @@ def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
         _command(ports[1], "--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # the command starts the server as a child of its own: both have to be ended
+        start_new_session=True,  # the command starts the server as its child: both must be terminated
     )
     try:
         if not _started(process, ports):
             raise InputError(f"--web {web_port}: Rerun's server does not start there")
         yield process
     finally:
-        with suppress(ProcessLookupError):  # both have ended by themselves
+        with suppress(ProcessLookupError):  # both have already exited
             os.killpg(process.pid, signal.SIGTERM)
         process.wait()
 
 
 def answers(port: int) -> bool:
-    """Whether somebody on this machine takes calls there."""
+    """Whether something on this machine accepts connections at this port."""
     with socket.socket() as probe:
         return probe.connect_ex((_LOOPBACK, port)) == 0
 
@@ -105,8 +106,8 @@ def _fed(
     *,
     stays: bool = False,
 ) -> Iterator[threading.Event]:
-    """What is logged inside goes to the viewer at `port`. Once that is not `here` any more, sets `stop` and the event
-    that is given. Raises InputError, `refused`, if it takes nothing from the first."""
+    """Send what is logged inside to the viewer at `port`. Once it is not `here` any more, sets `stop` and the yielded
+    event. Raises InputError, `refused`, if it cannot be reached at the start."""
     gone, over = threading.Event(), threading.Event()
 
     def watch() -> None:
@@ -119,14 +120,14 @@ def _fed(
     rec.connect_grpc(_address(port))
     watcher = threading.Thread(target=watch, name="viewer", daemon=True)
     try:
-        # Rerun holds up whoever logs to a viewer that it never reached, without end.
+        # Logging to a viewer that was never reached blocks for ever.
         if not _reached(rec, here):
             raise InputError(refused)
         watcher.start()
         yield gone
         try:
             rec.flush()
-        except RuntimeError:  # nobody takes it any more
+        except RuntimeError:  # the viewer is gone
             gone.set()
         if stays:
             stop.wait()
@@ -145,7 +146,7 @@ def _reached(rec: rr.RecordingStream, here: Callable[[], bool]) -> bool:
 
 
 def _started(process: subprocess.Popen[bytes], ports: Sequence[int]) -> bool:
-    """Wait until all ports answer; False if the process ends before, or takes too long."""
+    """Wait until all ports answer; False if the process exits before, or takes too long."""
     deadline_s = time.monotonic() + _START_S
     while not all(map(answers, ports)):
         if _ended(process, _LOOK_EVERY_S) or time.monotonic() > deadline_s:
@@ -162,7 +163,7 @@ def _ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
 
 
 def _command(port: int, *options: str) -> list[str]:
-    """Bound to this machine: whoever reaches a viewer sees what it shows, and can draw into it."""
+    """Bound to loopback: anyone who can connect to a viewer can see its data and draw into it."""
     return [sys.executable, "-m", "rerun", "--bind", _LOOPBACK, "--port", str(port), *options]
 
 
