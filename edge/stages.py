@@ -21,7 +21,7 @@ STAGES = {
 
 
 def table_markdown() -> str:
-    """The table as the documents show it."""
+    """The table as shown in the documentation."""
     rows = [f"| {stage} | {text} |" for stage, text in STAGES.items()]
     return "\n".join(["| stage | from what to what |", "|---|---|", *rows]) + "\n"
 
