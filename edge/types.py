@@ -74,7 +74,7 @@ class OwnShip:
     lat_lon_alt: tuple[float, float, float] | None  # degrees, degrees, metres AMSL, of the ned origin
     R_body_gimbal: Array | None = None  # [3, 3]; None: the camera is fixed to the body
     clock_std_s: float = 0.0  # of the autopilot's timestamps converted to our clock
-    attitude_std_rad: float = 0.0  # about each axis, of an attitude extrapolated or interpolated with its rates
+    attitude_std_rad: float = 0.0  # about each axis, of an extrapolated or interpolated attitude
     axes_epoch: int = 0  # changes when the ned axes may have changed: the autopilot or its estimator was reset
     origin_epoch: int = 0  # the same for the ned origin
 

@@ -16,7 +16,7 @@ from edge.estimator.window import cut, fit_frame, pixel_aspect, window_around
 from edge.types import Array, Estimate, Frame
 
 WORTH_A_LOOK = 0.1  # a place of the whole frame with a lower probability is not examined in a window
-FAINTEST = 0.02  # lowest score of a window that examines a place of the whole frame
+FAINTEST = 0.02  # lowest score of a window at a place of the whole frame, also if it detects nothing
 # Places and targets examined in one frame, even if there is room for fewer targets: the likeliest place may turn out to
 # be false in frame after frame.
 PLACES_MOST = 4

@@ -27,7 +27,7 @@ class Jumps:
         self._gimbal: tuple[int, Array, GimbalFrame] | None = None  # time, R_frame_gimbal, frame
 
     def attitude(self, time_ns: int, R_ned_body: Array, rates_radps: Array) -> bool:
-        """Whether this attitude [3, 3] is not reachable from the last sample with its body rates [3]."""
+        """Whether this attitude [3, 3] is not reachable from the last sample with the body rates [3] of both."""
         last, self._attitude = self._attitude, (time_ns, R_ned_body, rates_radps)
         if last is None or not 0 < time_ns - last[0] <= ATTITUDE_GAP_MAX_NS:
             return False
@@ -44,7 +44,7 @@ class Jumps:
         return float(rotation_angle(last[1], R_frame_gimbal)) > GIMBAL_MIN_RAD + GIMBAL_RADPS * dt_s
 
     def position(self, time_ns: int, t_ned_m: Array, v_ned_mps: Array) -> bool:
-        """Whether this position [3] is not reachable from the last sample with their velocities [3]."""
+        """Whether this position [3] is not reachable from the last sample with the velocities [3] of both."""
         last, self._position = self._position, (time_ns, t_ned_m, v_ned_mps)
         if last is None or not 0 < time_ns - last[0] <= POSITION_GAP_MAX_NS:
             return False

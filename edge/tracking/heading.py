@@ -47,7 +47,7 @@ class Flight:
 
 
 def reversal(R: Array, along: Array) -> Array:
-    """The other rotation with the same outline: mirrored along the line of sight (unit, [3]) and left to right.
+    """The other rotation with the same outline: mirrored in depth (`along`: unit line of sight [3]) and left to right.
 
     R [3, 3] transforms target axes into those of `along`. The function is its own inverse.
     """

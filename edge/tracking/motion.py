@@ -114,7 +114,7 @@ def unknown_motion(motion: Motion, view: View) -> Motion:
 
 
 def turning(motion: Motion, time_ns: int) -> Array:
-    """[3, 3], the rotation of the target's velocity from the motion's time to a later one."""
+    """[3, 3], the rotation by which the target turns from the motion's time to a later one."""
     return so3.exp((time_ns - motion.time_ns) / NS_PER_S * _turning_radps(motion))
 
 
