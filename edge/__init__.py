@@ -2,6 +2,6 @@
 
 import os
 
-# Left to itself, ONNX Runtime gives the machine a number, keeps it on disk, and tells its maker of every session over
-# whatever link there is. It reads this when it is loaded.
+# Disables ONNX Runtime's telemetry, which would store an id of the machine on disk and report every session to its
+# vendor over any available link. It is read when the library is loaded.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,4 +1,4 @@
-"""Intrinsics from pictures of a board: detect, choose views that differ, fit, judge, write ROS's camera_info YAML."""
+"""Intrinsics from pictures of a board: detect, select different views, fit, judge, write ROS's camera_info YAML."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from edge.cameras.video import open_video
 from edge.errors import InputError
 from edge.types import Array
 
-PICTURES_MAX = 150  # of a video, evenly spread: more show nothing new
-VIEWS_MAX = 60  # beyond, a fit takes long and gains little
-DIFFERENT_SHARE = 0.03  # of the picture's diagonal that corners must have moved, on average, to be another view
-TOLD_MIN = 0.0005  # of the picture: what is rounded to nothing is not told
+PICTURES_MAX = 150  # of a video, evenly spaced: more show nothing new
+VIEWS_MAX = 60  # with more, a fit takes long and gains little
+DIFFERENT_SHARE = 0.03  # of the image diagonal: mean movement of the corners from which on a view is different
+TOLD_MIN = 0.0005  # of the image: shares that would be rounded to zero are not reported
 
 
 def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
-    """Names and gray pictures of a folder, or of a video evenly spread. Raises InputError, naming the file."""
+    """Names and gray pictures of a folder, or of a video, evenly spaced. Raises InputError that names the file."""
     if source.is_dir():
         for path in list_pictures(source):
             gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -50,7 +50,7 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
 
 
 def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) -> Calibration:
-    """The camera that took the board's pictures. Raises InputError, a sentence that says what to film instead."""
+    """Calibrate the camera that took the pictures. Raises InputError with a sentence that says what to film instead."""
     detector, views, boards, pictures = detector_of(board), list[View](), 0, 0
     size_wh: Size | None = None
     for name, gray in pictures_of(source):
@@ -77,7 +77,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
 
 
 def differ(view: View, other: View, size_wh: Size) -> bool:
-    """Whether the corners that both show lie elsewhere."""
+    """Whether the corners that both views show have moved."""
     _, mine, others = np.intersect1d(view.ids, other.ids, return_indices=True)
     if not len(mine):
         return True
@@ -86,7 +86,7 @@ def differ(view: View, other: View, size_wh: Size) -> bool:
 
 
 def camera_info_yaml(found: Calibration, name: str) -> str:
-    """What ROS camera_calibration writes and camera_info_manager reads; the comments say how good it is."""
+    """YAML as ROS camera_calibration writes and camera_info_manager reads it; comments state the quality."""
 
     def matrix(key: str, values: Array) -> str:
         numbers = ", ".join(f"{value:.10g}" for value in values.ravel())
@@ -127,7 +127,7 @@ def report(found: Calibration, out: Path) -> list[str]:
 
 
 def refuse_unwritable(out: Path) -> None:
-    """Raises InputError, before an hour of pictures is looked at for nothing."""
+    """Raises InputError if `out` cannot be written, before time is spent on the pictures."""
     folder = out.absolute().parent
     if out.is_dir() or not os.access(out if out.exists() else folder, os.W_OK):
         raise InputError(f"{out} cannot be written")

@@ -1,4 +1,4 @@
-"""The board that calibrate looks for: what it shows, how it is found in a picture, how it is drawn to be printed."""
+"""The calibration board: its pattern, its detection in a picture, and its drawing for printing."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from edge.errors import InputError
 
-CORNERS_MIN = 8  # of one view
-# OpenCV's chessboard detector takes no fewer than three corners a side; of corners in one row no plane is known.
+CORNERS_MIN = 8  # in one view
+# OpenCV's chessboard detector needs at least three corners per side; corners in one row do not determine a plane.
 SQUARES_MIN = {"charuco": ("ChArUco board", 3), "chessboard": ("chessboard", 4)}
 DRAWN_SQUARE_PX = 120
 
@@ -24,7 +24,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """What the board shows. Its size in metres does not matter to intrinsics."""
+    """The board's pattern. Its size in metres does not matter for intrinsics."""
 
     pattern: Literal["charuco", "chessboard"]
     squares: Size  # across, down
@@ -58,7 +58,7 @@ class CharucoDetector:
         numbers = np.asarray(ids).reshape(-1)
         corners = np.asarray(self._board.getChessboardCorners(), dtype=np.float32)[numbers]
         if np.linalg.matrix_rank(corners[:, :2] - corners[0, :2]) < 2:
-            return None  # all in one row: no plane
+            return None  # all in one row, which does not determine a plane
         return View(numbers.astype(np.int64), corners, np.asarray(pixels, dtype=np.float32).reshape(-1, 2))
 
 
@@ -76,7 +76,7 @@ class ChessboardDetector:
 
 
 def detector_of(settings: BoardSettings) -> Detector:
-    """Raises InputError for a board that cannot be found, or not well enough."""
+    """Raises InputError for a board that cannot be detected, or not well enough."""
     (name, least), (across, down) = SQUARES_MIN[settings.pattern], settings.squares
     if min(settings.squares) < least:
         raise InputError(f"--squares: a {name} needs at least {least}x{least} squares")

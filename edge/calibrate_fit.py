@@ -1,4 +1,4 @@
-"""A camera fitted to views of a board with every lens model, and judged: does the model describe it, do the views tell.
+"""Fits all lens models to views of a board and judges whether a model describes the camera and the views determine it.
 
 The fit is OpenCV's (Z. Zhang, "A flexible new technique for camera calibration", 2000).
 """
@@ -20,18 +20,18 @@ Coefficients = Literal[4, 5, 8]
 VIEWS_MIN = 8
 RMS_MAX_PX = 1.5
 OUTLIER_FACTOR = 3.0
-FOCAL_SIGMA_MAX = 0.005  # relative; above it the views do not settle the focal length
-# A board that always faces the camera leaves focal length and distance undecided, whatever the fit's own sigma says.
+FOCAL_SIGMA_MAX = 0.005  # relative; above it the views do not determine the focal length
+# Views of a board that faces the camera cannot separate focal length and distance, whatever the fit's sigma says.
 TILT_MIN_RAD, TILTED_MIN = np.deg2rad(15.0), 3
-COVERED_MIN = 0.5  # share of the picture's 4x4 cells with a corner in one view or another
-# More coefficients that take this much off the reprojection error describe something that fewer cannot; what is below
-# so many pixels is no fault of a lens model.
+COVERED_MIN = 0.5  # share of the image's 4x4 cells with a corner in any view
+# If more coefficients reduce the reprojection error by this much, fewer do not describe the lens; below this many
+# pixels, the error is not a lens model's.
 GAIN_MIN, GAIN_MIN_PX = 0.25, 0.02
-# A fit leaves the outermost corners, where no board was, to chance; without them a picture is still one to fly with.
+# The fit does not determine the outermost corners, where no board was seen; an image is usable without them.
 WITHOUT_RAY_MAX = 0.02
 FLAGS: dict[Coefficients, int] = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}  # fewest first
 MODEL: dict[Coefficients, str] = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
-_GRID_POINTS = 129  # a side of the picture, of those that are asked whether the lens shows them
+_GRID_POINTS = 129  # per side of the image, checked for being the image of exactly one ray
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class Calibration:
     K: list[list[float]]  # 3x3, pixel centres at integers
     distortion: list[float]  # k1 k2 p1 p2 k3 [k4 k5 k6]
     model: str
-    rms_px: float  # of all corners' reprojection
+    rms_px: float  # reprojection error of all corners
     focal_sigma: float  # relative 1-sigma of the focal length
-    covered: float  # share of the picture that boards were seen in
+    covered: float  # share of the image in which boards were seen
     tilted: int  # views of a board that does not face the camera
-    without_ray: float  # share of the picture, in its corners, where the lens cannot be inverted
+    without_ray: float  # share of the image, in its corners, where the distortion cannot be inverted
     views: int  # used
     boards: int  # pictures that showed the board
-    pictures: int  # looked at
+    pictures: int  # examined
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,31 +59,31 @@ class Fit:
     coefficients: Coefficients
     K: Array  # [3, 3]
     distortion: tuple[float, ...]  # k1 k2 p1 p2 k3 [k4 k5 k6]
-    rms_px: float  # inf: the fit came to no numbers
-    focal_sigma: float  # relative; inf: the views do not settle it
+    rms_px: float  # inf: the fit failed
+    focal_sigma: float  # relative; inf: the views do not determine it
     errors_px: Array  # [views]
-    tilts_rad: Array  # [views], of the board against the sensor
+    tilts_rad: Array  # [views], of the board relative to the sensor
 
     @property
     def settled(self) -> bool:
         return self.focal_sigma <= FOCAL_SIGMA_MAX
 
     def gains_on(self, fewer: Fit) -> bool:
-        """Whether it describes the views so much better that the model of fewer coefficients does not describe them."""
+        """Whether it fits the views so much better that the model of fewer coefficients does not describe the lens."""
         least_px = min((1.0 - GAIN_MIN) * fewer.rms_px, fewer.rms_px - GAIN_MIN_PX)
         return self.settled and self.rms_px <= least_px
 
     def without_ray(self, size_wh: Size) -> float:
-        """Share of a picture's pixels that the lens bends no single ray to."""
+        """Share of an image's pixels that are not the image of exactly one ray."""
         sides = [np.linspace(0, side - 1, _GRID_POINTS) for side in size_wh]
         grid = np.stack(np.meshgrid(*sides), axis=-1)
         return 1.0 - float(np.mean(Lens(self.K, self.distortion).shows(grid)))
 
 
 def fit(views: list[View], size_wh: Size) -> tuple[list[View], dict[Coefficients, Fit]]:
-    """Every lens model fitted to the same views, fewest coefficients first; and these views.
+    """The views used, and every lens model fitted to them, fewest coefficients first.
 
-    Left out are those that the model which fits best does not agree with: a board that moved while it was filmed.
+    Views that disagree with the best-fitting model are left out: the board moved while it was filmed.
     """
     fits = _each_model(views, size_wh)
     errors_px = _best(fits).errors_px
@@ -96,7 +96,7 @@ def fit(views: list[View], size_wh: Size) -> tuple[list[View], dict[Coefficients
 def calibration_of(
     views: list[View], size_wh: Size, coefficients: Coefficients, boards: int, pictures: int
 ) -> Calibration | str:
-    """The camera that sees the views so, or why it cannot be told and what to do: the end of a sentence."""
+    """The camera that fits the views, or why it cannot be determined and what to do: the end of a sentence."""
     used, fits = fit(views, size_wh)
     reason = reason_against(coefficients, fits, used, size_wh)
     if reason is not None:
@@ -121,8 +121,8 @@ def calibration_of(
 def reason_against(
     coefficients: Coefficients, fits: dict[Coefficients, Fit], views: list[View], size_wh: Size
 ) -> str | None:
-    """Why the model of so many coefficients is not to be flown with, of all that were fitted to the views, and what to
-    do; None: it is. What is wrong with the views comes before what is wrong with the model."""
+    """Why the model with this number of coefficients, of all that were fitted, must not be used, and what to do; None:
+    it may. Faults of the views come before faults of the model."""
     chosen = fits[coefficients]
     return (
         _no_model(chosen, fits)
@@ -134,7 +134,7 @@ def reason_against(
 
 
 def _each_model(views: list[View], size_wh: Size) -> dict[Coefficients, Fit]:
-    """Each begins where the one before it ended: of wide lenses, from nothing, they end in other minima."""
+    """Each fit starts from the previous one's result: for wide lenses, without it, they end in other minima."""
     fits: dict[Coefficients, Fit] = {}
     start: Fit | None = None
     for coefficients in FLAGS:
@@ -151,7 +151,7 @@ def _fitted(views: list[View], size_wh: Size, coefficients: Coefficients, start:
         rms_px, K, distortion, rvecs, _, sigma, _, errors_px = cv2.calibrateCameraExtended(
             [view.board for view in views], [view.pixels for view in views], size_wh, K_begin, begin, flags=flags
         )
-    except cv2.error:  # a view from which no plane can be told
+    except cv2.error:  # a view that does not determine a plane
         nothing = np.full(len(views), np.nan)
         return Fit(coefficients, np.eye(3), (), np.inf, np.inf, nothing, nothing)
     told = np.asarray(distortion, dtype=np.float64).reshape(-1)[: 8 if coefficients == 8 else 5]
@@ -169,7 +169,7 @@ def _fitted(views: list[View], size_wh: Size, coefficients: Coefficients, start:
 
 
 def _holds(size_wh: Size, K: Array) -> bool:
-    """Whether OpenCV takes K to begin with: its principal point must lie in the picture."""
+    """Whether OpenCV accepts K as a start: its principal point must lie in the image."""
     return bool(np.all(K[:2, 2] >= 0) and np.all(K[:2, 2] < size_wh) and np.all(np.diag(K) > 0))
 
 
@@ -178,8 +178,8 @@ def _best(fits: dict[Coefficients, Fit]) -> Fit:
 
 
 def _tilted(fits: dict[Coefficients, Fit]) -> int:
-    """Views of a tilted board, as the models that describe the views tell it: the one that sees fewest, since a focal
-    length that is far too long makes what faces the camera look tilted."""
+    """Number of views of a tilted board: the least of the models that describe the views, because a focal length that
+    is far too long makes a board that faces the camera look tilted."""
     best = _best(fits)
     return min(int(np.sum(one.tilts_rad > TILT_MIN_RAD)) for one in fits.values() if not best.gains_on(one))
 

@@ -1,4 +1,4 @@
-"""Validate a configuration as far as can be without flying: keys, certificates, model, camera."""
+"""Validate a configuration as far as possible without running: keys, certificates, model, camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Found = TypeVar("Found")
 
 
 def check(file: ConfigFile) -> list[str]:
-    """Lines for a person on what the configuration holds. Raises InputError: a line for each part that does not do."""
+    """Lines for a person that summarise the configuration. Raises InputError with one line for each faulty part."""
     config, faults = file.config, list[str]()
     _tried(lambda: _check_certificates(file), faults)
     model = _tried(lambda: load_configured(file), faults)
@@ -43,7 +43,7 @@ def check(file: ConfigFile) -> list[str]:
 
 
 def _tried(look: Callable[[], Found], faults: list[str]) -> Found | None:
-    """What a look finds; None where it finds a fault, which is added."""
+    """The result of a check; None if it finds a fault, which is added to `faults`."""
     try:
         return look()
     except InputError as error:
@@ -52,7 +52,7 @@ def _tried(look: Callable[[], Found], faults: list[str]) -> Found | None:
 
 
 def _camera(file: ConfigFile) -> tuple[CameraInfo, bool]:
-    """What the camera gives, and whether it opened. Raises InputError."""
+    """The camera's properties, and whether it opened. Raises InputError."""
     with file.blame(*camera_key(file.config.camera)):
         source, camera, opened = open_source(file.config.camera)
         source.close()

@@ -18,7 +18,7 @@ from msgs.signals import on_signals
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input, told in a sentence that names file and key, 130 interrupted, 141 unread."""
+    """Exit codes: 0 done, 2 bad input (with a sentence that names file and key), 130 interrupted, 141 output closed."""
     options = _parser().parse_args(arguments)
     set_up_logging()
     return exit_code(lambda: int(options.act(options)), InputError)
@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    # Not to be ended by it until it can be obeyed: the configuration is yet to be read.
+    # Must not end the process before it can be handled: the configuration has not been read yet.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     from edge.config import load_config
     from edge.daemon import run
@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
     config = load_config(options.config)
     code = exit_code(lambda: run(config, stop, reloader), InputError)
     if left_behind():
-        # It would come back from its library while the interpreter is taken down, and abort the process.
+        # Such a thread would return from its library during interpreter shutdown and abort the process.
         logging.shutdown()
         os._exit(code)
     return code

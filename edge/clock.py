@@ -1,7 +1,7 @@
-"""What time it is for the daemon: the host's clocks, or in lock-step a sequence's, which stands still between steps.
+"""The daemon's time source: the host's clocks, or in lock-step mode a sequence's, which stands still between steps.
 
-Whatever decides or stamps by time asks here, so that a replay can own time. What guards against a process that hangs
-(the watchdog, a wait for a thread's end) keeps to the host's clock.
+Every decision and timestamp uses it, so that a replay can control time. Only guards against a hanging process (the
+watchdog, timeouts for the end of a thread) use the host's clock.
 """
 
 from __future__ import annotations
@@ -10,35 +10,35 @@ import time
 from dataclasses import dataclass, field
 
 UTC_PERIOD_NS = 1_000_000_000
-UTC_SET_NS = 1_000_000  # by less nobody sets it, and the next measurement finds it
-SLEPT_NS = 10_000_000  # no machine goes to sleep and wakes in less
+UTC_SET_NS = 1_000_000  # a smaller step of UTC is found by the next measurement
+SLEPT_NS = 10_000_000  # no machine suspends and resumes in less
 
 _stepped_ns: int | None = None
 
 
 def monotonic_ns() -> int:
-    """Monotonic nanoseconds, of the host or of the step."""
+    """Monotonic nanoseconds, of the host or of the current step."""
     return time.monotonic_ns() if _stepped_ns is None else _stepped_ns
 
 
 def utc_ns() -> int:
-    """Nanoseconds since 1970 UTC; in lock-step the same as `monotonic_ns`: nothing tells the day of a replay."""
+    """Nanoseconds since 1970 UTC; in lock-step mode the same as `monotonic_ns`, as a replay has no date."""
     return time.time_ns() if _stepped_ns is None else _stepped_ns
 
 
 def asleep_ns() -> int:
-    """How long the machine has slept since its start; 0 in lock-step. The monotonic clock stands still meanwhile."""
-    # In this order whoever is held up between the two finds less, not more.
+    """Total time in suspend since boot, which the monotonic clock does not count; 0 in lock-step mode."""
+    # In this order, a delay between the two readings makes the result smaller, not larger.
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns() if _stepped_ns is None else 0
 
 
 def stepped() -> bool:
-    """Whether time stands still but for `step_to`."""
+    """Whether time is advanced by `step_to` only (lock-step mode)."""
     return _stepped_ns is not None
 
 
 def step_to(time_ns: int) -> None:
-    """Let it be `time_ns`, from now on until the next step. Raises ValueError for a step back."""
+    """Set the time to `time_ns` until the next step. Raises ValueError for a step back."""
     global _stepped_ns
     if _stepped_ns is not None and time_ns < _stepped_ns:
         raise ValueError(f"{time_ns} is before {_stepped_ns}")
@@ -46,15 +46,15 @@ def step_to(time_ns: int) -> None:
 
 
 def run_freely() -> None:
-    """Keep to the host's clocks again."""
+    """Return to the host's clocks."""
     global _stepped_ns
     _stepped_ns = None
 
 
 @dataclass
 class UtcClock:
-    """UTC of a monotonic time and back, by an offset measured anew each second, and as soon as UTC has been set or the
-    machine has slept. Use from one thread."""
+    """Converts monotonic time to UTC and back, by an offset measured every second and as soon as UTC was stepped or the
+    machine was suspended. Use from one thread."""
 
     uncertainty_ns: int = 0  # of the last measurement: half the time between the two readings around it
     _offset_ns: int = 0
@@ -74,13 +74,13 @@ class UtcClock:
         return self._offset_ns
 
     def _was_set(self, before_ns: int) -> bool:
-        """Whether no reading of UTC since `before_ns`, however long it was held up, can be of the offset of before."""
+        """Whether UTC was stepped: a reading since `before_ns`, however delayed, does not fit the stored offset."""
         now_utc_ns, after_ns = utc_ns(), monotonic_ns()
         ahead_ns = now_utc_ns - self._offset_ns
         return not before_ns - UTC_SET_NS <= ahead_ns <= after_ns + UTC_SET_NS
 
     def _measure(self) -> None:
-        """Bracketed, and the tightest of a few: whoever is held up between two readings tells nothing false."""
+        """UTC is read between two monotonic readings; the closest pair of a few is used, so that delays do no harm."""
         readings = []
         for _ in range(5):
             before_ns, now_utc_ns, after_ns = monotonic_ns(), utc_ns(), monotonic_ns()
@@ -90,13 +90,13 @@ class UtcClock:
 
 
 class SleepWatch:
-    """Notices that the machine has slept: by the monotonic clock what was known before looks as new as ever."""
+    """Detects that the machine was suspended: by the monotonic clock alone, old state would look current."""
 
     def __init__(self) -> None:
         self._asleep_ns = asleep_ns()
 
     def slept_ns(self) -> int:
-        """For how long, since this was last asked; 0: not at all."""
+        """Time suspended since the last call; 0: not at all."""
         slept_ns = asleep_ns() - self._asleep_ns
         self._asleep_ns += max(slept_ns, 0)
         return slept_ns if slept_ns >= SLEPT_NS else 0

@@ -1,6 +1,6 @@
-"""The typed configuration tree: one TOML file, unknown keys refused, every field described.
+"""The typed configuration tree: one TOML file, unknown keys rejected, every field described.
 
-Paths are taken from the folder the file lies in. `uavpose-edge check --config FILE` validates one.
+Paths are relative to the file's folder. `uavpose-edge check --config FILE` validates one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from msgs.topics import check_uav_name
 
 SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
-# Optical axis along the nose, image right along the right wing: the mount when all three angles are zero.
+# The mount with all three angles zero: optical axis along the nose, image right along the right wing.
 R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -46,7 +46,7 @@ def _signing_key(path: Path) -> Path:
 
 
 def _no_folder(path: Path) -> Path:
-    if os.path.isdir(path):  # Path's own raises where a folder above may not be entered
+    if os.path.isdir(path):  # Path.is_dir raises if a parent folder may not be entered
         raise ValueError(f"{path} is a folder; give a file in it")
     return path
 
@@ -58,7 +58,7 @@ def _endpoint(text: str) -> str:
 
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-LeverM = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]  # longer are millimetres, no doubt
+LeverM = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]  # larger values are surely millimetres
 
 
 class VehicleSettings(Section):
@@ -243,7 +243,7 @@ class Config(Section):
     model: ModelSettings = ModelSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     zenoh: ZenohSettings = ZenohSettings()
-    # Checked though it is the default, so that its folder is taken from the file's.
+    # The default is validated too, so that it is relative to the file's folder.
     recorder: RecorderSettings = Field(default_factory=dict, validate_default=True)
     mavlink: MavlinkSettings = MavlinkSettings()
     health: HealthSettings = HealthSettings()
@@ -259,7 +259,7 @@ class Config(Section):
 
 @dataclass(frozen=True)
 class ConfigFile:
-    """A configuration and where it was written, so that a complaint can name file, line and key."""
+    """A configuration and its source, so that an error can name file, line and key."""
 
     path: Path
     text: str
@@ -268,7 +268,7 @@ class ConfigFile:
 
     @contextmanager
     def blame(self, *key: str) -> Iterator[None]:
-        """Errors raised inside are told as errors of this key, unless they know theirs: blame("model", "path")."""
+        """Attribute errors raised inside to this key, unless they name their own: blame("model", "path")."""
         try:
             yield
         except InputError as error:
@@ -276,7 +276,7 @@ class ConfigFile:
 
 
 def load_config(path: Path) -> ConfigFile:
-    """Read and validate a TOML file. Raises InputError: one line a fault, each naming file, line and key."""
+    """Read and validate a TOML file. Raises InputError with one line per fault, each naming file, line and key."""
     text = read_text(path, InputError)
     tree = parse_toml(text, path, InputError)
     try:
@@ -288,7 +288,7 @@ def load_config(path: Path) -> ConfigFile:
 
 
 def _contents(config: Config) -> dict[str, str]:
-    """What the files hold that are read once, at the start; one that cannot be read is told by who needs it."""
+    """Hashes of the files that are read only once, at the start; unreadable ones are reported where they are used."""
     intrinsics, camera_tls = getattr(config.camera, "intrinsics", None), getattr(config.camera, "tls", None)
     files = {
         "[camera] intrinsics": (intrinsics.file,) if intrinsics is not None else (),
@@ -311,7 +311,7 @@ def _paths(tls: ZenohTlsSettings | None) -> tuple[Path, ...]:
 def _key(fault: Fault) -> tuple[str, ...]:
     parts = [str(part) for part in fault.location]
     if parts[:1] == ["camera"] and len(parts) > 1:
-        parts = parts[:1] + parts[2:]  # pydantic puts the chosen type there
+        parts = parts[:1] + parts[2:]  # pydantic inserts the selected type there
     return tuple(parts)
 
 
@@ -335,12 +335,12 @@ def _sentence(path: Path, text: str, key: tuple[str, ...], reason: str) -> str:
 
 
 def _line_of(text: str, key: tuple[str, ...]) -> int | None:
-    """Line of the key's assignment, else of its table's, inline or by header, else None (a key that is not there)."""
+    """Line of the key's assignment, else of its table (inline or header), else None (the key is missing)."""
     section: tuple[str, ...] = ()
     table_line = None
     words = tuple(word for word in key if not word.isdigit())
     for number, line in enumerate(text.splitlines(), start=1):
-        header = re.match(r"\s*\[\s*([A-Za-z][^\[\]]*)\]", line)  # a row of numbers is of a matrix
+        header = re.match(r"\s*\[\s*([A-Za-z][^\[\]]*)\]", line)  # a row of numbers belongs to a matrix
         if header:
             section = tuple(part.strip() for part in header[1].split("."))
             if section == words[: len(section)]:

@@ -1,4 +1,4 @@
-"""The section of source of the frames: [camera], one type of it for each kind, and its intrinsics."""
+"""The section [camera], with one type for each kind of source, and the intrinsics."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from edge.config_path import ConfigPath
 from msgs.session import check_endpoint
 from msgs.settings import Section
 
-SIDE_MAX_PX = 65_535  # JPEG's own bound; beyond it memory is asked for that no machine has
-MONOTONIC_MAX_NS = 10**18  # 31 years since the start of the machine: a greater one is UTC
+SIDE_MAX_PX = 65_535  # JPEG's limit; larger images would need more memory than any machine has
+MONOTONIC_MAX_NS = 10**18  # 31 years since boot: a larger value is UTC
 
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -21,7 +21,7 @@ Side = Annotated[int, Field(gt=0, le=SIDE_MAX_PX)]
 
 
 def _network_address(text: str) -> str:
-    # Not told: the address itself, in which a password may stand.
+    # The error does not contain the address, in which there may be a password.
     scheme = re.match(r"([a-z][a-z0-9+.-]*)://.", text)  # ffmpeg knows none in capitals
     if scheme is None or scheme[1] == "file":
         raise ValueError('is no network address such as rtsp://HOST/PATH or udp://HOST:PORT; a video is type = "file"')
@@ -175,5 +175,5 @@ CameraSettings = Annotated[
 
 
 def camera_key(camera: CameraSettings) -> tuple[str, str]:
-    """The key that names where a camera's frames are from."""
+    """The key that names the source of a camera's frames."""
     return "camera", {"stream": "url", "device": "device", "zenoh": "topic"}.get(camera.type, "path")

@@ -1,4 +1,4 @@
-"""The sections of what goes to the ground and to disk: [zenoh] and [recorder]."""
+"""The sections for output to the ground and to disk: [zenoh] and [recorder]."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ZenohTlsSettings(Section):
 
     @model_validator(mode="after")
     def _do(self) -> ZenohTlsSettings:
-        # Not its dates: before GPS or the ground tells the time, a computer without a clock must fly all the same.
+        # Validity dates are not checked: a computer without a clock must be able to fly before it knows the time.
         self.files().check()
         return self
 

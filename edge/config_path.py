@@ -1,4 +1,4 @@
-"""Paths in the configuration: taken from the folder that its file lies in."""
+"""Paths in the configuration: relative to the folder of its file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _from_config_folder(path: Path, info: ValidationInfo) -> Path:
     folder = (info.context or {}).get("folder", Path())
     try:
         return (folder / path.expanduser()).resolve()
-    except RuntimeError as error:  # nobody's home, or links in a circle
+    except RuntimeError as error:  # an unknown user's home, or a loop of links
         raise ValueError(f"'{path}' leads nowhere: {error}") from error
 
 

@@ -1,4 +1,4 @@
-"""docs/configuration.md from the configuration tree itself: every key with its values, default and description.
+"""Generates docs/configuration.md from the configuration tree: every key with its values, default and description.
 
 python -m edge.config_reference > docs/configuration.md
 """
@@ -37,7 +37,7 @@ def reference() -> str:
 
 
 def _sections(name: str, field: Schema, definitions: Schema) -> Iterator[tuple[str, Schema]]:
-    """Title and schema of a table of the file and of those within, one for each type it may be."""
+    """Title and schema of a table and of those inside it, one for each type it may have."""
     for section in _alternatives(field, definitions):
         kind = section["properties"].get("type", {}).get("const")
         yield f"`[{name}]`" + (f', `type = "{kind}"`' if kind else ""), section
@@ -49,7 +49,7 @@ def _sections(name: str, field: Schema, definitions: Schema) -> Iterator[tuple[s
 
 
 def _alternatives(field: Schema, definitions: Schema) -> list[Schema]:
-    """What tables a field may be; none if it is a value."""
+    """The tables that a field may be; empty if it is a value."""
     options = field.get("oneOf") or field.get("anyOf") or [field]
     return [definitions[option["$ref"].rpartition("/")[2]] for option in options if "$ref" in option]
 

@@ -1,7 +1,7 @@
-"""The daemon: newest frame → own ship at its exposure → where targets should be → poses → tracks → the links.
+"""The daemon: newest frame → own-ship state at its exposure → predicted targets → poses → tracks → links.
 
-`run` sets up, `Pipeline.fly` is the loop. Threads are in `edge/threads.py`, stages in `edge/stages.py`; none of the
-other threads ever makes the loop wait.
+`run` sets up, `Pipeline.fly` is the loop. Threads are in `edge/threads.py`, stages in `edge/stages.py`; no other thread
+ever blocks the loop.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ TICK_S = 0.1
 
 
 def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
-    """Fly until `stop` is set or the recording ends; 0. Raises InputError for what a person can mend."""
+    """Run until `stop` is set or the recording ends; returns 0. Raises InputError for what the user can correct."""
     config = file.config
     with ExitStack() as cleanup:
         model = load_configured(file)
@@ -53,22 +53,22 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader)
         cleanup.callback(pipeline.search.stop)
         pipeline.search.start()
-        # What lives by now lives to the end: the collector need not walk it between frames.
+        # Objects that exist now live until exit: exclude them from garbage collection between frames.
         gc.collect()
         gc.freeze()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
-        # In lock-step the start waits for the player's first word, and he may hang up before it.
+        # In lock-step mode start() waits for the player's first message; the player may disconnect before sending it.
         with file.blame(*camera_key(config.camera)), suppress(EndOfStream):
             capture.start(outlets.settle)
             pipeline.fly(stop)
-    # With the links stopped, their counts are whole.
+    # The links have stopped, so their counters are final.
     log.info("stopped: %s", pipeline.snapshot().line())
     return 0
 
 
 class Pipeline:
-    """One frame at a time through the stages, and at every turn a word to the supervisor."""
+    """Processes one frame at a time through all stages and reports to the supervisor in every iteration."""
 
     def __init__(
         self,
@@ -96,12 +96,12 @@ class Pipeline:
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, capture.reasons)
-        self.search = Search()  # to be started; until then each search is made where it is asked for
+        self.search = Search()  # not started yet; until then each search runs in the caller's thread
         self._since_acquire = 0
         self._out_of_order = self._time_jumps = 0
 
     def ready(self) -> None:
-        """Warmed up: say so, and what is not as it was asked for."""
+        """Log and report that the daemon is ready, and any fallback from the configured execution provider."""
         model = self._estimator.model
         name = f"{model.contract.name} ({model.contract.precision}) on {model.provider}"
         log.info("ready: %s, camera %s", name, self._board.camera.name)
@@ -142,7 +142,7 @@ class Pipeline:
             self._time_jumps = frame.meta.time_jumps
             self._tracker.doubt_motion()
         if self._tracker.is_late(frame.meta.capture_ns):
-            # The tracks are valid at a later time than this frame's: told with its stamp they would be wrong.
+            # The tracks are already valid for a later time; published with this frame's stamp they would be wrong.
             self._out_of_order += 1
             return
         clock = StageClock(frame.meta, monotonic_ns())
@@ -166,7 +166,7 @@ class Pipeline:
         self.supervisor.frame_done(frame.meta, clock.stages_ns(), tracks, own_ship is not None)
 
     def _slept(self) -> bool:
-        """Whether the machine has slept since the last look: frame, targets and own ship are then of who knows when."""
+        """Whether the computer was suspended since the last check: frame, tracks and own-ship state are then stale."""
         slept_ns = self._sleep.slept_ns()
         if slept_ns == 0:
             return False
@@ -200,7 +200,7 @@ class Pipeline:
         if not searches:
             return found
         if not found:
-            # The whole frame and windows looked into in vain leave no time for finer looks: the next frame has them.
+            # Unsuccessful track windows plus the whole frame leave no time for finer ones; the next frame makes them.
             found = self._estimator.acquire(frame, thrice=unhurried and not expected)
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
@@ -229,13 +229,13 @@ class Pipeline:
         seen = self._estimator.track(frame, boxes, twice)
         if pointed_at is not None and (there := seen[-1]) is not None:
             self._by_hand.found(there)
-            if not lies_on(there.box_xyxy_px, held):  # those held have their room
+            if not lies_on(there.box_xyxy_px, held):  # a tracked target has its slot already
                 self._tracker.make_room(there)
         clock.estimated(self._estimator.model.take_runs_ns())
         for i, place in enumerate(places, start=len(held)):
             look = seen[i]
             if look is None or lies_on(look.box_xyxy_px, held):
-                continue  # a sight of a target that is held, surer than its own window's, needs no place to agree
+                continue  # a tracked target, seen more clearly than in its own window, needs no confirmation
             if not self._estimator.confirms(place, [look]):
                 seen[i] = None
         return [estimate for estimate in seen if estimate is not None]
@@ -250,7 +250,7 @@ class Pipeline:
         self._outlets.show(frame)
 
     def _take_reload(self) -> None:
-        """Between two frames: a new model behind the same tracks."""
+        """Between two frames: switch to a newly loaded model and configuration; tracks are kept."""
         new = self._reloader.take(self._board.file, self._estimator, self._board.camera, self._outlets.event)
         if new is None:
             return

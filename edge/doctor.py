@@ -1,4 +1,4 @@
-"""`uavpose-edge doctor`: look at everything the daemon needs on this machine, and say what to do about each fault."""
+"""`uavpose-edge doctor`: check everything the daemon needs on this machine, and advise on each fault."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def doctor(file: ConfigFile, as_json: bool) -> int:
 
 
 def findings(file: ConfigFile) -> Iterator[Finding]:
-    """Every look in its order; none of them raises for what it finds."""
+    """All checks in order; none raises because of what it finds."""
     yield from machine_findings(file.config)
     running = running_daemon(file.config)
     frame_ms: float | None = None
@@ -62,7 +62,7 @@ def findings(file: ConfigFile) -> Iterator[Finding]:
 
 
 def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float | None]]:
-    """A camera serves one program at a time: where the daemon has it, its word is taken."""
+    """Findings as reported by the running daemon: a camera serves one program at a time."""
     of_camera = [(kind, text) for kind, text in told_reasons(running) if kind.startswith(CAMERA_REASONS)]
     if of_camera:
         said = "; ".join(text for _, text in of_camera)
@@ -74,7 +74,7 @@ def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float 
 
 
 def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
-    """Opens it as the daemon does, and waits for pictures; with each finding the frame rate that was seen."""
+    """Open the camera as the daemon does and wait for pictures; with each finding the frame rate measured."""
     camera = file.config.camera
     device = getattr(camera, "device", None)
     if device is not None and (fault := device_fault(Path(device), "video")) is not None:
@@ -108,18 +108,18 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
     if not reasons:
         yield good("camera", text), rate_hz
         return
-    # Stamps that jump may be a busy machine's; of a camera that is frozen or lost again nothing is seen.
+    # Jumping timestamps may be due to a busy machine; a camera that is frozen or lost again gives no usable frames.
     bad = poor if all(kind == STAMPS for kind, _ in reasons) else wrong
     yield bad("camera", f"{text}; {said}", _advice(reasons)), rate_hz
 
 
 def _advice(reasons: Iterable[tuple[str, str]]) -> str:
-    """What to do about the first of these kinds that has its own."""
+    """Advice for the first of these kinds that has any."""
     return next((ADVICE[kind] for kind, _ in reasons if kind in ADVICE), ADVICE_CAMERA)
 
 
 def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
-    """Exposure times of the first frames that come, and the size of the last; None: none came. Raises InputError."""
+    """Exposure times of the first frames received, and the size of the last; None: no frame. Raises InputError."""
     until_s, seen_ns, size_wh = time.monotonic() + FRAME_S, list[int](), None
     while time.monotonic() < until_s and len(seen_ns) < LIVE_FRAMES:
         try:

@@ -1,4 +1,4 @@
-"""The links: is the autopilot heard, does the ground answer, are our own endpoints free?"""
+"""Checks of the links: is the autopilot received, does the ground answer, are our own endpoints free?"""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
 from msgs.session import client_config, peer_config
 
-CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # how the kinds of edge.health.Reason begin that tell of it
+CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # prefixes of the kinds of edge.health.Reason about it
 NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = "is the autopilot on, its port set to MAVLink 2 at this speed, its stream sent to this address?"
 HEARING_S = 4.0
@@ -37,7 +37,7 @@ LOOK_S = 0.1
 
 
 def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator[Finding]:
-    """`running` is what the daemon says of itself: its endpoints are then its own, and not tried."""
+    """`running`: the running daemon's `info`, if any: its endpoints are then in use and not tried."""
     if running is not None:
         said = f"the daemon runs (process {running['pid']}) and is {running.get('state', 'starting')}"
         others = {kind: text for kind, text in told_reasons(running) if not kind.startswith(CAMERA_REASONS)}
@@ -56,12 +56,12 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
 
 
 def told_reasons(running: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Kind and text of what a daemon says is wrong with it."""
+    """Kind and text of the reasons that a daemon reports."""
     return list(zip(running.get("reason_kinds", ()), running.get("reasons", ()), strict=True))
 
 
 def running_daemon(config: Config) -> Mapping[str, Any] | None:
-    """What the daemon that flies with this configuration says of itself (`info`); None if none does."""
+    """`info` of the daemon that runs with this configuration; None if there is none."""
     tls = config.zenoh.tls.files() if config.zenoh.tls is not None else None
     for endpoint in loopback_endpoints(config.zenoh) if config.zenoh.enabled else []:
         if (answer := ask(endpoint, config.vehicle.name, tls)) is not None:
@@ -88,7 +88,7 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
 
 
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
-    """Listens as the daemon does, until a heartbeat is heard."""
+    """Listen as the daemon does until a heartbeat is received."""
     if settings.signing_key is not None:
         yield signing_finding(signing_state_of(settings, settings.signing_key))
     for endpoint in settings.endpoints:
@@ -130,11 +130,11 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
 
 
 def signing_finding(state: Path) -> Finding:
-    """Whether the daemon can keep the last timestamp that it signed with, and what is kept is of no time to come."""
+    """Whether the daemon can store the last timestamp used for signing, and the stored one is not in the future."""
     advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
-    if os.path.isdir(state):  # Path's own raises where a folder above may not be entered
+    if os.path.isdir(state):  # Path.is_dir raises if a parent folder may not be entered
         return wrong("signing", f"{state} is a folder: after a restart old messages would pass as new", advice)
-    with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so that the folder decides
+    with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so the folder's rights decide
         ahead = ahead_of_clock(state, clock.utc_ns())
         if ahead is None:
             return good("signing", f"the last timestamp is kept in {state}")
@@ -144,7 +144,7 @@ def signing_finding(state: Path) -> Finding:
 
 
 def _wait(look: Callable[[], dict[str, int]], done: Callable[[dict[str, int]], bool]) -> dict[str, int]:
-    """Look until it is done or HEARING_S are over; the last look."""
+    """Poll until `done` or for HEARING_S; returns the last result."""
     pause, counted = threading.Event(), look()
     for _ in range(round(HEARING_S / LOOK_S)):
         if done(counted):

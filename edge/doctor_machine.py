@@ -1,4 +1,4 @@
-"""The machine: processor, clock, memory and disk."""
+"""Checks of the machine: processor, clock, memory and disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edge.findings import Finding, good, poor, wrong
 
 CPUINFO = Path("/proc/cpuinfo")
 GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-# The instructions that make an 8-bit network faster than a float one, as /proc/cpuinfo names them.
+# Instructions that make an 8-bit network faster than a float one, as named in /proc/cpuinfo.
 DOT_PRODUCT = {"x86_64": ("avx512_vnni", "avx_vnni"), "aarch64": ("asimddp", "i8mm")}
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 
@@ -54,7 +54,7 @@ def _cores(threads: int) -> Iterator[Finding]:
 
 
 def clock_finding(state: int) -> Finding:
-    """From adjtimex's return value, -1 where it cannot be asked."""
+    """From adjtimex's return value, -1 if it is not available."""
     if state == TIME_ERROR:
         advice = "install chrony, with GPS or the ground's time; stamps are judged by age, and poses refused without it"
         return poor("clock", "UTC is not synchronised", advice)
@@ -71,12 +71,12 @@ def _clock_state() -> int:
 
 
 def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Finding:
-    """Where recordings go; the folder is made when one begins, so its parents count. Not `from_start`: only when the
-    ground asks for one."""
+    """Space for recordings; the folder is created by the first one, so its nearest parent is checked. `from_start`
+    False: only the ground starts recordings."""
     bad, of_what = (wrong, "") if from_start else (poor, "a recording that the ground asks for will fail: ")
-    # Paths' own `exists` and `is_dir` raise where a folder above may not be searched. A link that leads there is there.
+    # Path.exists and Path.is_dir raise if a parent folder may not be searched. Even a broken link counts as existing.
     there = next((parent for parent in (folder, *folder.parents) if os.path.lexists(parent)), Path("/"))
-    needed = os.W_OK | os.X_OK | (os.R_OK if there == folder else 0)  # the recorder looks for its files of before
+    needed = os.W_OK | os.X_OK | (os.R_OK if there == folder else 0)  # the recorder lists its earlier files
     if os.path.isdir(there) and os.statvfs(there).f_flag & os.ST_RDONLY:
         advice = (
             "mount it to be written (`findmnt -T` shows what it is; a failing card is made read-only), or name another"

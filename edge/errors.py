@@ -1,12 +1,12 @@
-"""The one error a person can mend: the command line prints it as a sentence and leaves with exit code 2."""
+"""The error class for what the user can correct: the command line prints it and exits with code 2."""
 
 from __future__ import annotations
 
 
 class InputError(Exception):
-    """A file, key or device that a person named does not do; the text is a whole sentence.
+    """A file, key or device given by the user cannot be used; the text is a complete sentence.
 
-    `key` is the configuration key at fault, for example ("camera", "intrinsics"), where the raiser knows it.
+    `key` is the configuration key at fault, for example ("camera", "intrinsics"), if known where it is raised.
     """
 
     def __init__(self, text: str, key: tuple[str, ...] = ()) -> None:

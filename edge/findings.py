@@ -1,4 +1,4 @@
-"""What the doctor finds: one line each, and what to do about it."""
+"""Findings of the doctor: one line each, and advice."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MARKS = {"good": "ok", "poor": "poor", "wrong": "WRONG"}
 
 @dataclass(frozen=True)
 class Finding:
-    """One look at one thing. `poor` works, but less well than it could; `wrong` does not."""
+    """The result of one check. `poor` works, but less well than possible; `wrong` does not work."""
 
     what: str
     verdict: Literal["good", "poor", "wrong"]

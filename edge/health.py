@@ -1,4 +1,4 @@
-"""How the daemon is: one state with its reasons, counters, and how long each stage takes. Single-threaded."""
+"""Health of the daemon: one state with its reasons, counters, and the times of the stages. Single-threaded."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ import numpy as np
 from edge.types import Track, TrackState
 
 WINDOW_FRAMES = 900  # of latencies: half a minute at 30 frames a second
-RECENT_NS = 3_000_000_000  # what is wrong is judged by: over, it is soon forgotten
+RECENT_NS = 3_000_000_000  # period over which faults are judged, so that one that is over soon clears
 NO_FRAME_NS = 2_000_000_000
-FIRST_FRAME_NS = 10_000_000_000  # what a stream may take to open; who has given none by then is not there
+FIRST_FRAME_NS = 10_000_000_000  # time for a stream to open; a camera without a frame by then counts as absent
 DROPS_TOLERATED = 0.1
 ANNOUNCE_NS = 1_000_000_000
 
 
 class Activity(Enum):
-    """What the loop does, however well. From worst to best."""
+    """What the loop is doing. From worst to best."""
 
     WAITING = "waiting"  # for frames
     SEARCHING = "searching"  # frames, but no target
-    COASTING = "coasting"  # confirmed targets, none seen just now
-    TRACKING = "tracking"  # a confirmed target, seen
+    COASTING = "coasting"  # confirmed targets, but none detected now
+    TRACKING = "tracking"  # a confirmed target is detected
 
 
 class HealthState(Enum):
-    """How the daemon is, in one word. From best to worst."""
+    """State of the daemon in one word. From best to worst."""
 
     TRACKING = "tracking"
     COASTING = "coasting"
     SEARCHING = "searching"
     INIT = "init"  # no frame yet
     DEGRADED = "degraded"  # works, but less well than it should: see the reasons, and the activity
-    FAULT = "fault"  # gives nothing: see the reasons
+    FAULT = "fault"  # no output: see the reasons
 
 
 _WELL = {
@@ -50,15 +50,15 @@ _ACTIVITIES, _STATES = tuple(Activity), tuple(HealthState)
 
 @dataclass(frozen=True)
 class Reason:
-    """Why all is not well."""
+    """One cause of a degraded or fault state."""
 
-    kind: str  # of a fixed few, for machines
-    text: str  # for a person; may hold numbers that change
+    kind: str  # one of a fixed set, for programs
+    text: str  # for a person; may contain changing numbers
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How the daemon is, what it does, and why it is not better."""
+    """State and activity of the daemon, with the reasons."""
 
     state: HealthState
     activity: Activity
@@ -66,7 +66,7 @@ class Condition:
 
     @property
     def headline(self) -> str:
-        """`degraded, tracking`, or a state that says it all."""
+        """`degraded, tracking`, or the state alone if it implies the activity."""
         return f"{self.state.value}, {self.activity.value}" if self.state is HealthState.DEGRADED else self.state.value
 
     @property
@@ -77,11 +77,11 @@ class Condition:
         return f"{self.headline}: {'; '.join(self.texts)}" if self.reasons else self.headline
 
     def same_news(self, other: Condition) -> bool:
-        """Whether an operator who was told the other knows this one: numbers in a reason are no news."""
+        """Whether it is no news after `other`: changed numbers in a reason do not count."""
         return (self.state, self.activity, self._kinds()) == (other.state, other.activity, other._kinds())
 
     def worse_than(self, other: Condition) -> bool:
-        """A worse state, or in the same one a worse activity, or a reason that the other has not."""
+        """A worse state, or the same state with a worse activity or an additional reason."""
         if self.state is not other.state:
             return _STATES.index(self.state) > _STATES.index(other.state)
         less = _ACTIVITIES.index(self.activity) < _ACTIVITIES.index(other.activity)
@@ -102,7 +102,7 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class HealthSnapshot:
-    """What goes out once a second."""
+    """The status that is published once a second."""
 
     time_ns: int  # monotonic
     condition: Condition
@@ -110,10 +110,10 @@ class HealthSnapshot:
     frame_rate_hz: float
     counters: Mapping[str, int]
     latency_ms: Mapping[str, Percentiles]  # by stage (edge.stages.STAGES)
-    facts: Mapping[str, str] = field(default_factory=dict)  # what the daemon flies with, e.g. the model's hash
+    facts: Mapping[str, str] = field(default_factory=dict)  # what the daemon runs with, e.g. the model's hash
 
     def brief(self) -> str:
-        """For the log each second: state, tracks, rate, latency from exposure to the links, frames dropped."""
+        """Short form for the log: state, tracks, rate, latency from exposure to the links, frames dropped."""
         total = self.latency_ms.get("total")
         latency = f", {total.p50:.0f}/{total.p95:.0f}/{total.p99:.0f} ms p50/p95/p99" if total is not None else ""
         return f"{self._head()}{latency}, dropped={self.counters.get('dropped', 0)}"
@@ -130,10 +130,10 @@ class HealthSnapshot:
 
 
 class Announcer:
-    """When a change is worth telling an operator: a condition that flickers must not flood a telemetry radio.
+    """When to report a change to the operator: a flickering condition must not flood a telemetry radio.
 
-    A worse one is told at once, a better one when it has lasted ANNOUNCE_NS; never two within that time but for a
-    fault.
+    A worse condition is reported at once, a better one when it has lasted ANNOUNCE_NS; never two within that time,
+    except a fault.
     """
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ class Announcer:
         self._since_ns = 0
 
     def due(self, condition: Condition, now_ns: int) -> bool:
-        """Whether to tell what holds at `now_ns` now; it then counts as told. Call it at every turn."""
+        """Whether to report the condition at `now_ns`; it then counts as reported. Call it in every iteration."""
         if self._current is None or not condition.same_news(self._current):
             self._current, self._since_ns = condition, now_ns
         if self._told is not None:
@@ -167,8 +167,8 @@ def judge(
     faults: Sequence[Reason] = (),
     waited_ns: int = 0,
 ) -> Condition:
-    """How the daemon is. `frame_age_ns` is None before the first frame, which was waited for so long; `faults` are what
-    else is less well than it should be. Pure."""
+    """Condition of the daemon. `frame_age_ns`: None before the first frame; `waited_ns`: time waited for that one;
+    `faults`: further reasons. Pure."""
     if frame_age_ns is None:
         state = HealthState.INIT if waited_ns <= max(no_frame_ns, FIRST_FRAME_NS) else HealthState.FAULT
         return Condition(state, Activity.WAITING, (Reason("no_camera", "waiting for the camera"), *faults))
@@ -190,15 +190,15 @@ def judge(
 
 
 class Health:
-    """Collects what the loop saw; `assess` and `snapshot` say what it means."""
+    """Collects data from the loop; `assess` and `snapshot` evaluate them."""
 
     def __init__(self, wants_attitude: bool, no_frame_ns: int = NO_FRAME_NS) -> None:
         self._wants_attitude = wants_attitude
         self.no_frame_ns = no_frame_ns
-        self.faults: tuple[Reason, ...] = ()  # what others noticed, told as reasons while it is there
+        self.faults: tuple[Reason, ...] = ()  # found elsewhere, reported as reasons while present
         self._stages_ns: dict[str, deque[int]] = {}
         self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number, total ns
-        self._began_ns: int | None = None  # when it was first asked
+        self._began_ns: int | None = None  # time of the first call
         self._done_ns: int | None = None
         self._tracks: tuple[Track, ...] = ()
         self._has_attitude = False
@@ -212,7 +212,7 @@ class Health:
         has_attitude: bool,
         now_ns: int,
     ) -> None:
-        """Note one frame: its number, in which a gap is a drop, the time each stage took, what came out."""
+        """Add one frame: its number (a gap is a drop), the times of its stages, and its results."""
         for stage, duration_ns in stages_ns.items():
             self._stages_ns.setdefault(stage, deque(maxlen=WINDOW_FRAMES)).append(duration_ns)
         self._done_ns = now_ns
@@ -241,13 +241,13 @@ class Health:
         condition = self.assess(now_ns)
         latency_ms = {stage: percentiles_ms(values) for stage, values in self._stages_ns.items()}
         sure = sum(track.state is not TrackState.TENTATIVE for track in self._tracks)
-        # Of a camera that is gone, targets and rate are history.
+        # Without a camera, the last targets and rate are out of date.
         held, rate_hz = (0, 0.0) if condition.activity is Activity.WAITING else (sure, self._frame_rate_hz())
         counted = {"poses": self._poses, **counters}
         return HealthSnapshot(now_ns, condition, held, rate_hz, counted, latency_ms, facts or {})
 
     def recent_total_ms(self, now_ns: int) -> Percentiles | None:
-        """From exposure to the links, over RECENT_NS; None without a frame in them."""
+        """Latency from exposure to the links over RECENT_NS; None without a frame in that period."""
         self._forget(now_ns)
         return percentiles_ms(total_ns for _, _, total_ns in self._recent) if self._recent else None
 

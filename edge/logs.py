@@ -1,4 +1,4 @@
-"""The daemon's log: one line a fault, and a count in place of its repetitions; nobody waits for its reader."""
+"""The daemon's log: one line per fault, with repetitions counted; no thread waits for the reader of the log."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ FAULTS_REMEMBERED = 64
 LINES_WAITING = 1000
 DRAIN_S = 1.0
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-# OpenCV and ffmpeg write lines of their own, past any counting: one for each try to open a camera, many for each
-# picture that a radio spoiled. Whoever looks into a fault sets these variables otherwise.
+# OpenCV and ffmpeg write their own lines, which are not counted: one for each attempt to open a camera, many for each
+# corrupted picture. For debugging, set these variables differently.
 QUIET = {"OPENCV_LOG_LEVEL": "ERROR", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class PatientStream(io.TextIOBase):
-    """Writes to a stream by a thread of its own: who logs flies, and a reader that stands still (a journal, a paused
-    terminal, a full pipe) must not hold it up. What comes meanwhile waits, the newest of too much is lost."""
+    """Writes to a stream in its own thread, so that a stalled reader (a journal, a paused terminal, a full pipe) does
+    not block the threads that log. Lines are queued meanwhile; if there are too many, the newest are lost."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._waiting: queue.Queue[str | threading.Event] = queue.Queue(LINES_WAITING)
-        self._lost = 0  # in all; counted by who writes alone, so that no count is lost between two threads
+        self._lost = 0  # in total; changed by the writing threads only, so that no count is lost
         threading.Thread(target=self._work, name="log", daemon=True).start()
 
     def write(self, text: str) -> int:
@@ -44,7 +44,7 @@ class PatientStream(io.TextIOBase):
         return len(text)
 
     def drain(self) -> None:
-        """Return when all is written, or after DRAIN_S."""
+        """Return when everything is written, or after DRAIN_S."""
         written = threading.Event()
         with contextlib.suppress(queue.Full):
             self._waiting.put_nowait(written)
@@ -60,7 +60,7 @@ class PatientStream(io.TextIOBase):
             lost = self._lost - told
             told += lost
             said = f"{lost} lines of the log were lost: nobody read it\n" if lost else ""
-            with contextlib.suppress(OSError, ValueError):  # the reader is gone, or the stream closed
+            with contextlib.suppress(OSError, ValueError):  # no reader, or the stream is closed
                 self._stream.write(said + line)
                 self._stream.flush()
 
@@ -73,10 +73,10 @@ class _Fault:
 
 
 class CountingHandler(logging.StreamHandler[TextIO]):
-    """Writes a warning or an error at once, the same one (logger, level, words but for their numbers) again only as a
-    count after REPEAT_S. What is below a warning is written as it comes.
+    """Writes a warning or an error at once; repetitions (same logger, level and words, ignoring numbers) only as a
+    count after REPEAT_S. Lower levels are written unchanged.
 
-    `now_s` counts the time between them: not a record's own, which is of a clock that may be set back.
+    `now_s` measures the time between them; records' own times are from a clock that may be set back.
     """
 
     def __init__(self, stream: TextIO, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -117,7 +117,7 @@ class CountingHandler(logging.StreamHandler[TextIO]):
 
 
 def set_up_logging() -> None:
-    """Everything from INFO on to standard error. To be called before OpenCV is imported."""
+    """Log everything from INFO on to standard error. To be called before OpenCV is imported."""
     for variable, level in QUIET.items():
         os.environ.setdefault(variable, level)
     handler = CountingHandler(PatientStream(sys.stderr))  # type: ignore[arg-type]

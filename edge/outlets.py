@@ -1,4 +1,4 @@
-"""All links as one: what the loop tells goes to each that is on, and none of them makes it wait."""
+"""All links as one: the loop's output goes to each enabled link, and none of them blocks the loop."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Python's logging levels are those of rcl_interfaces/Log; MAVLink counts the other way (MAV_SEVERITY).
+# Python's logging levels equal those of rcl_interfaces/Log; MAV_SEVERITY counts in the opposite direction.
 LEVELS = {HealthState.DEGRADED: logging.WARNING, HealthState.FAULT: logging.ERROR}
 MAV_SEVERITY = {logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3}
 
 
 class Outlets:
-    """The enabled links, running. Peers may come and go; only our own endpoints must be free."""
+    """The running links that are enabled. Peers may come and go; only our own endpoints must be free."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class Outlets:
 
     def publish(self, report: Report) -> None:
         if self._board is not None:
-            # What a camera gives may be known no sooner, as over zenoh, and change in flight.
+            # The true size may not be known earlier, for example over zenoh, and may change in flight.
             self._board.image_size_wh = report.image_size_wh
         if self._mavlink is not None:
             self._mavlink.publish(report)
@@ -52,21 +52,21 @@ class Outlets:
             self._zenoh.publish(report)
 
     def show(self, frame: Frame) -> None:
-        """The picture itself, for who looks and for recordings."""
+        """The picture itself, for viewers and recordings."""
         if self._pictures is not None:
             self._pictures.show(frame)
 
     def set_health(self, condition: Condition) -> None:
-        """Told at every turn of the loop: what follows from it (HEARTBEAT) stops when the loop is stuck."""
+        """To be called in every iteration of the loop, so that HEARTBEAT, which depends on it, stops with the loop."""
         if self._mavlink is not None:
             self._mavlink.set_health(condition)
 
     def tell(self, condition: Condition) -> None:
-        """A change of state, as an event."""
+        """Report a change of state as an event."""
         self._say(LEVELS.get(condition.state, logging.INFO), str(condition), of_state=True)
 
     def event(self, level: int, text: str) -> None:
-        """Something an operator should know; from any thread."""
+        """A message for the operator; may be called from any thread."""
         self._say(level, text)
 
     def _say(self, level: int, text: str, of_state: bool = False) -> None:
@@ -76,7 +76,7 @@ class Outlets:
             self._zenoh.publish_event(level, text)
 
     def last_event(self, level: int, text: str) -> None:
-        """An event that nothing follows: returns when each link has sent it and ended."""
+        """The last event: returns when each link has sent it and ended."""
         self.event(level, text)
         for link in (self._pictures, self._mavlink, self._zenoh, self._recorder):
             if link is not None:
@@ -87,7 +87,7 @@ class Outlets:
             self._zenoh.publish_diagnostics(snapshot)
 
     def settle(self) -> None:
-        """In lock-step: return when what was told has been sent and what was received is heard."""
+        """In lock-step mode: return when all output is sent and all input is processed."""
         if self._mavlink is not None:
             self._mavlink.settle()
         if self._zenoh is not None:
@@ -106,9 +106,9 @@ class Outlets:
 def start_outlets(
     board: StatusBoard, own_ship: OwnShipBuffer, requests: RequestQueue, reload: AskReload, cleanup: ExitStack
 ) -> Outlets:
-    """Start the enabled links, to be stopped by `cleanup`. A link that is off is not even imported.
+    """Start the enabled links, to be stopped by `cleanup`. A disabled link is not even imported.
 
-    Over zenoh the board answers who asks.
+    Over zenoh, the board answers status queries.
 
     Raises InputError (LinkError) when an endpoint of our own cannot be opened.
     """

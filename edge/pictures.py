@@ -1,6 +1,6 @@
-"""The camera's pictures for who looks and for recordings: JPEG, made by a thread of its own; the loop never waits.
+"""The camera's pictures for viewers and recordings: JPEG, encoded in a separate thread; the loop never waits.
 
-Live they are few and small, and made only while somebody looks; on disk they are as often and as good as was asked for.
+Live ones are few and small, encoded only while there is a viewer; recorded ones have the configured rate and quality.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from edge.types import Frame
 
 LIVE_BYTES_MAX = 150_000
 LIVE_QUALITIES = (80, 60, 40, 20)  # the first that fits
-# Then these, in codes of the picture's own, which take longer: in JPEG's usual ones 4K is 130 kB at its very worst.
+# Then these, with optimised Huffman tables, which take longer: with the usual ones 4K is 130 kB at the lowest quality.
 LIVE_TIGHT_QUALITIES = (20, 10, 5)
 RECORDED_QUALITY = 90
 WAITING_MAX = 4  # frames
@@ -31,25 +31,25 @@ class Picture:
 
     capture_ns: int  # monotonic
     jpeg: bytes
-    live: bool  # to who looks
-    recorded: bool  # to the disk
+    live: bool  # to viewers
+    recorded: bool  # to disk
 
 
 class PictureLink(Protocol):
-    """What takes pictures."""
+    """A receiver of pictures."""
 
     def wants_picture(self) -> bool:
-        """Whether anybody looks."""
+        """Whether there is a viewer."""
 
     def records_picture(self) -> bool:
-        """Whether what is handed over is recorded just now."""
+        """Whether a recording is in progress."""
 
     def publish_picture(self, picture: Picture) -> None:
-        """Take one; never waits."""
+        """Accept a picture; never waits."""
 
 
 class Rate:
-    """When the next is due, by the frames' own times; counted on from when it was due, so that the rate is met."""
+    """When the next picture is due, by the frames' times; counted from the last due time, so that the rate is met."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = round(1e9 / hz) if hz > 0 else None
@@ -80,7 +80,7 @@ class Pictures:
         self._thread.start()
 
     def show(self, frame: Frame) -> None:
-        """Leave a frame for the thread if it is due; of those it cannot keep up with the oldest is dropped, counted."""
+        """Queue a frame for the thread if due; if the thread cannot keep up, the oldest is dropped and counted."""
         capture_ns = frame.meta.capture_ns
         live = self._link.wants_picture() and self._live.due(capture_ns)
         recorded = self._link.records_picture() and self._recorded.due(capture_ns)
@@ -92,7 +92,7 @@ class Pictures:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Hand over what waits. May be called twice."""
+        """Encode and hand over what is queued, then stop. May be called twice."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -124,8 +124,8 @@ class Pictures:
 
 
 def jpeg(image_bgr: NDArray[np.uint8], quality: int, tight: bool = False) -> bytes | None:
-    """[H, W, 3] as JPEG, if `tight` in codes of its own; None if it cannot be encoded (JPEG ends at 65,535 pixels a
-    side)."""
+    """[H, W, 3] as JPEG, with optimised Huffman tables if `tight`; None if it cannot be encoded (JPEG is limited to
+    65,535 pixels per side)."""
     try:
         settings = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, int(tight)]
         done, data = cv2.imencode(".jpg", image_bgr, settings)
@@ -135,7 +135,7 @@ def jpeg(image_bgr: NDArray[np.uint8], quality: int, tight: bool = False) -> byt
 
 
 def small_jpeg(image_bgr: NDArray[np.uint8]) -> bytes | None:
-    """As good as LIVE_BYTES_MAX lets it be, all its pixels kept so that what is drawn on it fits; None: none does."""
+    """The best quality within LIVE_BYTES_MAX, at full resolution so that overlays fit; None: no quality fits."""
     for quality, tight in (*((q, False) for q in LIVE_QUALITIES), *((q, True) for q in LIVE_TIGHT_QUALITIES)):
         data = jpeg(image_bgr, quality, tight)
         if data is not None and len(data) <= LIVE_BYTES_MAX:

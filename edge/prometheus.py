@@ -1,4 +1,4 @@
-"""Metrics for Prometheus in its text format, served on loopback alone by a thread of its own."""
+"""Metrics for Prometheus in its text format, served on loopback only, by a separate thread."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
 
 def metrics(board: StatusBoard) -> str:
-    """Everything in seconds and counts; without state before the first second is over."""
+    """All metrics, in seconds and counts; without the state during the first second."""
     return "\n".join(_lines(board)) + "\n"
 
 
@@ -73,7 +73,7 @@ class MetricsServer:
 
     def __init__(self, board: StatusBoard, port: int) -> None:
         class Handler(BaseHTTPRequestHandler):
-            timeout = 5.0  # a client that says nothing holds its thread no longer
+            timeout = 5.0  # limits how long a silent client occupies its thread
 
             def do_GET(self) -> None:
                 if self.path != "/metrics":
@@ -87,7 +87,7 @@ class MetricsServer:
                 self.wfile.write(body)
 
             def log_message(self, format: str, *args: object) -> None:
-                """A scrape is no news."""
+                """Scrapes are not logged."""
 
         try:
             self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)

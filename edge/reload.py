@@ -1,4 +1,4 @@
-"""SIGHUP or a command: the configuration read again, a new model put in between two frames; what is wrong is refused.
+"""Reload by SIGHUP or command: reads the configuration again, replaces the model between two frames, rejects faults.
 
 | key                                                       | when it is changed         |
 |-----------------------------------------------------------|----------------------------|
@@ -34,10 +34,10 @@ LIVE_SECTIONS = frozenset({"model"})
 
 @dataclass(frozen=True)
 class Reloaded:
-    """What the loop takes over."""
+    """The result of a reload, for the loop."""
 
-    file: ConfigFile  # what flies from now on: the old, but for what can be changed in flight
-    estimator: Estimator  # warm
+    file: ConfigFile  # configuration from now on: the old one, except for keys that can change in flight
+    estimator: Estimator  # warmed up
     outcome: ReloadOutcome
 
     @property
@@ -56,8 +56,8 @@ def load_configured(file: ConfigFile) -> Model:
 
 
 def warm_estimator(model: Model, max_targets: int, camera: CameraInfo) -> Estimator:
-    """Both stages, gone through once with a black picture of the camera's size: first calls allocate, and should not
-    cost a frame."""
+    """An estimator whose stages were run once on a black picture of the camera's size: first calls allocate memory, and
+    should not delay a frame."""
     estimator = Estimator(model, max_targets)
     width, height = camera.image_size_wh
     black = np.zeros((height, width, 3), dtype=np.uint8)
@@ -67,7 +67,7 @@ def warm_estimator(model: Model, max_targets: int, camera: CameraInfo) -> Estima
 
 
 def needs_restart(old: Config, new: Config) -> list[str]:
-    """Keys that differ and cannot be changed in flight, as `[section] key`."""
+    """Keys that differ and cannot change in flight, as `[section] key`."""
     named = []
     for section in Config.model_fields:
         if section in LIVE_SECTIONS:
@@ -82,7 +82,7 @@ def needs_restart(old: Config, new: Config) -> list[str]:
 
 
 def with_live_keys(old: Config, new: Config) -> Config:
-    """`old` with what can be changed in flight taken from `new`."""
+    """`old` with the keys that can change in flight taken from `new`."""
     changes: dict[str, Any] = {section: getattr(new, section) for section in LIVE_SECTIONS}
     for section in {section for section, _ in LIVE_KEYS}:
         keys = {key: getattr(getattr(new, section), key) for name, key in LIVE_KEYS if name == section}
@@ -91,7 +91,7 @@ def with_live_keys(old: Config, new: Config) -> Config:
 
 
 def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Reloaded:
-    """Read the configuration again and make ready what it asks for. Raises InputError; `flying` then goes on."""
+    """Read the configuration again and prepare the changes. Raises InputError; `flying` then remains in use."""
     new = load_config(flying.path)
     config = with_live_keys(flying.config, new.config)
     file = replace(new, config=config, contents=flying.contents)
@@ -114,22 +114,22 @@ def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Relo
 
 
 class Reloader:
-    """Asked by a signal or a command, works in a thread of its own, delivers to the loop; one reload at a time."""
+    """Triggered by a signal or a command, works in its own thread, delivers to the loop; one reload at a time."""
 
     def __init__(self) -> None:
         self._asked = False
         self._ready: Reloaded | None = None
         self._taken = threading.Event()
-        self._thread: threading.Thread | None = None  # of the reload under way
+        self._thread: threading.Thread | None = None  # of the reload in progress
         self._lock = threading.Lock()
-        self._answer: Callable[[ReloadOutcome], None] | None = None  # of what is asked for, or under way
+        self._answer: Callable[[ReloadOutcome], None] | None = None  # for the reload that is requested or in progress
 
     def ask(self) -> None:
-        """From any thread; the loop sees it at its next turn."""
+        """Request a reload, from any thread; the loop sees it in its next iteration."""
         self._asked = True
 
     def ask_for(self, answer: Callable[[ReloadOutcome], None]) -> bool:
-        """The same, and `answer` hears the outcome on the reload's thread; False if another one waits for its own."""
+        """As `ask`; `answer` is called with the outcome on the reload's thread. False if another reload is pending."""
         with self._lock:
             if self._answer is not None or self._thread is not None:
                 return False
@@ -140,7 +140,7 @@ class Reloader:
     def take(
         self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
     ) -> Reloaded | None:
-        """At every turn of the loop: begin what was asked for, hand over what is ready. Never waits."""
+        """To be called in every iteration of the loop: start a requested reload, return a finished one. Never waits."""
         ready, self._ready = self._ready, None
         if ready is not None:
             self._taken.set()
@@ -159,7 +159,7 @@ class Reloader:
         log.info("reload: reading %s", flying.path)
         try:
             ready = reload(flying, estimator, camera)
-        except Exception as error:  # whatever is wrong with a new model, the old one flies on
+        except Exception as error:  # whatever is wrong with a new model, the old one stays in use
             reason = str(error) if isinstance(error, InputError) else repr(error)
             text = f"reload refused, flying on as before: {reason}"
             log.error("%s", text)
@@ -168,11 +168,11 @@ class Reloader:
         else:
             outcome, self._ready = ready.outcome, ready
             del ready
-            # `estimator` is let go of here, when the loop has the new one: freeing its memory takes time.
+            # The old estimator is released in this thread, after the loop has the new one: freeing memory takes time.
             self._taken.wait()
         with self._lock:
             answer, self._answer = self._answer, None
-            self._thread = None  # before the answer: who has it may ask again at once
+            self._thread = None  # before the answer, whose receiver may request the next reload at once
         if answer is not None:
             answer(outcome)
 

@@ -1,4 +1,4 @@
-"""What a person asks of the running daemon: a link leaves it here, the loop takes it at its next frame."""
+"""Operator requests to the running daemon: queued by a link, processed by the loop at its next frame."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ POINTED_AGE_MAX_NS = 2_000_000_000
 
 @dataclass(frozen=True)
 class TrackBox:
-    """Look for a target here."""
+    """Look for a target in this box."""
 
-    box_xyxy_share: tuple[float, float, float, float]  # of the picture's width and height, 0..1
+    box_xyxy_share: tuple[float, float, float, float]  # of the image's width and height, 0..1
 
 
 @dataclass(frozen=True)
 class SelectTarget:
-    """Choose a target that is tracked."""
+    """Select a tracked target."""
 
     track_id: int
 
@@ -36,23 +36,23 @@ Request = TrackBox | SelectTarget | StopTracking
 
 @dataclass(frozen=True)
 class ReloadOutcome:
-    """What came of a reload of model and configuration."""
+    """Outcome of a reload of model and configuration."""
 
-    flies: bool  # False: refused, all is as before
+    flies: bool  # False: rejected, nothing has changed
     said: str  # a sentence for a person
-    model_sha256: str  # that flies now
+    model_sha256: str  # of the model in use now
     taken_over: tuple[str, ...] = ()  # `[section] key`
     needs_restart: tuple[str, ...] = ()
 
 
-# Asks for a reload, whose outcome is told once, from another thread; False, and nothing is told: one is under way.
+# Requests a reload, whose outcome is passed on once, from another thread; False, with no outcome: one is in progress.
 AskReload = Callable[[Callable[[ReloadOutcome], None]], bool]
 
 
 class RequestQueue:
-    """Bounded, and safe to use from several threads; neither side ever waits for the other.
+    """Bounded and thread-safe; neither side ever waits for the other.
 
-    What was pointed at longer than POINTED_AGE_MAX_NS ago is dropped: the picture is another one by then.
+    Requests other than a stop are dropped after POINTED_AGE_MAX_NS, as the image has changed by then.
     """
 
     def __init__(self) -> None:
@@ -61,9 +61,9 @@ class RequestQueue:
         self._too_late = 0
 
     def put(self, request: Request) -> bool:
-        """Leave a request; False, and it is not taken, if too many wait.
+        """Queue a request; False, and it is dropped, if too many are queued.
 
-        A stop always is: it undoes what waits, and where there is no room takes its place.
+        A stop is always accepted: it cancels what is queued, and replaces it if there is no room.
         """
         with self._lock:
             self._drop_old()
@@ -75,14 +75,14 @@ class RequestQueue:
             return True
 
     def take(self) -> list[Request]:
-        """All that wait and are not too late, oldest first."""
+        """All queued requests that are not too old, oldest first."""
         with self._lock:
             self._drop_old()
             waiting, self._waiting = self._waiting, []
             return [request for request, _ in waiting]
 
     def too_late(self) -> int:
-        """How many were dropped since the last call."""
+        """Number of requests dropped as too old since the last call."""
         with self._lock:
             count, self._too_late = self._too_late, 0
             return count

@@ -1,7 +1,7 @@
-"""The whole frame looked over beside the loop: a search for more targets must not make the poses of those held late.
+"""Search of the whole frame parallel to the loop, so that looking for more targets does not delay the tracked ones.
 
-What it finds is only a place. The loop looks into it through a window of the next frame, as it does where a person
-points, and only what is seen there is a target.
+It only proposes places. The loop evaluates each in a window of the next frame, as it does for a place that the operator
+selects; only what is detected there counts as a target.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from edge.types import Array, Estimate, Frame
 
 log = logging.getLogger(__name__)
 
-STOP_TIMEOUT_S = 5.0  # a process that ends during an inference is aborted; on a busy machine one takes long
-PLACE_AGE_MAX_NS = 500_000_000  # a target has left its window by then
-# At few frames a second no place is younger than the frame before; where the machine sets the pace, the search, at a
-# lower priority, lasts longer than from one frame to the next. A place that is too old costs a window in vain.
+STOP_TIMEOUT_S = 5.0  # exiting during an inference aborts the process; on a busy machine an inference takes long
+PLACE_AGE_MAX_NS = 500_000_000  # after that a target has left its window
+# At low frame rates a place is at least one frame interval old; where processing limits the frame rate, the search, at
+# a lower priority, takes longer than one interval. A place that is too old costs a useless window.
 PLACE_AGE_MAX_FRAMES = 2.5
-INTERVAL_MAX_NS = 2_000_000_000  # a longer one is a gap: there are no tracks at such a rate
+INTERVAL_MAX_NS = 2_000_000_000  # a longer interval is a gap: there are no tracks at such a rate
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class _Asked:
 
 
 class Search:
-    """One search at a time, in a thread of its own; in lock-step on the caller's. Used by the loop."""
+    """One search at a time, in its own thread; in lock-step mode in the caller's. Used by the loop."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._asked: _Asked | None = None
         self._busy = False
         self._places: list[Estimate] = []
-        self._seen_ns = 0  # exposure of the frame that they were seen in
-        self._asked_for_ns = 0  # exposure of the last frame that they were asked for
+        self._seen_ns = 0  # exposure time of the frame that the places were found in
+        self._asked_for_ns = 0  # exposure time of the last frame that the places were requested for
         self._counts: Counter[str] = Counter(searches=0)
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -55,7 +55,7 @@ class Search:
             self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, after the search under way. May be called without start."""
+        """End the thread after the search in progress. May be called without start."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -63,7 +63,7 @@ class Search:
             self._thread.join(STOP_TIMEOUT_S)
 
     def begin(self, estimator: Estimator, frame: Frame, known_boxes: Sequence[Array]) -> bool:
-        """Look for targets that lie on none of `known_boxes` [4] px; False while another search is under way."""
+        """Search for targets that overlap none of `known_boxes` [4] px; False while another search is in progress."""
         with self._changed:
             if self._busy:
                 return False
@@ -75,8 +75,8 @@ class Search:
         return True
 
     def places(self, capture_ns: int, known_boxes: Sequence[Array], at_most: int) -> list[Estimate]:
-        """What was found since the last call, best first, and may still be there at `capture_ns` (monotonic), off
-        `known_boxes`; asked of every frame, in their order."""
+        """Places found since the last call, best first, that may still be valid at `capture_ns` (monotonic) and overlap
+        none of `known_boxes`. To be called for every frame, in order."""
         interval_ns = min(capture_ns - self._asked_for_ns, INTERVAL_MAX_NS)
         self._asked_for_ns = capture_ns
         with self._changed:
@@ -86,7 +86,7 @@ class Search:
         return [place for place in found if not lies_on(place.box_xyxy_px, known_boxes)][: max(at_most, 0)]
 
     def counters(self) -> dict[str, int]:
-        """searches made, search_failed, and refused_REASON of what they saw."""
+        """Counters `searches`, `search_failed`, and `refused_REASON` of rejected detections."""
         with self._changed:
             return dict(self._counts)
 
@@ -109,7 +109,7 @@ class Search:
         try:
             places = asked.estimator.anywhere(asked.frame, asked.known_boxes, refused)
         except Exception:
-            # One search is lost; tracking goes on, and the next may do.
+            # Only this search is lost: tracking continues, and the next search may succeed.
             failed = True
             log.exception("a search of the whole frame failed")
         with self._changed:

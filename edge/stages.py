@@ -1,4 +1,4 @@
-"""How long one frame is in each stage, from its exposure to the links."""
+"""Time that one frame spends in each stage, from its exposure to the links."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ STAGES = {
 
 
 def table_markdown() -> str:
-    """The table as the documents show it."""
+    """The table as shown in the documentation."""
     rows = [f"| {stage} | {text} |" for stage, text in STAGES.items()]
     return "\n".join(["| stage | from what to what |", "|---|---|", *rows]) + "\n"
 
 
 class StageClock:
-    """Laps of one frame; each belongs to a row of STAGES."""
+    """Stage times of one frame; each lap is added to a row of STAGES."""
 
     def __init__(self, meta: FrameMeta, now_ns: int) -> None:
         self._begin_ns = meta.capture_ns
@@ -35,11 +35,11 @@ class StageClock:
         self._stages_ns = Counter(capture=meta.arrival_ns - meta.capture_ns, wait=now_ns - meta.arrival_ns)
 
     def lap(self, stage: str) -> None:
-        """All since the lap before was `stage`."""
+        """Count the time since the last lap as `stage`."""
         self._until(clock.monotonic_ns(), stage)
 
     def estimated(self, runs_ns: Sequence[tuple[int, int]]) -> None:
-        """All since the lap before was the estimator's, and `runs_ns` (begin, end) its inferences."""
+        """Split the time since the last lap, all spent in the estimator, by its inferences `runs_ns` (begin, end)."""
         before = "preprocess"
         for begin_ns, end_ns in runs_ns:
             self._until(begin_ns, before)
@@ -48,7 +48,7 @@ class StageClock:
         self._until(clock.monotonic_ns(), before)
 
     def stages_ns(self) -> dict[str, int]:
-        """Nanoseconds by stage, and from exposure to the last lap as `total`."""
+        """Nanoseconds per stage; `total` is from exposure to the last lap."""
         return {**self._stages_ns, "total": self._last_ns - self._begin_ns}
 
     def _until(self, now_ns: int, stage: str) -> None:

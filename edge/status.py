@@ -1,4 +1,4 @@
-"""`uavpose-edge status`: ask the running daemon over zenoh on loopback, and print its answer."""
+"""`uavpose-edge status`: query the running daemon over zenoh on loopback and print its answer."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
 def status(config: Path | None, connect: str | None, vehicle: str | None, as_json: bool) -> int:
-    """Print how the daemon is; 0 if it works, 1 if it does not answer, waits for its first frame, stands
-    still or is in FAULT.
+    """Print the daemon's status; returns 0 if it works, 1 if it does not answer, waits for its first frame, is stuck or
+    in FAULT.
 
-    Raises InputError for an address or name that is none, or a configuration that keeps zenoh off.
+    Raises InputError for an invalid address or name, or a configuration with zenoh disabled.
     """
     endpoint, uav, tls = _address(config, connect, vehicle)
     answer = ask(endpoint, uav, tls)
@@ -41,14 +41,14 @@ def status(config: Path | None, connect: str | None, vehicle: str | None, as_jso
 def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] | None:
     """`info`, `config` and `model` of the daemon that listens at `endpoint`; None if none answers.
 
-    Raises InputError where several answer, as at a router on the ground, and `uav` is `*`.
+    Raises InputError if several answer, as at a router on the ground, and `uav` is `*`.
     """
     try:
         with zenoh.open(client_config([endpoint], tls=tls)) as session:
             vehicles = {str(info.get("vehicle")): info for info in _answers(session, uav, "info")}
             if len(vehicles) > 1:
                 raise InputError(f"{' and '.join(sorted(vehicles))} answer at {endpoint}: say which with --vehicle")
-            # Of that one alone: what answers first to `*` may be another.
+            # Of this vehicle only: the first answer to `*` may be another's.
             answers = {
                 what: next(_answers(session, name, what), None) for name in vehicles for what in ("config", "model")
             }
@@ -60,7 +60,7 @@ def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] 
 
 
 def works(info: dict[str, Any]) -> bool:
-    """Whether the daemon's loop turns and gives what it is for."""
+    """Whether the daemon's loop is running and produces output."""
     return (
         info.get("state") not in (None, HealthState.INIT.value, HealthState.FAULT.value)
         and info.get("age_s", 0.0) < STALE_S
@@ -92,7 +92,7 @@ def for_a_person(answer: dict[str, Any]) -> str:
 
 
 def _headline(info: dict[str, Any]) -> str:
-    """The state, and what goes on behind one that does not tell it."""
+    """The state, with the activity if the state does not imply it."""
     state = info.get("state", "starting")
     return f"{state}, {info['activity']}" if state == HealthState.DEGRADED.value else state
 
@@ -110,7 +110,7 @@ def _answers(session: zenoh.Session, uav: str, what: str) -> Iterator[dict[str, 
 
 
 def _address(config: Path | None, connect: str | None, vehicle: str | None) -> tuple[str, str, TlsFiles | None]:
-    """Endpoint, vehicle (`*`: any) and certificates to ask with."""
+    """Endpoint, vehicle (`*`: any) and certificates for the query."""
     settings, uav, tls = ZenohSettings(), vehicle or "*", None
     if config is not None:
         loaded = load_config(config).config
@@ -131,6 +131,6 @@ def _address(config: Path | None, connect: str | None, vehicle: str | None) -> t
 
 
 def loopback_endpoints(settings: ZenohSettings) -> list[str]:
-    """Where a daemon with these settings can be asked on its own machine; what listens everywhere does so there."""
+    """Loopback endpoints of a daemon with these settings; one that listens on all addresses is reached there too."""
     own = [point.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:") for point in settings.listen]
     return [endpoint for endpoint in own if any(f"/{host}:" in endpoint for host in LOOPBACK)]

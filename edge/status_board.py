@@ -1,6 +1,6 @@
-"""What the daemon answers to who asks: zenoh queries on `uavpose/@v1/<uav>/info`, `config` and `model`, in JSON.
+"""Status answers of the daemon: zenoh queries on `uavpose/@v1/<uav>/info`, `config` and `model`, answered in JSON.
 
-`info` is how it is, at most a second old (`age_s`); `config` is what it flies with, without the passwords that stand in
+`info` is its state, at most a second old (`age_s`); `config` is the configuration in use, without passwords in
 addresses; `model` is the model's contract, hash and file.
 """
 
@@ -28,19 +28,19 @@ DISTRIBUTION = "mf-uavpose6d-edge"
 
 
 class StatusBoard:
-    """Written by the loop, whole values at a time; read from any thread."""
+    """Written by the loop, always as whole values; read from any thread."""
 
     def __init__(self, file: ConfigFile, model: Model, camera: CameraInfo) -> None:
         self.file = file
         self.model = model
         self.camera = camera
-        self.image_size_wh = camera.image_size_wh  # of the newest frame: until one came, as the camera was opened
+        self.image_size_wh = camera.image_size_wh  # of the newest frame; before the first, as the camera was opened
         self.snapshot: HealthSnapshot | None = None
         self._start_ns = clock.monotonic_ns()
         self._version = importlib.metadata.version(DISTRIBUTION)
 
     def facts(self) -> dict[str, str]:
-        """What the daemon flies with, in short."""
+        """What the daemon runs with, in short."""
         return {"version": self._version, "model_sha256": self.model.sha256, "model_provider": self.model.provider}
 
     def info(self) -> dict[str, Any]:
@@ -82,12 +82,12 @@ class StatusBoard:
 
 
 def key_of(uav: str, what: str) -> str:
-    """Where `what` (info, config, model) of a vehicle is asked for; `uav` may be `*`."""
+    """Key for queries of `what` (info, config, model) of a vehicle; `uav` may be `*`."""
     return f"uavpose/@v1/{uav if uav == '*' else check_uav_name(uav)}/{what}"
 
 
 def declare_status(session: zenoh.Session, board: StatusBoard) -> Callable[[], None]:
-    """Answer until the returned function is called. Answers are made on zenoh's receiving thread."""
+    """Answer queries, on zenoh's receiving thread, until the returned function is called."""
     uav = board.file.config.vehicle.name
     asked = {"info": board.info, "config": board.config, "model": board.model_card}
     declared = []

@@ -1,4 +1,4 @@
-"""What the loop tells of itself: its state at every turn, changes as events, and once a second how all goes."""
+"""The loop's self-reporting: its state in every iteration, changes as events, and a snapshot once a second."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LOG_EVERY_N_SNAPSHOTS = 10
 
 
 class Supervisor:
-    """Called by the loop alone, at every turn; feeds the watchdogs, the links, the status board and the log."""
+    """Called only by the loop, in every iteration; feeds the watchdogs, the links, the status board and the log."""
 
     def __init__(
         self,
@@ -55,12 +55,12 @@ class Supervisor:
         self.apply(settings)
 
     def apply(self, settings: HealthSettings) -> None:
-        """Judge by these limits from now on."""
+        """Use these limits from now on."""
         self._health.no_frame_ns = round(settings.no_frame_s * 1e9)
         self._latency_max_ms = settings.latency_max_ms
 
     def ready(self) -> None:
-        """Warmed up: what runs now is expected to go on running."""
+        """The daemon is warmed up: the watched threads running now are expected to keep running."""
         self._threads_wanted = threads.running()
         self._notifier.ready()
 
@@ -80,7 +80,7 @@ class Supervisor:
             self._outlets.event(level, text)
 
     def turn(self) -> None:
-        """Once each time round the loop, whether or not a frame came."""
+        """To be called once per iteration of the loop, with or without a frame."""
         now_ns = clock.monotonic_ns()
         self.watchdog.beat(time.monotonic_ns())
         self._notifier.feed(now_ns)
@@ -115,7 +115,7 @@ class Supervisor:
             found.append(Reason("slow", f"slow: p95 {total.p95:.0f} ms from exposure to the links"))
         for link, limit_ms in self._age_max_ms.items():
             if total is not None and total.p50 > limit_ms:
-                # Not one of two goes out: all else may look well, and a peer would wait in vain.
+                # More than half of the poses are withheld although everything else may look healthy.
                 text = (
                     f"poses too old to be sent: {total.p50:.0f} ms from the exposure, [{link}] max_age_ms {limit_ms:g}"
                 )

@@ -1,4 +1,4 @@
-"""Telling systemd how the daemon is: sd_notify's datagrams, written by hand as they are one line each."""
+"""Status reports to systemd: the datagrams of sd_notify, written by hand as they are one line each."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ FEEDS_PER_LIMIT = 3
 
 
 class Notifier:
-    """Speaks on NOTIFY_SOCKET where systemd gave one (Type=notify, WatchdogSec=); silent elsewhere.
+    """Sends on NOTIFY_SOCKET if systemd has set it (Type=notify, WatchdogSec=); otherwise does nothing.
 
-    Raises nothing: a manager that does not listen is no reason to land.
+    Never raises: a service manager that does not listen must not end the flight.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -30,11 +30,11 @@ class Notifier:
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """What `systemctl status` shows, one line."""
+        """The line that `systemctl status` shows."""
         self._send(f"STATUS={text.splitlines()[0] if text else ''}")
 
     def feed(self, now_ns: int) -> None:
-        """Say that the loop turns, as often as the watchdog wants to hear it. Call it at every turn."""
+        """Report that the loop is running, as often as the watchdog requires. Call it in every iteration."""
         if self._period_ns and now_ns >= self._due_ns:
             self._due_ns = now_ns + self._period_ns
             self._send("WATCHDOG=1")
@@ -51,7 +51,7 @@ class Notifier:
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int:
-    """WatchdogSec= in nanoseconds, 0 if there is none or it is meant for another process."""
+    """WatchdogSec= in nanoseconds, 0 if it is not set or set for another process."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0
     try:

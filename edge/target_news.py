@@ -1,4 +1,4 @@
-"""Which targets came and went from frame to frame, as words for an operator. Pure."""
+"""Targets acquired and lost from frame to frame, as messages for the operator. Pure."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class _Held:
 
 
 class TargetNews:
-    """A target is acquired when its track is confirmed, and lost when that track is no more."""
+    """A target is acquired when its track is confirmed, and lost when that track no longer exists."""
 
     def __init__(self) -> None:
         self._held: dict[int, _Held] = {}
 
     def words(self, tracks: Iterable[Track]) -> list[tuple[int, str]]:
-        """(logging level, text) of what changed since the frame before. Call it for every frame: numbers are used
-        again."""
+        """(logging level, text) of changes since the previous frame. Call it for every frame, as track numbers are
+        reused."""
         sure = {track.track_id: track for track in tracks if track.state is not TrackState.TENTATIVE}
         told = [(logging.WARNING, _lost(number, self._held[number])) for number in sorted(self._held.keys() - sure)]
         acquired = sorted(sure.keys() - self._held.keys())

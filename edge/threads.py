@@ -1,4 +1,4 @@
-"""The table of threads: who does what, whom nobody waits for, and which yield to the loop."""
+"""The table of threads: what each does, what it never waits for, and which have a lower priority than the loop."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
-YIELDS = 10  # how much nicer than the loop's threads are those that look over whole frames
+YIELDS = 10  # niceness of the threads that search whole frames, relative to the loop's
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class ThreadRow:
     name: str  # of the threading.Thread
     does: str
     never_waits_for: str
-    watched: bool = False  # once it runs it runs to the end: its absence is a fault
+    watched: bool = False  # once started it runs until the end: its absence is a fault
 
 
 THREADS = (
@@ -36,29 +36,29 @@ THREADS = (
     ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
 )
 
-# These run libraries' code that must not come back while the interpreter is taken down.
+# These run library code that must not return to Python during interpreter shutdown.
 FOREIGN = frozenset({"capture", "search", "zenoh", "closing", "pictures", "lookup", "reload"})
 
 
 def yield_to_the_loop() -> None:
-    """Lower the priority of the calling thread and of those that it will start."""
-    with suppress(OSError):  # where a sandbox forbids it, they compete with the loop and no more
+    """Lower the priority of the calling thread and of those that it starts later."""
+    with suppress(OSError):  # if a sandbox forbids it, they only compete with the loop
         os.nice(YIELDS)
 
 
 def running() -> frozenset[str]:
-    """Names of the watched threads that run now."""
+    """Names of the watched threads that are running."""
     alive = {thread.name for thread in threading.enumerate()}
     return frozenset(row.name for row in THREADS if row.watched and row.name in alive)
 
 
 def left_behind() -> bool:
-    """Whether a thread that must not outlive the interpreter has not ended in the time that stopping gives it."""
+    """Whether a thread that must not outlive the interpreter has not ended in the time allowed."""
     return any(thread.name in FOREIGN for thread in threading.enumerate())
 
 
 def table_markdown() -> str:
-    """The table as the documents show it."""
+    """The table as shown in the documentation."""
     lines = ["| thread | does | never waits for |", "|---|---|---|"]
     lines += [f"| {row.name} | {row.does} | {row.never_waits_for} |" for row in THREADS]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""What moves through the daemon: Frame → Estimate → Track → Report. Each names its frames and units."""
+"""The data types of the pipeline: Frame → Estimate → Track → Report. Each states its frames and units."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameMeta:
-    """Who a frame is, all times on the monotonic clock."""
+    """Identity and timing of a frame; all times on the monotonic clock."""
 
-    sequence: int  # counts frames the source produced less repeats that were withheld, so a gap is a drop
+    sequence: int  # counts the source's frames, without suppressed repeats: a gap means dropped frames
     capture_ns: int  # exposure time
-    arrival_ns: int  # when the daemon held the pixels
-    time_jumps: int = 0  # how often the camera's time had jumped by then
+    arrival_ns: int  # when the pixels were in memory
+    time_jumps: int = 0  # number of jumps of the camera's timestamps so far
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture as the camera gave it and the intrinsics of exactly its pixels, its lens's distortion among them."""
+    """One image as the camera delivered it, with the intrinsics and lens distortion of exactly these pixels."""
 
     meta: FrameMeta
     image_bgr: NDArray[np.uint8]  # [H, W, 3]
@@ -34,7 +34,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """What a camera gives, known before its first frame."""
+    """Properties of a camera that are known before its first frame."""
 
     name: str
     image_size_wh: tuple[int, int]
@@ -57,7 +57,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Mount:
-    """How the camera sits on its vehicle."""
+    """Camera pose on the vehicle."""
 
     R_body_cam: Array  # [3, 3], cam (optical) into body (FRD)
     t_body_cam_m: Array  # [3], the camera's centre from the body origin
@@ -73,13 +73,13 @@ class OwnShip:
     v_ned_body_mps: Array | None  # [3]
     lat_lon_alt: tuple[float, float, float] | None  # degrees, degrees, metres AMSL, of the ned origin
     R_body_gimbal: Array | None = None  # [3, 3]; None: the camera is fixed to the body
-    clock_std_s: float = 0.0  # of the autopilot's stamps on our clock
-    attitude_std_rad: float = 0.0  # about each axis, of an attitude that was gone on from by its rates
-    axes_epoch: int = 0  # another number, other ned axes: the autopilot has begun anew, or its filter has
-    origin_epoch: int = 0  # the same of ned's origin
+    clock_std_s: float = 0.0  # of the autopilot's timestamps converted to our clock
+    attitude_std_rad: float = 0.0  # about each axis, of an extrapolated or interpolated attitude
+    axes_epoch: int = 0  # changes when the ned axes may have changed: the autopilot or its estimator was reset
+    origin_epoch: int = 0  # the same for the ned origin
 
     def camera(self, mount: Mount) -> Mount:
-        """How the camera sits on the body now; on a gimbal, `mount` says how it sits on that."""
+        """Camera pose on the body at this instant; with a gimbal, `mount` is the camera pose on the gimbal."""
         if self.R_body_gimbal is None:
             return mount
         return Mount(self.R_body_gimbal @ mount.R_body_cam, mount.t_body_cam_m)
@@ -98,10 +98,10 @@ class Track:
     track_id: int  # 0..max_targets-1; the topic's `tN`
     state: TrackState
     time_ns: int  # monotonic time the state is valid for
-    measured_ns: int  # monotonic time of the last measurement in it: its age is what a receiver judges
-    born_ns: int  # monotonic time of the first: a number is used again
+    measured_ns: int  # monotonic time of the last measurement in it; receivers judge a track by its age
+    born_ns: int  # monotonic time of the first measurement; tells tracks apart, as track_id is reused
     score: float
-    box_xyxy_px: Array  # [4], where the target is, or should be, on the frame
+    box_xyxy_px: Array  # [4], the target's box on the frame, measured or predicted
     R_cam_target: Array  # [3, 3]
     t_cam_target_m: Array  # [3]
     covariance: Array  # [6, 6] in cam, as in Estimate
@@ -121,5 +121,5 @@ class Report:
     tracks: tuple[Track, ...]
     own_ship: OwnShip | None  # at meta.capture_ns; None: no attitude, tracks are in `cam` only
     model_sha256: str
-    chosen_id: int | None = None  # track_id of the target that a person pointed at
-    distortion: tuple[float, ...] = ()  # of the frame's lens, as Frame has it
+    chosen_id: int | None = None  # track_id of the target that the operator selected
+    distortion: tuple[float, ...] = ()  # of the frame's lens, as in Frame

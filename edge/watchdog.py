@@ -1,4 +1,4 @@
-"""Ends the process when its main loop stands still: a dead daemon is restarted, a stuck one would fly on silent."""
+"""Ends the process if its main loop is stuck: a daemon that exits is restarted, a stuck one would stay silent."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from contextlib import contextmanager
 log = logging.getLogger(__name__)
 
 LOOKS_PER_LIMIT = 10
-LAST_WORDS_S = 2.0  # at most; they take as long as the links take to send them
+LAST_WORDS_S = 2.0  # at most; depends on how long the links take to send the last event
 EXIT_STUCK = 70
 
 
 class Watchdog:
-    """Armed after warm-up, on the monotonic clock. Code that holds the interpreter's lock for ever stops this thread
-    too; then systemd's own watchdog, fed by the loop alone, ends the process. Time for which this thread was held up
-    itself is not held against the loop: the host stood still, and a restart would only cost the tracks."""
+    """Armed after warm-up, on the monotonic clock. Code that never releases the GIL stops this thread too; then
+    systemd's watchdog, fed by the loop only, ends the process. Time during which this thread itself was held up does
+    not count: the host was stalled, and a restart would only lose the tracks."""
 
     def __init__(self, limit_s: float, last_words: Callable[[str], None]) -> None:
         self._limit_ns = round(limit_s * 1e9)
@@ -28,7 +28,7 @@ class Watchdog:
         self._beat_ns = 0
 
     def beat(self, now_ns: int) -> None:
-        """The loop has come round. Costs an assignment."""
+        """The loop has completed an iteration. Costs one assignment."""
         self._beat_ns = now_ns
 
     @contextmanager
@@ -60,7 +60,7 @@ class Watchdog:
 
     def _end(self, sentence: str) -> None:
         log.critical("%s", sentence)
-        # A link that hangs with the loop must not keep the process from its end.
+        # A link that hangs together with the loop must not prevent the process from ending.
         last_words = [
             threading.Thread(target=self._last_words, args=(sentence,), daemon=True),
             threading.Thread(target=logging.shutdown, daemon=True),

@@ -1,1 +1,1 @@
-"""`uavpose-edge bench`: what inference takes on this machine, in ratios first. `command.py` reads top-down."""
+"""`uavpose-edge bench`: inference times on this machine, above all as ratios. Start at `command.py`."""

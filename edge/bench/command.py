@@ -1,4 +1,4 @@
-"""The `bench` sub-command of `uavpose-edge`: what a person gives, what is printed."""
+"""The `bench` sub-command of `uavpose-edge`: options and output."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edge.errors import InputError
 
 PIPELINE = "uavpose-replay"
 THREADS, RUNS = "1,2", 50
-THREADS_MAX = 64  # as [model] threads has it
+THREADS_MAX = 64  # as in [model] threads
 
 
 def register(commands: argparse._SubParsersAction) -> None:
@@ -37,7 +37,7 @@ def register(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """0, or what the pipeline's command returns. Raises InputError."""
+    """Returns 0, or the exit status of the pipeline's command. Raises InputError."""
     if options.pipeline:
         return _pipeline(options)
     for name in ("sequence", "minutes", "fps"):
@@ -70,7 +70,7 @@ def _threads(text: str) -> list[int]:
 
 
 def _pipeline(options: argparse.Namespace) -> int:
-    """The replay harness is a program of its own, beside this one; the daemon's package does not import it."""
+    """Runs the replay harness as a separate program; the daemon's package does not import it."""
     for name in ("threads", "runs", "spinning", "alone"):
         if getattr(options, name) not in (None, False):
             raise InputError(f"--{name} cannot be combined with --pipeline, which runs the daemon as configured")

@@ -1,6 +1,6 @@
-"""Other engines that time the same network: those that packages installed beside this one bring with them.
+"""Other inference engines to time the same network with, provided by other installed packages.
 
-A package offers one under the entry point group GROUP. So nothing that flies depends on any of them.
+A package registers one under the entry point group GROUP, so the daemon depends on none of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GROUP = "uavpose_edge.bench_engines"
 
 
 class Engine(Protocol):
-    """A call that infers once, on image [1, H, W, 3] and K [1, 3, 3], on so many threads; None: not this file."""
+    """Returns a call that runs one inference on image [1, H, W, 3] and K [1, 3, 3]; None: cannot run this file."""
 
     def __call__(
         self, path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
@@ -29,7 +29,7 @@ class Engine(Protocol):
 
 
 def other_engines() -> Mapping[str, Engine]:
-    """By name: `openvino` if it is installed, and what the entry points bring, as far as what they need is there.
+    """By name: `openvino` if installed, and those of the entry points whose requirements are installed.
 
     Loading one may take seconds.
     """

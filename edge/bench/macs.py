@@ -1,4 +1,4 @@
-"""Multiply-accumulates of a network, counted from the kernels that ONNX Runtime runs for one input size."""
+"""Multiply-accumulates (MACs) of a network, from the kernels that ONNX Runtime executes for one input size."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Macs:
 
 
 def count_macs(model: bytes, size_wh: tuple[int, int]) -> Macs:
-    """Run `model` (msgs.contract's inputs) once at `size_wh` under ONNX Runtime's profiler and add up its kernels."""
+    """Run `model` (inputs as in msgs.contract) once at `size_wh` under ONNX Runtime's profiler and sum its kernels."""
     width, height = size_wh
     with tempfile.TemporaryDirectory() as folder:
         options = ort.SessionOptions()
         options.enable_profiling = True
         options.profile_file_prefix = str(Path(folder) / "profile")
-        # Layouts of the last level hide the shapes of the weights, and so does packing them in advance.
+        # The layout optimisations of the highest level, and prepacking, would hide the shapes of the weights.
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
         options.add_session_config_entry("session.disable_prepacking", "1")
         session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -46,7 +46,7 @@ def count_macs(model: bytes, size_wh: tuple[int, int]) -> Macs:
 
 
 def macs_of_kernels(kernels: Iterable[Mapping[str, Any]]) -> Macs:
-    """The sum over convolutions and matrix products; `kernels` as the profiler describes them."""
+    """The sum over convolutions and matrix products; `kernels` as the profiler reports them."""
     int8 = float32 = 0
     for kernel in kernels:
         name = str(kernel["op_name"])
@@ -69,7 +69,7 @@ def _shape(typed: Mapping[str, Shape]) -> Shape:
 
 
 def _convolution(inputs: list[Shape], output: Shape) -> int:
-    """Each element of the output is a sum over the kernel [C_in / groups, ...] of its channel."""
+    """Each output element is a sum over its channel's kernel [C_in / groups, ...]."""
     weight = next(shape for shape in inputs[1:] if len(shape) >= 3)
     return math.prod(output) * math.prod(weight[1:])
 

@@ -1,4 +1,4 @@
-"""Everything that is timed: model files by stage, number of threads and engine, and the machine's own peak."""
+"""All measurements: model files by stage, number of threads and engine, and the machine's peak."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 @dataclass(frozen=True)
 class Case:
-    """One row: a file's stage on so many threads of an engine (`onnxruntime`, `openvino`, `pytorch`)."""
+    """One row: a stage of a file on a number of threads of an engine (`onnxruntime`, `openvino`, `pytorch`)."""
 
     file: str
     stage: str
@@ -42,13 +42,13 @@ class Row:
     size_wh: tuple[int, int]
     macs: Macs
     ms: Milliseconds
-    limit_ms: float  # at the machine's peak on these threads
+    limit_ms: float  # least time, at the machine's peak on these threads
 
 
 @dataclass(frozen=True)
 class Machine:
     cpu: str
-    cores: int  # that this process may use
+    cores: int  # available to this process
     onnxruntime: str
     openvino: str | None  # None: not installed
 
@@ -72,9 +72,9 @@ def measure(
     others: bool,
     on_round: Callable[[int], None],
 ) -> Measured:
-    """Time all of it in turns, on noise, with `others` in every engine there is.
+    """Time all cases in turns, on noise, and `others` in every available engine.
 
-    Raises InputError on a file that is no model.
+    Raises InputError for a file that is not a model.
     """
     engines = other_engines() if others else {}
     calls: dict[Case, Callable[[], object]] = {}
@@ -132,7 +132,7 @@ def _machine() -> Machine:
 
 
 def _cpu_name() -> str:
-    """As the kernel tells it; Arm kernels tell none, there it is the architecture."""
+    """The CPU's name from the kernel; Arm kernels give none, then the architecture."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8").splitlines()
     except OSError:

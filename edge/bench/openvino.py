@@ -1,4 +1,4 @@
-"""The same file in OpenVINO, where the package `openvino` is installed."""
+"""The same file in OpenVINO, if the package `openvino` is installed."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def version() -> str | None:
 def engine(
     path: Path, contract: ModelContract, image: NDArray[np.uint8], K: NDArray[np.float32], threads: int
 ) -> Callable[[], object]:
-    """`edge.bench.engines.Engine` on the CPU, compiled for this size alone."""
+    """`edge.bench.engines.Engine` on the CPU, compiled for this size only."""
     core = importlib.import_module(PACKAGE).Core()
     network = core.read_model(str(path))
     network.reshape({"image": list(image.shape), "K": list(K.shape)})
-    # Left to itself it computes FP32 files in bfloat16 where the processor can.
+    # By default it computes FP32 files in bfloat16 if the processor supports it.
     precision = {"INFERENCE_PRECISION_HINT": "f32"}
     settings = {"INFERENCE_NUM_THREADS": threads, "NUM_STREAMS": 1, "PERFORMANCE_HINT": "LATENCY", **precision}
     request = core.compile_model(network, "CPU", settings).create_infer_request()

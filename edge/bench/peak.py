@@ -1,7 +1,7 @@
-"""What this machine multiplies at most: one large matrix product, INT8 and FP32, through ONNX Runtime.
+"""The machine's peak rate of multiplication: one large matrix product, INT8 and FP32, in ONNX Runtime.
 
-The two one-node graphs are written here byte by byte (protobuf fields of onnx.proto), since nothing else that flies
-needs the `onnx` package.
+The two one-node graphs are serialised here by hand (protobuf fields of onnx.proto), as nothing else in the daemon needs
+the `onnx` package.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ _IR_VERSION, _OPSET = 8, 17
 
 @dataclass(frozen=True)
 class Peak:
-    """10^9 multiply-accumulates a second on that many threads."""
+    """10^9 multiply-accumulates a second on the given number of threads."""
 
     threads: int
     int8_gmac_per_s: float
     fp32_gmac_per_s: float
 
     def limit_ms(self, int8_macs: int, float_macs: int) -> float:
-        """The least time these take one after the other, if every one ran at the peak."""
+        """Least time for these MACs, one after the other at the peak rate."""
         return int8_macs / self.int8_gmac_per_s / 1e6 + float_macs / self.fp32_gmac_per_s / 1e6
 
 
 def product(precision: str, options: ort.SessionOptions) -> Callable[[], object]:
-    """A call that multiplies once, `int8` (unsigned by signed, as the network's layers do) or `fp32`."""
+    """A call that multiplies once, `int8` (unsigned by signed, like the network's layers) or `fp32`."""
     rng = np.random.default_rng(0)
     left: NDArray[np.generic]
     if precision == "int8":

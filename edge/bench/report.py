@@ -1,4 +1,4 @@
-"""What a run came to: ratios, then milliseconds beside the work that is in them. Pure functions."""
+"""Results of a run: ratios, then milliseconds with the number of operations. Pure functions."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class Ratio:
     stage: str
     threads: int
     value: float  # of 10th percentiles
-    cpu: float | None  # of processor time; None: what stands below has none
+    cpu: float | None  # of processor time; None: the denominator has none
 
 
 def ratios(measured: Measured) -> list[Ratio]:
-    """All that the given files allow. The first file of a kind stands for it."""
+    """All ratios that the given files allow. The first file of a kind represents it."""
     return [
         ratio
         for threads in sorted({row.case.threads for row in measured.rows})
@@ -75,7 +75,7 @@ def _kind(row: Row) -> tuple[str, str, str, str, int]:
 
 
 def headline(found: list[Ratio], name: str) -> float | None:
-    """The one figure of a ratio: on the most threads, at its stage of HEADLINES where that was measured."""
+    """The single figure of a ratio: on the most threads, at its stage in HEADLINES if that was measured."""
     own = [ratio for ratio in found if ratio.name == name]
     best = max(own, key=lambda ratio: (ratio.stage == HEADLINES[name], ratio.threads), default=None)
     return best.value if best is not None else None
@@ -90,7 +90,7 @@ def stage_ms(measured: Measured, stage: str) -> float | None:
 
 
 def to_tree(measured: Measured) -> dict[str, Any]:
-    """For a script: JSON's types. `null`: not measured."""
+    """For scripts: JSON types. `null`: not measured."""
     found = ratios(measured)
     return {
         "machine": asdict(measured.machine),

@@ -1,4 +1,4 @@
-"""Timed calls, taken in turns: what disturbs the machine meanwhile disturbs all of them alike."""
+"""Timed calls, taken in turns, so that other load on the machine affects all of them alike."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True)
 class Milliseconds:
-    """Of one call. p10 is what the code takes when it has the machine to itself, p50 and p99 what it came to.
+    """Of one call. p10 is the time of the code with the machine to itself, p50 and p99 the times as they occurred.
 
-    `cpu` is the processor time of all its threads (median), which no other process adds to.
+    `cpu` is the processor time of all its threads (median), to which other processes do not add.
     """
 
     p10: float
@@ -29,7 +29,7 @@ class Milliseconds:
 def time_in_turns(
     calls: Mapping[Key, Callable[[], object]], rounds: int, on_round: Callable[[int], None]
 ) -> dict[Key, Milliseconds]:
-    """Each call once a round, in the same order, after UNTIMED_ROUNDS that do not count."""
+    """Each call once per round, in the same order, after UNTIMED_ROUNDS warm-up rounds."""
     durations_ns: dict[Key, list[tuple[int, int]]] = {key: [] for key in calls}
     for turn in range(UNTIMED_ROUNDS + rounds):
         for key, call in calls.items():

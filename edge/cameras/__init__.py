@@ -1,4 +1,4 @@
-"""Where frames come from."""
+"""Camera sources and the supply of frames to the loop."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 
 
 class FrameSupply(Protocol):
-    """Where the loop's frames come from."""
+    """Supplies the loop with frames."""
 
     def start(self, settle: Callable[[], None]) -> None:
-        """Begin; `settle` has the links send what they were told, for who waits for it."""
+        """Begin; `settle` makes the links send everything queued, for a supply that waits for that."""
 
     def newest(self, timeout_s: float) -> Frame | None:
         """The newest frame not yet taken, waiting up to `timeout_s`. Raises EndOfStream after the last."""
 
     def reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        """What is wrong with the camera at `now_ns` (monotonic)."""
+        """Faults of the camera at `now_ns` (monotonic)."""
 
     def counters(self) -> Mapping[str, int]:
-        """Frames captured, and what was amiss, by name."""
+        """Frames captured, and faults, by name."""
 
     def stop(self) -> None:
-        """End it and close the camera."""
+        """Stop and close the camera."""
 
 
 def open_capture(settings: CameraSettings) -> tuple[FrameSupply, CameraInfo]:
-    """What supplies the configured camera's frames, to be started and stopped, and what it gives. Raises InputError."""
+    """The frame supply of the configured camera, to be started and stopped, and its properties. Raises InputError."""
     source, info, opened = open_source(settings)
     if isinstance(settings, SequenceCamera) and settings.lockstep is not None and isinstance(source, SequenceSource):
         return LockstepCapture(source, settings.lockstep), info
@@ -58,9 +58,9 @@ def open_capture(settings: CameraSettings) -> tuple[FrameSupply, CameraInfo]:
 
 
 def open_source(settings: CameraSettings) -> tuple[Source, CameraInfo, bool]:
-    """The configured source, what it gives, and whether it is open.
+    """The configured source, its properties, and whether it is open.
 
-    A live camera that does not answer yet is no error: it is opened later. Raises InputError when none ever will.
+    A live camera that does not answer yet is not an error: it is opened later. Raises InputError if it never can be.
     """
     if isinstance(settings, SequenceCamera | FolderCamera | FileCamera):
         recording = _recording(settings)
@@ -80,7 +80,7 @@ def _recording(settings: SequenceCamera | FolderCamera | FileCamera) -> Sequence
 
 def _live(settings: DeviceCamera | StreamCamera | ZenohCamera) -> LiveSource | ZenohSource:
     if isinstance(settings, ZenohCamera):
-        # Not at the top: a daemon without zenoh does not load it.
+        # Imported here: a daemon without zenoh does not load it.
         from edge.cameras.zenoh_topic import ZenohSource
 
         return ZenohSource(settings)

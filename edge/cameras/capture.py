@@ -1,4 +1,4 @@
-"""The capture thread: never blocks on a reader, keeps the newest frame alone, counts what it drops."""
+"""The capture thread: never blocks on the consumer, keeps only the newest frame, counts what it drops."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from edge.types import Frame
 log = logging.getLogger(__name__)
 
 FROZEN_TOLD_NS = 1_000_000_000
-JUMPS_TOLD_S = 5  # after the last jump of the stamps all is well again
+JUMPS_TOLD_S = 5  # how long a jump of the timestamps is reported
 JUMPS_KEPT = 1000
 
 
 class Capture:
-    """Owns a source and the thread that reads it. The source may be open already, or not yet."""
+    """Owns a source and the thread that reads it. The source may already be open."""
 
     def __init__(self, source: Source, opened: bool) -> None:
         self._source = source
@@ -40,21 +40,21 @@ class Capture:
         self._watch = FrameWatch()
         self._frozen_since_ns: int | None = None
         self._frozen_told = False
-        self._withheld = 0  # repeats of a live camera: the frames are numbered without them, so a gap is a drop
-        self._jumped_ns: deque[int] = deque(maxlen=JUMPS_KEPT)  # when stamps jumped, monotonic
-        self._lost: str | None = None  # why there is no camera just now
+        self._withheld = 0  # repeats of a live camera: frames are numbered without them, so a gap is a drop
+        self._jumped_ns: deque[int] = deque(maxlen=JUMPS_KEPT)  # when timestamps jumped, monotonic
+        self._lost: str | None = None  # why there is no camera now
         self._link = Reconnect()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
     def start(self, _: Callable[[], None] = lambda: None) -> None:
-        """Begin to read; nobody waits here for what the links send."""
+        """Begin to read; `settle` is not used."""
         self._thread.start()
 
     def newest(self, timeout_s: float) -> Frame | None:
-        """The newest frame not yet taken, waiting up to `timeout_s`; None when none came.
+        """The newest frame not yet taken, waiting up to `timeout_s`; None if there is none.
 
-        Raises EndOfStream after the last frame was taken, InputError when the source can never deliver, and whatever
-        else ended the thread: without it the daemon would wait for ever.
+        Raises EndOfStream after the last frame was taken, InputError if the source can never deliver, and any other
+        exception that ended the thread: without that the daemon would wait forever.
         """
         with self._fresh:
             self._fresh.wait_for(lambda: self._newest is not None or self._end is not None, timeout_s)
@@ -68,14 +68,14 @@ class Capture:
         return self._link.state is LinkState.STREAMING
 
     def counters(self) -> dict[str, int]:
-        """captured; dropped, at the source (known where it numbers its frames) or overtaken before they were taken;
-        frozen (the same picture again); time_jumps; reconnects; what the source itself counts, as camera_NAME.
+        """captured; dropped, at the source (if it numbers its frames) or replaced by a newer one before being taken;
+        frozen (the same picture again); time_jumps; reconnects; the source's own counters, as camera_NAME.
         """
         with self._fresh:
             return {**self._counts, **{f"camera_{name}": n for name, n in self._source.counts.items()}}
 
     def reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        """What is wrong with the camera at `now_ns` (monotonic): lost, frozen, stamps that jump. From any thread."""
+        """Faults of the camera at `now_ns` (monotonic): lost, frozen, jumping timestamps. From any thread."""
         found = []
         with self._fresh:
             if self._lost is not None:
@@ -89,7 +89,7 @@ class Capture:
         return tuple(found)
 
     def stop(self) -> None:
-        """Stop the thread and close the source; a driver stuck in a read keeps nobody waiting for long."""
+        """Stop the thread and close the source; waits only briefly for a driver that is stuck in a read."""
         self._stop.set()
         if self._thread.ident is not None:
             self._thread.join(timeout=1.0)
@@ -118,8 +118,8 @@ class Capture:
                     self._offer(replace(frame, meta=replace(frame.meta, sequence=number, time_jumps=jumps)))
 
     def _open(self) -> None:
-        """Raises SourceLost, and InputError for a camera that never fitted; one that did may come back in another mode,
-        and the next time in its own."""
+        """Raises SourceLost, and InputError for a camera that never fitted its intrinsics. One that did may return in
+        another mode once, and in its own the next time."""
         try:
             self._source.open()
         except InputError as error:
@@ -140,7 +140,7 @@ class Capture:
             self._frozen_since_ns = None
 
     def _lives(self, frame: Frame) -> bool:
-        """Whether the frame shows something new; of a live camera, a picture sent again is stale whatever its stamp."""
+        """Whether the frame is new; from a live camera, a repeated picture is stale whatever its timestamp."""
         now_ns = time.monotonic_ns()
         jumps, repeats = self._watch.jumps(frame), self._watch.repeats(frame)
         frozen = repeats and self._source.live

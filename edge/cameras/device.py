@@ -16,20 +16,20 @@ from edge.types import CameraInfo
 log = logging.getLogger(__name__)
 
 STAMP_AGE_MAX_NS = 1_000_000_000
-# V4L2's own: its menu of V4L2_CID_EXPOSURE_AUTO, and the unit of V4L2_CID_EXPOSURE_ABSOLUTE.
+# V4L2: menu of V4L2_CID_EXPOSURE_AUTO, and unit of V4L2_CID_EXPOSURE_ABSOLUTE.
 EXPOSURE_MANUAL = 1
 EXPOSURE_UNITS_PER_MS = 10
 FPS_TOLERANCE = 0.05
-EXPOSURE_TOLERANCE = 0.1  # drivers have steps
-# OpenCV gives the buffer of a frame back when the next one is asked for: with one alone the driver would have nowhere
-# to put the next picture while this one is decoded, and lose every other one. A third would only hold stale ones.
+EXPOSURE_TOLERANCE = 0.1  # drivers round to steps
+# OpenCV returns a frame's buffer when the next frame is requested: with a single buffer the driver could not store the
+# next picture while this one is decoded, and would lose every other one. A third would only hold stale pictures.
 BUFFERS = 2
-# How long OpenCV waits for a frame that does not come; its own 10 s would be that long without a word or a retry.
+# How long OpenCV waits for a frame; its default would be 10 s without a message or a retry.
 TIMEOUT_VARIABLE, TIMEOUT_S = "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", 3
 
 
 class DeviceSource(LiveSource):
-    """Stamped by the driver, on the monotonic clock, where it does so."""
+    """Frames with the driver's timestamps, if these are on the monotonic clock."""
 
     def __init__(self, settings: DeviceCamera) -> None:
         intrinsics = load_intrinsics(settings.intrinsics)
@@ -41,7 +41,7 @@ class DeviceSource(LiveSource):
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
 
     def nominal(self) -> CameraInfo:
-        """What is known before the camera answers: the picture that is asked of it."""
+        """Properties before the camera answers: the requested picture."""
         return self._info(self._asked, None)
 
     def _connect(self) -> cv2.VideoCapture:
@@ -66,8 +66,8 @@ class DeviceSource(LiveSource):
         return capture
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
-        # OpenCV hands the V4L2 buffer's timestamp over as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC where the driver
-        # sets V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not tell; a driver without stamps gives 0.
+        # OpenCV returns the V4L2 buffer's timestamp as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC if the driver sets
+        # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not report; a driver without timestamps gives 0.
         stamp_ns = round(position_ms * 1e6)
         if not self._stamps.believes(stamp_ns, arrival_ns):
             self.counts["unstamped"] += 1
@@ -76,7 +76,7 @@ class DeviceSource(LiveSource):
 
 
 def complaints(settings: DeviceCamera, fourcc: str, fps: float, exposure_ms: float) -> list[str]:
-    """What the device does other than asked; the size is judged with the intrinsics."""
+    """Deviations of the device from the requested settings; the size is checked with the intrinsics."""
     found = []
     if fourcc != settings.fourcc:
         found.append(f"gives {fourcc or 'an unnamed format'}, not {settings.fourcc}")

@@ -1,4 +1,4 @@
-"""A video file, played by its own times on the monotonic clock."""
+"""A video file, played in real time by its own timestamps."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
-# What is skipped is decoded all the same: a video that decodes slower than its rate never catches up.
+# Skipped frames are decoded all the same, so a video that decodes slower than its rate never catches up.
 SKIPPING_MAX_NS = 250_000_000
-ROUNDING_NS = 1_000_000  # files round times, Matroska to the millisecond
-GAP_MAX_NS = 60_000_000_000  # between two frames of one film
+ROUNDING_NS = 1_000_000  # files round timestamps, Matroska to the millisecond
+GAP_MAX_NS = 60_000_000_000  # between two frames of one recording
 
 
 class FileSource:
-    """A frame is taken as exposed at start + its time in the video; those a late reader missed are skipped, as with a
-    camera.
+    """A frame counts as exposed at start + its time in the video; frames that a late reader missed are skipped, as with
+    a camera.
 
-    Where skipping takes too long, the frame is an old one and says so by its stamp.
+    If skipping takes too long, the frame is an old one, as its timestamp shows.
     """
 
     live = False
@@ -42,9 +42,9 @@ class FileSource:
         self.counts: Counter[str] = Counter()
 
     def open(self) -> CameraInfo:
-        """Raises InputError: no video, no times, or intrinsics that do not fit."""
+        """Raises InputError: no video, no timestamps, or intrinsics that do not fit."""
         path = self._settings.path
-        if not os.path.isfile(path):  # Path's own raises where a folder above may not be entered
+        if not os.path.isfile(path):  # Path.is_file raises if a parent folder may not be entered
             raise InputError(f"{path} does not exist")
         self._capture = open_video(str(path))
         if not self._capture.isOpened():
@@ -57,7 +57,7 @@ class FileSource:
                 f"{path} does not say when its frames were taken; put it into a file that does, "
                 f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -c copy {path.stem}.mp4"
             )
-        self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # not above 0: not known
+        self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less: unknown
         size_wh = (
             int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
             int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
@@ -94,7 +94,7 @@ class FileSource:
             self._capture = None
 
     def _grab(self, capture: cv2.VideoCapture) -> None:
-        """Go on to the next frame. Raises EndOfStream if there is none, InputError if there never was one."""
+        """Advance to the next frame. Raises EndOfStream if there is none, InputError if there never was one."""
         if not capture.grab():
             if self._times.index < 0:
                 raise InputError(f"{self._settings.path} has no readable frame")
@@ -102,31 +102,31 @@ class FileSource:
         self._times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
 
     def _follows(self) -> bool:
-        """Whether another frame comes after this one: the last is not skipped, however late the reader."""
+        """Whether another frame follows: the last one is not skipped, however late the reader."""
         return self._frames <= 0 or self._times.index + 1 < self._frames
 
 
 class VideoTimes:
-    """When the frames of a video were taken, from the first on.
+    """Times of a video's frames, relative to the first.
 
-    Where the file's times are those of its rate but for their rounding, they are exact. A frame that has none, as the
-    last ones of some files, or one of another clock, as where two videos were joined, follows at that rate.
+    If the file's timestamps are those of its frame rate except for rounding, the exact times are used. A frame without
+    a timestamp (the last ones of some files) or with one of another clock (joined videos) follows at that rate.
     """
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
         self._period_ns = self._step_ns = round(1e9 / fps)
-        self._stamp_ns = self._told_ns = 0  # of the last frame: as it stands in the file, and from the first on
+        self._stamp_ns = self._told_ns = 0  # of the last frame: its timestamp in the file, and the sum since the first
         self.index = -1  # of the last frame
         self.last_ns = 0
 
     @property
     def next_ns(self) -> int:
-        """When the frame to come was taken, if it follows as the last did: what it says itself is not known before."""
+        """Expected time of the next frame, from the last interval: its timestamp is not known before it is read."""
         return self.last_ns + self._step_ns
 
     def take(self, stamp_ns: int) -> None:
-        """The next frame, by its time in the file."""
+        """Add the next frame, by its timestamp in the file."""
         self.index += 1
         since_ns, self._stamp_ns = stamp_ns - self._stamp_ns, stamp_ns
         if self.index == 0:
@@ -139,7 +139,7 @@ class VideoTimes:
 
 
 def _tells_times(path: Path) -> bool:
-    """Whether a video's frames have times, or it has one frame alone. H.264 and JPEG without a container have none."""
+    """Whether a video's frames have timestamps, or it has only one. H.264 and JPEG without a container have none."""
     capture = open_video(str(path))
     stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if capture.grab()]
     capture.release()
@@ -147,6 +147,6 @@ def _tells_times(path: Path) -> bool:
 
 
 def _is_bare_jpeg(path: Path) -> bool:
-    """Whether JPEG follows JPEG, as they are or parted as a web camera sends them: ffmpeg makes up their times."""
+    """Whether it is a sequence of JPEGs, plain or as multipart from a web camera: ffmpeg invents their timestamps."""
     with path.open("rb") as file:
         return file.read(16).lstrip().startswith((b"\xff\xd8", b"--"))

@@ -12,7 +12,7 @@ from edge.errors import InputError
 
 
 class FolderSource(SequenceSource):
-    """Picture k is taken as exposed at start + k / fps; those a late reader missed are skipped, as with a camera."""
+    """Picture k counts as exposed at start + k / fps; those that a late reader missed are skipped, as with a camera."""
 
     def __init__(self, settings: FolderCamera) -> None:
         super().__init__(settings)

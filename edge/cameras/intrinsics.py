@@ -1,4 +1,4 @@
-"""Calibrations: read, and fitted to the picture's size."""
+"""Calibrations: reading, and scaling to the image size."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from edge.types import Array
 
 INTRINSICS_KEY = ("camera", "intrinsics")
 DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own files name none
-FOCAL_RATIO_MAX = 2.0  # pixels are as wide as high, or in anamorphic pictures nearly so
-OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, a principal point may lie outside the picture, which may be cut out
-CLEAR_SHARE = 0.5  # of its sides, in the picture's middle, that a lens must show without folding
-ROUNDING = 1e-6  # what a tool that multiplies matrices leaves where K has its zeros and its one
-YAML_HEAD = "%YAML:1.0\n---\n"  # without it OpenCV takes nothing for YAML
+FOCAL_RATIO_MAX = 2.0  # pixels are square, or nearly so in anamorphic video
+OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, the principal point may lie outside the image, which may be cropped
+CLEAR_SHARE = 0.5  # share of the sides, in the middle, in which the lens model must not fold
+ROUNDING = 1e-6  # tolerance for the zeros and the one of K, from tools that multiply matrices
+YAML_HEAD = "%YAML:1.0\n---\n"  # required by OpenCV to recognise YAML
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera with plumb-bob distortion, for pictures of one size."""
+    """A pinhole camera with plumb-bob distortion, for images of one size."""
 
     K: Array  # [3, 3], pixel centres at integers
     image_size_wh: tuple[int, int]
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty: none
 
     def scaled_to(self, image_size_wh: tuple[int, int], said_by: str = "the camera gives") -> Intrinsics:
-        """The same lens on pictures of another size. Raises InputError unless both sides scale alike, exactly."""
+        """The same lens for images of another size. Raises InputError unless both sides scale by exactly the same."""
         (w, h), (new_w, new_h) = self.image_size_wh, image_size_wh
         if new_w * h != new_h * w:
             raise InputError(
@@ -48,7 +48,7 @@ class Intrinsics:
 
 
 def load_intrinsics(settings: IntrinsicsSettings) -> Intrinsics:
-    """From the numbers in the configuration or the file it names. Raises InputError, also for what no camera is."""
+    """From the numbers in the configuration or the file it names. Raises InputError, also for impossible values."""
     intrinsics = read_calibration(settings.file) if settings.file is not None else _from_numbers(settings)
     reason = _no_camera(intrinsics)
     if reason is not None:
@@ -57,7 +57,7 @@ def load_intrinsics(settings: IntrinsicsSettings) -> Intrinsics:
 
 
 def _no_camera(intrinsics: Intrinsics) -> str | None:
-    """Why no camera has these numbers; None: one may."""
+    """Why no camera can have these values; None: possible."""
     K, sides = intrinsics.K, np.array(intrinsics.image_size_wh)
     if not 1 / FOCAL_RATIO_MAX <= K[0, 0] / K[1, 1] <= FOCAL_RATIO_MAX:
         return f"fx {K[0, 0]:g} and fy {K[1, 1]:g} cannot be of one camera"
@@ -100,7 +100,7 @@ def read_calibration(path: Path) -> Intrinsics:
         distortion = _matrix(storage, path, "distortion_coefficients")
         model = storage.getNode("distortion_model").string()
         fisheye = storage.getNode("fisheye_model")
-    except (cv2.error, SystemError) as error:  # OpenCV's constructor raises its own error wrapped in SystemError
+    except (cv2.error, SystemError) as error:  # OpenCV's constructor wraps its error in SystemError
         reason = _opencv_reason(error, lines_before=read.count("\n") - text.count("\n"))
         hint = f"not YAML as OpenCV reads it{reason}; lists stand in brackets, as data: [1.0, 0.0]"
         raise InputError(f"calibration {path} is {hint}", INTRINSICS_KEY) from error
@@ -120,26 +120,26 @@ def read_calibration(path: Path) -> Intrinsics:
 
 
 def _as_opencv_reads(text: str) -> str:
-    """The same YAML, line by line, without what OpenCV cannot read and nobody needs: comments behind values, the
-    camera's name."""
+    """The same YAML, with the same lines, without parts that OpenCV cannot read and that are not needed: comments after
+    values, the camera's name."""
     plain = re.sub(r"(?m)(?:^|[ \t]+)#.*$", "", text)
     plain = re.sub(r"(?m)^camera_name[ \t]*:.*$(?:\n[ \t]+\S.*$)*", lambda name: "\n" * name[0].count("\n"), plain)
     return plain if plain.startswith("%YAML") else YAML_HEAD + plain.removeprefix("---\n")
 
 
 def _opencv_reason(error: Exception, lines_before: int) -> str:
-    """`, line N: what OpenCV says`; empty where it does not say. `lines_before`: of its text that the file has not."""
+    """`, line N: OpenCV's message`; empty if there is none. `lines_before`: lines that were put before the file's."""
     said = re.search(r"\((\d+)\): (.+)", str(error.__cause__ or error))
     if said is None:
         return ""
     words = said[2].partition(" in function")[0].strip()
     if words.count("'") % 2:
-        words = words.removesuffix("'")  # OpenCV 5 quotes all of it
+        words = words.removesuffix("'")  # OpenCV 5 quotes the whole message
     return f", line {int(said[1]) - lines_before}: {words.rstrip('!')}"
 
 
 def pinhole(numbers: Array, named: str, key: tuple[str, ...] = ()) -> Array:
-    """K [3, 3] from its numbers, row by row. Raises InputError, which begins with `named` (their file and key)."""
+    """K [3, 3] from its numbers, row by row. Raises InputError that begins with `named` (their file and key)."""
     if numbers.size != 9 or not np.isfinite(numbers).all():
         raise InputError(f"{named} is not 9 finite numbers", key)
     K = numbers.reshape(3, 3)
@@ -160,7 +160,7 @@ def _side_px(storage: cv2.FileStorage, path: Path, name: str) -> int:
 
 
 def _matrix(storage: cv2.FileStorage, path: Path, name: str) -> Array:
-    """Flat numbers of a matrix, as OpenCV tags it or ROS writes it (rows, cols, data); empty if there is none.
+    """Flat numbers of a matrix in OpenCV's or ROS's form (rows, cols, data); empty if there is none.
 
     Raises InputError.
     """
@@ -174,7 +174,7 @@ def _matrix(storage: cv2.FileStorage, path: Path, name: str) -> Array:
 
 
 def _number(node: cv2.FileNode, named: str) -> float:
-    """Raises InputError. OpenCV itself takes text, such as O.1 with a letter O, for the largest number there is."""
+    """Raises InputError. OpenCV itself reads text, such as O.1 with a letter O, as the largest possible number."""
     if not (node.isInt() or node.isReal()):
         text = repr(node.string()) if node.isString() else "a list"
         raise InputError(f"{named} holds {text} in place of a number", INTRINSICS_KEY)

@@ -1,4 +1,4 @@
-"""What a V4L2 device and a network stream have in common: OpenCV reads them, and both may vanish and come back."""
+"""Common base of V4L2 devices and network streams: OpenCV reads them, and both may disappear and return."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from edge.cameras.source import EndOfStream, SourceLost
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
-UNDECODABLE_MAX = 10  # pictures in a row, beyond which the camera is opened anew
+UNDECODABLE_MAX = 10  # pictures in a row after which the camera is reopened
 
 
 class LiveSource(ABC):
-    """Frames as they arrive. A kind of camera says how it is opened (`_connect`) and stamped (`_exposure_ns`)."""
+    """Frames as they arrive. Subclasses define how the camera is opened (`_connect`) and timed (`_exposure_ns`)."""
 
     live = True
 
@@ -33,11 +33,11 @@ class LiveSource(ABC):
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0)
 
     def nominal(self) -> CameraInfo:
-        """What is known before the camera answers: the calibration's."""
+        """Properties before the camera answers: those of the calibration."""
         return self._info(self._intrinsics, None)
 
     def open(self) -> CameraInfo:
-        """Raises SourceLost while the camera does not answer, InputError if the intrinsics do not fit its picture."""
+        """Raises SourceLost if the camera does not answer, InputError if the intrinsics do not fit its picture."""
         capture = self._connect()
         if not capture.isOpened():
             capture.release()
@@ -56,9 +56,9 @@ class LiveSource(ABC):
         return self._info(self._fitted, fps if fps > 0 else None)
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next frame that can be decoded; the others are left out, counted, and have their sequence numbers.
+        """The next frame that can be decoded; others are skipped and counted, and use up sequence numbers.
 
-        Raises SourceLost when none comes, or none that can be decoded.
+        Raises SourceLost if none arrives, or none that can be decoded.
         """
         assert self._capture is not None
         why = ""
@@ -92,7 +92,7 @@ class LiveSource(ABC):
         return CameraInfo(self._name, fitted.image_size_wh, fitted.K, fps, fitted.distortion)
 
     def _refitted(self, size_wh: tuple[int, int]) -> Intrinsics:
-        """Raises SourceLost: opened again, the camera may be in its own mode."""
+        """Raises SourceLost if the intrinsics do not fit: when reopened, the camera may be in its usual mode again."""
         try:
             return self._intrinsics.scaled_to(size_wh)
         except InputError as error:
@@ -100,7 +100,7 @@ class LiveSource(ABC):
 
     @abstractmethod
     def _connect(self) -> cv2.VideoCapture:
-        """Open it, or try to."""
+        """Try to open the camera."""
 
     @abstractmethod
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
@@ -108,7 +108,7 @@ class LiveSource(ABC):
 
 
 def _retrieved(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, str]:
-    """The picture just grabbed; None where it cannot be decoded, as when a cable or a radio tore it, and why."""
+    """The picture just grabbed, or None and why it cannot be decoded, for example corrupted by a cable or a radio."""
     try:
         retrieved, image_bgr = capture.retrieve()
     except cv2.error as error:

@@ -1,11 +1,11 @@
-"""A sequence in lock-step: a player says over a socket what time it is and which frame is next, and waits for the end.
+"""A sequence in lock-step mode: over a socket, a player sets time and frames, and waits for the end of each step.
 
-One line a step, answered `ok` when the loop has come round and the links have sent what it told them:
+One line per step, answered with `ok` when the loop has processed it and the links have sent its output:
 
-    time NS      let it be NS (monotonic); what the peers sent before is heard
+    time NS      set the time to NS (monotonic); what peers sent before is received
     frame INDEX  frame INDEX of the sequence is exposed now
 
-`ready` goes out first, when the daemon is warm. The recording is over when the player hangs up.
+`ready` is sent first, when the daemon is warm. The recording ends when the player disconnects.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LINE_MAX = 64
 
 
 class LockstepCapture:
-    """In place of `Capture`: the same to the loop, but on the loop's own thread. From now on time stands still."""
+    """Replaces `Capture`, but works in the loop's own thread. Once it is created, only the player advances the time."""
 
     def __init__(self, source: SequenceSource, address: str) -> None:
         """`address` is the player's HOST:PORT. Raises InputError if nobody answers there."""
@@ -46,18 +46,18 @@ class LockstepCapture:
         clock.step_to(0)
 
     def start(self, settle: Callable[[], None]) -> None:
-        """Say that all is ready, and wait for the first word: before it there is no time to go by.
+        """Send `ready` and wait for the first step: before it the time is not set.
 
-        `settle` has the links send what the loop told them.
+        `settle` makes the links send everything queued.
         """
         self._settle = settle
         self._say("ready")
         self._obey(self._line(None))
 
     def newest(self, timeout_s: float) -> Frame | None:
-        """Carry out the player's next word, waiting up to `timeout_s` for it; the frame, if it was one.
+        """Execute the player's next step, waiting up to `timeout_s` for it; returns the frame, if it was one.
 
-        Raises EndOfStream when the player has hung up, InputError when it asks for what the sequence does not have.
+        Raises EndOfStream if the player has disconnected, InputError for a frame that the sequence does not have.
         """
         if self._owes_answer:
             self._settle()
@@ -67,15 +67,15 @@ class LockstepCapture:
         return None if line is None else self._obey(line)
 
     def reasons(self, _: int) -> tuple[Reason, ...]:
-        """Nothing is ever wrong with this camera."""
+        """This camera never has faults."""
         return ()
 
     def counters(self) -> dict[str, int]:
-        """captured: frames asked for so far; none is ever dropped."""
+        """captured: frames requested so far; none is ever dropped."""
         return {"captured": self._frames, "dropped": 0}
 
     def stop(self) -> None:
-        """Hang up and close the sequence."""
+        """Disconnect and close the sequence."""
         self._player.close()
         self._source.close()
 
@@ -95,7 +95,7 @@ class LockstepCapture:
         return frame
 
     def _line(self, timeout_s: float | None) -> str | None:
-        """The player's next line; None when none came in time. Raises EndOfStream when it has hung up."""
+        """The player's next line; None if there is none in time. Raises EndOfStream if the player has disconnected."""
         while b"\n" not in self._unread:
             if not select.select([self._player], [], [], timeout_s)[0]:
                 return None

@@ -1,4 +1,4 @@
-"""When to open a lost camera again: a pure state machine; `capture` drives it."""
+"""When to reopen a lost camera: a pure state machine, driven by `capture`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class LinkState(Enum):
 
 @dataclass(frozen=True)
 class Reconnect:
-    """Capped exponential backoff: 0.25 s, 0.5 s, ... 5 s; a delivered frame makes it forget its failures."""
+    """Capped exponential backoff: 0.25 s, 0.5 s, ... 5 s; a delivered frame resets it."""
 
     state: LinkState = LinkState.CLOSED
     failures: int = 0

@@ -1,6 +1,6 @@
 """A BOP scene played in real time: frame k is exposed at start + k / fps on the monotonic clock.
 
-A scene made of a recording has no picture of a frame that was not recorded: to who reads it, that one was dropped.
+A scene made from a recording lacks pictures of frames that were not recorded: for the reader, these were dropped.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from edge.errors import InputError
 from edge.types import Array, CameraInfo, Frame, FrameMeta
 
 DECODED_AHEAD = 2
-DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself knows pinhole cameras alone
-SOURCE_KEY = "source"  # of sequence.toml, in scenes made of a video or a recording: what was filmed
+DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself has pinhole cameras only
+SOURCE_KEY = "source"  # of sequence.toml, in scenes made from a video or a recording: what was filmed
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
 
@@ -39,11 +39,11 @@ class ScenePicture:
     path: Path
     K: Array  # [3, 3], pixel centres at integers
     distortion: tuple[float, ...]  # k1 k2 p1 p2 k3; empty: none
-    frame: int | None = None  # of the sequence, from 0; None: the one after that of the picture before
+    frame: int | None = None  # number in the sequence, from 0; None: the picture's index
 
 
 class SequenceSource:
-    """Hands no frame over before its exposure; a reader that is late finds the newest exposed, as with a camera."""
+    """Delivers no frame before its exposure time; a late reader gets the newest one exposed, as with a camera."""
 
     live = False
 
@@ -51,7 +51,7 @@ class SequenceSource:
         self._settings = settings
         self.counts: Counter[str] = Counter()
         self._pictures: list[ScenePicture] = []
-        self._frames: list[int] = []  # of the sequence, that each of them is
+        self._frames: list[int] = []  # frame number of each picture in the sequence
         self._image_size_wh = (0, 0)
         self._start_ns: int | None = None
         self._next = 0
@@ -95,7 +95,7 @@ class SequenceSource:
         return self._shown(self._at(index), image_bgr, FrameMeta(self._frame(index), capture_ns, time.monotonic_ns()))
 
     def exposed_now(self, index: int, sequence: int) -> Frame:
-        """Frame `index` as if exposed this instant, the camera's frame `sequence`. Raises InputError."""
+        """Frame `index` as if exposed now, with the sequence number `sequence`. Raises InputError."""
         frames = self._frames[-1] + 1
         wanted = index % frames if self._settings.loop else index
         if wanted not in self._frames:
@@ -113,7 +113,7 @@ class SequenceSource:
         return read_scene(folder)
 
     def _shown(self, picture: ScenePicture, image_bgr: NDArray[np.uint8], meta: FrameMeta) -> Frame:
-        """Raises InputError for a picture that the intrinsics are not of."""
+        """Raises InputError for a picture that does not have the size of the first."""
         if (image_bgr.shape[1], image_bgr.shape[0]) != self._image_size_wh:
             raise InputError(f"{picture.path} differs in size from the first picture of the scene")
         return Frame(meta, image_bgr, picture.K, picture.distortion)
@@ -125,7 +125,7 @@ class SequenceSource:
         return self._pictures[index % len(self._pictures)]
 
     def _frame(self, index: int) -> int:
-        """The number of frame of a picture, counted on from round to round."""
+        """Frame number of a picture, continuing from loop to loop."""
         rounds, within = divmod(index, len(self._frames))
         return rounds * (self._frames[-1] + 1) + self._frames[within]
 
@@ -142,9 +142,9 @@ class SequenceSource:
 
 
 def read_scene(folder: Path) -> list[ScenePicture]:
-    """Pictures of a BOP scene (bop_datasets_format: scene_camera.json, rgb/ or gray/) by growing number.
+    """Pictures of a BOP scene (bop_datasets_format: scene_camera.json, rgb/ or gray/), sorted by number.
 
-    Raises InputError when the folder is no such scene, naming file and key.
+    Raises InputError with file and key if the folder is not such a scene.
     """
     index = folder / "scene_camera.json"
     try:
@@ -156,7 +156,7 @@ def read_scene(folder: Path) -> list[ScenePicture]:
         raise InputError(f"{index} is not as BOP writes it: {error!r}") from error
     paths = {
         int(path.stem): path
-        for name in ("gray", "rgb")  # the later wins where a frame has both
+        for name in ("gray", "rgb")  # the latter wins if a frame has both
         for path in sorted((folder / name).glob("*"), reverse=True)
         if path.stem.isdecimal() and path.suffix.lower() in PICTURE_SUFFIXES
     }
@@ -171,10 +171,10 @@ def read_scene(folder: Path) -> list[ScenePicture]:
 
 
 def frames_of(folder: Path, numbers: Sequence[int]) -> list[int]:
-    """Which frame of the sequence each picture is, from 0, by the growing `numbers` of the scene's pictures.
+    """Frame number of each picture in the sequence, from 0; `numbers`: of the scene's pictures, sorted.
 
-    They follow each other, whatever their numbers; in a scene made of a recording a number left out is a frame that was
-    not recorded. Raises InputError if sequence.toml cannot be read.
+    Pictures are consecutive frames, whatever their numbers, except in a scene made from a recording: there a missing
+    number is a frame that was not recorded. Raises InputError if sequence.toml cannot be read.
     """
     path = folder / "sequence.toml"
     try:
@@ -198,7 +198,7 @@ def _camera(index: Path, key: str, entry: object) -> tuple[Array, tuple[float, .
 
 
 def _flat(numbers: object) -> Array:
-    """[n]; one that is not finite in place of what are no numbers."""
+    """[n]; a single NaN if these are not numbers."""
     try:
         return np.array(numbers, dtype=np.float64).reshape(-1)
     except (ValueError, TypeError, OverflowError):

@@ -1,4 +1,4 @@
-"""What every camera does, one small file a kind: open, read, close."""
+"""The interface of all cameras: open, read, close. There is one small file per kind."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ class SourceLost(Exception):
 class Source(Protocol):
     """A source of frames, driven by one thread at a time."""
 
-    live: bool  # what it shows is happening now: a picture that repeats is a fault, not a recording's
-    counts: Counter[str]  # what it met that should not be, by reason, with every reason in it from the start
+    live: bool  # a real camera, not a recording: a repeated picture is then a fault
+    counts: Counter[str]  # faults by reason, with every reason present from the start
 
     def open(self) -> CameraInfo:
-        """Make ready for `read`. Raises SourceLost when a later try may do, InputError when none will."""
+        """Prepare for `read`. Raises SourceLost if a later attempt may succeed, InputError if none will."""
 
     def read(self, stop: threading.Event) -> Frame:
         """Wait for the next frame. Raises EndOfStream (also when `stop` is set), SourceLost or InputError."""
 
     def close(self) -> None:
-        """Let go of the device or file; it may be opened again."""
+        """Release the device or file; it may be opened again."""
 
 
 def wait_until(time_ns: int, stop: threading.Event) -> None:

@@ -1,4 +1,4 @@
-"""Whose clock a camera's stamps are of, and where a stream's own clock lies on ours. Pure."""
+"""Which clock a camera's timestamps come from, and a stream's clock relative to ours. Pure."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ from collections import deque
 
 import numpy as np
 
-DOUBTED_FRAMES = 100  # in a row that are too old: no backlog is so long, so the clock is another
+DOUBTED_FRAMES = 100  # too old in a row: no backlog is that long, so they are of another clock
 WINDOW_NS = 5_000_000_000
-DRIFT_PPM = 500  # no two quartz clocks run further apart
-# Encoders that count frames instead of time run slow by as much as the sensor does: 1000 ppm where they tell 30 a
-# second of 29.97. Little more is believed, as what a decoder or a link cannot keep up with looks alike, and is stale.
+DRIFT_PPM = 500  # upper limit for the drift between two quartz clocks
+# Encoders that count frames instead of time run slow by as much as the sensor does: 1000 ppm if 29.97 Hz is declared as
+# 30. Little more is accepted, because a decoder or a link that cannot keep up looks alike, and its frames are stale.
 SLOW_MAX_PPM = 2_000
 SLOW_WINDOW_NS = 2_500_000_000
-SLOW_WINDOWS = 6  # 15 s: no clock that is followed is by then so late that it is taken for a backlog
-RAMP_OFF_SHARE, RAMP_OFF_NS = 0.05, 3_000_000  # how far off its line a ramp may be: of its rise, or this if it is more
-# What waited while nobody read comes faster than it was filmed, each frame less late than the one before.
+SLOW_WINDOWS = 6  # 15 s: within it, an acceptable clock is not late enough to be taken for a backlog
+RAMP_OFF_SHARE, RAMP_OFF_NS = 0.05, 3_000_000  # deviation of a ramp from a line: share of its rise, or this if larger
+# Frames that were buffered while nobody read arrive faster than they were filmed, each less late than the one before.
 CATCHING_UP_NS = 10_000_000
-CAUGHT_UP_NS = 500_000_000  # no frame that much less late for so long
-CATCHING_UP_MAX_NS = 5_000_000_000  # after it the stream's clock runs faster than ours, and will go on so
+CAUGHT_UP_NS = 500_000_000  # caught up if for this long no frame was less late by CATCHING_UP_NS
+CATCHING_UP_MAX_NS = 5_000_000_000  # if it lasts longer, the stream's clock simply runs faster than ours
 
 
 class StampCheck:
-    """Judges stamps that should be of our clock, but may be of none.
+    """Judges whether timestamps are of our clock.
 
-    A stamp that is too old is no reason to take the arrival for the exposure: after a stall the first frames *are* old,
-    and told as new ones they would be wrong. Only where stamps never fitted, or do so no more for DOUBTED_FRAMES, is it
-    the clock.
+    A timestamp that is too old is not replaced by the arrival time: after a stall the first frames *are* old, and would
+    be wrong if treated as new. Only if timestamps never fitted, or no longer do for DOUBTED_FRAMES, is it the clock.
     """
 
     def __init__(self, age_max_ns: int) -> None:
@@ -34,7 +33,7 @@ class StampCheck:
         self._doubted = DOUBTED_FRAMES
 
     def believes(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Whether this is when the frame that came at `arrival_ns` (monotonic) was exposed."""
+        """Whether the timestamp is the exposure time of the frame that arrived at `arrival_ns` (monotonic)."""
         age_ns = arrival_ns - stamp_ns
         if age_ns < 0:
             return False
@@ -43,11 +42,11 @@ class StampCheck:
 
 
 class SlowClock:
-    """By how much a stream's clock runs slower than ours, in ppm; 0 where that is no more than DRIFT_PPM.
+    """How much slower a stream's clock runs than ours, in ppm; 0 if that is no more than DRIFT_PPM.
 
-    What a backlog adds to the delay of the fastest frames is a step, what a slow clock adds is a ramp: only one that
-    was straight over SLOW_WINDOWS is believed, and then until another is. A fast clock needs none of it: its frames
-    become the fastest by themselves.
+    A backlog adds a step to the delay of the fastest frames, a slow clock adds a ramp: only a ramp that was straight
+    over SLOW_WINDOWS is accepted, and kept until the next one. A fast clock needs no correction: its frames become the
+    fastest by themselves.
     """
 
     def __init__(self) -> None:
@@ -78,10 +77,10 @@ class SlowClock:
 class StreamClock:
     """Presentation times of a stream on the monotonic clock.
 
-    A stream's clock begins anywhere, so its offset is taken from the frame that came fastest: what the others took
-    longer is the network's and the decoder's jitter, or a backlog, and leaves the stamp. That frame is forgotten no
-    faster than two clocks drift apart, or the stream's has been seen to. What is common to all frames (encoder,
-    network, decoder) stays in the stamp; `latency_ms` takes that off, if it was measured.
+    A stream's clock has an arbitrary start, so its offset is taken from the frame with the least delay: additional
+    delay of others is jitter of network and decoder, or a backlog, and is removed. The least delay grows only as fast
+    as two clocks drift apart, or as the stream's clock was measured to. The delay common to all frames (encoder,
+    network, decoder) remains in the timestamp; `latency_ms` subtracts it, if it was measured.
     """
 
     def __init__(self) -> None:
@@ -89,13 +88,13 @@ class StreamClock:
         self._fastest: tuple[int, int] | None = None  # (arrival, arrival - stamp)
         self._began_ns = 0
         self._slow = SlowClock()
-        self._recent: deque[tuple[int, int]] = deque()  # the same of the last WINDOW_NS, the latter growing
+        self._recent: deque[tuple[int, int]] = deque()  # the same for the last WINDOW_NS, delays increasing
         self._first_ns: int | None = None  # arrival
         self._less_late: tuple[int, int] | None = None  # the last frame that showed the stream to be catching up
-        self.caught_up = False  # whether the stream tells what is now: before that, its stamps are too young
+        self.caught_up = False  # whether the stream is current; before that, its timestamps are too young
 
     def monotonic_ns(self, stamp_ns: int, arrival_ns: int) -> int | None:
-        """The frame's time on our clock, never later than its arrival; None if the stream gives no stamp that grows."""
+        """The frame's time on our clock, never later than its arrival; None if the timestamp does not increase."""
         self._look_whether_caught_up(arrival_ns, arrival_ns - stamp_ns)
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if last_ns is not None and stamp_ns <= last_ns:
@@ -113,11 +112,11 @@ class StreamClock:
         self._recent.append((arrival_ns, delay_ns))
         while arrival_ns - self._recent[0][0] > WINDOW_NS:
             self._recent.popleft()
-        # What waited for seconds is of the offset that the clocks had then.
+        # For a frame that was buffered for seconds, the clocks' offset at its own time counts.
         return stamp_ns + self._reference_ns(stamp_ns + self._reference_ns(arrival_ns))
 
     def behind_ns(self, now_ns: int) -> int:
-        """By how much even the fastest frame of the last WINDOW_NS came later than the stream once did."""
+        """How much later even the fastest frame of the last WINDOW_NS was than the least delay: a backlog."""
         if self._fastest is None or now_ns - self._began_ns < WINDOW_NS:
             return 0
         arrival_ns, delay_ns = self._recent[0]

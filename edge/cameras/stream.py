@@ -21,14 +21,14 @@ from edge.errors import InputError
 from edge.types import Frame
 
 TIMEOUT_MS = 3000
-BEHIND_MAX_NS = 250_000_000  # a backlog for good; opened anew, the stream begins with what is now
-# OpenCV takes ffmpeg's options from here alone. Each unlike ffmpeg's defaults lets no frames wait in a buffer.
+BEHIND_MAX_NS = 250_000_000  # a permanent backlog; a reopened stream begins with current frames
+# The only way to pass options to ffmpeg through OpenCV. Unlike ffmpeg's defaults, these keep no frames in a buffer.
 OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 LOW_DELAY = "fflags;nobuffer|flags;low_delay"
 
 
 class StreamSource(LiveSource):
-    """Stamped by the stream's own clock, as it advances between frames, laid on ours by the fastest arrivals."""
+    """Frames with the stream's own timestamps, mapped to our clock by the fastest arrivals (`StreamClock`)."""
 
     def __init__(self, settings: StreamCamera) -> None:
         super().__init__(no_password(settings.url), load_intrinsics(settings.intrinsics))
@@ -36,11 +36,11 @@ class StreamSource(LiveSource):
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
         self._timeless = False
-        self._unread_since_ns: int | None = None  # opened, and nothing was read
+        self._unread_since_ns: int | None = None  # since when it is open without anything having been read
         self.counts["catching_up"] = 0
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next frame; what waited while nobody read, or in the server, is passed over, as nobody knows its age."""
+        """The next frame; frames that were buffered, here or in the server, are skipped, as their age is unknown."""
         if self._waited_unnoticed():
             self._call_again()
         self._unread_since_ns = None
@@ -69,8 +69,8 @@ class StreamSource(LiveSource):
             raise SourceLost(str(error)) from error
 
     def _waited_unnoticed(self) -> bool:
-        """Whether pictures without times wait here, of which nobody could tell how old they are. A web camera sends who
-        calls again what is now; who serves a bare TCP connection may end with it."""
+        """Whether pictures without timestamps are buffered here, whose age is unknown. A web camera starts with current
+        ones on a new connection; the server of a bare TCP connection may exit when it is closed."""
         asked_anew = self._timeless and self._settings.url.startswith("http")
         since_ns = self._unread_since_ns
         return asked_anew and since_ns is not None and time.monotonic_ns() - since_ns >= CAUGHT_UP_NS
@@ -87,9 +87,9 @@ class StreamSource(LiveSource):
 
 @contextmanager
 def _ffmpeg_options(options: str) -> Iterator[None]:
-    """For what is opened inside alone: a video opened later with these would lose its last frame.
+    """Only for what is opened inside the block: a video file opened with these would lose its last frame.
 
-    Options that the user has set stay.
+    Options set by the user are kept.
     """
     if OPTIONS_VARIABLE in os.environ:
         yield

@@ -1,4 +1,4 @@
-"""What files and network streams have in common: ffmpeg reads them, through OpenCV."""
+"""Common to video files and network streams: both are read by ffmpeg through OpenCV."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import cv2
 
-COUNTED_FPS = 25.0  # as which ffmpeg counts pictures that come without times
+COUNTED_FPS = 25.0  # rate that ffmpeg assumes for pictures without timestamps
 
 
 def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:
-    """`settings`: OpenCV's properties and their values, by turns.
+    """`settings`: OpenCV's properties and their values, alternating.
 
-    Pictures come as the sensor read them out, whatever the video says of how to turn them: so the lens was calibrated,
-    and so the camera sits on its mount.
+    Pictures are not rotated, whatever the video's metadata say: calibration and mount refer to the sensor's readout.
     """
     capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, settings)
     if capture.isOpened():
@@ -22,13 +21,12 @@ def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:
 
 
 def may_be_bare_jpeg(capture: cv2.VideoCapture) -> bool:
-    """Whether JPEG may follow JPEG with nothing between that tells the time, as web cameras send them: the times that
-    ffmpeg tells then are made up, whatever the pictures' rate is. A container may look alike until it tells one that
-    `is_counted` is not."""
+    """Whether it may be a sequence of JPEGs without timestamps, as web cameras send: ffmpeg then invents them, whatever
+    the rate. A container may look the same until it gives a timestamp for which `is_counted` is false."""
     jpeg = capture.get(cv2.CAP_PROP_FOURCC) == cv2.VideoWriter.fourcc(*"MJPG")
     return jpeg and capture.get(cv2.CAP_PROP_FPS) == COUNTED_FPS and capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0
 
 
 def is_counted(position_ms: float) -> bool:
-    """Whether a time may be a count of pictures: no camera's own clock keeps to it for long."""
+    """Whether a timestamp may be a count of pictures at COUNTED_FPS: a real clock does not match that for long."""
     return round(position_ms * COUNTED_FPS) % 1000 == 0

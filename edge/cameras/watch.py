@@ -1,4 +1,4 @@
-"""Whether a camera is alive: pictures that repeat and stamps that jump look like frames, and are none. Pure."""
+"""Detects frozen cameras and jumping timestamps: repeated pictures look like frames, but are not new. Pure."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from edge.types import Frame
 
-SAMPLED_EVERY_PX = 8  # enough to tell two pictures of a living sensor apart
+SAMPLED_EVERY_PX = 8  # enough to distinguish two pictures of a real sensor
 DELAY_JUMP_NS = 250_000_000
 
 
 class FrameWatch:
-    """Compares each frame with the one before."""
+    """Compares each frame with the previous one."""
 
     def __init__(self) -> None:
         self._image_bgr: NDArray[np.uint8] | None = None
@@ -21,7 +21,7 @@ class FrameWatch:
         self._delay_ns = 0
 
     def repeats(self, frame: Frame) -> bool:
-        """Whether the picture is the very one before, to the last pixel: no sensor's noise does that."""
+        """Whether the picture equals the previous one in every pixel, which sensor noise rules out for a new one."""
         sample = np.ascontiguousarray(frame.image_bgr[::SAMPLED_EVERY_PX, ::SAMPLED_EVERY_PX])
         same = (
             self._sample is not None
@@ -33,7 +33,7 @@ class FrameWatch:
         return same
 
     def jumps(self, frame: Frame) -> bool:
-        """Whether the exposure's stamp goes back, lies in the future, or is suddenly much younger or older."""
+        """Whether the exposure time goes back, lies in the future, or is suddenly much newer or older."""
         capture_ns, delay_ns = frame.meta.capture_ns, frame.meta.arrival_ns - frame.meta.capture_ns
         first = self._image_bgr is None
         jumped = delay_ns < 0 or (

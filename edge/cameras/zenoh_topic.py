@@ -30,13 +30,13 @@ log = logging.getLogger(__name__)
 SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
-PUBLISHER_SILENT_NS = 1_000_000_000  # then another may take its place
-# A picture turned by what its EXIF says would be of another camera than was calibrated.
+PUBLISHER_SILENT_NS = 1_000_000_000  # then another may replace it
+# A picture rotated according to its EXIF data would not fit the calibration.
 DECODING = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 
 
 class _UnusableError(Exception):
-    """A picture that is not one for the daemon; the text says what it is instead."""
+    """A picture that the daemon cannot use; the text says why."""
 
     def __init__(self, counted_as: str, text: str) -> None:
         super().__init__(text)
@@ -44,10 +44,10 @@ class _UnusableError(Exception):
 
 
 class ZenohSource:
-    """The newest picture of a topic, stamped by its header as far as the sender's UTC agrees with ours.
+    """The newest picture of a topic, with its header's timestamp as long as the sender's UTC agrees with ours.
 
-    A picture that cannot be decoded or is of another size than the calibration's is counted and dropped, and so are
-    those of a second publisher: of two cameras, or a camera and a recording of it, one alone is looked through.
+    A picture that cannot be decoded or whose shape does not fit the calibration is counted and dropped, and so are
+    those of a second publisher: of two cameras, or a camera and a recording of it, only one is used.
     """
 
     live = True
@@ -62,8 +62,8 @@ class ZenohSource:
         self._clock = UtcClock()
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
         self._sequence = 0
-        self._sent: tuple[bytes, int] | None = None  # the publisher and its number of the last picture
-        self._heeded: tuple[bytes, int] | None = None  # the publisher that is looked at, heard ns
+        self._sent: tuple[bytes, int] | None = None  # publisher of the last picture, and its sequence number
+        self._heeded: tuple[bytes, int] | None = None  # the publisher in use, and when its last picture arrived (ns)
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0)
 
     def nominal(self) -> CameraInfo:
@@ -71,7 +71,7 @@ class ZenohSource:
         return CameraInfo(self._settings.topic, lens.image_size_wh, lens.K, None, lens.distortion)
 
     def open(self) -> CameraInfo:
-        """Raises SourceLost while nothing answers at the endpoint. The publisher may come later."""
+        """Raises SourceLost if nothing answers at the endpoint. The publisher may appear later."""
         tls = self._settings.tls.files() if self._settings.tls is not None else None
         try:
             self._session = zenoh.open(client_config([self._settings.connect], tls=tls))
@@ -79,12 +79,12 @@ class ZenohSource:
             self._session.declare_subscriber(key, handlers.Callback(self._take, indirect=False))
         except zenoh.ZError as error:
             self.close()
-            reason = str(error).partition(" at /")[0].rstrip("! ")  # what follows is a line of zenoh's source
+            reason = str(error).partition(" at /")[0].rstrip("! ")  # the rest is a location in zenoh's source
             raise SourceLost(f"no zenoh session with {self._settings.connect}: {reason}") from error
         return self.nominal()
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next picture. Raises SourceLost when none came for three seconds, or none that can be used."""
+        """The next picture. Raises SourceLost if none arrived for three seconds, or none that can be used."""
         silent_ns = time.monotonic_ns() + round(SILENCE_S * 1e9)
         unusable, why = 0, ""
         while time.monotonic_ns() < silent_ns:
@@ -102,7 +102,7 @@ class ZenohSource:
                 unusable, why = unusable + 1, str(error)
         topic, seconds = self._settings.topic, f"{SILENCE_S:.0f} s"
         if unusable:
-            # Who is told that none came looks for a cable, not for the calibration.
+            # "No picture" would make the user check the cable instead of the calibration.
             raise SourceLost(f"of {unusable} pictures on {topic} in {seconds} none can be used: the last {why}")
         raise SourceLost(f"no picture on {topic} for {seconds}")
 
@@ -112,7 +112,7 @@ class ZenohSource:
             self._session = None
 
     def _take(self, sample: zenoh.Sample) -> None:
-        """On zenoh's thread: keep the newest; what it replaces shows as a gap in the numbers."""
+        """On zenoh's thread: keep the newest picture; a replaced one shows as a gap in the sequence numbers."""
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         parsed, now_ns = parse_attachment(attachment), time.monotonic_ns()
         publisher = b"" if parsed is None else parsed[2]
@@ -151,7 +151,7 @@ class ZenohSource:
             raise _UnusableError("misfit", f"is of another shape: {error}") from error
 
     def _number(self, attachment: bytes) -> int:
-        """Counts up with the publisher's own numbers while one publisher sends, so that what is lost shows as a gap."""
+        """Sequence number that advances with the publisher's own numbers, so that lost pictures show as a gap."""
         parsed = parse_attachment(attachment)
         step = 1
         if parsed is not None:
@@ -164,9 +164,9 @@ class ZenohSource:
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8] | None:
-    """JPEG or PNG of 8 bits to [H, W, 3] BGR as its sensor read it out, or None.
+    """JPEG or PNG of 8 bits to [H, W, 3] BGR as the sensor read it out, or None.
 
-    Of deeper pictures nobody knows how bright they are meant: 12 bits in 16 would be nearly black.
+    The brightness scale of deeper pictures is unknown: 12 bits in 16 would be nearly black.
     """
     try:
         image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), DECODING)

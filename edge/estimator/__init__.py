@@ -1,1 +1,1 @@
-"""From a frame to poses: windows, network, decoding."""
+"""Frame to poses: windows, network, decoding."""

@@ -1,4 +1,4 @@
-"""From network outputs to estimates: what is accepted, where it lies on the frame, how sure it is. Pure."""
+"""From network outputs to estimates: acceptance, position on the frame, covariance. Pure."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from edge.estimator.window import PixelMap, whole_frame
 from edge.types import Array, Estimate
 from msgs.contract import ModelContract
 
-# A depth beyond the trained range is believed with a covariance that reaches back to the range, up to this factor.
+# A depth outside the trained range, up to this factor, is accepted with a covariance that reaches back to the range.
 RANGE_EXCESS_MAX = 2.0
-# Two boxes of which the smaller lies this much inside the larger are one aircraft.
+# Two boxes are of one aircraft if this share of the smaller lies inside the larger.
 SAME_TARGET_OVERLAP = 0.5
 ROTATION_TOLERANCE = 0.05
-# A longer side below this many pixels of the frame shows no shape to tell a pose from.
+# A box whose longer side is below this many pixels of the frame shows too little shape for a pose.
 BOX_MIN_PX = 8.0
-# A box this near to the frame's edge, in its longer sides and in pixels, may be cut by it.
+# A box this near to the frame's edge, as a share of its longer side plus pixels, may be cut by it.
 EDGE_SHARE, EDGE_PX = 0.05, 1.5
-# What is cut off is not known, so neither is how large the whole is nor where its middle: 1-sigma of log Z, and of the
-# origin's pixels in longer sides of the box. They cover the shipped model's errors on targets of which half is off.
+# Of a cut target neither size nor centre is known: 1-sigma of log Z, and of the origin's pixels in units of the box's
+# longer side. They cover the shipped model's errors on targets of which half is outside.
 CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
-# Nor does what is left show which end is the nose: each axis, radians.
+# The visible part does not show which end is the nose either: 1-sigma about each axis.
 CUT_SIGMA_ROTATION_RAD = 0.8
-# What scores low is often not what it is taken for: 1-sigma of those that are not, as above. Times 1 - score it is the
-# variance of the doubt. Chosen on the validation split and the first flights of strangers.
+# Low scores are often false: 1-sigma errors of those, units as above. Their squares times (1 - score) are added to the
+# variances. Chosen on the validation split and the first flights of unseen airframes.
 DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
-# A depth at the farthest that a graph tells is a least depth, one at the nearest a greatest: 1-sigma of log Z then, and
-# how near counts as at it.
+# A depth at the graph's upper limit is only a lower bound, one at its lower limit only an upper bound: 1-sigma of log Z
+# then, and the relative tolerance for being at a limit.
 LIMIT_SIGMA_LOG_Z, LIMIT_TOLERANCE = 1.0, 1e-3
 
 
 class Shown(NamedTuple):
-    """What of a frame the network was shown, and as which pixels."""
+    """The part of a frame that the network was given, and the mapping of its pixels."""
 
     pixel_map: PixelMap
     K: Array  # [3, 3] of the network's pixels
-    size_wh: tuple[int, int]  # the network's
+    size_wh: tuple[int, int]  # of the network's input
     frame_wh: tuple[int, int]
 
     def cut_sides(self, box_xyxy_px: Array) -> NDArray[np.bool_]:
-        """[4], at which sides of a box on the frame an edge of the window, with more of the frame behind it, may hide
-        a part of what the box holds."""
+        """[4], for each side of a box on the frame: whether an edge of the window, beyond which the frame continues,
+        may cut the object in the box."""
         lens = self.pixel_map.lens
         corners = np.array([[-0.5, -0.5], np.array(self.size_wh) - 0.5])
         window = self.pixel_map.to_pinhole(corners).ravel()
@@ -69,10 +69,10 @@ def decode(
 ) -> list[Estimate]:
     """Accepted, distinct targets of one image of the batch, best score first.
 
-    What the contract's least score would take for a target and is refused is counted by reason.
+    Rejected peaks are counted in `refused` by reason if their score reaches the contract's minimum.
 
-    A target cut by the edge of what was shown, of a size that was not trained or at the end of what depth can be told
-    has a covariance that says so; one whose origin lies off the frame, or too small to show a shape, is not told.
+    The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training
+    or at a limit of depth. A cut target with its origin off the frame, or one too small to show a shape, is rejected.
     """
     acquiring = stage == "acquire"
     calibration = contract.acquire_score if acquiring else contract.track_score
@@ -117,8 +117,8 @@ def pose_covariance(
 ) -> Array:
     """Covariance [6, 6] (x, y, z m, rotation x, y, z rad; cam) from sigma [6] of (u, v, log Z, rotation).
 
-    t = Z K^-1 [u, v, 1], so J = [Z K^-1 e_u, Z K^-1 e_v, t]. `K` is of the pixels that u and v are counted in.
-    Outside the trained range the distance to it, in log Z, is added to the depth's sigma.
+    t = Z K^-1 [u, v, 1], so J = [Z K^-1 e_u, Z K^-1 e_v, t]. `K` is that of the image whose pixels u and v are in.
+    Outside the trained range, the distance to it in log Z is added to the sigma of log Z, in quadrature.
     """
     t_m, sigma = np.asarray(t_cam_target_m, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
     K_inverse = np.linalg.inv(np.asarray(K, dtype=np.float64))
@@ -131,7 +131,7 @@ def pose_covariance(
 
 
 def distinct(estimates: Sequence[Estimate], known_boxes: Sequence[Array] = ()) -> list[Estimate]:
-    """Those, in order, that lie on none of the known boxes nor on one taken before."""
+    """The estimates, in order, that overlap none of the known boxes and no estimate kept before."""
     boxes = list(known_boxes)
     kept = []
     for estimate in estimates:
@@ -142,12 +142,12 @@ def distinct(estimates: Sequence[Estimate], known_boxes: Sequence[Array] = ()) -
 
 
 def lies_on(box_xyxy: ArrayLike, known_boxes: Sequence[Array]) -> bool:
-    """Whether a box is of the same target as one of `known_boxes`."""
+    """Whether a box overlaps one of `known_boxes` so much that both are of the same target."""
     return any(overlap(box_xyxy, known) >= SAME_TARGET_OVERLAP for known in known_boxes)
 
 
 def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:
-    """Intersection over the smaller box's area, 0..1."""
+    """Intersection area over the smaller box's area, 0..1."""
     a, b = np.asarray(box_a_xyxy, dtype=np.float64), np.asarray(box_b_xyxy, dtype=np.float64)
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     if sides.min() <= 0:
@@ -156,7 +156,7 @@ def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:
 
 
 def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> Estimate | None:
-    """The estimate for an expected box: a strong one beats a weak one, a near one a far one."""
+    """The estimate that fits an expected box best, by score and distance; None if there are no estimates."""
     box = np.asarray(box_xyxy_px, dtype=np.float64)
     longer_px = max(box[2] - box[0], box[3] - box[1], 1.0)
 
@@ -180,7 +180,7 @@ def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tu
 
 
 def grown(box_xyxy_px: Array, shown: Shown) -> Array | None:
-    """The box, longer by its longer side beyond each edge of the window that cuts what it holds; None: none does."""
+    """The box, extended by its longer side at each side where a window edge cuts its object; None: not cut."""
     cut = shown.cut_sides(box_xyxy_px)
     if not np.any(cut):
         return None
@@ -189,7 +189,7 @@ def grown(box_xyxy_px: Array, shown: Shown) -> Array | None:
 
 
 def _is_cut(box_xyxy_px: Array, frame_wh: tuple[int, int]) -> bool:
-    """Whether the frame's edge may hide a part of what the box holds."""
+    """Whether the frame's edge may cut the object in the box."""
     margin_px = _edge_margin_px(box_xyxy_px)
     return bool(
         np.any(box_xyxy_px[:2] < margin_px - 0.5) or np.any(box_xyxy_px[2:] > np.array(frame_wh) - 0.5 - margin_px)
@@ -201,7 +201,7 @@ def _edge_margin_px(box_xyxy_px: Array) -> float:
 
 
 def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int, int]) -> str | None:
-    """Why too little of a target is on the frame to tell its pose, or None."""
+    """Why too little of a target is on the frame to give its pose; None: enough of it is."""
     limit = np.array(frame_wh) - 0.5
     visible = np.minimum(box_xyxy_px[2:], limit) - np.maximum(box_xyxy_px[:2], -0.5)
     if np.max(visible) < BOX_MIN_PX or np.min(visible) <= 0:
@@ -212,8 +212,8 @@ def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int
 
 
 def _widened(sigma: Array, score: float, longer_px: float, cut: bool, trained_box_px: tuple[float, float]) -> Array:
-    """Sigma [6] of (u, v, log Z, rotation), wider by what the score leaves in doubt and by what the network was not
-    taught: cut targets, other sizes."""
+    """Sigma [6] of (u, v, log Z, rotation), enlarged for a low score and for what training did not contain: cut
+    targets, other sizes."""
     origin_px = DOUBT_SIGMA_ORIGIN * longer_px
     doubt = np.array([origin_px, origin_px, DOUBT_SIGMA_LOG_Z, *[DOUBT_SIGMA_ROTATION_RAD] * 3])
     wider = np.hypot(sigma, np.sqrt(1.0 - score) * doubt)
@@ -226,7 +226,7 @@ def _widened(sigma: Array, score: float, longer_px: float, cut: bool, trained_bo
 
 
 def _excess(value: float, trained: tuple[float, float]) -> float:
-    """Factor by which a depth or a size lies outside what was trained; 1 inside."""
+    """Factor by which a depth or a size lies outside the trained interval; 1 inside."""
     low, high = trained
     return float(max(low / value, value / high, 1.0))
 

@@ -1,4 +1,4 @@
-"""The estimator's two stages: acquire on the whole frame, track in windows of its native pixels."""
+"""The estimator's two stages: acquire on the downscaled whole frame, track in windows of its native pixels."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from edge.estimator.model import Model, Peaks
 from edge.estimator.window import cut, fit_frame, pixel_aspect, window_around
 from edge.types import Array, Estimate, Frame
 
-WORTH_A_LOOK = 0.1  # where the whole frame has a target less probably, no window is spent on it
-FAINTEST = 0.02  # the least that a window says of a place that the whole frame has named
-# So many places and targets are looked at in one frame, of however few there is room for: the likeliest place may show
-# none, frame after frame.
+WORTH_A_LOOK = 0.1  # a place of the whole frame with a lower probability is not examined in a window
+FAINTEST = 0.02  # lowest score of a window at a place of the whole frame, also if it detects nothing
+# Places and targets examined in one frame, even if there is room for fewer targets: the likeliest place may turn out to
+# be false in frame after frame.
 PLACES_MOST = 4
-LOOKS_MOST = 3  # in larger windows each, until no window's edge cuts the target
+LOOKS_MOST = 3  # evaluations of one target, each in a larger window, until no window's edge cuts it
 
 
 class Estimator:
-    """Poses of the targets in single frames; between them it remembers only whether the last windows were looked at
-    mirrored, and counts of what it refused."""
+    """Poses of the targets in single frames. Between frames it keeps only whether the last windows were evaluated
+    mirrored, and the counts of rejections."""
 
     def __init__(self, model: Model, max_targets: int = 4) -> None:
         self.model = model
@@ -38,7 +38,7 @@ class Estimator:
         return self.model.contract.track_size_wh is not None
 
     def warm_up(self, frame: Frame) -> None:
-        """Go through both stages with an empty frame of the camera's size, so that the first real one is fast."""
+        """Run both stages on `frame`, an empty one of the camera's size, so that the first real frame is fast."""
         width, height = frame.image_bgr.shape[1], frame.image_bgr.shape[0]
         self.acquire(frame)
         box = np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])
@@ -49,11 +49,11 @@ class Estimator:
         self.refused.clear()
 
     def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), thrice: bool = True) -> list[Estimate]:
-        """Targets anywhere in the frame that lie on none of `known_boxes` (box_xyxy_px), best first.
+        """Targets anywhere in the frame that overlap none of `known_boxes` (box_xyxy_px), best first.
 
-        Each is looked at in a track window of the same frame, which lies as the whole frame has the target: coarsely;
-        if `thrice`, twice more in a window that lies as the first has it, plain and mirrored. What the windows do not
-        show, or all together do not confirm, is no target.
+        Each is evaluated in a track window of the same frame, placed by the coarse detection in the whole frame; if
+        `thrice`, twice more in a window placed by the first result, plain and mirrored. A detection that the windows do
+        not show, or do not confirm together, is dropped.
         """
         room = max(self._max_targets - len(known_boxes), 0)
         if not self.has_track_stage:
@@ -79,7 +79,7 @@ class Estimator:
         return distinct(sorted(found, key=lambda estimate: -estimate.score), known_boxes)[:room]
 
     def _together(self, seen: tuple[Estimate, Estimate], *finer: Estimate | None) -> Estimate | None:
-        """What a place of the whole frame, the first look at it and two finer ones say; None: that there is nothing."""
+        """Combine a place of the whole frame, its first window and two finer ones; None: no target."""
         place, first = seen
         looks = [look for look in finer if look is not None and of_one_target(look, first)]
         if not looks or not self.confirms(place, [first, *looks], missed=len(finer) - len(looks)):
@@ -87,15 +87,15 @@ class Estimator:
         return of_looks(looks, [first])
 
     def confirms(self, place: Estimate, looks: Sequence[Estimate], missed: int = 0) -> bool:
-        """Whether windows show a target where the whole frame, this one or one before, has a place; `missed`: how many
-        windows do not."""
+        """Whether windows confirm a place proposed by the whole frame, this one or an earlier one; `missed`: number of
+        windows without a detection."""
         scores = [*(look.score for look in looks), *[FAINTEST] * missed]
         return confirmed(place.score, scores) >= self.model.contract.acquire_score_min
 
     def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
-        """Places that are worth a look, as far as the whole frame alone tells; refusals are added to `refused`.
+        """Places worth examining in a window, from the whole frame alone; rejections are counted in `refused`.
 
-        It touches nothing of the estimator's own, so another thread than the loop's may call it.
+        Changes no state of the estimator, so it may be called from a thread other than the loop's.
         """
         return self._whole(frame, known_boxes, self._worth_a_look, self.model.infer, refused)
 
@@ -123,8 +123,8 @@ class Estimator:
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows.
 
-        Every other frame is looked at mirrored: what the network gets wrong of one it gets wrong otherwise of the next.
-        `twice`, if any: which boxes are looked at both ways at once.
+        Every other frame is evaluated mirrored, because the network's errors on an image and on its mirror image
+        differ. `twice`, if given: which boxes are evaluated both ways in this frame.
         """
         self._mirror = not self._mirror
         again = [i for i, both in enumerate(twice) if both]
@@ -140,7 +140,7 @@ class Estimator:
     def _look_both_ways(
         self, frame: Frame, boxes_xyxy_px: Sequence[Array], score_min: float, looks_left: int = LOOKS_MOST
     ) -> tuple[list[Estimate | None], list[Estimate | None]]:
-        """What plain windows show and what mirrored ones do; one inference for all."""
+        """The results of the plain windows and those of the mirrored ones; one inference for all."""
         count = len(boxes_xyxy_px)
         mirrors = [False] * count + [True] * count
         found = self._look(frame, [*boxes_xyxy_px, *boxes_xyxy_px], score_min, mirrors, looks_left)
@@ -154,9 +154,9 @@ class Estimator:
         mirrors: Sequence[bool] = (),
         looks_left: int = LOOKS_MOST,
     ) -> list[Estimate | None]:
-        """For each box the target in the window around it; `mirrors`, if any: which windows are looked at mirrored.
+        """For each box the target in the window around it; `mirrors`, if given: which windows are evaluated mirrored.
 
-        What a window's edge cuts is looked at again through a larger one, and is there or is not.
+        A target cut by a window's edge is evaluated again in a larger window; only that result counts, even if None.
         """
         contract = self.model.contract
         if contract.track_size_wh is None:
@@ -192,7 +192,7 @@ class Estimator:
 
 
 def _of_either(one: Estimate | None, other: Estimate | None) -> Estimate | None:
-    """What two looks at one place say: both together if they show one aircraft, else the surer."""
+    """The result of two evaluations of one place: combined if they show one aircraft, else the one of higher score."""
     looks = sorted(filter(None, (one, other)), key=lambda look: -look.score)
     if not looks:
         return None
@@ -200,6 +200,6 @@ def _of_either(one: Estimate | None, other: Estimate | None) -> Estimate | None:
 
 
 def _each_once(found: Sequence[Estimate | None]) -> list[Estimate | None]:
-    """Two windows may see the same aircraft; the stronger sight of it counts."""
+    """Where two windows see the same aircraft, keep only the detection of higher score; the others become None."""
     kept = {id(e) for e in distinct(sorted(filter(None, found), key=lambda e: -e.score))}
     return [estimate if id(estimate) in kept else None for estimate in found]

@@ -1,4 +1,4 @@
-"""A lens that bends rays: from the frame's pixels to those of the pinhole camera of the same K, and back. Pure.
+"""Lens distortion: from the frame's pixels to those of an undistorted (pinhole) camera of the same K, and back. Pure.
 
 The model is OpenCV's and ROS's plumb bob: k1 k2 p1 p2 [k3 [k4 k5 k6]].
 """
@@ -15,24 +15,24 @@ from numpy.typing import ArrayLike
 
 from edge.types import Array
 
-# Beyond this tangent (76 degrees off the axis) no pinhole camera is asked for a picture.
+# Tangent of the largest angle off the axis that is undistorted (76 degrees).
 RADIUS_MAX = 4.0
-# How far, in sides of the frame, the pinhole's picture may reach beyond the frame's own pixels.
+# How far the pinhole image may extend beyond the frame's pixels, in sides of the frame.
 EXTENT_EXCESS = 0.5
-RETURNED_MAX_PX = 0.5  # a pixel that comes back farther from where it was has no ray of its own
+RETURNED_MAX_PX = 0.5  # a pixel off by more after undistorting and distorting again has no ray of its own
 _EXACT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-_GRID_POINTS = 65  # a side; the border alone would not do: a lens may fold inside the frame
+_GRID_POINTS = 65  # per side; the border alone is not enough: a lens model may fold inside the frame
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """K [3, 3] (pixel centres at integers) and the distortion that `pinhole` pixels lack and `frame` pixels have."""
+    """K [3, 3] (pixel centres at integers) and the distortion that frame pixels have and pinhole pixels lack."""
 
     K: Array
     distortion: tuple[float, ...]  # k1 k2 p1 p2 [k3 [k4 k5 k6]]
 
     def to_pinhole(self, points_px: ArrayLike) -> Array:
-        """[..., 2] frame pixels to pinhole pixels; of use inside the frame, where the lens can be inverted."""
+        """[..., 2] frame pixels to pinhole pixels; valid inside the frame where the distortion can be inverted."""
         points = np.asarray(points_px, dtype=np.float64)
         straight = cv2.undistortPoints(
             points.reshape(-1, 1, 2), self.K, np.array(self.distortion), P=self.K, criteria=_EXACT
@@ -53,32 +53,32 @@ class Lens:
         return np.asarray(homogeneous @ np.linalg.inv(self.K).T)
 
     def box_to_pinhole(self, box_xyxy_px: ArrayLike) -> Array:
-        """Box [..., 4] on the frame to the box on the pinhole's picture that its sides' middles bound."""
+        """Box [..., 4] on the frame to the box on the pinhole image through the midpoints of its sides."""
         return _through(self.to_pinhole, box_xyxy_px)
 
     def box_to_frame(self, box_xyxy_px: ArrayLike) -> Array:
-        """Box [..., 4] on the pinhole's picture to the box on the frame that its sides' middles bound."""
+        """Box [..., 4] on the pinhole image to the box on the frame through the midpoints of its sides."""
         return _through(self.to_frame, box_xyxy_px)
 
     def shows(self, points_px: ArrayLike) -> Array:
-        """Whether each of [..., 2] frame pixels is where the lens bends one ray and no other."""
+        """Whether each of [..., 2] frame pixels is the image of exactly one ray."""
         straight = self.to_pinhole(points_px)
         radius = np.linalg.norm(self.rays(straight)[..., :2], axis=-1)
         returned = np.abs(self.to_frame(straight) - np.asarray(points_px)).max(axis=-1)
         return np.asarray((radius < self.radius_max) & (returned < RETURNED_MAX_PX))  # NaN compares false
 
     def extent_xyxy_px(self, frame_wh: tuple[int, int]) -> Array:
-        """The box [4] of pinhole pixels that holds all of the frame that the lens lets through, within bounds."""
+        """The box [4] of pinhole pixels around all valid pixels of the frame, limited by EXTENT_EXCESS."""
         return _extent(self.K.tobytes(), self.distortion, frame_wh).copy()
 
     @property
     def radius_max(self) -> float:
-        """Tangent of the angle off the axis up to which the lens maps rays one to one."""
+        """Tangent of the angle off the axis up to which the distortion model is one to one."""
         return _radius_max(self.distortion)
 
 
 def lens_of(K: ArrayLike, distortion: tuple[float, ...]) -> Lens | None:
-    """The lens, or None where there is nothing to bend."""
+    """The lens, or None without distortion."""
     return Lens(np.asarray(K, dtype=np.float64), distortion) if any(distortion) else None
 
 
@@ -92,7 +92,7 @@ def _through(convert: Callable[[Array], Array], box_xyxy_px: ArrayLike) -> Array
 
 @lru_cache(maxsize=16)
 def _radius_max(distortion: tuple[float, ...]) -> float:
-    """Where the radial part stops growing: beyond, the polynomial folds the picture over itself."""
+    """Where the radial part stops growing: beyond it the polynomial folds the image over itself."""
     k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * (8 - len(distortion)))
     r = np.linspace(0.0, RADIUS_MAX, 4001)
     r2 = r * r

@@ -1,7 +1,7 @@
-"""Looks at one target in one frame, plain or mirrored, and what several of them say together. Pure.
+"""Evaluations of one target in one frame ("looks"), plain or mirrored, and how several are combined. Pure.
 
-An aircraft mirrored left to right is an aircraft still, its port side for its starboard side, and what the network gets
-wrong of a picture it gets wrong otherwise of the mirrored one: the two together are better than either.
+An aircraft mirrored left to right is still an aircraft, with port and starboard swapped, and the network's errors on an
+image and on its mirror image differ: the two combined are better than either.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from edge.estimator.model import Peaks
 from edge.types import Array, Estimate
 from msgs.geometry import rotation_angle, so3_log
 
-# cam x and target y turn round; the two together make a rotation of a rotation.
+# Mirroring negates cam x and target y; applied from both sides they keep a rotation a rotation.
 MIRROR_CAM, MIRROR_TARGET = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
-# Rotations nearer than this are one answer, of which there is a mean; the others are another.
+# Rotations nearer to each other than this agree and are averaged; others are a different answer.
 AGREEING_RAD = np.radians(40.0)
-# Farther than this is no worse: a nose taken for a tail.
+# A larger distance counts no more than this: nose and tail confused.
 DISAGREEING_RAD = np.radians(60.0)
 
-# No one look is surer than this of a target, nor of there being none.
+# Limits of a single evaluation's probability of a target.
 SUREST_NO, SUREST_YES = 0.01, 0.995
 
 
 def mirrored(images_bgr: NDArray[np.uint8], K: Array, turned: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], Array]:
-    """Images [N, H, W, 3], those that are `turned` [N] with left for right, and the K [N, 3, 3] of these pixels."""
+    """Images [N, H, W, 3], those in `turned` [N] mirrored left to right, and the K [N, 3, 3] of these pixels."""
     images_bgr, K = images_bgr.copy(), K.copy()
     for i in np.flatnonzero(turned):
         images_bgr[i] = cv2.flip(images_bgr[i], 1)
@@ -40,8 +40,8 @@ def mirrored(images_bgr: NDArray[np.uint8], K: Array, turned: NDArray[np.bool_])
 
 
 def unmirrored(peaks: Peaks, width_px: int, turned: NDArray[np.bool_]) -> Peaks:
-    """What the network says of images of which some are `turned` [N], for the images as they were; doing it twice gives
-    the first back."""
+    """The network's outputs for images of which some are mirrored (`turned` [N]), converted to the original images. It
+    is its own inverse."""
     last_px = np.array([width_px - 1, 0], dtype=np.float32)
     turn = np.array([-1.0, 1.0], dtype=np.float32)
     at_peaks = turned[:, None, None]
@@ -59,10 +59,10 @@ def unmirrored(peaks: Peaks, width_px: int, turned: NDArray[np.bool_]) -> Peaks:
 
 
 def confirmed(place_score: float, look_scores: Sequence[float]) -> float:
-    """Probability of a target where the whole frame has one with `place_score` and windows with `look_scores`.
+    """Probability of a target that the whole frame shows with `place_score` and windows show with `look_scores`.
 
-    The odds multiply: the frame's, made small, and its native pixels are taken for two witnesses. The windows, of which
-    there is at least one, show the same pixels and are one witness, their mean.
+    The odds are multiplied: the downscaled frame and the native pixels are treated as independent evidence. The
+    windows, at least one, show the same pixels and count once, with their mean log-odds.
     """
     place, *looks = np.clip([place_score, *look_scores], SUREST_NO, SUREST_YES)
     log_odds = np.log(place / (1.0 - place)) + np.mean([np.log(look / (1.0 - look)) for look in looks])
@@ -70,16 +70,16 @@ def confirmed(place_score: float, look_scores: Sequence[float]) -> float:
 
 
 def of_one_target(look: Estimate, first: Estimate) -> bool:
-    """Whether a look lies where the first one does, and is not of another aircraft in the same window."""
+    """Whether two evaluations show the same target, not two aircraft in the same window."""
     return lies_on(look.box_xyxy_px, [first.box_xyxy_px])
 
 
 def of_looks(looks: Sequence[Estimate], coarser: Sequence[Estimate] = ()) -> Estimate:
-    """One estimate of one target seen in several windows of one frame.
+    """One estimate of one target evaluated in several windows of one frame.
 
-    Box, direction and range are means over `looks`; so is the rotation over all that agree with the most believed one,
-    of those through `coarser` windows too. All are of the same pixels: the covariance is no smaller than their mean,
-    and larger by how far they lie apart.
+    Box, direction and range (geometric mean) are means over `looks`. The rotation is the mean of those that agree with
+    the most plausible one, those of `coarser` windows included. As all evaluations share the same pixels, the
+    covariance is not reduced: it is the mean of theirs plus the scatter between them.
     """
     if len(looks) == 1 and not coarser:
         return looks[0]
@@ -106,9 +106,9 @@ def of_looks(looks: Sequence[Estimate], coarser: Sequence[Estimate] = ()) -> Est
 
 
 def _rotation_of(looks: Sequence[Estimate]) -> tuple[Array, Array]:
-    """Mean R_cam_target [3, 3] of those around the one that the others, each by its sureness, lie nearest to.
+    """Mean R_cam_target [3, 3] of the rotations that agree with the (weighted) medoid, and its covariance [3, 3].
 
-    And its covariance [3, 3]: theirs, and how far all lie from it.
+    The covariance is the weighted mean of theirs plus the scatter of all rotations about the mean.
     """
     R = np.stack([look.R_cam_target for look in looks])
     covariances = np.stack([look.covariance[3:, 3:] for look in looks])

@@ -1,4 +1,4 @@
-"""The network: an ONNX file with its contract inside, refused with a sentence when it is not what the daemon flies."""
+"""The network: an ONNX file with the contract in its metadata; any deviation from it is rejected with a clear error."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
     "sigma": (6,),
 }
 SIZE_STEP_PX = 32
-FREE_SIDES = ("W", "H")  # what the graph calls the sides of its input
+FREE_SIDES = ("W", "H")  # names of the graph's free input dimensions
 RUNS_REMEMBERED = 16
 _LOG_FATAL = 4
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """What the network says of N images, M peaks each, in the images' own pixels (see msgs.contract)."""
+    """The network's outputs for N images, M peaks each, in the images' own pixels (see msgs.contract)."""
 
     score: NDArray[np.float32]  # [N, M]
     center_px: NDArray[np.float32]  # [N, M, 2]
@@ -53,9 +53,9 @@ class Peaks:
 
 
 class Model:
-    """A loaded file: a session that takes any size, and others for one size each.
+    """A loaded file: one session for any input size, and others for one fixed size each.
 
-    `run` belongs to the loop's thread and is timed; `infer` may be called from any.
+    `run` is for the loop's thread only and is timed; `infer` may be called from any thread.
     """
 
     def __init__(
@@ -74,8 +74,8 @@ class Model:
         self.contract = contract
         self.path = path
         self.sha256 = sha256
-        self.provider = provider  # what it runs on
-        self.fallback_reason = fallback_reason  # a sentence; None: that is what was asked for
+        self.provider = provider  # the one it really runs on
+        self.fallback_reason = fallback_reason  # a sentence; None: runs on the requested provider
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
@@ -85,7 +85,7 @@ class Model:
         return peaks
 
     def infer(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
-        """The same, untimed."""
+        """As `run`, untimed."""
         feeds = {"image": images_bgr, "K": K.astype(np.float32)}
         session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
         return Peaks(*session.run(list(OUTPUT_NAMES), feeds))
@@ -97,9 +97,9 @@ class Model:
         return taken
 
     def warm_up(self) -> None:
-        """One inference at each size, and one of two windows at once, as soon as there are two targets.
+        """One inference at each size, and one of two windows in a batch, as there will be with two targets.
 
-        Raises InputError if the graph does not run or its outputs' shapes are wrong.
+        Raises InputError if the graph does not run or its outputs have wrong shapes.
         """
         self._try(1, self.contract.acquire_size_wh)
         if self.contract.track_size_wh is not None:
@@ -107,13 +107,13 @@ class Model:
                 self._try(count, self.contract.track_size_wh)
 
     def _try(self, count: int, size_wh: tuple[int, int]) -> None:
-        """Run `count` black pictures. Raises InputError."""
+        """Run a batch of `count` black images. Raises InputError."""
         width, height = size_wh
         images = np.zeros((count, height, width, 3), dtype=np.uint8)
         K = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
         try:
             peaks = self.run(images, np.stack([K] * count))
-        except Exception as error:  # ONNX Runtime's errors have no common base of their own
+        except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
             pictures = "" if count == 1 else f" with {count} pictures at once"
             reason = " ".join(str(error).split())
             raise InputError(f"model {self.path} does not run at {width}x{height}{pictures}: {reason}") from error
@@ -124,10 +124,9 @@ class Model:
 
 
 def load_model(path: Path, threads: int, spinning: bool = False, provider: Provider = "cpu") -> Model:
-    """Open an ONNX file and check it against the contract. Raises InputError: which, and what is wrong.
+    """Open an ONNX file and check it against the contract. Raises InputError with the file and what is wrong.
 
-    A `provider` that this machine does not have is no error: the model then runs on the CPU and says why in
-    `fallback_reason`.
+    An unavailable `provider` is not an error: the model then runs on the CPU, with the reason in `fallback_reason`.
     """
     try:
         content = path.read_bytes()
@@ -135,16 +134,16 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
         raise InputError(f"model {path} cannot be read: {error.strerror}") from error
     chosen = choose_provider(provider, ort.get_available_providers())
     with ThreadPoolExecutor(1, initializer=yield_to_the_loop) as opener:
-        # A session's threads have the priority of the thread that opens it: a search of the whole frame makes no pose
-        # late that a window of the same moment gives.
+        # A session's threads inherit the priority of the thread that opens it, here a low one: a search of the whole
+        # frame then does not delay the track windows of the same time.
         session = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
     chosen = chosen.confirmed(session.get_providers())
     contract = _contract(session.get_modelmeta().custom_metadata_map, path)
     _check_graph(session, contract, path)
     fixed = {}
     if contract.track_size_wh is not None:
-        # Where the size is known the arithmetic of shapes is done once, here. The whole frame's share of it is too
-        # small to be worth the memory.
+        # With fixed dimensions, shapes are computed once, here. For the whole frame the gain is too small to be worth
+        # the memory of another session.
         options = session_options(threads, spinning)
         for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
             options.add_free_dimension_override_by_name(name, side)
@@ -154,7 +153,7 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
 
 
 def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
-    """One inference at a time on so many threads, which sleep between inferences unless `spinning`."""
+    """One inference at a time on `threads` threads, which sleep between inferences unless `spinning`."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -167,7 +166,7 @@ def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
 def _open(content: bytes, path: Path, options: ort.SessionOptions, chosen: ChosenProvider) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(content, options, providers=list(chosen.names))
-    except Exception as error:  # ONNX Runtime's errors have no common base of their own
+    except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"model {path} is not a loadable ONNX file: {reason}") from error
 

@@ -1,4 +1,4 @@
-"""Which part of the machine the network runs on: ONNX Runtime's execution providers, and the way back to the CPU."""
+"""What hardware the network runs on: ONNX Runtime's execution providers, with the CPU as fallback."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 
-# In the order that ONNX Runtime asks them: what one cannot run goes to the next.
+# In ONNX Runtime's order of preference: nodes that one cannot run are assigned to the next.
 NAMES: dict[Provider, tuple[str, ...]] = {
     "cpu": ("CPUExecutionProvider",),
     "cuda": ("CUDAExecutionProvider", "CPUExecutionProvider"),
@@ -25,14 +25,14 @@ PACKAGES: dict[Provider, str] = {
 
 @dataclass(frozen=True)
 class ChosenProvider:
-    """What a session is asked to run on."""
+    """The execution providers to request for a session."""
 
     provider: Provider
     names: tuple[str, ...]  # as ONNX Runtime calls them
     fallback_reason: str | None = None
 
     def confirmed(self, running: Sequence[str]) -> ChosenProvider:
-        """As the session says it runs: a provider that is built in may still lack its driver or libraries."""
+        """Corrected by what the session really runs on: a built-in provider may still lack its driver or libraries."""
         if self.names[0] in running:
             return self
         reason = (
@@ -44,7 +44,7 @@ class ChosenProvider:
 
 
 def choose_provider(wanted: Provider, available: Sequence[str]) -> ChosenProvider:
-    """`wanted` where ONNX Runtime was built with it, else the CPU with the reason. Pure."""
+    """`wanted` if ONNX Runtime was built with it, else the CPU with the reason. Pure."""
     first = NAMES[wanted][0]
     if first in available:
         return ChosenProvider(wanted, tuple(name for name in NAMES[wanted] if name in available))

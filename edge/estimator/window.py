@@ -1,7 +1,7 @@
-"""Between the frame's pixels and the network's: whole frames fitted, windows cut, K following exactly. Pure.
+"""Between the frame's pixels and the network's: fits whole frames, cuts windows, transforms K exactly. Pure.
 
-The network always sees a pinhole camera of square pixels. A lens's distortion is taken out of the pixels that it is
-shown and of no others, and put back into the boxes it finds.
+The network always sees a pinhole camera of square pixels. Only the pixels it is given are undistorted; the boxes it
+finds are distorted back to the frame.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from edge.types import Array
 
 Image = NDArray[np.uint8]
 
-# Pixels whose sides differ by less are as good as square: training has such, and a calibration is no more exact.
+# Pixels whose sides differ by less count as square: training contains such, and calibrations are no more exact.
 SQUARE_WITHIN = 0.03
-ASPECT_MOST = 4.0  # no camera's pixels are longer; without a bound a slip in fx or fy would ask for any memory
+ASPECT_MOST = 4.0  # no camera's pixels are longer; unbounded, a mistake in fx or fy could demand any amount of memory
 
-_GRID_POINTS = 9  # each way, to find what part of the frame a window sees through a lens
-_MARGIN_PX = 4.0  # and how much that may miss between them, with what bilinear sampling takes beside a point
-_NOWHERE = -1000.0  # a pixel outside every frame
+_GRID_POINTS = 9  # each way, to find the part of the frame that a window covers through a lens
+_MARGIN_PX = 4.0  # around that part: for what lies between the grid points, and for bilinear sampling
+_NOWHERE = -1000.0  # a coordinate outside every frame
 
 
 @dataclass(frozen=True)
 class PixelMap:
     """Pinhole pixels c to network pixels c' = (c + 0.5) * scale - 0.5 + offset, each axis; pixel centres at integers.
 
-    Without a lens the frame's pixels are the pinhole's.
+    Without a lens, frame pixels are pinhole pixels.
     """
 
     scale_xy: tuple[float, float]
@@ -61,7 +61,7 @@ class PixelMap:
         return box if self.lens is None else self.lens.box_to_frame(box)
 
     def intrinsics(self, K: ArrayLike) -> Array:
-        """K [3, 3] of the frame to K of the network's pixels: the same camera, other pixels."""
+        """K [3, 3] of the frame to K of the network's pixels: the same camera with other pixels."""
         (sx, sy), (ox, oy) = self.scale_xy, self.offset_xy
         to_network = np.array([[sx, 0.0, 0.5 * sx - 0.5 + ox], [0.0, sy, 0.5 * sy - 0.5 + oy], [0.0, 0.0, 1.0]])
         return to_network @ np.asarray(K, dtype=np.float64)
@@ -82,10 +82,10 @@ class Window:
 
 
 def pixel_aspect(K: ArrayLike) -> float:
-    """How many times as high as wide a pixel is, by the angles that it spans; 1 where that makes no difference.
+    """Height of a pixel over its width, in angles; exactly 1 if it is within SQUARE_WITHIN of square.
 
-    Of a picture of other pixels, as capture cards make of analogue and of squeezed ones, the network has seen none: it
-    would take the aircraft for a longer or a higher one, and be sure of it.
+    Capture cards deliver non-square pixels for analogue and anamorphic video. The network was trained on none: it would
+    confidently take the aircraft for a longer or a taller one.
     """
     f = np.asarray(K, dtype=np.float64)
     aspect = float(np.clip(f[0, 0] / f[1, 1], 1.0 / ASPECT_MOST, ASPECT_MOST))
@@ -93,7 +93,7 @@ def pixel_aspect(K: ArrayLike) -> float:
 
 
 def whole_frame(frame_wh: tuple[int, int], lens: Lens | None = None) -> Window:
-    """The window that holds all that the frame shows."""
+    """The window that contains the whole frame, undistorted."""
     if lens is None:
         return Window(0, 0, *frame_wh)
     x0, y0, x1, y1 = lens.extent_xyxy_px(frame_wh)
@@ -108,7 +108,7 @@ def fit_frame(
     lens: Lens | None = None,
     aspect: float = 1.0,
 ) -> tuple[Image, PixelMap]:
-    """The whole frame [H, W, 3] on the network's [h, w, 3]: on square pixels and centred on black, or squashed.
+    """The whole frame [H, W, 3] as the network's image [h, w, 3]: letterboxed (square pixels, black bars) or squashed.
 
     `aspect`: of the frame's pixels (pixel_aspect).
     """
@@ -138,12 +138,13 @@ def window_around(
     lens: Lens | None = None,
     aspect: float = 1.0,
 ) -> Window:
-    """The window of the network's aspect around a box on the frame, its shorter side window_scale times the longer.
+    """The window around a box on the frame, with the network's aspect ratio.
 
-    Sides are compared as the pixels' `aspect` (pixel_aspect) has them, so that the network sees square ones.
+    Its shorter side is window_scale times the box's longer one; sides are measured with the pixels' `aspect`
+    (pixel_aspect), so that the network sees square pixels.
 
-    It is moved into the frame where it fits there: real pixels say more than a border. It never outgrows the frame's
-    longer side: the box of a target predicted at arm's length has no bounds, and the memory for its window has.
+    If it fits, it is moved into the frame: real pixels are worth more than a repeated border. It is limited to the
+    frame's longer side: the box of a target predicted very near is unbounded, memory is not.
     """
     seen = whole_frame(image_size_wh, lens)
     box = np.asarray(box_xyxy_px, dtype=np.float64)
@@ -154,7 +155,7 @@ def window_around(
         _halvable(max(round(side * size / shorter / high), 2), size)
         for size, high in zip(size_wh, (1.0, aspect), strict=True)
     )
-    # Outermost pixel centres lie half a pixel inside the box's edges.
+    # The outermost pixel centres lie half a pixel inside the window's edges.
     left = round(0.5 * (x0 + x1) - 0.5 * (width - 1))
     top = round(0.5 * (y0 + y1) - 0.5 * (height - 1))
     return Window(
@@ -163,7 +164,7 @@ def window_around(
 
 
 def cut(image_bgr: Image, window: Window, size_wh: tuple[int, int], lens: Lens | None = None) -> Image:
-    """The window's pixels at the network's size [h, w, 3]; beyond the frame its border is repeated."""
+    """The window's pixels at the network's size [h, w, 3]; beyond the frame its border pixels are repeated."""
     if lens is not None:
         return _straightened(image_bgr, lens, window.pixel_map(size_wh, lens), size_wh, cv2.BORDER_REPLICATE)
     height, width = image_bgr.shape[:2]
@@ -182,9 +183,9 @@ def cut(image_bgr: Image, window: Window, size_wh: tuple[int, int], lens: Lens |
 
 
 def _straightened(image_bgr: Image, lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int], border: int) -> Image:
-    """What the map's pinhole camera sees [h, w, 3]: the part of the frame it looks at, reduced, then bent straight.
+    """The image [h, w, 3] of the map's pinhole camera: the part of the frame it covers, downscaled, then undistorted.
 
-    Reducing first keeps the averages that a remap, which samples points, would skip.
+    Downscaling first averages pixels; a remap alone only samples points.
     """
     grid = np.stack(np.meshgrid(*(np.linspace(-0.5, side - 0.5, _GRID_POINTS) for side in size_wh)), axis=-1)
     pinhole = pixel_map.to_pinhole(grid).reshape(-1, 2)
@@ -207,16 +208,16 @@ def _straightened(image_bgr: Image, lens: Lens, pixel_map: PixelMap, size_wh: tu
 
 
 def _folded(lens: Lens, pixel_map: PixelMap, size_wh: tuple[int, int]) -> NDArray[np.bool_]:
-    """[h, w] of the network's pixels whose rays the lens lets through nowhere."""
+    """[h, w], which of the network's pixels have rays beyond the lens model's valid radius."""
     columns, rows = np.meshgrid(np.arange(size_wh[0]), np.arange(size_wh[1]))
     rays = lens.rays(pixel_map.to_pinhole(np.stack([columns, rows], axis=-1)))
     return np.asarray(np.hypot(rays[..., 0], rays[..., 1]) > lens.radius_max)
 
 
 def _span(coordinates: Array, shrink: float, limit: int) -> tuple[int, int]:
-    """First and one past the last pixel, inside 0 .. limit and never empty, that hold the coordinates.
+    """First and one past the last pixel, inside 0 .. limit and never empty, of an interval with the coordinates.
 
-    So many that they can be halved on the way to `shrink` of them, where the limit has room for that.
+    If the limit allows, its length can be halved without remainder on the way to `shrink` times the length.
     """
     margin_px, step = _MARGIN_PX / shrink, 2 ** int(-np.log2(shrink))
     first = int(np.clip(np.floor(coordinates.min() - margin_px), 0, limit - 1))
@@ -226,18 +227,18 @@ def _span(coordinates: Array, shrink: float, limit: int) -> tuple[int, int]:
 
 
 def _straight(lens: Lens, box_xyxy_px: Array) -> Array:
-    """The box [4] on the pinhole's picture; as it is where the lens cannot be inverted, as in some lenses' corners."""
+    """The box [4] on the pinhole image; unchanged where the lens cannot be inverted, as in some lenses' corners."""
     straight = lens.box_to_pinhole(box_xyxy_px)
     return straight if np.isfinite(straight).all() else box_xyxy_px
 
 
 def _clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:
-    """The box's part on the frame: only there is a lens known. A box beside it becomes the nearest edge."""
+    """The box's part on the frame, as the lens is known only there. A box outside collapses onto the nearest edge."""
     return np.clip(box_xyxy_px, -0.5, np.tile(image_size_wh, 2) - 0.5)
 
 
 def _halvable(length: int, size: int) -> int:
-    """The length, or a little less, that can be halved without remainder as long as it is twice the size: fast."""
+    """The length, or slightly less, such that it can be halved without remainder while it is twice `size` or more."""
     return length - length % 2 ** int(np.log2(max(length / size, 1.0)))
 
 
@@ -248,12 +249,12 @@ def _inside(start: int, length: int, low: int, limit: int) -> int:
 
 
 def _resize(image_bgr: Image, size_wh: tuple[int, int]) -> Image:
-    """Area averages when it shrinks, bilinear when it grows. Halving first is the cheap way to the same averages."""
+    """Area averages for downscaling, bilinear for upscaling. Halving first is a cheaper way to the same averages."""
     pixels = image_bgr
     while pixels.shape[1] >= 2 * size_wh[0] and pixels.shape[0] >= 2 * size_wh[1]:
         half_wh = (pixels.shape[1] // 2, pixels.shape[0] // 2)
         pixels = np.asarray(cv2.resize(pixels, half_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    # First the sides that shrink: where one shrinks and the other grows, OpenCV has no averages.
+    # First the sides that shrink: if one shrinks and the other grows, OpenCV does not average.
     less_wh = (min(size_wh[0], pixels.shape[1]), min(size_wh[1], pixels.shape[0]))
     averaged = cv2.resize(pixels, less_wh, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(averaged, size_wh, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)

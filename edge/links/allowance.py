@@ -1,10 +1,10 @@
-"""How much of what anybody may bring about without end is told. Pure: every time comes in as an argument."""
+"""Rate limit for output that others can trigger without end. Pure: every time is an argument."""
 
 from __future__ import annotations
 
 
 class Allowance:
-    """So many at once, and one more each period."""
+    """A token bucket: a number at once, and one more each period."""
 
     def __init__(self, at_once: int, period_ns: int) -> None:
         self._at_once = at_once
@@ -13,7 +13,7 @@ class Allowance:
         self._counted_ns = 0
 
     def take(self, now_ns: int) -> bool:
-        """Whether one more may go at `now_ns`; it then counts as gone."""
+        """Whether one more is allowed at `now_ns`; it is then counted."""
         more = (now_ns - self._counted_ns) // self._period_ns
         self._counted_ns += more * self._period_ns
         self._left = min(self._left + more, self._at_once)

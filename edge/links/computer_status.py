@@ -1,4 +1,4 @@
-"""How the companion computer is: read from Linux, told as ONBOARD_COMPUTER_STATUS (390)."""
+"""Status of the companion computer: read from Linux, sent as ONBOARD_COMPUTER_STATUS (390)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UNKNOWN_8, UNKNOWN_INT8, UNKNOWN_INT16, UNKNOWN_32 = 2**8 - 1, 2**7 - 1, 2**15 -
 @dataclass(frozen=True)
 class ComputerStatus:
     uptime_ms: int
-    cores_percent: tuple[int, ...]  # busy since the reading before; empty at the first
+    cores_percent: tuple[int, ...]  # busy since the previous reading; empty at the first
     total_percent: int | None
     ram_used_mib: int
     ram_total_mib: int
@@ -24,7 +24,7 @@ class ComputerStatus:
 
 
 class ComputerReader:
-    """Loads are between one reading and the next. Raises OSError or ValueError where Linux tells nothing."""
+    """Loads are averages between two readings. Raises OSError or ValueError if Linux does not provide the data."""
 
     def __init__(self, proc: Path = PROC, thermal: Path = THERMAL) -> None:
         self._proc = proc
@@ -52,12 +52,12 @@ class ComputerReader:
             try:
                 found.append(max(min(round(int(zone.read_text()) / 1000), UNKNOWN_INT8 - 1), -128))
             except (OSError, ValueError):
-                continue  # a zone that is asleep
+                continue  # an inactive thermal zone
         return found
 
 
 def onboard_computer_status(status: ComputerStatus, utc_us: int) -> Any:
-    """ONBOARD_COMPUTER_STATUS (390); what is not read says so by its field's largest value."""
+    """ONBOARD_COMPUTER_STATUS (390); unknown values are marked by the largest value of their field."""
     total = UNKNOWN_8 if status.total_percent is None else status.total_percent
     return dialect.MAVLink_onboard_computer_status_message(
         utc_us,
@@ -85,7 +85,7 @@ def _jiffies(stat: str) -> dict[str, tuple[int, int]]:
     rows = (line.split() for line in stat.splitlines() if line.startswith("cpu"))
     found = {}
     for name, *counts in rows:
-        numbers = [int(count) for count in counts[:8]]  # guests are counted in user time already
+        numbers = [int(count) for count in counts[:8]]  # the rest, guest time, is included in user time
         found[name] = (sum(numbers) - numbers[3] - numbers[4], sum(numbers))
     return found
 

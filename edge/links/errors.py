@@ -1,4 +1,4 @@
-"""What a link says when it cannot do what its settings ask."""
+"""The error of a link that cannot do what its settings ask for."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""COMMAND_LONG and COMMAND_INT addressed to us. Pure: what is asked, the MAV_RESULT it gets, and what follows.
+"""COMMAND_LONG and COMMAND_INT addressed to us. Pure: the request, its MAV_RESULT, and the actions that follow.
 
 | command | |
 |---|---|
-| 2004 CAMERA_TRACK_POINT, 2005 CAMERA_TRACK_RECTANGLE | look for a target there, and tell its box again if it is off |
+| 2004 CAMERA_TRACK_POINT, 2005 CAMERA_TRACK_RECTANGLE | look for a target there; send its box again if switched off |
 | 2010 CAMERA_STOP_TRACKING | drop all targets |
-| 511 SET_MESSAGE_INTERVAL | of what is sent at a rate |
-| 512 REQUEST_MESSAGE | of what is sent |
+| 511 SET_MESSAGE_INTERVAL | for messages sent at a rate |
+| 512 REQUEST_MESSAGE | for messages that are sent |
 
-All else is UNSUPPORTED.
+All other commands are UNSUPPORTED.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from edge.links.mavlink_table import CAMERA_INFORMATION, HEARTBEAT, IMAGE_STATUS
 from edge.requests import Request, StopTracking, TrackBox
 from msgs.mavlink import dialect
 
-POINT_HALF_SHARE = 0.02  # of the picture's width: the box looked into where a point comes without a radius
+POINT_HALF_SHARE = 0.02  # of the image width: half the box to examine around a point without a radius
 RECTANGLE_MIN_SHARE = 1e-3
 REQUESTABLE = frozenset((HEARTBEAT, CAMERA_INFORMATION, *RATE_LIMITS_HZ))
 
@@ -38,9 +38,9 @@ class Answer:
 
 
 def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
-    """Answer a COMMAND_LONG or COMMAND_INT; no parameter of it is trusted.
+    """Answer a COMMAND_LONG or COMMAND_INT; none of its parameters is trusted.
 
-    `enabled` holds the ids that the configuration lets out, `aspect` is the picture's width by its height.
+    `enabled`: message ids that the configuration allows to be sent; `aspect`: image width over height.
     """
     if command.command == dialect.MAV_CMD_REQUEST_MESSAGE:
         return _request_message(command.param1, enabled)
@@ -85,7 +85,7 @@ def _set_interval(number: float, interval_us: float, enabled: Container[int]) ->
 def _track_point(x: float, y: float, radius: float, aspect: float) -> Answer:
     if not (_is_share(x) and _is_share(y)):
         return Answer(dialect.MAV_RESULT_DENIED)
-    # The radius may be left out, as NaN or 0, which would be one pixel.
+    # The radius may be omitted, as NaN or as 0, which would be one pixel.
     half = radius if _is_share(radius) and radius > RECTANGLE_MIN_SHARE else POINT_HALF_SHARE
     return _look_into((x - half, y - half * aspect, x + half, y + half * aspect))
 
@@ -101,7 +101,7 @@ def _track_rectangle(corners: tuple[float, float, float, float]) -> Answer:
 
 def _look_into(box: tuple[float, float, float, float]) -> Answer:
     left, top, right, bottom = (min(max(value, 0.0), 1.0) for value in box)
-    # A ground station switches the box off when it stops tracking, and need not switch it on when it starts again.
+    # Ground stations switch the box message off when they stop tracking, and may not switch it on again.
     box_told = (IMAGE_STATUS, RESUMED_HZ)
     return Answer(dialect.MAV_RESULT_ACCEPTED, request=TrackBox((left, top, right, bottom)), interval=box_told)
 

@@ -1,31 +1,32 @@
-"""Our UTC beside the autopilot's, which mostly has it from GPS (SYSTEM_TIME, 2). Pure.
+"""Compares our UTC with the autopilot's, which usually comes from GPS (SYSTEM_TIME, 2). Pure.
 
-Nothing is put right by it: recordings and logs go by this computer's clock too. But one without a battery and a network
-flies with the time of its last shutdown, and every receiver refuses its poses as too old.
+The difference is only reported, not corrected: recordings and logs use this computer's clock too. But a computer with
+neither a battery-backed clock nor a network runs on the time of its last shutdown, and receivers reject its poses as
+too old.
 """
 
 from __future__ import annotations
 
-SET_FROM_US = 1_577_836_800_000_000  # 2020: before it, an autopilot has not been told the time
+SET_FROM_US = 1_577_836_800_000_000  # 2020: an earlier time means that the autopilot does not know it
 SET_UNTIL_US = 4_102_444_800_000_000  # 2100
 APART_NS = 1_000_000_000
 TOGETHER_NS = 500_000_000
-AGREEING = 3  # stamps in a row that must say so
+AGREEING = 3  # timestamps in a row that must agree
 TOLD_AGAIN_NS = 60_000_000_000
 
 
 class Daytime:
-    """Every time comes in as an argument."""
+    """Every time is an argument."""
 
     def __init__(self) -> None:
-        self.ahead_ns: int | None = None  # ours of the autopilot's; None: it has not told any
+        self.ahead_ns: int | None = None  # our UTC minus the autopilot's; None: it has not sent any
         self._apart = False
         self._in_a_row = 0
         self._untold = False
         self._told_ns: int | None = None
 
     def compare(self, time_unix_us: int, our_utc_ns: int) -> None:
-        """`time_unix_us` of a SYSTEM_TIME, and our UTC at the moment that it was stamped."""
+        """`time_unix_us` of a SYSTEM_TIME, and our UTC at the time of its timestamp."""
         if not SET_FROM_US <= time_unix_us <= SET_UNTIL_US:
             return
         self.ahead_ns = our_utc_ns - time_unix_us * 1000
@@ -36,7 +37,7 @@ class Daytime:
             self._in_a_row = 0
 
     def news(self, now_ns: int) -> list[str]:
-        """A sentence each time that the two turn out to lie apart, at most one a minute (`now_ns` is monotonic)."""
+        """A sentence each time that the two are found to differ, at most one a minute (`now_ns` is monotonic)."""
         untold, self._untold = self._untold, False
         just_told = self._told_ns is not None and now_ns - self._told_ns < TOLD_AGAIN_NS
         if not untold or just_told or self.ahead_ns is None:

@@ -1,10 +1,10 @@
-"""What an endpoint's text says. Pure.
+"""Parses endpoint texts. Pure.
 
 udpin:HOST:PORT     wait on this port for the autopilot
-udpout:HOST:PORT    talk to this address
-tcpin:HOST:PORT     be a TCP server
-tcpout:HOST:PORT    be a TCP client; connected again for ever
-serial:DEVICE:BAUD  a serial port; opened again for ever
+udpout:HOST:PORT    send to this address
+tcpin:HOST:PORT     TCP server
+tcpout:HOST:PORT    TCP client; reconnects indefinitely
+serial:DEVICE:BAUD  serial port; reopened indefinitely
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class SerialEndpoint:
 
 
 def parse_endpoint(text: str) -> NetworkEndpoint | SerialEndpoint:
-    """Raises ValueError with a sentence that names the text and the forms there are."""
+    """Raises ValueError with a sentence that names the text and the valid forms."""
     serial = re.fullmatch(r"serial:(/\S+):(\d{1,8})", text)
     if serial and 0 < int(serial[2]) <= BAUD_MAX:
         return SerialEndpoint(serial[1], int(serial[2]), text)
@@ -48,8 +48,8 @@ def parse_endpoint(text: str) -> NetworkEndpoint | SerialEndpoint:
 
 
 def plain_host(text: str) -> str:
-    """An address as sockets tell senders, but without its zone, and an IPv4 one seen through IPv6 as itself. Raises
-    ValueError for what is no address."""
+    """A sender's address as sockets report it, without the zone; an IPv4-mapped IPv6 address becomes IPv4. Raises
+    ValueError if it is not an address."""
     try:
         address = ipaddress.ip_address(text.partition("%")[0])
     except ValueError:

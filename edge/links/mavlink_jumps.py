@@ -1,7 +1,7 @@
-"""Own attitude and position that jump: what no flight brings about is a reset of the autopilot's filter, what no motor
-does a gimbal that lost its bearings or is another one.
+"""Jumps of own attitude and position. A change that no flight can cause is a reset of the autopilot's estimator; one
+that no motor can cause, a gimbal that lost its reference or was replaced.
 
-Tracks are held in ned. Taken for flight, a jump of the own ship would move every target with it, in the camera's frame.
+Tracks are kept in ned: a jump of the own ship taken for flight would shift every target relative to the camera.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NS_PER_S = 1e9
 
 
 class Jumps:
-    """Compares each sample with the one before; times are monotonic ns of the measurement."""
+    """Compares each sample with the previous one; times are monotonic ns of the measurement."""
 
     def __init__(self) -> None:
         self._attitude: tuple[int, Array, Array] | None = None  # time, R_ned_body, rates
@@ -27,7 +27,7 @@ class Jumps:
         self._gimbal: tuple[int, Array, GimbalFrame] | None = None  # time, R_frame_gimbal, frame
 
     def attitude(self, time_ns: int, R_ned_body: Array, rates_radps: Array) -> bool:
-        """Whether the body [3, 3] cannot have turned here since the last sample at its rates [3]."""
+        """Whether this attitude [3, 3] is not reachable from the last sample with the body rates [3] of both."""
         last, self._attitude = self._attitude, (time_ns, R_ned_body, rates_radps)
         if last is None or not 0 < time_ns - last[0] <= ATTITUDE_GAP_MAX_NS:
             return False
@@ -36,7 +36,7 @@ class Jumps:
         return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.5 * TURNING_RADPS2 * dt_s**2
 
     def gimbal(self, time_ns: int, R_frame_gimbal: Array, frame: GimbalFrame) -> bool:
-        """Whether the gimbal [3, 3] cannot have turned here since the last sample in the same frame."""
+        """Whether this attitude of the gimbal [3, 3] is not reachable from the last sample in the same frame."""
         last, self._gimbal = self._gimbal, (time_ns, R_frame_gimbal, frame)
         if last is None or last[2] is not frame or not 0 < time_ns - last[0] <= ATTITUDE_GAP_MAX_NS:
             return False
@@ -44,7 +44,7 @@ class Jumps:
         return float(rotation_angle(last[1], R_frame_gimbal)) > GIMBAL_MIN_RAD + GIMBAL_RADPS * dt_s
 
     def position(self, time_ns: int, t_ned_m: Array, v_ned_mps: Array) -> bool:
-        """Whether the own ship cannot have flown here [3] since the last sample at its velocities [3]."""
+        """Whether this position [3] is not reachable from the last sample with the velocities [3] of both."""
         last, self._position = self._position, (time_ns, t_ned_m, v_ned_mps)
         if last is None or not 0 < time_ns - last[0] <= POSITION_GAP_MAX_NS:
             return False

@@ -1,4 +1,4 @@
-"""The link to the autopilot: one thread that owns the sockets and ports and drives the station."""
+"""The link to the autopilot: one thread that owns the sockets and serial ports and drives the station."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from msgs.mavlink import dialect
 log = logging.getLogger(__name__)
 
 TICK_S = 0.05
-HEARING_A_TURN_NS = 10_000_000  # for each endpoint, so that a flood cannot keep reports from going out
-HELD_UP_MAX_NS = 100_000_000  # between the look at a report's age and its sending
+HEARING_A_TURN_NS = 10_000_000  # receiving time per endpoint and turn, so that a flood cannot block reports
+HELD_UP_MAX_NS = 100_000_000  # between the check of a report's age and its sending
 EVENTS_WAITING = 64
 STOP_TIMEOUT_S = 5.0
 
 
 def signing_of(settings: MavlinkSettings) -> Signing | None:
-    """As the settings ask. Raises InputError for a key file that does not do."""
+    """Signing as configured; None: unsigned. Raises InputError for an unusable key file."""
     if settings.signing_key is None:
         return None
     return open_signing(settings.signing_key, signing_state_of(settings, settings.signing_key), clock.utc_ns)
 
 
 def signing_state_of(settings: MavlinkSettings, signing_key: Path) -> Path:
-    """Where the last timestamp used with the key is kept."""
+    """The file that stores the last timestamp used with the key."""
     return settings.signing_state or Path(f"{signing_key}.timestamp")
 
 
 class MavlinkLink:
-    """Speaks MAVLink on the endpoints of `settings`. None of the methods but start and stop ever blocks."""
+    """MAVLink on the endpoints of `settings`. No method except start and stop ever blocks."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class MavlinkLink:
         self._signing = signing
         self._station = Station(settings, own_ship, camera_info, requests, signing)
         self._endpoints: list[Endpoint] = []
-        self._counted = self._count()  # replaced whole by the thread, so that nobody waits for it
+        self._counted = self._count()  # replaced as a whole by the thread, so that readers need no lock
         self._mail_lock = threading.Lock()
         self._report: Report | None = None
         self._condition: Condition | None = None
@@ -72,7 +72,7 @@ class MavlinkLink:
         self._wake, self._woken = socket.socketpair()
         self._thread: threading.Thread | None = None
         self._next_tick_ns = 0
-        self._told: tuple[int | None, int | None] | None = None  # system and autopilot that the log knows of
+        self._told: tuple[int | None, int | None] | None = None  # system and autopilot that were logged
 
     def start(self) -> None:
         """Open the endpoints and begin. Raises LinkError if one cannot be opened."""
@@ -83,7 +83,7 @@ class MavlinkLink:
             self._endpoints.append(Endpoint(transport, hosts, station.refused, station.recognition, packer))
         for end in (self._wake, self._woken):
             end.setblocking(False)
-        if not clock.stepped():  # else each step takes its turn here
+        if not clock.stepped():  # in lock-step mode, settle() runs the turns instead
             self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
             self._thread.start()
 
@@ -95,26 +95,26 @@ class MavlinkLink:
         self._poke()
 
     def set_health(self, condition: Condition) -> None:
-        """To be called at every turn of the loop: HEARTBEAT stops when it is not."""
+        """To be called in every iteration of the loop: without it, HEARTBEAT stops."""
         with self._mail_lock:
             self._condition = condition
 
     def event(self, severity: int, text: str, of_state: bool = False) -> None:
-        """Tell the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info). What tells the daemon's state
-        holds until the next that does."""
+        """A message to the operator; `severity` is a MAV_SEVERITY (3 error, 4 warning, 6 info). `of_state`: it reports
+        the daemon's state and is valid until the next one that does."""
         with self._mail_lock:
             self._lost_events += len(self._events) == EVENTS_WAITING
             self._events.append((severity, text, of_state))
         self._poke()
 
     def settle(self) -> None:
-        """In lock-step: a turn on the caller's thread: send what was left, hear what came, let time pass."""
+        """In lock-step mode, one turn on the caller's thread: send what is queued, receive, run what is due."""
         for part in self._turn():
             part()
         self._counted = self._count()
 
     def stop(self) -> None:
-        """Send what waits, end the thread and close the sockets. May be called twice, or without start."""
+        """Send what is queued, end the thread and close the sockets. May be called twice, or without start."""
         self._stopping.set()
         self._poke()
         ended = True
@@ -141,7 +141,7 @@ class MavlinkLink:
         return [port for endpoint in self._endpoints if (port := endpoint.transport.port) is not None]
 
     def _poke(self) -> None:
-        # Full: the thread has been told often enough. Closed: it is gone.
+        # A full socket has wake-ups enough; a closed one means that the thread has ended.
         with contextlib.suppress(OSError):
             self._wake.send(b"\0")
 
@@ -149,15 +149,15 @@ class MavlinkLink:
         stopping = False
         while not stopping:
             waited = self._tried(self._wait)
-            stopping = self._stopping.is_set()  # asked before the turn, which so sends all that was told before
+            stopping = self._stopping.is_set()  # checked before the turn, so that it still sends all that is queued
             done = [self._tried(part) for part in self._turn()]
             if not (waited and all(done)):
-                self._stopping.wait(TICK_S)  # it may fail at every turn
+                self._stopping.wait(TICK_S)  # no busy loop if every turn fails
         self._counted = self._count()
 
     def _tried(self, part: Callable[[], None]) -> bool:
-        """Whether it went well. What did not is lost; else the aircraft would fly on with a link that is silently
-        dead."""
+        """Run a part; whether it succeeded. A failure loses only that part: an exception that ended the thread would
+        silently end the link."""
         try:
             part()
         except Exception:
@@ -167,7 +167,7 @@ class MavlinkLink:
         return True
 
     def _turn(self) -> Iterator[Callable[[], None]]:
-        """The parts of a turn. None depends on another: an endpoint that fails silences neither the rest nor the
+        """The parts of a turn, independent of each other: an endpoint that fails stops neither the others nor the
         heartbeat."""
         yield self._deliver
         for number, endpoint in enumerate(self._endpoints):
@@ -181,8 +181,8 @@ class MavlinkLink:
             self._counted = self._count()
 
     def _wait(self) -> None:
-        """Until something is to be read or told, or the next tick is due."""
-        poll = select.poll()  # a new one each time, as connections come and go; it holds nothing in the kernel
+        """Wait until there is something to receive or send, or the next tick is due."""
+        poll = select.poll()  # a new one each time, as connections come and go; it has no kernel resources
         poll.register(self._woken, select.POLLIN)
         for endpoint in self._endpoints:
             for fileno in endpoint.transport.filenos():
@@ -203,7 +203,7 @@ class MavlinkLink:
         return counted if uncertainty_ns is None else {**counted, "timesync_uncertainty_us": uncertainty_ns // 1000}
 
     def _deliver(self) -> None:
-        """Send what the loop left."""
+        """Send what the loop has queued."""
         with contextlib.suppress(BlockingIOError):
             self._woken.recv(65536)
         with self._mail_lock:
@@ -223,8 +223,7 @@ class MavlinkLink:
             self._send(self._station.event(severity, text, now_ns, of_state))
 
     def _in_time(self, report: Report, now_ns: int) -> Iterator[Letter]:
-        """The report's messages one by one, each while the process has not been held up since the report's age was
-        looked at."""
+        """The report's messages one by one; ends if the process was held up after the report's age was checked."""
         for letter in self._station.report(report, now_ns):
             if clock.monotonic_ns() - now_ns > HELD_UP_MAX_NS:
                 self._station.counters["held_up"] += 1
@@ -266,6 +265,6 @@ class MavlinkLink:
                 self._unpackable(error)
 
     def _unpackable(self, error: ValueError) -> None:
-        """A value that no field holds: this is not sent, the next may be."""
+        """A value does not fit its field: the message is not sent."""
         self._station.counters["unpackable"] += 1
         log.warning("mavlink: not sent: %s", error)

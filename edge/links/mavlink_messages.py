@@ -17,7 +17,7 @@ from msgs.geometry import q_wxyz_from_R
 from msgs.mavlink import dialect
 
 NAN = math.nan
-# Fields whose definition gives NaN the meaning "not known".
+# Fields for which the message definition allows NaN as "not known".
 IMAGE_STATUS_UNKNOWN = ("point_x", "point_y", "radius", "rec_top_x", "rec_top_y", "rec_bottom_x", "rec_bottom_y")
 GEO_STATUS_UNKNOWN = ("h_acc", "v_acc", "vel_n", "vel_e", "vel_d", "vel_acc", "hdg", "hdg_acc")
 CAMERA_INFORMATION_UNKNOWN = ("focal_length", "sensor_size_h", "sensor_size_v")
@@ -35,7 +35,7 @@ SYSTEM_STATUS = {
     Activity.COASTING: dialect.MAV_STATE_ACTIVE,
     Activity.TRACKING: dialect.MAV_STATE_ACTIVE,
 }
-# HEARTBEAT.custom_mode: the activity in the lowest byte, and bits for what is wrong.
+# HEARTBEAT.custom_mode: the activity in the lowest byte, and bits for degraded and fault.
 MODE_ACTIVITY = {activity: number for number, activity in enumerate(Activity)}
 MODE_DEGRADED, MODE_FAULT = 1 << 8, 1 << 9
 TRACKING_STATUS = {
@@ -69,11 +69,11 @@ def target_relative(track: Track, utc_us: int) -> Any:
 
 
 def image_status(report: Report, track: Track | None) -> Any:
-    """CAMERA_TRACKING_IMAGE_STATUS (275): the box as shares of the picture, 0..1; idle without a track. One that lies
-    outside is no rectangle in the picture: the target is predicted, and none is told."""
+    """CAMERA_TRACKING_IMAGE_STATUS (275): the box in shares of the image, 0..1; idle without a track. A predicted box
+    outside the image is sent without a rectangle."""
     if track is None:
         return idle_image_status()
-    # Pixel centres are integers, so the picture's edge lies half a pixel before 0.
+    # Pixel centres are integers, so the image edge lies half a pixel before 0.
     shares = (track.box_xyxy_px.reshape(2, 2) + 0.5) / np.array(report.image_size_wh)
     (left, top), (right, bottom) = np.clip(shares, 0.0, 1.0).tolist()
     if right <= left or bottom <= top:
@@ -100,14 +100,14 @@ def idle_image_status() -> Any:
 
 
 def geo_status(report: Report, track: Track) -> Any | None:
-    """CAMERA_TRACKING_GEO_STATUS (276): the target on the globe; None without own attitude and global position."""
+    """CAMERA_TRACKING_GEO_STATUS (276): the target's global position; None without own attitude and global position."""
     own_ship = report.own_ship
     t_m, R, P = track.t_ned_target_m, track.R_ned_target, track.covariance_ned
     if own_ship is None or own_ship.lat_lon_alt is None or t_m is None or R is None or P is None:
         return None
     lat, lon, alt = lat_lon_alt_from_ned(own_ship.lat_lon_alt, t_m)
     velocity, vel_acc = [NAN] * 3, NAN
-    # Without own position the velocity is relative to the own ship, which this message cannot say.
+    # Without own position the velocity is relative to the own ship, which this message cannot express.
     if own_ship.t_ned_body_m is not None and track.v_ned_target_mps is not None:
         velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
     heading_rad, heading_std_rad = _heading_rad(R, P[6:, 6:]) if rotation_known(track) else (NAN, NAN)
@@ -127,7 +127,7 @@ def geo_status(report: Report, track: Track) -> Any | None:
 
 
 def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_ms: int) -> Any:
-    """CAMERA_INFORMATION (259). The focal length in mm follows from the sensor's width, and is else not known (NaN)."""
+    """CAMERA_INFORMATION (259). The focal length in mm is computed from the sensor's width; NaN if that is unknown."""
     width_px, height_px = camera.image_size_wh
     mm_per_px = NAN if sensor_width_mm is None else sensor_width_mm / width_px
     name = camera.name.encode()[:32]
@@ -149,8 +149,8 @@ def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_m
 
 
 def interval_request(system_id: int, message_id: int, rate_hz: float) -> Any:
-    """COMMAND_LONG (76) that asks the autopilot of a system for a message at a rate."""
-    # PX4 refuses the command unless the parameters it does not know are zero.
+    """COMMAND_LONG (76) that requests a message at a rate from a system's autopilot."""
+    # PX4 rejects the command unless its unused parameters are zero.
     return dialect.MAVLink_command_long_message(
         system_id, AUTOPILOT_COMPONENT, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
         message_id, 1e6 / rate_hz, 0, 0, 0, 0, 0,
@@ -158,17 +158,17 @@ def interval_request(system_id: int, message_id: int, rate_hz: float) -> Any:
 
 
 def statustexts(severity: int, text: str, text_id: int) -> list[Any]:
-    """STATUSTEXT (253), in chunks of 50 bytes if need be; `text_id` 1..65535 ties them together."""
+    """STATUSTEXT (253), in chunks of 50 bytes if necessary; `text_id` 1..65535 links them."""
     chunks = _cut(text.encode())
     shared = text_id if len(chunks) > 1 else 0
     if shared and len(chunks[-1]) == STATUSTEXT_BYTES:
-        chunks.append(b"")  # a null is what tells the last chunk: without one the whole text is waited for in vain
+        chunks.append(b"")  # a null marks the last chunk: without one, receivers keep waiting for the rest
     return [dialect.MAVLink_statustext_message(severity, chunk, shared, i) for i, chunk in enumerate(chunks)]
 
 
 def _cut(data: bytes) -> list[bytes]:
-    """UTF-8 in pieces that a STATUSTEXT holds, at least one. None ends inside a character, as receivers decode each by
-    itself; where a character would, spaces fill the piece, as a null would end the text.
+    """UTF-8 in pieces of a STATUSTEXT's size, at least one. No piece ends inside a character, as receivers decode each
+    separately; it is filled with spaces instead, as a null would end the text.
     """
     pieces = []
     while len(data) > STATUSTEXT_BYTES:
@@ -181,8 +181,8 @@ def _cut(data: bytes) -> list[bytes]:
 
 
 def _heading_rad(R_ned_target: Array, P: Array) -> tuple[float, float]:
-    """Heading 0..2 pi and its standard deviation, by the rotation's covariance P [3, 3] in ned. The steeper the nose
-    points, the more a small tilt turns the heading: NaN where it is not known to UNSURE_ROTATION_RAD."""
+    """Heading 0..2 pi and its standard deviation, from the rotation's covariance P [3, 3] in ned. The steeper the nose
+    points, the more a small tilt turns the heading: NaN if its standard deviation exceeds UNSURE_ROTATION_RAD."""
     north, east, down = R_ned_target[:, 0].tolist()
     heading_rad = math.atan2(east, north)
     slope = down / max(math.hypot(north, east), 1e-9)

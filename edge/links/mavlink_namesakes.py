@@ -1,6 +1,6 @@
-"""Other components of our vehicle that bear one of our ids: a camera or a companion that was there before. Pure.
+"""Detects other components of our vehicle with one of our ids: an existing camera or companion. Pure.
 
-Both would obey the same commands, and take each other's answers.
+Both would execute the same commands and receive each other's answers.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 from edge.links.mavlink_packing import Letter
 from edge.links.mavlink_table import HEARTBEAT
 
-REMEMBERED = 64  # heartbeats of ours: routers may bring them back to us, seconds later
-HEARD_OFTEN = 3  # those that are none of ours
+REMEMBERED = 64  # of our own heartbeats: routers may return them to us, seconds later
+HEARD_OFTEN = 3  # foreign heartbeats until it is reported
 
 
 class Namesakes:
-    """`keys` has of each of our component ids the setting that it is by."""
+    """`keys`: for each of our component ids the configuration key that sets it."""
 
     def __init__(self, keys: Mapping[int, str]) -> None:
         self._keys = dict(keys)
@@ -28,7 +28,7 @@ class Namesakes:
         self._ours += [_content(letter.component_id, letter.message) for letter in heartbeats]
 
     def heard(self, message: Any, vehicle_id: int | None) -> None:
-        """Any message but an autopilot's heartbeat."""
+        """Any message except an autopilot's heartbeat."""
         component_id = message.get_srcComponent()
         ours = message.get_srcSystem() == vehicle_id and component_id in self._keys
         if ours and message.get_msgId() == HEARTBEAT and _content(component_id, message) not in self._ours:

@@ -1,8 +1,8 @@
-"""Messages on their way out, and how each endpoint packs them.
+"""Outgoing messages, and how each endpoint packs them.
 
-A receiver counts losses by the sequence of a component's messages, and refuses signed ones that are not newer than the
-last with the same link id. Endpoints differ in what goes out on them and in how long that takes, so that each has
-sequences and a link id of its own.
+Receivers count losses by the sequence numbers of a component's messages, and reject signed ones that are not newer than
+the last with the same link id. Endpoints send different messages with different delays, so each has its own sequence
+numbers and link id.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LINK_IDS = 256
 
 @dataclass(frozen=True)
 class Letter:
-    """A message and who says it; in the fields `unknown`, NaN means "not known"."""
+    """A message and its sender; in the fields `unknown`, NaN means "not known"."""
 
     message: Any
     system_id: int
@@ -35,7 +35,7 @@ class Packer:
         self._senders: dict[tuple[int, int], MAVLink] = {}
 
     def packed(self, letter: Letter) -> bytes:
-        """The frame for this endpoint; its sequence counts on. Raises ValueError for a value that no field holds."""
+        """The frame for this endpoint, with the next sequence number. Raises ValueError if a value does not fit."""
         sender = (letter.system_id, letter.component_id)
         mav = self._senders.get(sender)
         if mav is None:

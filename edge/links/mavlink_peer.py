@@ -1,9 +1,9 @@
-"""One endpoint and whom it heeds there.
+"""One endpoint and the peer that it accepts ("heeds").
 
-Who may call, on UDP and as a TCP server, is heeded once it shows the heartbeat of an autopilot that we listen to, and
-until it falls silent, or speaks for other aircraft alone; before, nothing is sent to it. Who was dialled is heeded from
-the start. Another's autopilot that was taken for ours, and where messages are signed whoever holds back what ours says
-and plays it later, is heeded until ours itself is heard.
+A peer that connects to us (`udpin`, `tcpin`) is accepted once it sends the heartbeat of an autopilot that may be ours,
+until it is silent or sends messages of other aircraft only; before, nothing is sent to it. A peer that we connect to is
+accepted from the start. If the accepted peer is another aircraft that was taken for ours, or, with signing, one that
+delays our autopilot's messages and replays them later, it is replaced when ours itself is received.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from edge.links.transports.medium import Address, Received, Transport
 
 log = logging.getLogger(__name__)
 
-# What a heartbeat of component 1 looks like, in MAVLink 2 and 1. Of those who are not heeded nothing else is looked at.
+# A heartbeat of component 1 in MAVLink 2 and 1. Of other senders than the accepted peer, only these are examined.
 AUTOPILOT_HEARTBEAT = re.compile(rb"\xfd.[\x00\x01].{3}\x01\x00{3}|\xfe\x09.{2}\x01\x00", re.DOTALL)
 
 
 class Judge(Protocol):
-    """Who knows which autopilot is ours (`Recognition`)."""
+    """Decides which autopilot is ours (`Recognition`)."""
 
     def authentic(self, messages: list[Any]) -> list[Any]:
-        """Leaves out what is not signed as it must."""
+        """The messages without those that are not signed as required."""
 
     def introduces(self, message: Any, now_ns: int) -> bool:
-        """Whether it is a heartbeat for which its sender is heeded where nobody is; another's is remembered."""
+        """Whether it is a heartbeat for which its sender is accepted if there is no peer; another's is remembered."""
 
     def displaces(self, message: Any, now_ns: int) -> bool:
-        """Whether it is one for which its sender is heeded in the place of another."""
+        """Whether it is a heartbeat for which its sender replaces the accepted peer."""
 
     def is_stranger(self, message: Any) -> bool:
-        """Whether it is of another aircraft, for which nobody is heeded."""
+        """Whether it is of another aircraft, for which no peer is accepted."""
 
 
 class Endpoint:
-    """Of messages that come in it lets pass what `judge` believes, and packs for itself what goes out."""
+    """Passes incoming messages that `judge` accepts, and packs outgoing ones."""
 
     def __init__(
         self, transport: Transport, allowed_hosts: list[str], refused: Counter[str], judge: Judge, packer: Packer
@@ -53,7 +53,7 @@ class Endpoint:
         self._judge = judge
         self._packer = packer
         self._receiver = Receiver(refused)
-        # Strangers have a rate limit of their own: their flood must not use up the autopilot's.
+        # Other senders have a separate rate limit: a flood of theirs must not use up the autopilot's.
         self._stranger_receiver = Receiver(refused)
         self._found: Address | None = None
         self._heard_ns = 0
@@ -63,7 +63,7 @@ class Endpoint:
         return self._found if self.transport.finds_peers else self.transport.peer
 
     def believed(self, received: Received, now_ns: int) -> list[Any]:
-        """The messages of received bytes that are sound, authentic and from whom we heed."""
+        """The well-formed, authentic messages of received bytes, if they are from the accepted peer."""
         peer = self.peer
         stranger = received.sender != peer
         if stranger and (reason := self._unheard(received)) is not None:
@@ -71,7 +71,7 @@ class Endpoint:
             return []
         receiver = self._stranger_receiver if stranger else self._receiver
         messages = receiver.take(received.data, received.reader, now_ns)
-        # All are looked at: other aircraft are remembered by it.
+        # No short circuit: displaces() also remembers other aircraft.
         if stranger and peer is not None and not any([self._judge.displaces(message, now_ns) for message in messages]):
             self._refused["address"] += 1
             return []
@@ -82,13 +82,13 @@ class Endpoint:
                 return []
             self._found = received.sender
             log.info("mavlink: %s: autopilot at %s", self.transport.endpoint, received.sender)
-        # Of noise, of what is not signed, or of what other aircraft say, nobody is kept.
+        # Noise, unsigned messages and those of other aircraft do not keep a peer accepted.
         if not all(self._judge.is_stranger(message) for message in messages):
             self._heard_ns = now_ns
         return messages
 
     def _unheard(self, received: Received) -> str | None:
-        """Why a stranger's bytes are not even looked at, or None."""
+        """Why the bytes of a sender other than the accepted peer are not examined, or None."""
         if self.peer is not None and not (self.transport.finds_peers and AUTOPILOT_HEARTBEAT.search(received.data)):
             return "address"
         if self._allowed_hosts and plain_host(received.sender[0]) not in self._allowed_hosts:
@@ -96,13 +96,13 @@ class Endpoint:
         return None
 
     def send(self, letter: Letter) -> bool:
-        """Send to whom we heed, if there is anybody; False if that failed. Raises ValueError for a value that no field
-        holds."""
+        """Send to the accepted peer, if any; False if that failed. Raises ValueError if a value does not fit its
+        field."""
         peer = self.peer
         return peer is None or self.transport.send(self._packer.packed(letter), peer)
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass: connections come and go, and who is silent is heeded no more."""
+        """Maintain connections, and drop a peer that is silent or disconnected."""
         self.transport.tick(now_ns)
         if self._found is None:
             return

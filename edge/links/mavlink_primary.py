@@ -1,4 +1,4 @@
-"""Which target is told where a message has room for one alone: the same one, as long as it lives."""
+"""Selects the target for messages with room for only one: always the same one while it exists."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Sequence
 
 from edge.types import Track, TrackState
 
-WITHHELD_MAX_NS = 2_000_000_000  # as long as a target that nobody sees lives
+WITHHELD_MAX_NS = 2_000_000_000  # as long as a target that is not detected is kept
 
 
 class Primary:
-    """The chosen target, else the one told so far, else one that is seen before one that coasts, of the lowest number.
+    """The selected target, else the one sent so far, else the lowest-numbered, detected ones before coasting ones.
 
-    Who follows it must never be led to another aircraft and back: while it is withheld, none is told.
+    A follower must never be led to another aircraft and back: while the target is withheld, none is sent.
     """
 
     def __init__(self) -> None:
-        self._told: tuple[int, int] | None = None  # number and birth
+        self._told: tuple[int, int] | None = None  # track_id and born_ns of the one sent so far
         self._told_ns = 0
 
     def of(self, alive: Sequence[Track], sendable: Sequence[Track], chosen_id: int | None, now_ns: int) -> Track | None:

@@ -1,4 +1,4 @@
-"""What is asked of the autopilot and what may go out to it, and how often, as the settings have it. Pure."""
+"""Configured rates of the messages that are requested and of those that may be sent. Pure."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COMPUTER_STATUS_HZ = 1.0
 
 
 def wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict[int, float]:
-    """What is asked of the autopilot."""
+    """Rates of the messages that are requested from the autopilot, by id."""
     gimbal = {GIMBAL_ATTITUDE: GIMBAL_HZ} if own_ship.gimballed else {}
     return {
         ATTITUDE_QUATERNION: settings.attitude_rate_hz,
@@ -41,7 +41,7 @@ def wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict[
 
 
 def sent_rates_hz(settings: MavlinkSettings) -> dict[int, float]:
-    """What may go out, and how often."""
+    """Rates of the messages that may be sent, by id."""
     optional = {
         TARGET_RELATIVE: (settings.target_relative, settings.target_relative_rate_hz),
         FOLLOW_TARGET: (settings.follow_target, FOLLOW_TARGET_HZ),

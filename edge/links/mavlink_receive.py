@@ -1,4 +1,4 @@
-"""What is believed of received bytes. Pure but for its counters; everything refused is counted by reason."""
+"""Validation of received bytes. Pure except for its counters; everything rejected is counted by reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DATAGRAM_MAX = 8192  # bytes; longer ones carry no telemetry
 RATE_MAX_HZ = 2000
 MAGIC = (0xFD, 0xFE)  # MAVLink 2 and 1
 QUATERNION_TOLERANCE = 1e-2
-# No aircraft turns, lies or flies beyond these; finite nonsense would pass through the filter into what we tell.
+# Physical limits for aircraft: finite but absurd values would pass through the filter into our output.
 TURN_RATE_MAX_RADPS = 50.0
 ANGLE_MAX_RAD = 2.0 * math.pi
 LOCAL_MAX_M = 1e6
@@ -40,7 +40,7 @@ GIMBAL_COMPONENTS = (
     dialect.MAV_COMP_ID_GIMBAL5,
     dialect.MAV_COMP_ID_GIMBAL6,
 )
-# Types that fly with nobody's camera; an antenna tracker runs an autopilot's firmware as component 1.
+# Types that are not vehicles; an antenna tracker, for example, runs an autopilot's firmware as component 1.
 NOT_VEHICLES = (
     dialect.MAV_TYPE_GCS,
     dialect.MAV_TYPE_ANTENNA_TRACKER,
@@ -50,7 +50,7 @@ NOT_VEHICLES = (
     dialect.MAV_TYPE_CAMERA,
 )
 COMMANDS = (COMMAND_LONG, COMMAND_INT)
-# Fields that may be NaN: not known, and not used.
+# Fields that may be NaN (not known); they are not used.
 OPTIONAL_FIELDS = (
     "repr_offset_q",
     "angular_velocity_x",
@@ -73,10 +73,10 @@ def is_autopilot_heartbeat(message: Any) -> bool:
 
 
 class Receiver:
-    """Checks for one address, which was looked at before.
+    """Checks the messages of one sender, whose address was checked before.
 
-    Each kind of message of each system and component behind it has a rate limit of its own: no flood, not even one in
-    the autopilot's name, may use up that of the autopilot's heartbeat, which would seem to stop.
+    Each message id of each system and component has a separate rate limit: no flood, not even under the autopilot's id,
+    can use up the limit of the autopilot's heartbeat, which would then seem to stop.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -85,7 +85,7 @@ class Receiver:
         self._in_second: Counter[tuple[int, int, int]] = Counter()
 
     def take(self, data: bytes, reader: FrameReader, now_ns: int) -> list[Any]:
-        """Messages that are well-formed, of a kind we read and plausible; who sent them is the next check."""
+        """Messages that are well-formed, of a kind we read and plausible; their sender is checked afterwards."""
         if reader.datagram and data[:1] not in (b"\xfd", b"\xfe"):
             return self._refuse("not_mavlink")
         if reader.datagram and len(data) > DATAGRAM_MAX:
@@ -118,12 +118,12 @@ class Receiver:
 
 
 def malformed(message: Any) -> str | None:
-    """Why a parsed message is no use, whoever sent it; None if it is sound."""
+    """Why a parsed message is unusable, whoever sent it; None if it is valid."""
     message_id = message.get_msgId()
     if message_id not in READ_IDS:
         return "message_id"
     if message_id in COMMANDS:
-        return None  # NaN stands for "not given" there; each command looks at what it reads
+        return None  # NaN means "not given" there; each command checks the parameters it reads
     if not _finite(message):
         return "not_finite"
     if message_id in (ATTITUDE_QUATERNION, GIMBAL_ATTITUDE) and not _is_rotation(message):
@@ -166,7 +166,7 @@ def _finite(message: Any) -> bool:
 
 
 def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], bool]) -> str | None:
-    """Why a sound message is not for us: telemetry must come from our vehicle's autopilot, commands go to us."""
+    """Why a valid message is not for us: telemetry must be from our vehicle's autopilot, commands addressed to us."""
     if message.get_msgId() in COMMANDS:
         ours = message.target_system == vehicle_id and our_components(message.target_component)
         return None if ours else "not_for_us"
@@ -177,7 +177,7 @@ def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], 
     if component != AUTOPILOT_COMPONENT and not by_gimbal:
         return "not_our_autopilot"
     if message.get_msgId() == COMMAND_ACK:
-        # To another of the vehicle's components, it answers a question that was not ours; zeros leave it open.
+        # Addressed to another component it answers another's request; zeros mean that the addressee is not given.
         elsewhere = message.target_component != 0 and not our_components(message.target_component)
         return "not_for_us" if message.target_system not in (0, vehicle_id) or elsewhere else None
     return None

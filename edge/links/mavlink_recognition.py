@@ -1,6 +1,6 @@
-"""Whom we believe: whose messages are authentic, which autopilot is ours, and by which link it is heard.
+"""Decides which messages are authentic, which autopilot is ours, and on which link it is received.
 
-Every time comes in as an argument (monotonic ns). Pure but for its counters and what signing saves.
+Every time is an argument (monotonic ns). Pure except for its counters and the state that signing saves.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from edge.links.signing import Signing
 
 
 class Recognition:
-    """Links are numbers, in the order of preference."""
+    """Links are numbered in order of preference."""
 
     def __init__(self, vehicle: Vehicle, system_id: int | None, signing: Signing | None, refused: Counter[str]) -> None:
-        """`system_id` is what the settings name as our own, `signing` None: unsigned; `refused` counts by reason."""
+        """`system_id`: our own as configured, or None; `signing` None: unsigned; `refused`: counts by reason."""
         self.home = Home()
         self._vehicle = vehicle
         self._named = system_id
         self._signing = signing
         self._refused = refused
         self._rivals = Rivals()
-        self._left = Rivals()  # who is heard while our own is not
+        self._left = Rivals()  # autopilots received while our own is silent
         self._changes: list[str] = []
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
-        """Those that carry a valid signature; all of them where nothing is signed."""
+        """The messages with a valid signature; all of them without signing."""
         if self._signing is None:
             return list(messages)
         believed = []
@@ -44,7 +44,7 @@ class Recognition:
         return believed
 
     def introduces(self, message: Any, now_ns: int) -> bool:
-        """Whether an authentic message is the heartbeat of an autopilot that we would listen to. Another aircraft's is
+        """Whether an authentic message is the heartbeat of an autopilot that may be ours. Another aircraft's is
         remembered."""
         if not is_autopilot_heartbeat(message):
             return False
@@ -54,13 +54,13 @@ class Recognition:
         return True
 
     def is_stranger(self, message: Any) -> bool:
-        """Whether a message is of what is known to be another aircraft."""
+        """Whether a message is from a system known to be another aircraft."""
         return self._vehicle.is_stranger(message.get_srcSystem())
 
     def displaces(self, message: Any, now_ns: int) -> bool:
-        """Whether a message from an address that is not heeded is a heartbeat by which it is, and who was is no more:
-        that of the system that was our own before, or, where messages are signed, one whose signature proves that what
-        is heard was held back. Another aircraft's is remembered as such."""
+        """Whether a message from an address other than the accepted peer's is a heartbeat for which it replaces that
+        peer: one of the system that was our own before, or, with signing, one whose signature proves that the peer
+        delays messages. Another aircraft's is remembered as such."""
         if not is_autopilot_heartbeat(message):
             return False
         system = message.get_srcSystem()
@@ -71,16 +71,16 @@ class Recognition:
         return self._vehicle.was_own(system) if self._signing is None else self._signing.outruns(message, now_ns)
 
     def heard(self, message: Any, link: int, now_ns: int) -> None:
-        """An authentic message that came by a link: our autopilot's show where it is."""
+        """An authentic message received on a link; those of our autopilot show which links it is on."""
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._vehicle.system_id, AUTOPILOT_COMPONENT):
             self._vehicle.spoke(now_ns)
             self.home.heard(link, now_ns)
 
     def meet(self, heartbeat: Any, link: int, now_ns: int) -> bool:
-        """An autopilot's authentic heartbeat; whether it is our own's, if need be from now on."""
+        """Process an autopilot's authentic heartbeat; whether it is our own's, possibly from now on."""
         vehicle, system = self._vehicle, heartbeat.get_srcSystem()
         before, back = vehicle.system_id, vehicle.was_own(system)
-        # Not at another link's word: to PX4 goes less than to others.
+        # The kind of autopilot is taken from the home link only: PX4 is sent fewer messages than others.
         at_home = system != before or self.home.may_be(link, now_ns)
         if not vehicle.heartbeat(system, heartbeat.autopilot if at_home else None, now_ns):
             self._heard_other(system, now_ns)
@@ -88,7 +88,7 @@ class Recognition:
         self._rivals.forget(system)
         self._left = Rivals()
         if before not in (None, system):
-            self.home = Home()  # where the last one was heard says nothing of this one
+            self.home = Home()  # the previous autopilot's links say nothing about this one's
             since = f"autopilot {before} is silent; {system}, first heard since, is taken for our own: set system_id"
             again = f"autopilot {system} is heard again; it is our own, and {before} another's: set system_id"
             self._changes.append(again if back else since)
@@ -99,7 +99,7 @@ class Recognition:
         return True
 
     def news(self) -> list[str]:
-        """Sentences, each once: who else could be the own autopilot, and who is now, where the settings do not tell."""
+        """Sentences, each once: other candidates for our own autopilot, and changes of it, if it is not configured."""
         if self._named is not None or self._vehicle.contact is Contact.WAITING:
             return []
         if self._vehicle.contact is Contact.LOST:

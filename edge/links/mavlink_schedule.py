@@ -1,17 +1,17 @@
-"""How often each message may go. Pure: every time comes in as an argument."""
+"""Limits how often each message is sent. Pure: every time is an argument."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 
-RESUMED_HZ = math.inf  # to `set_rate`: the rate that holds, or the default of what is off
-ASKED_NS = 1_000_000_000  # what was asked for once and could not be told for so long is not told later
-EARLY_SHARE = 0.1  # a message may come this share of its interval early: frames jitter
+RESUMED_HZ = math.inf  # to `set_rate`: keep the current rate, or the default if the message is off
+ASKED_NS = 1_000_000_000  # a single request that could not be met for this long is dropped
+EARLY_SHARE = 0.1  # a message may be early by this share of its interval, as frame times jitter
 
 
 class Schedule:
-    """Rates by message id; each may have several instances (targets) with a rhythm of their own."""
+    """Rates by message id; each may have several instances (targets), timed independently."""
 
     def __init__(self, default_hz: Mapping[int, float]) -> None:
         self._default_hz = dict(default_hz)
@@ -24,24 +24,24 @@ class Schedule:
         return set(self._default_hz)
 
     def set_rate(self, message_id: int, hz: float | None) -> None:
-        """0 switches off, None takes the default, RESUMED_HZ does where it is off."""
+        """0 switches the message off, None sets the default, RESUMED_HZ the default if it is off."""
         if hz == RESUMED_HZ:
             hz = self._hz[message_id] or None
         self._hz[message_id] = self._default_hz[message_id] if hz is None else hz
 
     def ask_once(self, message_id: int, now_ns: int) -> None:
-        """Let the next opportunity within ASKED_NS be taken whatever the rate."""
+        """Send at the next opportunity within ASKED_NS, regardless of the rate."""
         self._once[message_id] = now_ns + ASKED_NS
 
     def due(self, message_id: int, instance: int, now_ns: int) -> bool:
-        """Whether to send now; it then counts as sent. False for what is not scheduled at all."""
+        """Whether to send now; it then counts as sent. False for a message that is not scheduled."""
         hz = self._hz.get(message_id, 0.0)
         if now_ns <= self._once.pop(message_id, -1):
             return message_id in self._hz
         if hz == 0.0:
             return False
         interval_ns = round(1e9 / hz)
-        # A rate that was raised since holds from now on; one that holds is due no later than this.
+        # A rate raised meanwhile takes effect now; with an unchanged rate the due time is never later than this.
         latest_ns = now_ns + round((1.0 + EARLY_SHARE) * interval_ns)
         due_ns = min(self._due_ns.get((message_id, instance), now_ns), latest_ns)
         self._due_ns[message_id, instance] = due_ns

@@ -1,4 +1,4 @@
-"""What the last frame had to tell of targets, for who asks for a message once. Pure."""
+"""Targets in the last frame, to answer requests for a single message. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edge.types import Report, Track
 
 @dataclass(frozen=True)
 class Sight:
-    """`tracks` of the report may be sent, `first` is told where there is room for one; `seen_ns` is monotonic."""
+    """`tracks`: those that may be sent; `first`: the one for messages with room for one; `seen_ns`: monotonic."""
 
     report: Report
     tracks: list[Track]
@@ -20,7 +20,7 @@ class Sight:
     seen_ns: int
 
     def tells(self, message_id: int) -> bool:
-        """Whether a message of a target could be made of it."""
+        """Whether a target message with this id can be sent."""
         if message_id == TARGET_RELATIVE:
             return bool(self.tracks)
         if message_id == ADSB_VEHICLE:

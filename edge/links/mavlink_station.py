@@ -1,7 +1,7 @@
-"""Both components we are on MAVLink, onboard computer and camera: messages in, messages out, no socket.
+"""Our two MAVLink components, onboard computer and camera: messages in, messages out, no sockets.
 
-Every time comes in as an argument (monotonic ns). Used by one thread. Links are known by number, in the order of
-preference; telemetry is taken from one of them alone, the home link.
+Every time is an argument (monotonic ns). Used by one thread. Links are numbered in order of preference; telemetry is
+accepted on only one of them, the home link.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, Report, Track
 from msgs.mavlink import dialect
 
-SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, to make ourselves known to a peer that waits for us
+SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, so that a peer that waits for us receives our heartbeat
 HEARTBEAT_NS = 1_000_000_000
-HEALTH_AGE_MAX_NS = 3_000_000_000  # no word from the loop for longer: it is stuck, and no heartbeat may hide that
-FRAMELESS_NS = 1_000_000_000  # no report for longer: nothing is tracked, and who draws the box is told so
+HEALTH_AGE_MAX_NS = 3_000_000_000  # older: the loop is stuck, which no heartbeat may hide
+FRAMELESS_NS = 1_000_000_000  # no report for longer: the image status becomes idle, so that displays clear the box
 TIMESYNC_NS = 200_000_000
 TEXTS_HELD = 4
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
@@ -63,7 +63,7 @@ STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
 
 @dataclass
 class Outgoing:
-    """For every peer, and for the home link alone."""
+    """Messages for all links, and for the home link only."""
 
     everywhere: list[Letter] = field(default_factory=list)
     home: list[Letter] = field(default_factory=list)
@@ -98,7 +98,7 @@ class Station:
         self._health: tuple[Condition, int] | None = None
         self._sight: Sight | None = None
         self._text_id = 0
-        # Until there is a vehicle to say it for: what went wrong, and in which state the daemon is.
+        # Held until the vehicle's id is known: the last warnings, and the daemon's state.
         self._held_texts: deque[tuple[int, str]] = deque(maxlen=TEXTS_HELD)
         self._held_state: tuple[int, str] | None = None
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
@@ -106,11 +106,11 @@ class Station:
 
     @property
     def home(self) -> int | None:
-        """The link that telemetry is asked for and taken from."""
+        """The link on which telemetry is requested and accepted."""
         return self.recognition.home.link
 
     def take(self, messages: Iterable[Any], link: int, now_ns: int) -> list[Letter]:
-        """Take authentic messages from a trusted address of a link; returns replies to it."""
+        """Process authentic messages from a trusted address of a link; returns replies to it."""
         replies: list[Letter] = []
         for message in messages:
             self.recognition.heard(message, link, now_ns)
@@ -125,11 +125,11 @@ class Station:
         return replies
 
     def health(self, condition: Condition, now_ns: int) -> None:
-        """A word from the loop; HEARTBEAT follows it and stops without it."""
+        """The loop's state, to be called regularly; HEARTBEAT reports it and stops without it."""
         self._health = (condition, now_ns)
 
     def tick(self, now_ns: int) -> Outgoing:
-        """Let time pass: heartbeats, own computer, time synchronisation, requests for rates."""
+        """What is due: heartbeats, computer status, time synchronisation, requests for rates."""
         self.vehicle.tick(now_ns)
         out = Outgoing()
         if now_ns >= self._heartbeat_due_ns and (condition := self._condition(now_ns)) is not None:
@@ -155,12 +155,12 @@ class Station:
         return out
 
     def report(self, report: Report, now_ns: int) -> list[Letter]:
-        """What goes out for one frame, as far as each message's rate allows.
+        """Messages for one frame, as far as each message's rate allows.
 
-        Nothing before there is a vehicle. While its autopilot is silent, what is seen in the picture alone: who draws
-        the target's box on another link would else draw the last one for ever.
+        Nothing before the vehicle is known. While its autopilot is silent, only the image status: otherwise a display
+        on another link would keep drawing the last box.
         """
-        # A camera that was not there at the start was known by its calibration alone.
+        # The true size and K: of a camera that was absent at the start, only the calibration was known.
         self._camera = replace(self._camera, image_size_wh=report.image_size_wh, K=report.K)
         if self.vehicle.contact is Contact.WAITING:
             return []
@@ -181,11 +181,11 @@ class Station:
         return out + self._traffic(report, tracks, first, now_ns)
 
     def event(self, severity: int, text: str, now_ns: int, of_state: bool = False) -> list[Letter]:
-        """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. What is wrong goes out always, what is only news
-        (a person who drags a point over the picture makes much of it) as far as a radio carries it.
+        """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. Warnings and errors are always sent; lesser ones
+        (an operator who drags a point over the image causes many) are rate-limited, for the sake of radios.
 
-        Before there is a vehicle to speak for, nothing does. Once there is, the last of what went wrong, and of what
-        tells the daemon's state (`of_state`) the very last, if that is wrong."""
+        Nothing is sent before the vehicle's id is known. Once it is, the last warnings are sent, and of the reports on
+        the daemon's state (`of_state`) the latest, if it is a warning."""
         wrong = severity <= dialect.MAV_SEVERITY_WARNING
         if self.vehicle.system_id is None:
             if of_state:
@@ -205,11 +205,11 @@ class Station:
         return [letter for text in held for letter in self._texts(*text)]
 
     def news(self, now_ns: int) -> list[str]:
-        """Sentences, each once: what a person has to set right."""
+        """Sentences, each once: problems that a person has to fix."""
         return self.recognition.news() + self._telemetry.news(now_ns) + self._namesakes.news()
 
     def withheld(self) -> list[str]:
-        """Sentences: what the settings ask for and this vehicle does not get."""
+        """Sentences: messages that are configured but not sent to this vehicle."""
         settings, found = self._settings, []
         if settings.target_relative and TARGET_RELATIVE not in self._enabled():
             found.append("TARGET_RELATIVE is not sent to PX4; target_relative_to_px4 = true sends it")
@@ -235,7 +235,7 @@ class Station:
         if message.get_msgId() in COMMANDS:
             allowed = self._settings.commanders
             return None if not allowed or message.get_srcSystem() in allowed else "not_a_commander"
-        # Who asks for our clock gets it where it asks; answers to us were asked for at home.
+        # TIMESYNC requests are answered on any link; replies to ours are accepted on the home link only.
         asks_time = message.get_msgId() == TIMESYNC and message.tc1 == 0
         return None if link == self.home or asks_time else "other_link"
 
@@ -244,7 +244,7 @@ class Station:
         self.vehicle.arrived(message_id, now_ns)
         if message_id == TIMESYNC:
             if message.tc1 == 0:
-                # The clock of our stamps: PX4 adds what it learns here to the one of TARGET_RELATIVE.
+                # UTC, the clock of our timestamps: PX4 adds the offset measured here to that of TARGET_RELATIVE.
                 return [self._letter(dialect.MAVLink_timesync_message(self._utc.utc_ns(now_ns), message.ts1))]
             self.counters["timesync_refused"] += not self.timesync.reply(message.tc1, message.ts1, now_ns)
         elif message_id == COMMAND_ACK:
@@ -287,7 +287,7 @@ class Station:
         return out if reply.send_once is None else out + self._once(reply.send_once, now_ns)
 
     def _tells(self, message_id: int, now_ns: int) -> bool:
-        """Whether there is anything now that a message could say."""
+        """Whether there is content for a message now."""
         if message_id in (CAMERA_INFORMATION, IMAGE_STATUS):
             return True
         if message_id == HEARTBEAT:
@@ -298,7 +298,7 @@ class Station:
         return message_id == COMPUTER_STATUS or (seen is not None and seen.tells(message_id))
 
     def _once(self, message_id: int, now_ns: int) -> list[Letter]:
-        """A message at once where nothing else is needed for it; else it goes as soon as it can be told."""
+        """The message at once if nothing else is needed for it; otherwise it is sent as soon as possible."""
         if message_id == CAMERA_INFORMATION:
             boot_ms = now_ns // 1_000_000 % 2**32
             information = words.camera_information(self._camera, self._settings.sensor_width_mm, boot_ms)
@@ -312,15 +312,15 @@ class Station:
         return []
 
     def _condition(self, now_ns: int) -> Condition | None:
-        """As the loop told it; None: it is stuck."""
+        """As the loop reported it; None: it is stuck."""
         return self._health[0] if self._health and now_ns - self._health[1] <= HEALTH_AGE_MAX_NS else None
 
     def _in_sight(self, now_ns: int) -> bool:
-        """Whether frames come."""
+        """Whether frames are arriving."""
         return self._sight is not None and now_ns - self._sight.seen_ns <= FRAMELESS_NS
 
     def _enabled(self) -> set[int]:
-        """Ids that may go out to this autopilot."""
+        """Message ids that may be sent to this autopilot."""
         to_px4 = self.vehicle.autopilot == dialect.MAV_AUTOPILOT_PX4
         withheld = {TARGET_RELATIVE} if to_px4 and not self._settings.target_relative_to_px4 else set()
         return self._schedule.message_ids - withheld - (self._traffic_ids if self._virtual_id_taken else set())

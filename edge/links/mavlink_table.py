@@ -1,4 +1,4 @@
-"""Every message that is sent or read: the table that the link follows and docs/mavlink.md is made from.
+"""All messages that are sent or read: the table that the link uses and docs/mavlink.md is generated from.
 
 python -m edge.links.mavlink_table    # prints the tables as Markdown
 """
@@ -32,7 +32,7 @@ TARGET_RELATIVE = MAVLink_target_relative_message.id
 
 @dataclass(frozen=True)
 class Sent:
-    """A message that goes out. `limits_hz` bounds what SET_MESSAGE_INTERVAL may ask; None: it may not."""
+    """A message that is sent. `limits_hz`: bounds for SET_MESSAGE_INTERVAL; None: its rate cannot be set."""
 
     message_id: int
     name: str

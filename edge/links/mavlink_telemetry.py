@@ -1,4 +1,4 @@
-"""The telemetry of autopilot and gimbal into the own ship, on the monotonic clock. Pure but for that buffer and UTC."""
+"""Telemetry of autopilot and gimbal to the own-ship buffer, on the monotonic clock. Pure except for that and UTC."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from msgs.mavlink import dialect
 
 BOOT_WRAP_MS = 2**32
 SAME_CLOCK_MS = 2000
-# After a jump none of its kind is taken for so long: the tracks must be carried over, in frames that know none.
+# After a jump, data of that kind are ignored for this long, so that frames without them carry the tracks over.
 JUMP_REST_NS = 300_000_000
-FALLBACK_NS = 1_000_000_000  # the better source silent for so long: the other one is taken
-# What leaves a gimbal's own attitude in doubt; standing at an end stop does not.
+FALLBACK_NS = 1_000_000_000  # silence of the better source after which the other one is used
+# Failures that make a gimbal's attitude doubtful; being at an end stop does not.
 GIMBAL_FAILURES = (
     dialect.GIMBAL_DEVICE_ERROR_FLAGS_ENCODER_ERROR
     | dialect.GIMBAL_DEVICE_ERROR_FLAGS_POWER_ERROR
@@ -42,9 +42,9 @@ SERVO_GIMBAL = "PX4 tells what it steers the gimbal's servos by, not where the c
 
 
 def gimbal_frame(flags: int) -> GimbalFrame | None:
-    """What the quaternion of GIMBAL_DEVICE_ATTITUDE_STATUS is told against; None if its flags contradict themselves.
+    """What the quaternion of GIMBAL_DEVICE_ATTITUDE_STATUS is relative to; None if its flags contradict each other.
 
-    64 says earth, 32 the vehicle's heading; where a gimbal sets neither, 16 (yaw lock) says earth.
+    Flag 64 means earth, 32 the vehicle's heading; if neither is set, 16 (yaw lock) means earth.
     """
     earth = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
     heading = flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
@@ -56,26 +56,26 @@ def gimbal_frame(flags: int) -> GimbalFrame | None:
 
 
 def steers_servos(message: Any, autopilot: int | None) -> bool:
-    """Whether a gimbal's attitude is what PX4 steers its servos by. That measures nothing, is told in the body's axes,
-    level or not, and its yaw lock says how it was asked for; of gimbals that measure, PX4 says the frame."""
+    """Whether a gimbal's attitude is PX4's servo command. That is not a measurement, is in body axes, level or not, and
+    its yaw lock flag is that of the request; for gimbals that measure, PX4 sets the frame flags."""
     framed = dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME | dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
     by_px4 = autopilot == dialect.MAV_AUTOPILOT_PX4 and message.get_srcComponent() == AUTOPILOT_COMPONENT
     return by_px4 and not message.flags & framed
 
 
 def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
-    """time_boot_ms without its wrap after 49.7 days, where TIMESYNC (autopilot's ns since boot minus ours) tells how
-    long the autopilot has been up; else as it came."""
+    """time_boot_ms without its wrap after 49.7 days, if TIMESYNC (autopilot's ns since boot minus ours) gives the
+    autopilot's uptime; otherwise unchanged."""
     if offset_ns is None:
         return boot_ms
     up_ms = (now_ns + offset_ns) // 1_000_000
     unwrapped_ms = boot_ms + round((up_ms - boot_ms) / BOOT_WRAP_MS) * BOOT_WRAP_MS
-    # Some peers answer TIMESYNC from another clock than the one in their stamps: it tells nothing of the wrap.
+    # Some peers answer TIMESYNC from a clock other than that of their timestamps: it says nothing about the wrap.
     return unwrapped_ms if unwrapped_ms >= 0 and abs(unwrapped_ms - up_ms) <= SAME_CLOCK_MS else boot_ms
 
 
 class Telemetry:
-    """`gimbal_id`: a component, or 1 to 6 of one that the autopilot speaks for; None: the first heard, until silent."""
+    """`gimbal_id`: a component, or 1 to 6 for one that the autopilot represents; None: the first one, until silent."""
 
     def __init__(
         self, own_ship: OwnShipBuffer, timesync: TimesyncEstimator, utc: UtcClock, gimbal_id: int | None
@@ -90,7 +90,7 @@ class Telemetry:
         self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
 
     def forget(self, now_ns: int) -> None:
-        """What was heard holds no more: the autopilot has started again, or it is another."""
+        """Discard all state: the autopilot has rebooted, or it is another one."""
         self._forget()
         self._positions_from_ns = now_ns + JUMP_REST_NS
 
@@ -101,15 +101,15 @@ class Telemetry:
         self._boot_clock = BootClock(self._timesync)
         self._forget_gimbal_clock()
         self._quaternion_ns: int | None = None
-        self._gimbal: tuple[int, int] | None = None  # its id, heard ns
+        self._gimbal: tuple[int, int] | None = None  # its id, ns of its last message
 
     def news(self, now_ns: int) -> list[str]:
-        """Sentences, each once: what a person has to set right."""
+        """Sentences, each once: problems that a person has to fix."""
         untold, self._servos_told = self._servos_heard and not self._servos_told, self._servos_heard
         return self.daytime.news(now_ns) + ([SERVO_GIMBAL] if untold else [])
 
     def take(self, message: Any, now_ns: int, autopilot: int | None = None) -> str | None:
-        """Take in a message that was found sound, of a MAV_AUTOPILOT or its gimbal; why it was not, or None."""
+        """Process a valid message of a MAV_AUTOPILOT or its gimbal; returns why it was rejected, or None."""
         message_id = message.get_msgId()
         if message_id == GIMBAL_ATTITUDE:
             return self._take_gimbal(message, now_ns, autopilot)
@@ -125,9 +125,9 @@ class Telemetry:
                 rising = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
         elif message_id == LOCAL_POSITION_NED:
             rising = self._add_position(time_ns, message, now_ns)
-        elif message_id == SYSTEM_TIME and not clock.stepped():  # else nothing here tells the day
+        elif message_id == SYSTEM_TIME and not clock.stepped():  # in lock-step mode nothing gives the date
             self.daytime.compare(message.time_unix_usec, self._utc.utc_ns(time_ns))
-        # 0, 0 is how an autopilot without a fix says so.
+        # 0, 0 means that the autopilot has no fix.
         elif message_id == GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
             place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
             v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
@@ -153,7 +153,7 @@ class Telemetry:
         return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
 
     def _take_gimbal(self, message: Any, now_ns: int, autopilot: int | None) -> str | None:
-        # One that an autopilot speaks for has a number from 1 to 6, by which it is told from the others there.
+        # A gimbal that the autopilot represents is identified by a number from 1 to 6.
         component = message.get_srcComponent()
         gimbal_id = message.gimbal_device_id or component if component == AUTOPILOT_COMPONENT else component
         if not self._heeds(gimbal_id, now_ns):
@@ -188,7 +188,7 @@ class Telemetry:
         return uptime_ms(message.time_boot_ms, self._timesync.offset_ns, now_ns) * 1_000_000
 
     def _forget_gimbal_clock(self) -> None:
-        # A gimbal that is a device of its own counts from its own start.
+        # A gimbal that is a separate device has its own boot time.
         self._gimbal_clock, self._gimbal_boot = BootClock(TimesyncEstimator()), RebootDetector()
 
     def _heeds(self, gimbal_id: int, now_ns: int) -> bool:

@@ -1,6 +1,6 @@
 """Targets as traffic: FOLLOW_TARGET and ADSB_VEHICLE. Pure.
 
-Both go out under a system id that is no vehicle's: ArduPilot drops a target that has its own.
+Both are sent under a virtual system id: ArduPilot ignores a target with its own id.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from msgs.mavlink import dialect
 
 CALLSIGN = "UAVPOSE"  # and the target's number: 8 characters at most
 POSITION_KNOWN, VELOCITY_KNOWN, ATTITUDE_KNOWN = 1, 2, 8  # est_capabilities, by the bit numbers of its definition
-VELOCITY_STD_MAX_MPS = 10.0  # 1-sigma, along the worst axis: neither message can tell how sure a velocity is
+VELOCITY_STD_MAX_MPS = 10.0  # 1-sigma, along the worst axis: neither message can express a velocity's uncertainty
 SPEED_MAX_CMPS = 32_767
 NS_PER_MS = 1_000_000
 
 
 def follow_target(report: Report, track: Track) -> Any | None:
-    """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a place on the globe or before
-    the velocity is known: ArduPilot takes the one in the message whatever est_capabilities says.
+    """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a global position or before the
+    velocity is known: ArduPilot uses the velocity in the message regardless of est_capabilities.
 
-    Acceleration and turn rate are not estimated and left 0, as est_capabilities says.
+    Acceleration and turn rate are not estimated and are 0; est_capabilities says so.
     """
     place, velocity = _place(report.own_ship, track), _velocity_mps(report.own_ship, track)
     R, P = track.R_ned_target, track.covariance_ned
@@ -53,7 +53,7 @@ def follow_target(report: Report, track: Track) -> Any | None:
 
 
 def adsb_vehicle(report: Report, track: Track, icao_address: int, now_ns: int) -> Any | None:
-    """ADSB_VEHICLE (246) with `icao_address` plus the target's number; None without a place on the globe."""
+    """ADSB_VEHICLE (246) with `icao_address` plus the target's number; None without a global position."""
     place = _place(report.own_ship, track)
     if place is None:
         return None
@@ -92,7 +92,7 @@ def _place(own_ship: OwnShip | None, track: Track) -> tuple[float, float, float]
 
 
 def _velocity_mps(own_ship: OwnShip | None, track: Track) -> list[float] | None:
-    """Over ground, once it is known. Without own position the track's is relative to the own ship, and of no use."""
+    """Velocity over ground, or None if unknown: without own position the track's is relative to the own ship."""
     if own_ship is None or own_ship.t_ned_body_m is None or track.v_ned_target_mps is None:
         return None
     P = track.covariance_ned

@@ -1,12 +1,12 @@
-"""The autopilot as seen from here: heard or not, which one, started again, and how often it tells what we asked for.
+"""State of the autopilot: received or not, which one, reboots, and the rates of the messages that we requested.
 
-A pure state machine: every time comes in as an argument, nothing goes out but decisions.
+A pure state machine: every time is an argument, the only output is decisions.
 
     WAITING --autopilot heartbeat--> HEARD --no heartbeat for 5 s--> LOST --heartbeat--> HEARD
 
-Rates are asked for one message at a time by MAV_CMD_SET_MESSAGE_INTERVAL, and again when one falls: another peer may
-have overwritten it. Refusals and silence are met with a growing pause, at most RETRY_MAX_NS. What stands in for another
-message is asked for only where that one was asked for in vain.
+Rates are requested for one message at a time by MAV_CMD_SET_MESSAGE_INTERVAL, and again if a rate drops: another peer
+may have overwritten it. After a refusal or no answer the pause grows, to at most RETRY_MAX_NS. A message that stands in
+for another is requested only if that one was requested without success.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ ACK_TIMEOUT_NS = 1_000_000_000
 RETRY_NS = 3_000_000_000
 RETRY_MAX_NS = 30_000_000_000
 RATE_WINDOW_NS = 2_000_000_000
-RATE_ENOUGH = 0.7  # of what was asked
-IN_VAIN = 2  # times asked for, and none came
+RATE_ENOUGH = 0.7  # of the requested rate
+IN_VAIN = 2  # requests without any message received
 
 
 class Contact(Enum):
@@ -35,7 +35,7 @@ class Contact(Enum):
 
 @dataclass
 class Stream:
-    """One message we want at a rate."""
+    """One message that we request at a rate."""
 
     message_id: int
     rate_hz: float
@@ -50,7 +50,7 @@ class Stream:
         return len(self.arrivals_ns) * 1e9 / RATE_WINDOW_NS
 
     def due(self, now_ns: int) -> bool:
-        """Whether to ask: never asked, or asked long enough ago and still too slow."""
+        """Whether to request it: never requested, or requested long enough ago and still too slow."""
         if self.asked_ns is None:
             return True
         if self.measured_hz(now_ns) >= RATE_ENOUGH * self.rate_hz:
@@ -66,9 +66,9 @@ class Stream:
 
 
 class Vehicle:
-    """`system_id` None: taken from the first autopilot heartbeat; after that one fell silent as `Succession` has it.
+    """`system_id` None: from the first autopilot heartbeat; changes after it falls silent by the rules of `Succession`.
 
-    `rates_hz` by message id; `stands_in` has of a message that is one the id that it stands in for.
+    `rates_hz` by message id; `stands_in`: id of a substitute message to the id of the message that it stands in for.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Vehicle:
         self._in_flight: tuple[int, int] | None = None  # message id, asked ns
 
     def heartbeat(self, system_id: int, autopilot: int | None, now_ns: int) -> bool:
-        """An autopilot's heartbeat; False if it is another vehicle's. `autopilot` None: its kind stays as it is."""
+        """An autopilot's heartbeat; False if it is another vehicle's. `autopilot` None: its kind is not changed."""
         if self._fixed and system_id != self.system_id:
             return False
         if not self._fixed and not self._succession.takes(system_id, self._silent(now_ns), now_ns):
@@ -105,16 +105,16 @@ class Vehicle:
         return True
 
     def spoke(self, now_ns: int) -> None:
-        """Anything from our autopilot."""
+        """A message of any kind from our autopilot."""
         self._spoke_ns = now_ns
         self._succession.spoke(now_ns)
 
     def noticed(self, system_id: int, now_ns: int) -> None:
-        """An autopilot's heartbeat from where ours is not: it is not taken for ours by that, and may never be."""
+        """An autopilot's heartbeat from an address that is not accepted: it does not make it ours, and may never be."""
         self._succession.noticed(system_id, now_ns)
 
     def was_own(self, system_id: int) -> bool:
-        """Whether a system was taken for our own until it fell silent, and another is now."""
+        """Whether a system was our own until it fell silent, and another one is now."""
         return self._succession.is_former(system_id)
 
     def is_stranger(self, system_id: int) -> bool:
@@ -122,7 +122,7 @@ class Vehicle:
         return self._succession.is_stranger(system_id)
 
     def boot_time(self, boot_ms: int) -> bool:
-        """A stamp of the autopilot's; True if it says that the autopilot has started again."""
+        """A timestamp of the autopilot; True if it shows that the autopilot has rebooted."""
         if not self._boot.rebooted(boot_ms):
             return False
         self.reboots += 1
@@ -134,28 +134,28 @@ class Vehicle:
             self._streams[message_id].arrivals_ns.append(now_ns)
 
     def measured_hz(self, message_id: int, now_ns: int) -> float:
-        """How often a message we asked for came in the last two seconds."""
+        """Rate of a requested message over the last two seconds."""
         return self._streams[message_id].measured_hz(now_ns)
 
     def acknowledged(self, accepted: bool) -> None:
-        """The answer to the request in flight."""
+        """The answer to the pending request."""
         if self._in_flight is not None:
             self.refusals += not accepted
             self._in_flight = None
 
     def ask_anew(self) -> None:
-        """Forget what was asked: the autopilot may have forgotten it too, or is heard by another link now."""
+        """Request all rates again: the autopilot may have lost them, or is received on another link now."""
         self._streams = self._new_streams()
         self._in_flight = None
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass."""
+        """Detect loss of the heartbeat."""
         if self.contact is Contact.HEARD and self._heartbeat_ns is not None and now_ns - self._heartbeat_ns > LOST_NS:
             self.contact = Contact.LOST
             self.ask_anew()
 
     def request(self, now_ns: int) -> tuple[int, float] | None:
-        """(message id, Hz) to ask for now, or None."""
+        """(message id, Hz) to request now, or None."""
         if self.contact is not Contact.HEARD:
             return None
         if self._in_flight is not None and now_ns - self._in_flight[1] < ACK_TIMEOUT_NS:
@@ -176,7 +176,7 @@ class Vehicle:
         return better.times_asked >= IN_VAIN and better.measured_hz(now_ns) == 0.0
 
     def _silent(self, now_ns: int) -> bool:
-        # Who still tells anything is there, though a crowded line may have lost its heartbeats.
+        # Any message shows that it is present, even if a congested line loses its heartbeats.
         quiet = self._spoke_ns is None or now_ns - self._spoke_ns > LOST_NS
         return quiet and self.contact is not Contact.HEARD
 

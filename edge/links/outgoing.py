@@ -1,4 +1,4 @@
-"""What a link may say of a report: only tracks that are sure, fresh and whole."""
+"""Which tracks of a report a link may send: only certain, recent and valid ones."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from edge.types import Report, Track, TrackState
 from msgs.wire import is_covariance
 
-UNSURE_RANGE_SHARE = 0.5  # range known worse than this is not told as a pose
-UNSURE_ROTATION_RAD = 1.0  # root mean square over the axes; of a rotation of which nothing is known it is 1.33
+UNSURE_RANGE_SHARE = 0.5  # 1-sigma over range above which a pose is not sent
+UNSURE_ROTATION_RAD = 1.0  # root mean square over the axes; 1.33 for a completely unknown rotation
 ROTATION_TOLERANCE = 1e-3
 NS_PER_MS = 1e6
 
 
 def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
-    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, measured lately, finite and consistent. One
-    whose covariance in ned is none is not known there, and fit in the camera's frame."""
+    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, recently measured, finite and consistent. A
+    track whose ned covariance is not valid is returned without its ned fields, for the camera frame only."""
     oldest_ns = now_ns - round(max_age_ms * NS_PER_MS)
     return [
         _of_what_is_known(track)
@@ -28,7 +28,7 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
 
 
 def rotation_known(track: Track) -> bool:
-    """Whether the covariance leaves any meaning to how the target is turned; else no link may tell an attitude."""
+    """Whether the rotation is certain enough to be sent; otherwise no link may send an attitude."""
     return float(np.trace(track.covariance[3:, 3:])) <= 3.0 * UNSURE_ROTATION_RAD**2
 
 

@@ -1,7 +1,7 @@
-"""MAVLink 2 message signing: what goes out is signed, what comes in is believed only with a signature.
+"""MAVLink 2 message signing: outgoing messages are signed, incoming ones accepted only with a valid signature.
 
 signature = first 6 bytes of sha256(key + frame from its magic to its signature's timestamp) (MAVLink guide, "Message
-signing"). Timestamps count 10 us since 2015-01-01 UTC and rise in every stream of (link id, system, component).
+signing"). Timestamps count 10 us since 2015-01-01 UTC and increase in every stream of (link id, system, component).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ EPOCH_S = 1_420_070_400  # 2015-01-01 UTC
 UNIT_NS = 10_000
 NEW_STREAM_BEHIND_MAX = 60 * 100_000  # one minute
 HELD_BACK_MAX_NS = 1_500_000_000
-RESERVED_AHEAD = 60 * 100_000  # so often the state is saved; after a crash these are skipped
-AHEAD_MAX_S = 600.0  # of the clock, what was saved; beyond it one of the two is wrong
+RESERVED_AHEAD = 60 * 100_000  # reserved by each save of the state; after a crash these are skipped
+AHEAD_MAX_S = 600.0  # saved timestamp minus clock; beyond it one of the two is wrong
 
 
 def timestamp_of(utc_ns: int) -> int:
@@ -35,10 +35,10 @@ def timestamp_of(utc_ns: int) -> int:
 
 
 def ahead_of_clock(state_file: Path, utc_ns: int) -> str | None:
-    """A sentence where the timestamp that a file keeps lies far beyond a UTC time, nanoseconds; else None.
+    """A sentence if the timestamp stored in a file is far ahead of a UTC time (nanoseconds); else None.
 
-    Nobody can tell whether the clock was wrong then or is now. An autopilot with the right time is refused all the
-    while in the first case, and in the second believing earlier stamps would let old messages pass.
+    Whether the clock was wrong then or is wrong now is unknown. In the first case an autopilot with the right time is
+    rejected until the clock catches up; in the second, accepting earlier timestamps would let old messages pass.
     """
     stamp = load_state(state_file)
     ahead_s = (stamp * UNIT_NS - utc_ns) / 1e9 + EPOCH_S
@@ -49,10 +49,10 @@ def ahead_of_clock(state_file: Path, utc_ns: int) -> str | None:
 
 
 class Signing:
-    """One key, the timestamps used with it, and those seen. Used by one thread.
+    """One key, the timestamps used with it, and those received. Used by one thread.
 
-    `saved` is what `save` was last given, or 0: no timestamp up to it is used again. `save` is called before a
-    timestamp beyond it is used, so that a restart without a clock that knows the time repeats none; `rest` at the end.
+    `saved` is the last value given to `save`, or 0: no timestamp up to it is used again. `save` is called before a
+    timestamp beyond it is used, so that a restart with a wrong clock repeats none; call `rest` at the end.
     """
 
     def __init__(self, key: bytes, saved: int, save: Callable[[int], None], utc_ns: Callable[[], int]) -> None:
@@ -60,14 +60,14 @@ class Signing:
             raise ValueError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
         self._key = key
         self._last = self._reserved = saved
-        self._seen = max(saved - RESERVED_AHEAD, 0)  # no later than what was last used
+        self._seen = max(saved - RESERVED_AHEAD, 0)  # not later than the last one used
         self._save = save
         self._utc_ns = utc_ns
         self._streams: dict[tuple[int, int, int], int] = {}
-        self._ahead: dict[tuple[int, int, int], tuple[int, int]] = {}  # not heard when it came another way; and when
+        self._ahead: dict[tuple[int, int, int], tuple[int, int]] = {}  # see outruns: timestamp, and when it arrived
 
     def next_timestamp(self) -> int:
-        """For the next message: the time it is, or one more than the last."""
+        """For the next message: the current time, or one more than the last timestamp."""
         self._last = min(max(self._last + 1, timestamp_of(self._utc_ns())), TIMESTAMP_MAX)
         if self._last > self._reserved:
             self._reserved = min(self._last + RESERVED_AHEAD, TIMESTAMP_MAX)
@@ -75,23 +75,23 @@ class Signing:
         return self._last
 
     def rest(self) -> None:
-        """Nothing more is signed: what was put aside and not used is free again. Else each start would run a minute
-        ahead of the one before, and soon refuse an autopilot that knows the time."""
+        """Nothing more is signed: release the reserved timestamps that were not used. Otherwise each start would be a
+        minute ahead of the one before, and soon reject an autopilot with the right time."""
         if self._last < self._reserved:
             self._reserved = self._last
             self._save(self._reserved)
 
     def prepare(self, mav: Any, link_id: int = 0) -> None:
-        """Let a pymavlink packer sign its next message, as one of a link (0..255)."""
+        """Have a pymavlink packer sign its next message with a link id (0..255)."""
         mav.signing.secret_key = self._key
         mav.signing.link_id = link_id
         mav.signing.sign_outgoing = True
         mav.signing.timestamp = self.next_timestamp()
 
     def refusal(self, message: Any) -> str | None:
-        """Why a parsed message is not believed: "unsigned", "signature" or "replay"; None if it is.
+        """Why a parsed message is rejected: "unsigned", "signature" or "replay"; None if it is accepted.
 
-        The hash comes first: what is not signed with our key leaves no trace in what is remembered of streams.
+        The signature is checked first: messages not signed with our key do not change the state of the streams.
         """
         reason = self.unproven(message)
         if reason is not None:
@@ -107,10 +107,10 @@ class Signing:
         return None
 
     def outruns(self, message: Any, now_ns: int) -> bool:
-        """Whether a message that came another way shows that what is heard of its stream is held back: what came that
-        way HELD_BACK_MAX_NS before `now_ns` (monotonic) has not been heard yet.
+        """Whether a message from another address shows that the accepted peer delays its stream: one that came from
+        there more than HELD_BACK_MAX_NS before `now_ns` (monotonic) has not arrived from the peer yet.
 
-        By the order of stamps, not by their time: autopilots that hear no time of others only count on.
+        Judged by the order of timestamps, not their time: autopilots without a time source only count up.
         """
         if self.unproven(message) is not None:
             return False
@@ -124,8 +124,8 @@ class Signing:
         return now_ns - ahead[1] > HELD_BACK_MAX_NS
 
     def unproven(self, message: Any) -> str | None:
-        """ "unsigned" or "signature" where a parsed message is not signed with our key, else None. It may be a replay;
-        nothing is remembered of it."""
+        """ "unsigned" or "signature" if a parsed message is not signed with our key, else None. It may be a replay;
+        no state is changed."""
         if not message.get_header().incompat_flags & dialect.MAVLINK_IFLAG_SIGNED:
             return "unsigned"
         frame = bytes(message.get_msgbuf())
@@ -141,7 +141,7 @@ def _stamp(message: Any) -> tuple[tuple[int, int, int], int]:
 
 
 def open_signing(key_file: Path, state_file: Path, utc_ns: Callable[[], int]) -> Signing:
-    """Signing with the key of a file, its timestamps kept in another. Raises InputError for a key file that is none."""
+    """Signing with the key in one file and timestamps in another. Raises InputError for an unusable key file."""
     ahead = ahead_of_clock(state_file, utc_ns())
     if ahead is not None:
         log.warning("mavlink: %s: until it is caught up with, an autopilot that stamps earlier is refused", ahead)
@@ -162,7 +162,7 @@ def load_state(path: Path) -> int:
 def _save_state(path: Path, stamp: int) -> None:
     scratch = path.with_name(path.name + ".new")
     try:
-        # No fsync: it could hold up poses on a slow card, and ext4 writes a file out before another takes its name.
+        # No fsync: on a slow card it could delay poses, and ext4 writes a file out before renaming it over another.
         scratch.write_text(str(stamp), encoding="ascii")
         scratch.replace(path)
     except OSError as error:

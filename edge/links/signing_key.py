@@ -1,4 +1,4 @@
-"""The file that holds the key of MAVLink's signatures."""
+"""The key file of MAVLink signing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KEY_BYTES = 32
 
 
 def load_key(path: Path) -> bytes:
-    """The 32 bytes of a key file. Raises InputError if it is absent, of another length or readable by others."""
+    """The 32 bytes of a key file. Raises InputError if it is missing, of another length or readable by others."""
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode

@@ -33,7 +33,7 @@ from msgs.settings import dotted, faults_of
 log = logging.getLogger(__name__)
 
 BODY_BYTES_MAX = 4096
-LOGGED_AT_ONCE, LOGGED_NS = 32, 1_000_000_000  # then one line a second, however many commands come
+LOGGED_AT_ONCE, LOGGED_NS = 32, 1_000_000_000  # then one line a second, however many commands arrive
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
@@ -84,18 +84,18 @@ COMMANDS: dict[str, type[Command]] = {
 
 
 class Refused(Exception):
-    """Why a command is not done; the text is for a person."""
+    """A command is not carried out; the text says why, for a person."""
 
 
 @dataclass(frozen=True)
 class Actions:
-    """What a vehicle can be told; None where it has no such function."""
+    """The functions that commands can call; None: not available on this vehicle."""
 
-    request: Callable[[Request], bool] | None  # False: too many wait
+    request: Callable[[Request], bool] | None  # False: too many are waiting
     recorder: Recorder | None
     set_rate: Callable[[float | None], None]
     reload: AskReload | None
-    targets: Callable[[], Mapping[str, int]] = dict  # those that are tracked just now: name and track id
+    targets: Callable[[], Mapping[str, int]] = dict  # currently tracked: name to track id
 
 
 def commands_key(uav: str) -> str:
@@ -117,7 +117,7 @@ def parse(name: str, body: bytes) -> Command:
 
 
 def carry_out(command: Track | Select | Stop | Record | Rate, actions: Actions) -> dict[str, Any]:
-    """Do it and say what was done, or raise Refused. Never waits."""
+    """Carry out the command and return what was done, or raise Refused. Never waits."""
     match command:
         case Record(on=on):
             if actions.recorder is None:
@@ -144,14 +144,14 @@ def carry_out(command: Track | Select | Stop | Record | Rate, actions: Actions) 
 
 
 def _track_id(name: str, targets: Mapping[str, int]) -> int:
-    """Raises Refused for one that is not tracked."""
+    """Raises Refused for a target that is not tracked."""
     if name not in targets:
         raise Refused(f"no target {name}; there {'are ' + ', '.join(sorted(targets)) if targets else 'is none'}")
     return targets[name]
 
 
 def answer(name: str, body: bytes, actions: Actions, reply: Callable[[dict[str, Any]], None]) -> None:
-    """Have `reply` send what goes back: at once, or from another thread when a reload is over."""
+    """Pass the answer to `reply`: at once, or from another thread when a reload has finished."""
 
     def done(what: dict[str, Any]) -> None:
         reply({"ok": True, "command": name, "done": what})
@@ -185,7 +185,7 @@ def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zeno
     def on_query(query: zenoh.Query) -> None:
         key = str(query.key_expr)
         if "*" in key:
-            # One word must not turn all vehicles at once, nor run every command.
+            # A single query must neither command several vehicles at once nor run every command.
             with query:
                 query.reply_err(b'{"ok": false, "error": "name one vehicle and one command"}')
             return

@@ -1,8 +1,8 @@
-"""The link to the ground: what each report says, put on the topic table's keys by a thread of its own.
+"""The link to the ground: publishes each report on the keys of the topic table, from its own thread.
 
 The loop only leaves the newest report in a mailbox. The session is a peer: it opens whether or not the ground is
-there, and zenoh goes on connecting. What goes out is recorded too, byte for byte, if there is a recorder; with zenoh
-off it is only recorded.
+reachable, and zenoh keeps trying to connect. Everything published is also recorded, byte for byte, if there is a
+recorder; with zenoh disabled it is only recorded.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ log = logging.getLogger(__name__)
 EVENTS_WAITING = 64
 PICTURES_WAITING = 4
 STOP_TIMEOUT_S = 5.0
-# Closing waits for a connection that is being tried; one to a router that does not answer is left to the process's end.
+# Closing waits for connection attempts; one to a router that does not answer is left to end with the process.
 CLOSE_TIMEOUT_S = 2.0
 SETTLE_TIMEOUT_S = 60.0
 
 
 @dataclass
 class Mailbox:
-    """What waits for the worker: the newest of each kind, and events and pictures in their order."""
+    """What is queued for the worker: the newest report and snapshot, and events and pictures in order."""
 
     report: Report | None = None
     snapshot: HealthSnapshot | None = None
@@ -83,8 +83,8 @@ class ZenohLink:
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
         self._delivering = False
-        self._targets: dict[str, int] = {}  # of the newest report: name and track id
-        self._links = 0  # routers and peers connected just now
+        self._targets: dict[str, int] = {}  # of the newest report: name to track id
+        self._links = 0  # routers and peers currently connected
         self._picture_publisher: TopicPublisher | None = None
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
@@ -108,7 +108,7 @@ class ZenohLink:
             return zenoh.open(config)
         except zenoh.ZError as error:
             endpoints = ", ".join(settings.listen) or "none"
-            reason = str(error).partition(" at /")[0]  # what follows is a line of zenoh's source
+            reason = str(error).partition(" at /")[0]  # the rest is a location in zenoh's source
             raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
 
     def publish(self, report: Report) -> None:
@@ -125,37 +125,37 @@ class ZenohLink:
             self._waiting.notify()
 
     def publish_event(self, level: int, text: str) -> None:
-        """`level` counts as in rcl_interfaces/Log: 10 debug, 20 info, 30 warn, 40 error, 50 fatal."""
+        """`level` as in rcl_interfaces/Log: 10 debug, 20 info, 30 warn, 40 error, 50 fatal."""
         with self._waiting:
             self._counters["events_lost"] += len(self._mailbox.events) == EVENTS_WAITING
             self._mailbox.events.append((clock.monotonic_ns(), level, text))
             self._waiting.notify()
 
     def wants_picture(self) -> bool:
-        """Whether anybody looks at pictures just now."""
+        """Whether pictures have a subscriber now."""
         publisher = self._picture_publisher
         return publisher is not None and publisher.matching()
 
     def records_picture(self) -> bool:
-        """Whether what goes out is recorded just now."""
+        """Whether a recording is in progress."""
         return self._recorder is not None and self._recorder.recording
 
     def publish_picture(self, picture: Picture) -> None:
-        """Leave one for the worker; the oldest of too many is dropped and counted."""
+        """Queue a picture for the worker; if there are too many, the oldest is dropped and counted."""
         with self._waiting:
             self._counters["pictures_replaced"] += len(self._mailbox.pictures) == PICTURES_WAITING
             self._mailbox.pictures.append(picture)
             self._waiting.notify()
 
     def settle(self) -> None:
-        """In lock-step: wait until all that was left is handed to zenoh. Raises LinkError if it is not."""
+        """In lock-step mode: wait until everything queued is handed to zenoh. Raises LinkError on a timeout."""
         with self._waiting:
             idle = self._waiting.wait_for(lambda: self._mailbox.empty() and not self._delivering, SETTLE_TIMEOUT_S)
         if not idle:
             raise LinkError(f"zenoh: not sent within {SETTLE_TIMEOUT_S:.0f} s")
 
     def stop(self) -> None:
-        """Send what waits, then close the session. May be called twice, or without start."""
+        """Send what is queued, then close the session. May be called twice, or without start."""
         with self._waiting:
             self._mailbox.stopping = True
             self._waiting.notify()
@@ -163,7 +163,7 @@ class ZenohLink:
             self._worker.join(STOP_TIMEOUT_S)
             self._worker = None
         if self._session is not None:
-            # An open session keeps the process from leaving, a thread that is still closing it does not.
+            # An open session keeps the process from exiting; a (daemon) thread that is still closing it does not.
             closer = threading.Thread(target=self._session.close, name="closing", daemon=True)
             closer.start()
             closer.join(CLOSE_TIMEOUT_S)
@@ -171,7 +171,7 @@ class ZenohLink:
 
     @property
     def session(self) -> zenoh.Session | None:
-        """Open between start and stop, if zenoh is on."""
+        """Open between start and stop, if zenoh is enabled."""
         return self._session
 
     def counters(self) -> dict[str, int]:
@@ -213,7 +213,7 @@ class ZenohLink:
                         return
 
     def _deliver(self, desk: Desk, mail: Mailbox) -> Counter[str]:
-        """Each by itself: one that cannot go out, whatever is wrong with it, silences neither link nor others."""
+        """Send each item independently: one that fails, for whatever reason, stops neither the link nor the others."""
         puts: list[Callable[[], None]] = []
         if mail.report is not None:
             puts.append(partial(desk.put_report, mail.report))
@@ -232,7 +232,7 @@ class ZenohLink:
 
 
 class Desk:
-    """Turns what is told into messages, and gives each to the publishers and the recorder; used by the worker alone."""
+    """Converts reports and events to messages for publishers and recorder; used by the worker only."""
 
     def __init__(
         self, node: Node | None, recorder: Recorder | None, vehicle_name: str, mount: Mount, max_age_ms: float
@@ -254,7 +254,7 @@ class Desk:
                 self._publisher(node, topic, None)
 
     def set_pose_rate(self, max_hz: float | None) -> None:
-        """Send poses and odometry no more often than this, None for all; they are recorded all the same. From any
+        """Limit the rate of poses and odometry; None: no limit. Recordings are not limited. May be called from any
         thread."""
         self._pose_period_s = 0.0 if max_hz is None else 1.0 / max_hz
 
@@ -284,7 +284,7 @@ class Desk:
         self._put(topics.DIAGNOSTICS, ros.diagnostics(snapshot, self._vehicle_name, stamp_ns))
 
     def open_pictures(self) -> TopicPublisher | None:
-        """Announce them; None without a node."""
+        """Declare the publisher of pictures; None without a node."""
         return None if self._node is None else self._publisher(self._node, topics.IMAGE, None)
 
     def put_picture(self, picture: Picture) -> None:
@@ -300,7 +300,7 @@ class Desk:
         self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))
 
     def _put(self, topic: Topic, message: Payload, target: str | None = None, until_ns: int | None = None) -> None:
-        """`until_ns` (monotonic): not after it, however long the process was held up on the way here."""
+        """`until_ns` (monotonic): the message is dropped if it is later than that, as after a stall of the process."""
         payload = message.encode()
         if until_ns is not None and clock.monotonic_ns() > until_ns:
             self.counted["too_late"] += 1
@@ -315,19 +315,19 @@ class Desk:
         if not topic.per_target or self._pose_period_s == 0.0:
             return True
         now_s = clock.monotonic_ns() / 1e9
-        # No further off than the rate of now has it, whatever rate was asked for before.
+        # At most one current period ahead, in case a lower rate was set before.
         due_s = min(self._pose_due_s.get((topic.name, target), 0.0), now_s + self._pose_period_s)
         if now_s < due_s:
             self._pose_due_s[topic.name, target] = due_s
             return False
-        # Counted on from when it was due, so that the rate is met though frames come at their own times.
+        # Counted from the due time, not from now, so that the mean rate is met although frames arrive at other times.
         self._pose_due_s[topic.name, target] = max(due_s, now_s - self._pose_period_s) + self._pose_period_s
         return True
 
     def _publisher(self, node: Node, topic: Topic, target: str | None) -> TopicPublisher:
         key = (topic.name, target)
         if key not in self._publishers:
-            if clock.stepped():  # the player waits for all that a frame gives: nothing may be lost for want of room
+            if clock.stepped():  # the player waits for all outputs of a frame: none may be dropped for congestion
                 topic = replace(topic, reliability=Reliability.RELIABLE, congestion=CongestionControl.BLOCK)
             self._publishers[key] = node.publisher(topic, target)
         return self._publishers[key]

@@ -1,4 +1,4 @@
-"""Tracks, own ship, camera and health as ROS 2 messages. Pure; stamps are UTC ns."""
+"""Tracks, own ship, camera and health as ROS 2 messages. Pure; timestamps are UTC ns."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ DIAGNOSTIC_LEVEL = {HealthState.DEGRADED: 1, HealthState.FAULT: 2}
 
 
 def q_xyzw(R: ArrayLike) -> Array:
-    """[3, 3] to the quaternion [4] as ROS writes it."""
+    """[3, 3] to a quaternion [4] in ROS order (x, y, z, w)."""
     return np.roll(q_wxyz_from_R(R), -1)
 
 
 def target_name(track: Track) -> str:
-    """The topic's `tN`."""
+    """`tN`, as in the topic name."""
     return f"t{track.track_id}"
 
 
 def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
-    """The target in `cam`; a rotation that is not known is none, with a variance that says so."""
+    """The target in `cam`; an unknown rotation is sent as identity with a variance that says so."""
     R, covariance = track.R_cam_target, track.covariance
     if not rotation_known(track):
         R, covariance = np.eye(3), _without_rotation(covariance)
@@ -34,7 +34,7 @@ def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
 
 
 def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | None:
-    """The target in `ned`; in base_link_ned, velocity relative, without own position. None: no own attitude."""
+    """The target in `ned`; without own position in base_link_ned, with relative velocity. None: no own attitude."""
     R, t_m, v_mps, P = track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned
     if R is None or t_m is None or v_mps is None or P is None:
         return None
@@ -58,7 +58,7 @@ def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | N
 
 
 def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
-    """All targets of one frame in `cam`; an empty array says that none was seen."""
+    """All targets of one frame in `cam`; an empty array means that there is none."""
     found = []
     for track in tracks:
         told = pose(track, stamp_ns)
@@ -69,7 +69,7 @@ def detections(tracks: list[Track], stamp_ns: int) -> cdr.Detection3DArray:
 
 
 def _without_rotation(covariance: Array) -> Array:
-    """[6, 6] of which only the position's part is left."""
+    """[6, 6] with only the position's part kept."""
     told = np.zeros((6, 6))
     told[:3, :3] = covariance[:3, :3]
     told[3:, 3:] = NOT_ESTIMATED * np.eye(3)
@@ -77,7 +77,7 @@ def _without_rotation(covariance: Array) -> Array:
 
 
 def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
-    """The own ship: its camera on its body, that in ned axes at itself, and those in `ned` if its position is known."""
+    """The own ship's transforms: camera on the body, body in base_link_ned, and that in `ned` if position is known."""
     q, q_camera = q_xyzw(own_ship.R_ned_body), q_xyzw(own_ship.camera(mount).R_body_cam)
     chain = [
         cdr.TransformStamped(stamp_ns, topics.FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q),
@@ -91,7 +91,7 @@ def transforms(own_ship: OwnShip, mount: Mount, stamp_ns: int) -> cdr.TFMessage:
 
 
 def camera_info(report: Report, stamp_ns: int) -> cdr.CameraInfo:
-    """The intrinsics of the frame the poses belong to, with its lens's distortion (sensor_msgs/CameraInfo)."""
+    """Intrinsics and lens distortion of the frame that the poses belong to (sensor_msgs/CameraInfo)."""
     width_px, height_px = report.image_size_wh
     P = np.hstack([report.K, np.zeros((3, 1))])
     model = "rational_polynomial" if len(report.distortion) > 5 else "plumb_bob"
@@ -101,7 +101,7 @@ def camera_info(report: Report, stamp_ns: int) -> cdr.CameraInfo:
 
 
 def diagnostics(snapshot: HealthSnapshot, vehicle_name: str, stamp_ns: int) -> cdr.DiagnosticArray:
-    """Health as one status: its state and reasons, counters and latencies."""
+    """Health as one DiagnosticStatus: state and reasons, counters and latencies."""
     condition = snapshot.condition
     values = {
         "state": condition.state.value,

@@ -1,4 +1,4 @@
-"""Which estimate belongs to which target: the pairing that fits best as a whole. Pure."""
+"""Assignment of estimates to targets that is best as a whole. Pure."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from edge.tracking.rotation import Attitude
 from edge.tracking.view import View
 from edge.types import Array, Estimate
 
-POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as the soft gate is inside it
-ROTATION_D2_MAX = 9.0  # what a rotation that does not fit may cost: a network errs, an aircraft rolls
+POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as motion.py has a soft gate inside
+ROTATION_D2_MAX = 9.0  # limit of a rotation's cost: the network may be wrong, and aircraft roll
 
 
 class Pair(NamedTuple):
-    """A target and the estimate that it takes, by their places in what was given."""
+    """A target and the estimate assigned to it, by their indices in the arguments."""
 
     target: int
     estimate: int
     seen: Innovation
-    left_out: list[int]  # targets that take none, though this one fits them too
+    left_out: list[int]  # targets without an estimate that this one fits too
 
 
 def associate(
     targets: Sequence[tuple[Motion, Attitude]], estimates: Sequence[Estimate], K: Array, view: View
 ) -> list[Pair]:
-    """Pairs inside the gate, each target and estimate once: as many as fit, of least distance in all.
+    """Pairs inside the gate, each target and estimate at most once: as many pairs as possible, at least total distance.
 
-    Where a target or an estimate has a choice, the rotation counts too: two that cross differ in it.
+    If a target or an estimate has several candidates, rotation counts too: crossing aircraft differ in it.
     """
     seen: dict[tuple[int, int], Innovation] = {}
     for i, (motion, _) in enumerate(targets):
@@ -54,9 +54,9 @@ def associate(
 
 
 def best_pairs(cost: Array) -> list[tuple[int, int]]:
-    """Of a matrix of costs, infinite where a pair cannot be: the most pairs, and of those the cheapest in all.
+    """The assignment with the most pairs, and of those the least total cost; infinite cost: not a possible pair.
 
-    Looks at every way, which is quick for the few targets that there are, after taking what nobody contests.
+    Takes uncontested pairs first, then tries all combinations, which is fast for a few targets.
     """
     possible = np.isfinite(cost)
     choices, rivals = possible.sum(axis=1), possible.sum(axis=0)
@@ -70,7 +70,7 @@ def best_pairs(cost: Array) -> list[tuple[int, int]]:
 
 
 def _best(cost: Array, rows: list[int], taken: frozenset[int]) -> tuple[int, float, list[tuple[int, int]]]:
-    """(minus the number of pairs, their cost, the pairs) of the best way for `rows` with columns `taken`."""
+    """(minus the number of pairs, their cost, the pairs) of the best assignment of `rows` with columns `taken`."""
     if not rows:
         return 0, 0.0, []
     i, others = rows[0], rows[1:]

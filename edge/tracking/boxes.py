@@ -1,4 +1,4 @@
-"""Boxes on the frame: where a target's lies as it moves, through the lens, and how two overlap. Pure."""
+"""Boxes on the frame: prediction for a moving target, through the lens, and overlap of two. Pure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from edge.estimator.lens import Lens
 from edge.types import Array
 
-RANGE_MIN_M = 1.0  # nearer, a projection is meaningless
+RANGE_MIN_M = 1.0  # below it a projection is meaningless
 SAME_BOX_IOU = 0.3  # above it two boxes are of one target
 
 
 @dataclass(frozen=True)
 class BoxModel:
-    """A measured box, remembered so that it moves with the bearing and scales with the range.
+    """A measured box, stored so that it moves with the bearing and scales with the range.
 
-    It is kept in pixels of the pinhole camera, as a lens shows one target in other sizes at other places.
+    It is stored in pinhole pixels, as lens distortion changes a target's apparent size with its place on the frame.
     """
 
     offset: Array  # [2] box centre minus projection of the target's origin, px * m / px of focal length
@@ -52,13 +52,13 @@ def iou(a_xyxy: Array, b_xyxy: Array) -> float:
 
 
 def inside(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> bool:
-    """Whether any of a box [4] lies in the picture."""
+    """Whether any part of a box [4] lies in the image."""
     return bool(np.all(box_xyxy_px[2:] > 0.0) and np.all(box_xyxy_px[:2] < np.array(image_size_wh) - 1.0))
 
 
 def _straight(box_xyxy_px: Array, lens: Lens) -> Array | None:
-    """A box [4] on the frame as the pinhole camera has it; None where the lens cannot be inverted, as in some lenses'
-    corners: there OpenCV tells anything."""
+    """A box [4] on the frame in pinhole pixels; None where the lens cannot be inverted, as in some lenses' corners:
+    OpenCV returns arbitrary values there."""
     if not any(lens.distortion):
         return box_xyxy_px
     straight = lens.box_to_pinhole(box_xyxy_px)
@@ -68,8 +68,8 @@ def _straight(box_xyxy_px: Array, lens: Lens) -> Array | None:
 def _bent(box_xyxy_px: Array, lens: Lens) -> Array:
     """A box [4] of pinhole pixels on the frame.
 
-    What is farther off the axis than the lens shows stays where the pinhole camera has it, which is farther out: the
-    lens's polynomial would fold it back into the picture.
+    Points farther off the axis than the lens model's valid radius keep their pinhole position, which is farther out:
+    the polynomial would fold them back into the image.
     """
     if not any(lens.distortion):
         return box_xyxy_px

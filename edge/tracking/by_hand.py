@@ -1,8 +1,8 @@
-"""What a person asked of the tracker. Pure: every time comes in as an argument.
+"""Operator requests to the tracker. Pure: every time is an argument.
 
-A box to look into is looked into for LOOK_NS, frame by frame, until a target is found there; it is then the chosen one
-for as long as its track lives, and if that ends before it was sure the look goes on. Stopping drops all targets and
-lets the search rest for REST_NS or until the next box.
+A requested box is examined in every frame for up to LOOK_NS until a target is found there; that is then the chosen
+target while its track exists, and if the track ends before it was confirmed the examination continues. "Stop" drops all
+targets and suspends the search for REST_NS or until the next selection.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ByHand:
     def __init__(self) -> None:
         self._chosen: tuple[int, int] | None = None  # track_id and born_ns
         self._box_share: Array | None = None
-        self._wanted_id: int | None = None  # of a target that was chosen by its name
+        self._wanted_id: int | None = None  # of a target that was selected by its number
         self._look_until_ns = 0
         self._rest_until_ns = 0
         self._found: Array | None = None  # [4] box_xyxy_px of the estimate that is to become the chosen track
@@ -34,7 +34,7 @@ class ByHand:
         return None if self._chosen is None else self._chosen[0]
 
     def take(self, request: Request, now_ns: int) -> None:
-        """Take a request that came before the frame of `now_ns`."""
+        """Process a request that arrived before the frame of `now_ns`."""
         self._chosen = self._wanted_id = None
         if isinstance(request, SelectTarget):
             self._box_share, self._wanted_id, self._rest_until_ns = None, request.track_id, now_ns
@@ -45,7 +45,7 @@ class ByHand:
             self._box_share, self._rest_until_ns = None, now_ns + REST_NS
 
     def box_xyxy_px(self, now_ns: int, image_size_wh: tuple[int, int], expected: Iterable[Track]) -> Array | None:
-        """Where to look [4], if that is still wanted; a target `expected` there already is chosen without a look."""
+        """The box [4] to examine, or None; if a target is `expected` there already, it is chosen instead."""
         if self._box_share is None or self._chosen is not None:
             return None
         if now_ns > self._look_until_ns:
@@ -60,15 +60,15 @@ class ByHand:
         return None
 
     def searches(self, now_ns: int) -> bool:
-        """Whether to look for targets that nobody pointed at."""
+        """Whether to search for targets that were not requested."""
         return now_ns >= self._rest_until_ns
 
     def found(self, estimate: Estimate) -> None:
-        """A target was there: its track is to be the chosen one."""
+        """A target was detected in the requested box: its track is to become the chosen one."""
         self._found = estimate.box_xyxy_px
 
     def settle(self, tracks: Iterable[Track]) -> None:
-        """After the tracks' update: which of them is the chosen one, or that it is gone."""
+        """After the tracker's update: determine which track is the chosen one, if it still exists."""
         tracks = list(tracks)
         if self._wanted_id is not None:
             self._choose_by_id(tracks, self._wanted_id)
@@ -83,7 +83,7 @@ class ByHand:
             self._box_share = None
 
     def news(self) -> list[str]:
-        """What the person should hear of it since the last call."""
+        """Messages for the operator since the last call."""
         told, self._news = self._news, []
         return told
 
@@ -95,7 +95,7 @@ class ByHand:
         return None
 
     def _choose_where(self, tracks: Iterable[Track], found_xyxy_px: Array) -> None:
-        """The track that took the estimate in. Another one near it is not what was pointed at: the look goes on."""
+        """Choose the track updated with the estimate. Another one nearby is not what was requested: keep examining."""
         seen = [track for track in tracks if track.measured_ns == track.time_ns]
         best = max(seen, key=lambda track: iou(track.box_xyxy_px, found_xyxy_px), default=None)
         if best is not None and iou(best.box_xyxy_px, found_xyxy_px) > SAME_BOX_IOU:
@@ -111,8 +111,8 @@ def _holds(box_xyxy_px: Array, point_px: Array) -> bool:
 
 
 def _fit(box_xyxy_px: Array, pointed_xyxy_px: Array) -> tuple[float, float]:
-    """Which of several targets was meant, the greatest: the one that the box is drawn round, else the one whose middle
-    is the nearest; a near target's box may hold a far one's."""
+    """Sort key, greatest first, for which of several targets was meant: the one whose box fits the requested box, else
+    the one with the nearest centre; a near target's box may contain a far one's."""
     drawn = iou(box_xyxy_px, pointed_xyxy_px)
     away_px = float(np.linalg.norm(_center(box_xyxy_px) - _center(pointed_xyxy_px)))
     return drawn if drawn > SAME_BOX_IOU else 0.0, -away_px

@@ -1,7 +1,7 @@
-"""The autopilot's clock and UTC against our monotonic one. Pure: every time comes in as an argument.
+"""The autopilot's clock relative to our monotonic one. Pure: every time is an argument.
 
-TIMESYNC (MAVLink 111): we ask with tc1 = 0 and ts1 = our ns; the reply mirrors ts1 and adds the autopilot's ns as tc1.
-offset = tc1 - (ts1 + now) / 2, and its error is at most half the round trip.
+TIMESYNC (MAVLink 111): a request has tc1 = 0 and ts1 = our ns; the reply mirrors ts1 and adds the autopilot's ns as
+tc1. offset = tc1 - (ts1 + now) / 2, and its error is at most half the round trip.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-SAMPLES = 32  # of which the one with the least round trip speaks
+SAMPLES = 32  # of which the one with the shortest round trip is used
 ASKED_KEPT = 16
 ROUND_TRIP_MAX_NS = 200_000_000
 JUMP_NS = 100_000_000
-JUMP_AGREEING = 3  # samples in a row that must say so
+JUMP_AGREEING = 3  # samples in a row that must agree on a jump
 STAMP_FUTURE_MAX_NS = 20_000_000
 STAMP_AGE_MAX_NS = 1_000_000_000
-QUICKEST_NS = 30_000_000_000  # no backlog of a link lasts so long
-DRIFT = 50e-6  # of two crystals against each other: by it an offset grows old
-UNSYNCED_STD_S = 0.02  # the least delay of a link that was not measured, taken for zero
-BOUND_TO_STD = 3.0**-0.5  # of an error that is anywhere within its bound
+QUICKEST_NS = 30_000_000_000  # longer than any backlog of a link lasts
+DRIFT = 50e-6  # of two crystals relative to each other: the offset's error grows by it with age
+UNSYNCED_STD_S = 0.02  # for the unmeasured minimum delay of a link, which is taken as zero
+BOUND_TO_STD = 3.0**-0.5  # of an error distributed uniformly within its bound
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Sample:
 
 
 class TimesyncEstimator:
-    """Offset of the autopilot's clock (ns since its boot) from ours, by TIMESYNC's two-way exchange."""
+    """Offset of the autopilot's clock (ns since its boot) from ours, measured by TIMESYNC's two-way exchange."""
 
     def __init__(self) -> None:
         self.jumps = 0
@@ -49,19 +49,19 @@ class TimesyncEstimator:
         return self._best().round_trip_ns // 2 if self._samples else None
 
     def std_s(self, now_ns: int) -> float | None:
-        """Of the offset now: within that bound when it was measured, and it has drifted since."""
+        """Standard deviation of the offset now: from the bound at the measurement, and the drift since."""
         if not self._samples:
             return None
         best = self._best()
         return (BOUND_TO_STD * best.round_trip_ns / 2 + DRIFT * max(now_ns - best.time_ns, 0)) * 1e-9
 
     def request(self, now_ns: int) -> int:
-        """The ts1 to ask with; its reply will be known by it."""
+        """The ts1 of a new request; its reply is recognised by it."""
         self._asked.append(now_ns)
         return now_ns
 
     def reply(self, tc1_ns: int, ts1_ns: int, now_ns: int) -> bool:
-        """Take in a reply; False if we did not ask for it, if it took too long, or while it may be an outlier."""
+        """Process a reply; False if it was not requested, if it took too long, or while it may be an outlier."""
         if ts1_ns not in self._asked:
             return False
         self._asked.remove(ts1_ns)
@@ -77,7 +77,7 @@ class TimesyncEstimator:
         return True
 
     def clear(self) -> None:
-        """The autopilot has started again."""
+        """Discard all samples: the autopilot has rebooted."""
         self._asked.clear()
         self._samples.clear()
         self._suspects.clear()
@@ -99,26 +99,26 @@ class TimesyncEstimator:
 
 
 class BootClock:
-    """The autopilot's boot time to monotonic ns: by TIMESYNC where that fits, else by the quickest arrival lately.
+    """The autopilot's boot time to monotonic ns: by TIMESYNC if the stamps fit it, else by the least recent delay.
 
-    The quickest arrival knows the offset but for the link's least delay, which is then taken for zero. Stamps that
-    fitted TIMESYNC once and are too old now are no other clock's: what they tell was held back, and is old.
+    The least delay (arrival minus stamp) gives the offset up to the link's minimum delay, which is taken as zero.
+    Stamps that fitted TIMESYNC before and are now too old are not of another clock: their messages were delayed.
     """
 
     def __init__(self, timesync: TimesyncEstimator) -> None:
         self._timesync = timesync
         self._fitted = False
-        self._quickest: deque[tuple[int, int]] = deque()  # (arrival, delay) of the last QUICKEST_NS, the latter growing
-        self.std_s = UNSYNCED_STD_S  # of the last stamp that was turned into monotonic time
+        self._quickest: deque[tuple[int, int]] = deque()  # (arrival, delay) of the last QUICKEST_NS, delays increasing
+        self.std_s = UNSYNCED_STD_S  # of the last stamp that was converted
 
     def monotonic_ns(self, boot_ns: int, arrival_ns: int) -> int:
-        """Monotonic time of a stamp; never later than its arrival."""
+        """Monotonic time of a timestamp; never later than its arrival."""
         least_delay_ns = self._least_delay_ns(arrival_ns - boot_ns, arrival_ns)
         offset_ns = self._timesync.offset_ns
         if offset_ns is not None:
             synced = boot_ns - offset_ns
             age_ns = arrival_ns - synced
-            # Some peers answer TIMESYNC from another clock than the one in their stamps.
+            # Some peers answer TIMESYNC from a clock other than that of their timestamps.
             fits = -STAMP_FUTURE_MAX_NS <= age_ns <= STAMP_AGE_MAX_NS
             self._fitted = self._fitted or fits
             if fits or (self._fitted and age_ns > 0):
@@ -137,7 +137,7 @@ class BootClock:
 
 
 class RebootDetector:
-    """Whether the autopilot has started again: its boot time fell by more than late datagrams explain."""
+    """Whether the autopilot has rebooted: its boot time fell by more than late datagrams can explain."""
 
     REORDER_MAX_MS = 2000
 

@@ -1,4 +1,4 @@
-"""Which two targets are one aircraft: both fit what is seen, by turns, and never are both seen at once."""
+"""Duplicate targets of one aircraft: both fit the same detections, take turns at them and are never both seen."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 TURNS_NS = 2_000_000_000
-TURNS_MIN = 20  # at few frames a second two that are often missed are not seen together for as long
+TURNS_MIN = 20  # at low frame rates, two targets that are often missed may not be seen together for TURNS_NS either
 
-Key = tuple[int, int]  # number and birth
+Key = tuple[int, int]  # track_id and born_ns
 
 
 @dataclass
@@ -19,17 +19,17 @@ class _Turns:
 
 
 class Doubles:
-    """Counts the turns of each two since they were last seen together. Used by the tracker, once a frame."""
+    """Counts the turns of each pair since both were last seen in one frame. Used by the tracker, once a frame."""
 
     def __init__(self) -> None:
         self._turns: dict[frozenset[Key], _Turns] = {}
 
     def among(self, both: set[Key], turns: Iterable[tuple[Key, Key]], time_ns: int) -> list[tuple[Key, Key]]:
-        """Of these `turns`, (who was seen, who was missed though it fits as well), those of one aircraft.
+        """Those of `turns` (target seen, target missed though it fits as well) that are of one aircraft.
 
-        Of `both`, any two were seen at once.
+        All targets in `both` were seen in this frame.
         """
-        # A target that nobody has seen for so long is gone, and its turns with it.
+        # A target not seen for that long is lost, and its turns with it.
         self._turns = {
             pair: one for pair, one in self._turns.items() if not pair <= both and time_ns - one.last_ns <= TURNS_NS
         }

@@ -1,4 +1,4 @@
-"""Small offsets on the WGS 84 ellipsoid, the earth taken as flat: within 3 m at 2 km, below 75 degrees of latitude."""
+"""Small offsets on the WGS 84 ellipsoid, flat-earth: error below 3 m at 2 km, below 75 degrees of latitude."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from edge.types import Array
 
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
-ORIGIN_ROUNDS = 2  # leave less than a millimetre at 100 km
+ORIGIN_ROUNDS = 2  # iterations; error below a millimetre at 100 km
 
 
 def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
-    """Metres for one radian of latitude, and of longitude."""
+    """Metres per radian of latitude, and of longitude."""
     e2 = FLATTENING * (2.0 - FLATTENING)
     lat_rad = np.deg2rad(lat_deg)
     w2 = 1.0 - e2 * np.sin(lat_rad) ** 2
@@ -23,7 +23,7 @@ def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
 
 
 def lat_lon_alt_from_ned(origin_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -> tuple[float, float, float]:
-    """(degrees, degrees in -180..180, m) of a point [3] given in the north-east-down axes at the origin."""
+    """(degrees, degrees in -180..180, m) of a point [3] given in north-east-down axes at the origin."""
     lat, lon, alt = origin_deg_m
     north, east, down = (float(x) for x in np.asarray(t_ned_m, dtype=np.float64))
     per_lat, per_lon = radii_m(lat, alt)
@@ -32,8 +32,8 @@ def lat_lon_alt_from_ned(origin_deg_m: tuple[float, float, float], t_ned_m: Arra
 
 
 def origin_of_ned(point_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -> tuple[float, float, float]:
-    """The origin from which `lat_lon_alt_from_ned` leads by t_ned_m [3] to the point: where both are known, far from it
-    too, what lies near the point is placed well."""
+    """The origin for which `lat_lon_alt_from_ned` of t_ned_m [3] gives the point. Positions near the point are then
+    accurate, even far from the origin."""
     lat, lon, alt = origin = lat_lon_alt_from_ned(point_deg_m, -np.asarray(t_ned_m, dtype=np.float64))
     for _ in range(ORIGIN_ROUNDS):
         there = lat_lon_alt_from_ned(origin, t_ned_m)

@@ -1,9 +1,9 @@
-"""Towards us or away? Outlines cannot say; how fixed-wing aircraft fly can.
+"""Towards the camera or away from it: evidence as log-odds.
 
 At long range perspective is weak, so an aircraft that is symmetric left to right has the same outline as its depth
-reversal: the same turned about, heading away instead of towards. A single picture leaves both open, a little in favour
-of one. Each function here weighs one kind of evidence and answers in log-odds for a rotation against its reversal:
-what the network says, where the target flies, and that it flies upright and banks into its turns. Pure.
+reversal, which heads away instead of towards the camera. A single image favours one of them only slightly. Each
+function here evaluates one kind of evidence, as log-odds of a rotation against its reversal: the network's choice, the
+direction of flight, and that aircraft fly upright and bank into their turns. Pure.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ MIRRORED_WINGS = np.diag([1.0, -1.0, 1.0])
 NETWORK_STD_FLOOR_RAD = float(np.deg2rad(4.0))
 GRAVITY_MPS2 = 9.81
 
-# Through the air an aircraft flies along its nose, about so fast.
+# Relative to the air, an aircraft flies along its nose at about this speed.
 AIRSPEED_MPS, AIRSPEED_STD_MPS = 28.0, 15.0
 OWN_AIRSPEED_MPS, OWN_AIRSPEED_STD_MPS = 20.0, 10.0
 WIND_STD_MPS = 5.0  # of each component, over ground
-SLIP_STD_RAD = float(np.deg2rad(5.0))  # nose against the way through the air
+SLIP_STD_RAD = float(np.deg2rad(5.0))  # angle between the nose and the velocity relative to the air
 
-BANK_STD_RAD = float(np.deg2rad(15.0))  # against that of a coordinated turn
-PITCH_STD_RAD = float(np.deg2rad(8.0))  # against the climb
-UNKNOWN_BANK_STD_RAD = float(np.deg2rad(30.0))  # where the turn is not known
+BANK_STD_RAD = float(np.deg2rad(15.0))  # about that of a coordinated turn
+PITCH_STD_RAD = float(np.deg2rad(8.0))  # about the climb angle
+UNKNOWN_BANK_STD_RAD = float(np.deg2rad(30.0))  # if the turn rate is unknown
 UNKNOWN_PITCH_STD_RAD = float(np.deg2rad(12.0))
-TAIL_DOF = 4.0  # Student's t: aircraft do loop and slip now and then
+TAIL_DOF = 4.0  # Student's t: aircraft do loop and slip occasionally
 SPEED_MIN_MPS, SPEED_MAX_MPS = 12.0, 60.0
-LOG_ODDS_MAX = 5.0  # of one kind of evidence
+LOG_ODDS_MAX = 5.0  # limit for one kind of evidence
 
 
 @dataclass(frozen=True)
 class Flight:
-    """What is known of a target's way, in ned axes."""
+    """What is known of a target's motion, in ned axes."""
 
     v_mps: Array  # [3], over ground, or relative to the own ship
     P_v: Array  # [3, 3]
-    turn_rate_radps: float | None  # None: not known, nor is the climb
+    turn_rate_radps: float | None  # None: unknown, and so is the climb
     turn_rate_variance: float
-    own_nose_ned: Array | None  # [3] if v_mps is relative to the own ship, which flies nose first too
+    own_nose_ned: Array | None  # [3] if v_mps is relative to the own ship, which also flies along its nose
 
 
 def reversal(R: Array, along: Array) -> Array:
-    """The other rotation of the same outline: mirrored in depth, `along` the unit sight line [3], and left to right.
+    """The other rotation with the same outline: mirrored in depth (`along`: unit line of sight [3]) and left to right.
 
-    R [3, 3] turns target axes into those of `along`. Doing it twice gives R again.
+    R [3, 3] transforms target axes into those of `along`. The function is its own inverse.
     """
     return (so3.IDENTITY - 2.0 * np.outer(along, along)) @ R @ MIRRORED_WINGS
 
 
 def reversed_covariance(P: Array, along: Array) -> Array:
-    """[3, 3] of the reversal's error: as R' = M exp(w) R B = exp(-M w) M R B, it turns with the mirror M."""
+    """Covariance [3, 3] of the reversal's error: as R' = M exp(w) R B = exp(-M w) M R B, it is mirrored by M."""
     mirror = so3.IDENTITY - 2.0 * np.outer(along, along)
     return mirror @ P @ mirror.T
 
@@ -63,8 +63,8 @@ def reversed_covariance(P: Array, along: Array) -> Array:
 def network_opinion(estimate: Estimate, along: Array) -> tuple[float, Array]:
     """(log-odds of the estimated rotation against its reversal, covariance [3, 3] in `cam` if it is the right one).
 
-    Trained by likelihood, the network tells one sigma for both: with probability p of the reversal, w away, its
-    variances are those about the right one plus p w w^T. Here p is what fits its variances best, and at most even.
+    The network, trained by likelihood, gives one sigma for both: with probability p of the reversal, w away, its
+    variances are those about the right rotation plus p w w^T. p is the least-squares fit to its variances, at most 0.5.
     """
     variances = np.diag(estimate.covariance)[3:]
     spread = np.square(so3.log(reversal(estimate.R_cam_target, along) @ estimate.R_cam_target.T))
@@ -74,7 +74,7 @@ def network_opinion(estimate: Estimate, along: Array) -> tuple[float, Array]:
 
 
 def flown_odds(R: Array, R_reversed: Array, P: Array, flight: Flight) -> float:
-    """Log-odds of R against its reversal by the way the target flies; both [3, 3] into ned axes, P [3, 3] of either."""
+    """Log-odds of R against its reversal from the target's flight; both [3, 3] into ned axes, P [3, 3] of either."""
     return _limited(
         _log_along_nose(R[:, 0], P, flight) - _log_along_nose(R_reversed[:, 0], P, flight)
         + _log_upright(R, P, flight) - _log_upright(R_reversed, P, flight)
@@ -97,7 +97,7 @@ def _log_along_nose(nose: Array, P: Array, flight: Flight) -> float:
 
 
 def _log_upright(R: Array, P: Array, flight: Flight) -> float:
-    """Log density, but for a constant, of bank and pitch of R [3, 3] in ned axes."""
+    """Log density, up to a constant, of bank and pitch of R [3, 3] in ned axes."""
     pitch, bank = -math.asin(min(max(R[2, 0], -1.0), 1.0)), math.atan2(R[2, 1], R[2, 2])
     rotation_variance = float(np.trace(P)) / 3.0
     if flight.turn_rate_radps is None:
@@ -105,7 +105,7 @@ def _log_upright(R: Array, P: Array, flight: Flight) -> float:
         pitch_variance, bank_variance = UNKNOWN_PITCH_STD_RAD**2, UNKNOWN_BANK_STD_RAD**2
     else:
         known = float(flight.v_mps @ flight.v_mps)
-        # A velocity not yet known is no slow flight.
+        # An unknown velocity must not be taken for slow flight.
         speed = min(max(math.sqrt(known + np.trace(flight.P_v) / 3.0), SPEED_MIN_MPS), SPEED_MAX_MPS)
         climb_variance = float(flight.P_v[2, 2]) / speed**2
         believed = PITCH_STD_RAD**2 / (PITCH_STD_RAD**2 + climb_variance)

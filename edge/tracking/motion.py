@@ -1,17 +1,17 @@
-"""Where one target is and how it moves: an EKF over position, velocity and turn rate. Pure.
+"""Position and motion of one target: an EKF over position, velocity and turn rate. Pure.
 
-The state lives in one of three frames, by what is known of the own ship:
+The state is kept in one of three frames, depending on what is known of the own ship:
     ned           attitude and position: coordinated turn about the vertical
     ned_relative  attitude only: ned axes, origin at the own ship; constant relative velocity
-    cam           neither: camera axes; the sight line turns, and range changes, at constant rates
-Measurements are always compared in `cam`, where their covariance is given. The rotation has a filter of its own
-(`rotation.py`): while it may be the depth reversal of the true one, nothing of it may reach the turn rate.
+    cam           neither: camera axes; the line of sight turns, and range changes, at constant rates
+Innovations are always computed in `cam`, where the measurement covariance is given. The rotation has its own filter
+(`rotation.py`): as it may be the depth reversal of the true one, it must not influence the turn rate.
 
-A network misjudges the range of one target by much the same factor in all frames (`range_scale.py`), which no number of
-frames shrinks. The filter lives in ranges as they are seen, so P holds what the frames leave open; the common factor is
-added where a track is told (`covariance`). Range is compared, and corrected, by its logarithm: else frames that read
-short would pull more than frames that read far. The constants below are tuning choices for fixed-wing aircraft at
-100-500 m, not measurements.
+The network misjudges the range of one target by nearly the same factor in all frames (`range_scale.py`), and averaging
+frames does not reduce that error. The state holds ranges as measured, so P covers only the other errors; the variance
+of the common factor is added on output (`covariance`). Range is compared and corrected by its logarithm: otherwise
+frames that read short would weigh more than frames that read far. The constants below are tuning choices for
+fixed-wing aircraft at 100-500 m, not measurements.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ DIMENSION = 7
 
 # Process noise, square roots of spectral densities.
 ACCELERATION = {"ned": 3.0, "ned_relative": 6.0}  # m/s^1.5; relative: the own ship manoeuvres too
-VERTICAL_SHARE = 0.5  # of that, up and down
-APPARENT_ACCELERATION = 0.3  # rad/s^1.5 times range: the camera's own turning, which `cam` cannot tell apart
+VERTICAL_SHARE = 0.5  # of that, for the vertical axis
+APPARENT_ACCELERATION = 0.3  # rad/s^1.5 times range: the camera's own turning, not separable in `cam`
 TURN_RATE_WALK = 0.1  # rad/s^1.5
 
-# Initial uncertainty of what one measurement does not tell.
-SPEED_STD_MPS = 80.0  # wide: a narrow one draws ranges towards those at which the target would be slow
+# Initial uncertainty of what one measurement does not determine.
+SPEED_STD_MPS = 80.0  # wide: a narrow one biases ranges towards those at which the target would be slow
 CLIMB_STD_MPS = 12.0
 APPARENT_RATE_STD = 0.5  # rad/s times range
 TURN_RATE_STD = 0.2  # rad/s
 TURN_RATE_MAX = 1.0  # rad/s
 
-# Added to each measurement: what a network's own sigma does not know of.
+# Added to each measurement: errors that the network's sigma does not include.
 MODEL_BEARING_PX = 1.0
 MODEL_LOG_RANGE = 0.01
-FIRST_SHARE = 0.2  # of the network's log-range variance, left open by a first frame
+FIRST_SHARE = 0.2  # of the network's log-range variance, in P after a first frame
 
-# A change of frame uses the last attitude known, this uncertain for each second since.
+# A change of frame uses the last known attitude; its standard deviation grows by this per second.
 STALE_ATTITUDE_RADPS = 0.5
 
 SHORTEST_S = 1e-3  # between measurements
-SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is raised to meet it
+SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is inflated
 
 
 @dataclass(frozen=True)
@@ -64,31 +64,31 @@ class Motion:
     t_m: Array  # [3] target origin in the frame
     v_mps: Array  # [3]
     turn_rate_radps: float  # about ned's down axis, right turns positive; 0 outside `ned`
-    P: Array  # [7, 7], order (t, v, turn rate), without the error of range that all frames share
+    P: Array  # [7, 7], order (t, v, turn rate), without the range error that all frames share
     scale: RangeScale
-    sight: Sight | None = None  # of a measurement at this very instant
+    sight: Sight | None = None  # of a measurement at exactly this time
 
 
 @dataclass(frozen=True)
 class Sight:
-    """Where the frame that saw a target has it in `cam`, more exactly than the state turned into that frame has, as by
-    how much its attitude is off is common to both."""
+    """The target in `cam` in the frame that detected it: more accurate than the state transformed into that frame, as
+    that frame's attitude error does not enter."""
 
     t_cam_m: Array  # [3]
-    covariance: Array  # [3, 3], without the error of range that all frames share
+    covariance: Array  # [3, 3], without the range error that all frames share
 
 
 @dataclass(frozen=True)
 class Innovation:
-    """What a measured position says beyond the prediction, in `cam`."""
+    """Measured minus predicted position, in `cam`."""
 
     residual_m: Array  # [3]; along the ray it is range times the difference of log ranges
     predicted_m: Array  # [3]
-    predicted_covariance: Array  # [3, 3], but for the frame's own attitude
-    attitude: Array  # [3, 3], what that may be off
-    across: Array  # [3, 3], the measurement's covariance but for that of its range
+    predicted_covariance: Array  # [3, 3], without the frame's attitude error
+    attitude: Array  # [3, 3], covariance due to that error
+    across: Array  # [3, 3], the measurement's covariance without that of its range
     log_range_variance: float  # the network's own
-    d2: float  # squared Mahalanobis distance, 3 degrees of freedom, as the network's own variances have it
+    d2: float  # squared Mahalanobis distance, 3 degrees of freedom, with the network's own variances
 
 
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
@@ -106,7 +106,7 @@ def begin(estimate: Estimate, K: Array, view: View) -> Motion:
 
 
 def unknown_motion(motion: Motion, view: View) -> Motion:
-    """The same place, and nothing known of how the target moves; `view` is of the motion's frame."""
+    """The same position with unknown velocity and turn rate; `view` is in the motion's frame."""
     range_m = float(np.linalg.norm(motion.t_m - view.t_frame_cam_m))
     P = np.zeros((DIMENSION, DIMENSION))
     P[POSITION, POSITION] = motion.P[POSITION, POSITION]
@@ -114,12 +114,12 @@ def unknown_motion(motion: Motion, view: View) -> Motion:
 
 
 def turning(motion: Motion, time_ns: int) -> Array:
-    """[3, 3], what turns the target from the motion's time to a later one."""
+    """[3, 3], the rotation by which the target turns from the motion's time to a later one."""
     return so3.exp((time_ns - motion.time_ns) / NS_PER_S * _turning_radps(motion))
 
 
 def propagate(motion: Motion, time_ns: int) -> Motion:
-    """The state at a later time; an earlier one changes nothing."""
+    """The state at a later time; for an earlier time it is returned unchanged."""
     dt = (time_ns - motion.time_ns) / NS_PER_S
     if dt <= 0.0:
         return motion
@@ -151,9 +151,9 @@ def propagate(motion: Motion, time_ns: int) -> Motion:
 
 
 def reframe(motion: Motion, old: View, new: View, attitude_age_s: float) -> Motion:
-    """The same target in the frame of `new`; `old` is the camera in the motion's frame, both at the motion's time.
+    """Transform to the frame of `new`; `old` is the camera in the motion's frame, both at the motion's time.
 
-    `attitude_age_s`: how long ago the attitude that links the frames was measured.
+    `attitude_age_s`: age of the attitude that links the frames.
     """
     through_cam = old.linked_by_cam(new)
     R_new_old = between(old, new)
@@ -183,17 +183,17 @@ def reframe(motion: Motion, old: View, new: View, attitude_age_s: float) -> Moti
 
 
 def between(old: View, new: View) -> Array:
-    """R_new_old [3, 3] between the frames of two views of one instant; ned's axes are those of ned_relative."""
+    """R_new_old [3, 3] between the frames of two views at one time; ned and ned_relative have the same axes."""
     if old.linked_by_cam(new):
         return new.R_frame_cam @ old.R_frame_cam.T
     return so3.IDENTITY
 
 
 def untangled(motion: Motion, view: View) -> Motion:
-    """The same with range and its rate uncorrelated with all else: no bearing may tell a range.
+    """The state with range and range rate decorrelated from all else, so that bearings do not change the range.
 
-    It could only by parallax, which needs the target's speed, own position to decimetres, and a filter that is linear
-    over all ranges that are possible; a Cartesian one infers ranges from noise.
+    Parallax could give range, but needs the target's speed, own position to decimetres, and a filter that is linear
+    over all possible ranges; a Cartesian one infers ranges from noise.
     """
     ray = motion.t_m - view.t_frame_cam_m
     along = ray / np.linalg.norm(ray)
@@ -264,9 +264,9 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
 
 
 def covariance(motion: Motion, view: View) -> Array:
-    """[6, 6] of position and velocity in the frame, with the error of range that all frames share.
+    """[6, 6] of position and velocity in the frame, with the range error that all frames share.
 
-    A target further away by a share is so in all its relative motion too.
+    A relative error of range causes the same relative error of the relative velocity.
     """
     per_share = np.concatenate([motion.t_m - view.t_frame_cam_m, _relative_velocity(motion, view)])
     return symmetric(motion.P[:TURN_RATE, :TURN_RATE] + motion.scale.common_variance * np.outer(per_share, per_share))
@@ -280,7 +280,7 @@ def t_in_cam(motion: Motion, view: View) -> Array:
 
 
 def covariance_in_cam(motion: Motion, view: View) -> Array:
-    """[3, 3] of t_in_cam, m^2; of a target not seen, with how far the frame's own attitude may be off."""
+    """[3, 3] of t_in_cam, m^2; for a target not detected in this frame, with the frame's attitude error."""
     t_cam_m = t_in_cam(motion, view)
     if motion.sight is not None:
         return symmetric(motion.sight.covariance + motion.scale.common_variance * np.outer(t_cam_m, t_cam_m))
@@ -290,17 +290,17 @@ def covariance_in_cam(motion: Motion, view: View) -> Array:
 
 
 def symmetric(P: Array) -> Array:
-    """P without the rounding that makes it differ from its transpose."""
+    """P made exactly symmetric: removes rounding errors."""
     return 0.5 * (P + P.T)
 
 
 def _relative_velocity(motion: Motion, view: View) -> Array:
-    """[3], of the target against the camera as far as that is known."""
+    """[3], of the target relative to the camera, or v_mps as it is if the camera's velocity is unknown."""
     return motion.v_mps if view.v_frame_cam_mps is None else motion.v_mps - view.v_frame_cam_mps
 
 
 def _rescaled(motion: Motion, log_factor: float, view: View) -> Motion:
-    """The target at exp(log_factor) of its range. How fast it is there is less sure; that it jumped is no speed."""
+    """The target moved to exp(log_factor) times its range. The jump is no speed, but velocity is less sure after it."""
     relative_m = motion.t_m - view.t_frame_cam_m
     P = _farther(motion.P, log_factor)
     P[VELOCITY, VELOCITY] += log_factor**2 * _first_velocity(motion.kind, float(np.linalg.norm(relative_m)))
@@ -308,7 +308,7 @@ def _rescaled(motion: Motion, log_factor: float, view: View) -> Motion:
 
 
 def _farther(P: Array, log_factor: float) -> Array:
-    """P [7, 7] of a target at exp(log_factor) of its range, by angles and shares of it as sure as before."""
+    """P [7, 7] of a target moved to exp(log_factor) times its range: angles and relative range stay as sure."""
     factors = np.ones(DIMENSION)
     factors[POSITION] = np.exp(log_factor)
     return P * np.outer(factors, factors)
@@ -328,7 +328,7 @@ def _rescaled_innovation(seen: Innovation, log_factor: float) -> Innovation:
 
 
 def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
-    """The measurement and what was predicted of it, `in_cam` with the frame's attitude unknown, weighed in `cam`."""
+    """Prediction (covariance `in_cam`, the frame's attitude error included) and measurement combined in `cam`."""
     gain = np.linalg.solve(in_cam + noise, in_cam).T
     keep = so3.IDENTITY - gain
     t_cam_m, log_factor = corrected(seen.predicted_m, gain @ seen.residual_m)
@@ -337,24 +337,24 @@ def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
 
 
 def _by_attitude(t_cam_m: Array, view: View) -> Array:
-    """Covariance [3, 3] in `cam` of a place in the frame, as the view's attitude may be off."""
+    """Covariance [3, 3] of a position in `cam` due to the view's attitude error."""
     across = so3.skew(t_cam_m)
     return view.attitude_variance * across @ across.T
 
 
 def _measurement_noise(estimate: Estimate, K: Array) -> tuple[Array, float]:
-    """Covariance [3, 3] in `cam` of an estimate's position but for its range, and the variance of its log range."""
+    """Covariance [3, 3] in `cam` of an estimate's position without its range, and the variance of its log range."""
     t = estimate.t_cam_target_m
     bearing_variance = (MODEL_BEARING_PX / float(K[0, 0])) ** 2
     C = symmetric(estimate.covariance[:3, :3])
     C += bearing_variance * (t @ t) * so3.IDENTITY + MODEL_LOG_RANGE**2 * np.outer(t, t)
-    # Marginal along the ray with all else held: taking it away leaves C positive semi-definite.
+    # Conditional variance along the ray, all else held: subtracting it leaves C positive semi-definite.
     log_range_variance = 1.0 / float(t @ np.linalg.solve(C, t))
     return C - log_range_variance * np.outer(t, t), log_range_variance
 
 
 def _turning_radps(motion: Motion) -> Array:
-    """[3], what turns the velocity: the target's turn in `ned`; in `cam` the sight line's, mostly the camera's own."""
+    """[3], turn rate of the velocity: in `ned` the target's; in `cam` the line of sight's, mostly the camera's own."""
     if motion.kind == "cam":
         return np.cross(motion.t_m, motion.v_mps) / max(float(motion.t_m @ motion.t_m), 1.0)
     return np.array([0.0, 0.0, motion.turn_rate_radps])
@@ -371,10 +371,10 @@ def _acceleration_density(motion: Motion) -> Array:
 
 
 def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
-    """P after a correction in `cam`: errors of range move with the sight line and scale its rate.
+    """P after a correction in `cam`: range errors turn with the line of sight and scale its rate.
 
-    What turns the sight line there is mostly the camera, so a change across it must not be read as parallax, from
-    which a filter in Cartesian coordinates would infer range.
+    The line of sight turns there mostly because the camera does, so a change across it must not be taken for parallax,
+    from which a filter in Cartesian coordinates would infer range.
     """
     range_m = float(np.linalg.norm(t_m))
     along = t_m / range_m
@@ -386,7 +386,7 @@ def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
 
 
 def _unknown_velocity(P: Array, kind: FrameKind, range_m: float) -> Array:
-    """P [7, 7] of a position alone, with what is unknown of velocity and turn rate."""
+    """P [7, 7] with the given position part and unknown velocity and turn rate."""
     P = P.copy()
     P[VELOCITY, VELOCITY] = _first_velocity(kind, range_m)
     P[TURN_RATE, TURN_RATE] = TURN_RATE_STD**2 if kind == "ned" else 0.0
@@ -394,7 +394,7 @@ def _unknown_velocity(P: Array, kind: FrameKind, range_m: float) -> Array:
 
 
 def _first_velocity(kind: FrameKind, range_m: float) -> Array:
-    """Covariance [3, 3] of a velocity that nothing is known of: aircraft fly more or less level."""
+    """Covariance [3, 3] of an unknown velocity; less in the vertical, as aircraft fly more or less level."""
     if kind == "cam":
         return max(SPEED_STD_MPS, APPARENT_RATE_STD * range_m) ** 2 * so3.IDENTITY
     return np.diag([SPEED_STD_MPS, SPEED_STD_MPS, CLIMB_STD_MPS]) ** 2

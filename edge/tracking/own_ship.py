@@ -1,4 +1,4 @@
-"""Where the camera's own vehicle was when a frame was exposed."""
+"""Attitude and position of the camera's vehicle at a frame's exposure time."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from edge.types import Array, OwnShip
 from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so3_log
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
-ATTITUDE_GAP_MAX_NS = 500_000_000  # neighbours further apart say nothing of the time between
-# How long an attitude goes on by its rates: one and a half times what lies between two, within these. Where more lies
-# between two they are of no use for frames, which come after the last: rather none than now and then.
+ATTITUDE_GAP_MAX_NS = 500_000_000  # no interpolation between samples further apart
+# How long an attitude is extrapolated with its rates: 1.5 times the usual interval, within these limits. If the usual
+# interval exceeds the upper one, attitudes are not used at all: rather none than for some frames only.
 ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
-USUAL_OF = 5  # so many samples tell how far they usually lie apart: one that is lost or late changes nothing
+USUAL_OF = 5  # samples that give the usual interval: a single lost or late one does not change it
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
-# Of the nose's length, what must be level for it to have a heading: nearer to the vertical than 15 degrees what little
-# the attitude is off turns the heading, and all that is told against it, by many times as much.
+# Least horizontal part of the unit nose vector for a defined heading: within 15 degrees of the vertical, small attitude
+# errors turn the heading, and everything given relative to it, many times as far.
 LEVEL_MIN = float(np.sin(np.deg2rad(15.0)))
-GIMBAL_STEP_MIN_NS = 5_000_000  # nearer, what lies between two is rounding, and no rate to go on by
+GIMBAL_STEP_MIN_NS = 5_000_000  # the difference of closer samples is mostly rounding and gives no rate
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
 GLOBAL_AGE_MAX_NS = 5_000_000_000
@@ -48,10 +48,10 @@ class _Position:
 
 
 class GimbalFrame(Enum):
-    """What a gimbal's attitude is told against (GIMBAL_DEVICE_ATTITUDE_STATUS, MAVLink 285)."""
+    """What a gimbal's attitude is relative to (GIMBAL_DEVICE_ATTITUDE_STATUS, MAVLink 285)."""
 
     EARTH = "earth"  # ned
-    HEADING = "heading"  # level axes that turn with the vehicle's heading alone
+    HEADING = "heading"  # level axes that turn only with the vehicle's heading
 
 
 @dataclass(frozen=True)
@@ -70,26 +70,26 @@ class _Global:
 
 
 class OwnShipBuffer:
-    """The last seconds of own attitude and position, on the monotonic clock. Safe to use from several threads.
+    """The last seconds of own attitude and position, on the monotonic clock. Thread-safe.
 
-    Each kind must come in rising time: a sample that does not is refused, and the `add_*` method returns False.
+    Each kind must be added in order of time: a sample that is not later is rejected, and `add_*` returns False.
     """
 
     def __init__(self, gimballed: bool = False) -> None:
-        """`gimballed`: the camera hangs on a gimbal, and without its attitude that of the body is of no use."""
+        """`gimballed`: the camera is on a gimbal; without the gimbal's attitude, that of the body is not used."""
         self.gimballed = gimballed
         self._lock = threading.Lock()
         self._gimbals: deque[_Gimbal] = deque(maxlen=KEPT)
         self._attitudes: deque[_Attitude] = deque(maxlen=KEPT)
         self._positions: deque[_Position] = deque(maxlen=KEPT)
         self._global: _Global | None = None
-        self._in_local_ned = False  # whether this autopilot tells positions in its local ned frame
+        self._in_local_ned = False  # whether this autopilot sends positions in its local ned frame
         self._axes_epoch = self._origin_epoch = 0
 
     def add_attitude(
         self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike, clock_std_s: float = 0.0
     ) -> bool:
-        """Attitude [4] and body rates [3] (FRD), at a time known to `clock_std_s`. Raises ValueError on a zero q."""
+        """Attitude [4] and body rates [3] (FRD); `clock_std_s`: of `time_ns`. Raises ValueError on a zero q."""
         rates_radps = np.array(rates_body_radps, dtype=np.float64)
         sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps, clock_std_s)
         with self._lock:
@@ -98,7 +98,7 @@ class OwnShipBuffer:
     def add_gimbal(
         self, time_ns: int, q_frame_gimbal_wxyz: ArrayLike, frame: GimbalFrame, clock_std_s: float = 0.0
     ) -> bool:
-        """Attitude [4] of the gimbal's axes (FRD when it looks ahead), at a time known to `clock_std_s`.
+        """Attitude [4] of the gimbal's axes (FRD when it points ahead); `clock_std_s`: of `time_ns`.
 
         Raises ValueError on a zero quaternion.
         """
@@ -115,10 +115,10 @@ class OwnShipBuffer:
     def add_global(
         self, time_ns: int, lat_lon_alt: tuple[float, float, float], v_ned_mps: tuple[float, float, float]
     ) -> bool:
-        """Place (degrees, degrees, m above mean sea level) and velocity of the body origin: they place ned's.
+        """Position (degrees, degrees, m above mean sea level) and velocity of the body origin, to locate ned's origin.
 
-        Of an autopilot that tells positions in local ned too it is of use while these come: ArduPilot goes on telling
-        the last place, standing still, when it does not know its position any more, but ends the local one.
+        If the autopilot also sends positions in local ned, this one is used only while those arrive: when ArduPilot
+        loses its position it keeps sending the last global one, at rest, but stops sending the local one.
         """
         with self._lock:
             if self._global is not None and time_ns <= self._global.time_ns:
@@ -127,10 +127,10 @@ class OwnShipBuffer:
             return True
 
     def clear(self, *, same_axes: bool = False, same_autopilot: bool = False) -> None:
-        """Forget all: the autopilot, or its filter, has started again, and its local origin with it.
+        """Discard all samples: the autopilot or its estimator was reset, and its local origin with it.
 
-        `same_axes`: what is attitude now was so before. Else north may have been another, or the gimbal's zero.
-        `same_autopilot`: what it tells and what not is as before.
+        `same_axes`: attitudes keep their meaning. Otherwise north, or the gimbal's zero, may have changed.
+        `same_autopilot`: it sends the same kinds of position as before.
         """
         with self._lock:
             self._in_local_ned = self._in_local_ned and same_autopilot
@@ -142,10 +142,10 @@ class OwnShipBuffer:
             self._global = None
 
     def at(self, time_ns: int) -> OwnShip | None:
-        """The own ship at a time: between neighbours by slerp, after the last by body rates for at most 150 ms.
+        """The own ship at a time: slerp between samples, extrapolation with body rates for at most 150 ms.
 
-        None without an attitude for that time, of the gimbal too if there is one. Position and velocity are None where
-        the positions do not reach; then the ned origin is the own ship itself.
+        None without an attitude for that time (also of the gimbal, if any). Position and velocity are None if no
+        position is available for it; the ned origin is then the own ship itself.
         """
         with self._lock:
             R_ned_body = _attitude_at(self._attitudes, time_ns)
@@ -177,15 +177,15 @@ class OwnShipBuffer:
         return self._attitudes, self._gimbals
 
     def _of_body_and_gimbal(self, body_std: float, gimbal_std: float) -> float:
-        """A doubt about the camera's attitude, by those about its sources': a gimbal's against the earth is the
-        camera's whole attitude."""
+        """A standard deviation of the camera's attitude from those of its sources: a gimbal attitude relative to earth
+        alone gives the camera's attitude."""
         if not self.gimballed:
             return body_std
         earth = self._gimbals[-1].frame is GimbalFrame.EARTH
         return gimbal_std if earth else float(np.hypot(body_std, gimbal_std))
 
     def _origin(self, time_ns: int, in_local_ned: bool) -> tuple[float, float, float] | None:
-        """Of the local ned origin, which stands still; else of the own ship itself, which has flown on since."""
+        """Global position of the local ned origin, which is fixed, else of the own ship, extrapolated to `time_ns`."""
         if self._global is None:
             return None
         place, age_ns = self._global.lat_lon_alt, time_ns - self._global.time_ns
@@ -208,7 +208,7 @@ def _append(samples: deque, sample: _Attitude | _Gimbal | _Position) -> bool:
 
 
 def _first_after(samples: deque, time_ns: int) -> int:
-    """Index of the first sample later than a time; counted from the end, where the answer is near."""
+    """Index of the first sample later than a time; searched from the end, as it is usually near there."""
     index = len(samples)
     while index > 0 and samples[index - 1].time_ns > time_ns:
         index -= 1
@@ -235,7 +235,7 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
 
 
 def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> float:
-    """How far it may have turned otherwise than between two samples, or by the rates of the last."""
+    """Standard deviation of an interpolated or extrapolated attitude, from unknown angular acceleration."""
     after = _first_after(samples, time_ns)
     if after == 0:
         return 0.0
@@ -245,13 +245,13 @@ def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> flo
 
 
 def _usual_gaps_ns(samples: deque) -> list[int]:
-    """Times between the last few samples, shortest first."""
+    """Intervals between the last few samples, shortest first."""
     times = [samples[i].time_ns for i in range(max(len(samples) - USUAL_OF, 0), len(samples))]
     return sorted(b - a for a, b in pairwise(times))
 
 
 def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
-    """How long after the last sample it can be gone on from; None: too few come, and they serve no frame."""
+    """How long the last sample may be extrapolated; None: samples are too rare to be used."""
     gaps_ns = _usual_gaps_ns(samples)
     least_ns, most_ns = ATTITUDE_AHEAD_NS
     if not gaps_ns:
@@ -261,7 +261,7 @@ def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
 
 
 def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
-    """Whether they still come, though perhaps too rarely to be of use themselves."""
+    """Whether positions still arrive, even if too rarely to be used themselves."""
     if not samples:
         return False
     gaps_ns = _usual_gaps_ns(samples)
@@ -270,8 +270,8 @@ def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
 
 
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
-    """R_body_gimbal: between neighbours by slerp, after the last at the rate of the last two for at most 150 ms; none
-    against the heading of a nose that points up or down."""
+    """R_body_gimbal: slerp between samples, extrapolation at the rate of the last two for at most 150 ms; None if given
+    relative to a heading while the nose points nearly straight up or down."""
     after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples)
     if after == 0 or reach_ns is None or (after == len(samples) and time_ns - samples[-1].time_ns > reach_ns):
         return None
@@ -280,7 +280,7 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
     if a.frame is not b.frame or not least_ns <= b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
         if after < len(samples) or time_ns - b.time_ns > ATTITUDE_AHEAD_NS[0]:
             return None
-        a, share = b, 0.0  # the last sample stands alone
+        a, share = b, 0.0  # the last sample alone, without a rate
     else:
         share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
     R = a.R_frame_gimbal @ so3_exp(share * so3_log(a.R_frame_gimbal.T @ b.R_frame_gimbal))
@@ -294,7 +294,7 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
 
 def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array] | None:
     after, gaps_ns = _first_after(samples, time_ns), _usual_gaps_ns(samples)
-    # Rare ones would serve a frame now and then; what is lost of frequent ones makes some gaps longer, not all.
+    # Rare positions would be available for some frames only. The shortest gap decides, as losses lengthen the others.
     if after == 0 or (gaps_ns and gaps_ns[0] > POSITION_AHEAD_MAX_NS):
         return None
     a = samples[after - 1]
@@ -309,6 +309,6 @@ def _position_at(samples: deque[_Position], time_ns: int) -> tuple[Array, Array]
     share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
     v_mps = a.v_ned_mps + share * (b.v_ned_mps - a.v_ned_mps)
     way_m = b.t_ned_m - a.t_ned_m
-    # The cubic that leaves `a` and reaches `b` at their velocities: a turn cuts no corner.
+    # Cubic Hermite interpolation with the velocities at `a` and `b`: a straight line would cut corners in a turn.
     bent_m = (1.0 - share) * (a.v_ned_mps * apart_s - way_m) - share * (b.v_ned_mps * apart_s - way_m)
     return a.t_ned_m + share * way_m + share * (1.0 - share) * bent_m, v_mps

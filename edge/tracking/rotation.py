@@ -1,15 +1,15 @@
-"""How one target is turned: a filter on SO(3) that keeps two rotations open, one the depth reversal of the other.
+"""Rotation of one target: a filter on SO(3) with two hypotheses, one the depth reversal of the other.
 
-Both have the same outline, so a frame's rotation is taken for whichever of the two it is nearer to, or its reversal is:
-the filter stays on one side and measures every frame, and log-odds say how sure that side is. They have a part that
-remembers what the network picks, and a part read anew from how the target flies (`heading.py`). The sides change only
-when the odds have stood against the held one for a while, so that what is told does not flicker; until then, and
-wherever the odds stay low, the covariance holds the other rotation too. What fits neither is left out and counted.
+Both have the same outline. Of a measured rotation and its reversal, the one nearer to the held hypothesis updates it,
+so every frame contributes; log-odds state the confidence in the held hypothesis. They are the sum of a remembered part,
+from the network's choices, and a part computed anew from the target's flight (`heading.py`). The held hypothesis is
+switched only after the odds were against it for a while, so that the output does not flicker; the covariance always
+includes the other one with its probability. Measurements that fit neither are rejected and counted.
 
-Errors of a rotation stand on the left: R = exp(theta) R_hat. Everything here is pure.
+Rotation errors are on the left: R = exp(theta) R_hat. Everything here is pure.
 
-Frames of one sight err alike, so a share of the network's variance is never averaged away: it is a constant error that
-is told but not estimated.
+Frames of the same view have similar errors, so a share of the network's variance is never averaged out: it is modelled
+as a constant error, included in the covariance but not estimated.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from edge.tracking.view import View
 from edge.types import Array, Estimate
 
 ROTATION_WALK = np.array([0.5, 0.2, 0.2])  # rad/s^0.5 about the target's roll, pitch and yaw axes: it rolls fastest
-COMMON_SHARE = 0.6  # of the network's variance: the same error in all frames of one sight
-MEMORY_S = 1.0  # over which the network's picks and its variance are remembered
-NETWORK_WEIGHT = 2.0  # frames whose picks count as independent, of those remembered
-NETWORK_LOG_ODDS_MAX = 3.0  # of those: less than what is seen of the flight can outweigh
+COMMON_SHARE = 0.6  # of the network's variance: the same error in all frames of the same view
+MEMORY_S = 1.0  # time constant for the network's choices and its variance
+NETWORK_WEIGHT = 2.0  # number of remembered frames whose choices count as independent
+NETWORK_LOG_ODDS_MAX = 3.0  # limit of the network's part, so that the evidence of flight can outweigh it
 
 SWITCH_LOG_ODDS = 1.0  # against the held rotation
 SWITCH_AFTER_S = 0.2
 
-SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is raised to meet it
+SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is inflated
 GATE_RAD = float(np.deg2rad(60.0))
-ODD_FRAMES = 6  # in a row that fit neither rotation: theirs is taken
-ODD_MEMORY = 30  # frames over which the share of such is counted
+ODD_FRAMES = 6  # in a row that fit neither hypothesis ("odd"): the last one is accepted
+ODD_MEMORY = 30  # frames over which the share of odd ones is averaged
 
 
 @dataclass(frozen=True)
 class Attitude:
     """The filter's state, in the frame of the target's Motion."""
 
-    R_frame_target: Array  # [3, 3], the held rotation
-    P: Array  # [3, 3], as if it were the right one
-    common: Array  # [3, 3], variance that all frames share
-    picked: float = 0.0  # log-odds for the held rotation by the network's picks
-    log_odds: float = 0.0  # by all evidence
-    against_s: float = 0.0  # how long it has stood against the held one
+    R_frame_target: Array  # [3, 3], the held hypothesis
+    P: Array  # [3, 3], assuming that it is the right one
+    common: Array  # [3, 3], covariance of the error that all frames share
+    picked: float = 0.0  # log-odds for the held rotation from the network's choices
+    log_odds: float = 0.0  # from all evidence
+    against_s: float = 0.0  # how long the odds have been against the held one
     odd_in_a_row: int = 0
-    odd_share: float = 0.0  # of the last ODD_MEMORY frames, fading: those that fitted neither
-    odd_w_target_rad: Array | None = None  # [3] from the held rotation to the last such, target axes
+    odd_share: float = 0.0  # exponentially averaged share of frames that fitted neither
+    odd_w_target_rad: Array | None = None  # [3] from the held rotation to the last odd one, target axes
 
 
 def begin(estimate: Estimate, view: View) -> Attitude:
@@ -64,14 +64,14 @@ def begin(estimate: Estimate, view: View) -> Attitude:
 
 
 def propagate(attitude: Attitude, turn: Array, dt_s: float) -> Attitude:
-    """The state dt_s later, when the target has turned by `turn` [3, 3] in the frame."""
+    """The state dt_s later, after the target has turned by `turn` [3, 3] in the frame."""
     R = turn @ attitude.R_frame_target
     P = turn @ attitude.P @ turn.T + (R * (ROTATION_WALK**2 * dt_s)) @ R.T
     return replace(attitude, R_frame_target=R, P=symmetric(P))
 
 
 def reframe(attitude: Attitude, R_new_old: Array, attitude_age_s: float) -> Attitude:
-    """The same target in other axes, which an attitude links that was measured `attitude_age_s` ago."""
+    """Transform to other axes, linked by an attitude that was measured `attitude_age_s` ago."""
     P = R_new_old @ attitude.P @ R_new_old.T + (STALE_ATTITUDE_RADPS * attitude_age_s) ** 2 * so3.IDENTITY
     common = R_new_old @ attitude.common @ R_new_old.T
     return replace(attitude, R_frame_target=R_new_old @ attitude.R_frame_target, P=symmetric(P), common=common)
@@ -83,7 +83,7 @@ def correct(attitude: Attitude, estimate: Estimate, view: View, dt_s: float) -> 
     log_odds, noise = network_opinion(estimate, along)
     held_cam = view.R_frame_cam.T @ attitude.R_frame_target
     picked_cam, other_cam = estimate.R_cam_target, reversal(estimate.R_cam_target, along)
-    # The cosine of the angle between rotations rises with the sum of their products.
+    # The cosine of the angle between two rotations increases with their elementwise inner product.
     agrees = bool(np.vdot(held_cam, picked_cam) >= np.vdot(held_cam, other_cam))
     fitting = picked_cam if agrees else other_cam
     w = so3.log(fitting @ held_cam.T)
@@ -102,7 +102,7 @@ def correct(attitude: Attitude, estimate: Estimate, view: View, dt_s: float) -> 
 
 
 def disagreement_d2(attitude: Attitude, estimate: Estimate, view: View) -> float:
-    """Squared Mahalanobis distance, 3 degrees of freedom, of a measured rotation or its reversal from the held one."""
+    """Squared Mahalanobis distance, 3 degrees of freedom, of the held rotation to a measured one or its reversal."""
     along = unit(estimate.t_cam_target_m)
     _, noise = network_opinion(estimate, along)
     held_cam = view.R_frame_cam.T @ attitude.R_frame_target
@@ -113,10 +113,10 @@ def disagreement_d2(attitude: Attitude, estimate: Estimate, view: View) -> float
 
 
 def weighed(attitude: Attitude, along: Array, flight: Flight | None, dt_s: float, settled: bool) -> Attitude:
-    """The state with its odds read anew, held on the other side if that is clearly the better one.
+    """The state with its odds recomputed, switched to the other hypothesis if that is clearly better.
 
-    `along` [3] is the unit sight line in the frame; flight: None where nothing is known of the target's way.
-    Before a track is `settled` nothing was told of it, and the better side is taken at once.
+    `along` [3] is the unit line of sight in the frame; flight: None if nothing is known of the target's motion.
+    Before a track is `settled` nothing of it was published, so the better hypothesis is taken at once.
     """
     other = reversal(attitude.R_frame_target, along)
     P = attitude.P + attitude.common
@@ -138,15 +138,15 @@ def weighed(attitude: Attitude, along: Array, flight: Flight | None, dt_s: float
 
 
 def covariance(attitude: Attitude, along: Array) -> Array:
-    """[3, 3], rad^2 in the frame, about the held rotation: with the chance of its reversal, and of others seen lately.
+    """[3, 3], rad^2 in the frame, about the held rotation, including its reversal and recent odd measurements.
 
-    If another rotation, w away, is the true one with probability p, the error spreads by p w w^T.
+    If another rotation, w away, is the true one with probability p, it adds p w w^T.
     """
     P = attitude.P + attitude.common
     w = so3.log(reversal(attitude.R_frame_target, along) @ attitude.R_frame_target.T)
     P += np.outer(w, w) / (1.0 + np.exp(np.clip(attitude.log_odds, -30.0, 30.0)))
     if attitude.odd_w_target_rad is not None:
-        # As if two frames had to agree: one odd frame says little, as many as not say all.
+        # As if two frames had to agree: a few odd frames count for little, a large majority almost fully.
         share = attitude.odd_share**2 / (attitude.odd_share**2 + (1.0 - attitude.odd_share) ** 2)
         odd = attitude.R_frame_target @ attitude.odd_w_target_rad
         P += share * np.outer(odd, odd)
@@ -154,7 +154,7 @@ def covariance(attitude: Attitude, along: Array) -> Array:
 
 
 def _odd(attitude: Attitude, w_target: Array, estimate: Estimate, view: View) -> Attitude:
-    """The state after a rotation that fits neither, w_target [3] away: the last of ODD_FRAMES in a row is taken."""
+    """The state after a rotation that fits neither, w_target [3] away: the last of ODD_FRAMES in a row is accepted."""
     in_a_row = attitude.odd_in_a_row + 1
     share = attitude.odd_share + (1.0 - attitude.odd_share) / ODD_MEMORY
     if in_a_row < ODD_FRAMES:
@@ -163,7 +163,7 @@ def _odd(attitude: Attitude, w_target: Array, estimate: Estimate, view: View) ->
 
 
 def _corrected(attitude: Attitude, w: Array, noise: Array) -> Attitude:
-    """The state after a rotation measured w [3] away, with covariance `noise` [3, 3] of which a share is common."""
+    """The state after a rotation measured w [3] away with covariance `noise` [3, 3], part of it common to frames."""
     white = (1.0 - COMMON_SHARE) * noise
     S = attitude.P + white
     white = white * max(1.0, float(w @ np.linalg.solve(S, w)) / SOFT_GATE)
@@ -174,7 +174,7 @@ def _corrected(attitude: Attitude, w: Array, noise: Array) -> Attitude:
 
 
 def unit(vector: Array) -> Array:
-    """Of length one [3]."""
+    """The vector [3] scaled to length one."""
     return vector / np.linalg.norm(vector)
 
 

@@ -1,4 +1,4 @@
-"""Rotations one at a time, in plain floats: many times as fast as the broadcasting ones of msgs.geometry. Pure."""
+"""Single rotations in plain floats: many times as fast as the broadcasting functions of msgs.geometry. Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from edge.types import Array
 
 IDENTITY = np.eye(3)
 IDENTITY.setflags(write=False)
-SMALL_RAD = 1e-4  # below it series are exact to rounding
+SMALL_RAD = 1e-4  # below it the series are exact to rounding
 
 
 def skew(vector: Array) -> Array:
@@ -40,7 +40,7 @@ def exp(rotation_vector_rad: Array) -> Array:
 def log(R: Array) -> Array:
     """A rotation matrix [3, 3] to its rotation vector [3], of length up to pi; well-conditioned up to there.
 
-    By way of the quaternion, from its largest part as Shepperd takes it.
+    By way of the quaternion, computed from its largest component (Shepperd's method).
     """
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     trace = a + e + i

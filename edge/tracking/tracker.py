@@ -1,8 +1,8 @@
-"""Estimates of single frames become tracks: association, life and death, and where each target will be next.
+"""From single-frame estimates to tracks: association, track initiation and deletion, prediction for the next frame.
 
-A target is tentative until it was seen CONFIRM_HITS times, coasts on prediction when it is missed, and is lost, and
-its number free again, after COAST_MAX_S. A position that stays outside the gate but under the same box wins after
-PERSISTENT frames. Of two targets that have taken turns at one aircraft for long (`doubles.py`) one goes.
+A target is tentative until it was detected CONFIRM_HITS times, coasts on prediction when missed, and is lost after
+COAST_MAX_S; its number is then free. An estimate that stays outside the gate but inside the target's box replaces it
+after PERSISTENT frames. Of two targets that took turns at one aircraft for long (`doubles.py`), one is deleted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from edge.tracking.view import NS_PER_S, View
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
 
 CONFIRM_HITS = 3
-TENTATIVE_MISSES = 2  # in a row: gone
+TENTATIVE_MISSES = 2  # in a row: deleted
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
 
@@ -50,18 +50,18 @@ class Target:
 
 @dataclass
 class Tracker:
-    """Up to `max_targets` targets seen through a camera that sits on its vehicle by `mount`. Use from one thread."""
+    """Up to `max_targets` targets seen by a camera mounted on its vehicle by `mount`. Use from one thread only."""
 
     max_targets: int
     mount: Mount
     out_of_order: int = 0  # frames dropped
     not_finite: int = 0  # estimates dropped
     _targets: list[Target] = field(default_factory=list)
-    _view: View | None = None  # the camera at the last frame
+    _view: View | None = None  # the camera in the last frame
     _tracks: tuple[Track, ...] = ()
     _motion_doubted: bool = False
     _doubles: Doubles = field(default_factory=Doubles)
-    _wanted: Estimate | None = None  # of the frame to come, to be a target before all others
+    _wanted: Estimate | None = None  # of the next update, to become a target before all others
 
     def predict(
         self,
@@ -71,9 +71,9 @@ class Tracker:
         image_size_wh: Size,
         distortion: tuple[float, ...] = (),
     ) -> list[Track]:
-        """Where each target should be in the frame taken at `capture_ns`, without those whose box misses the picture.
+        """Predicted tracks in the frame taken at `capture_ns`, without those whose box lies outside the image.
 
-        Oldest measurement first. Changes nothing. K [3, 3] px; image_size_wh px; distortion as Frame has it.
+        Oldest measurement first. Changes no state. K [3, 3] px; image_size_wh px; distortion as in Frame.
         """
         lens = Lens(K, distortion)
         view = View.of(capture_ns, own_ship, self.mount, self._view)
@@ -89,20 +89,20 @@ class Tracker:
         self._targets.clear()
 
     def doubt_motion(self) -> None:
-        """Forget how the targets move, not where they are, before the next frame and after it: the stamps that it was
-        learnt from, and the time between them and the next one, may be wrong."""
+        """Discard the targets' velocities and turn rates, not their positions, now and again after the next frame: the
+        timestamps they were estimated from, and the interval to the next frame, may be wrong."""
         self._motion_doubted = True
         self._forget_motion()
 
     def make_room(self, wanted: Estimate) -> None:
-        """Where there is no room for another target, forget one that was missed or is least sure; that place is for
-        `wanted`, if the next update has it."""
+        """If there is no free slot, delete a target that was missed or is least certain; the slot is reserved for
+        `wanted` if the next update contains it."""
         if len(self._targets) >= self.max_targets:
             self._targets.remove(min(self._targets, key=lambda t: (t.measured_ns, t.hits >= CONFIRM_HITS, t.score)))
             self._wanted = wanted
 
     def is_late(self, capture_ns: int) -> bool:
-        """Whether a frame is not later than the last: nothing of it can be used."""
+        """Whether a frame is not later than the last one and so cannot be used."""
         return self._view is not None and capture_ns <= self._view.time_ns
 
     def update(
@@ -115,16 +115,16 @@ class Tracker:
         distortion: tuple[float, ...] = (),
         chosen_id: int | None = None,
     ) -> tuple[Track, ...]:
-        """Take in what was seen in the frame taken at `capture_ns`; returns all tracks, by track_id.
+        """Update with the estimates of the frame taken at `capture_ns`; returns all tracks, by track_id.
 
-        `chosen_id`: which target a person chose.
-        A frame not later than the last is dropped and counted: the tracks stay as they were.
+        `chosen_id`: the target that the operator selected.
+        A frame not later than the last one is dropped and counted; the tracks stay unchanged.
         """
         if self.is_late(capture_ns):
             self.out_of_order += 1
             return self._tracks
         view = View.of(capture_ns, own_ship, self.mount, self._view)
-        # Before anything is paired: after a gap a prediction is so wide that whatever is seen would fit it.
+        # Before association: after a gap a prediction is so uncertain that any detection would fit it.
         self._targets = self._within_reach(capture_ns)
         for target in self._targets:
             target.motion, target.attitude = self._advanced(target, view)
@@ -153,7 +153,7 @@ class Tracker:
         return self._tracks
 
     def _within_reach(self, time_ns: int) -> list[Target]:
-        """Targets that were seen lately enough to be told from others."""
+        """Targets detected recently enough to be distinguished from others."""
         return [t for t in self._targets if (time_ns - t.measured_ns) / NS_PER_S <= COAST_MAX_S]
 
     def _forget_motion(self) -> None:
@@ -171,7 +171,7 @@ class Tracker:
             return ekf.untangled(motion, view), attitude
         old = self._view.moved_to(view.time_ns)
         through_cam = old.linked_by_cam(view)
-        # Leaving ned, the attitude is the last one known; entering it, the new one belongs to this very frame.
+        # Leaving ned, the linking attitude is the last known one, now stale; entering it, it is this frame's own.
         stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if through_cam and old.kind != "cam" else 0.0
         return (
             ekf.untangled(ekf.reframe(motion, old, view, stale_s), view),
@@ -179,9 +179,9 @@ class Tracker:
         )
 
     def _double(self, pairs: list[Pair], more: bool, chosen_id: int | None, time_ns: int) -> int | None:
-        """Number of a target, missed now, that is an aircraft that another is too: not the chosen, else the younger.
+        """Number of a target, missed in this frame, that duplicates another: not the selected, else the younger one.
 
-        `more`: something was seen that no target took. It may be who was missed.
+        `more`: a detection was assigned to no target. It may be of the missed one.
         """
         keys = [(target.track_id, target.born_ns) for target in self._targets]
         turns = [(keys[pair.target], keys[other]) for pair in pairs for other in pair.left_out]
@@ -200,7 +200,7 @@ class Tracker:
             if not free:
                 return
             if any(iou(estimate.box_xyxy_px, box) > SAME_BOX_IOU for box in boxes):
-                continue  # two windows saw one target
+                continue  # two windows showed one target
             motion, attitude = ekf.begin(estimate, lens.K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, lens)
             self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
@@ -218,7 +218,7 @@ def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view:
 
 
 def _flight(motion: Motion, view: View) -> Flight | None:
-    """What the motion tells of how the target flies; nothing in `cam`, where the way is mostly the camera's own."""
+    """The motion as evidence of heading; None in `cam`, where the apparent motion is mostly the camera's own."""
     P_v = ekf.covariance(motion, view)[ekf.VELOCITY, ekf.VELOCITY]
     if motion.kind == "ned":
         return Flight(motion.v_mps, P_v, motion.turn_rate_radps, float(motion.P[ekf.TURN_RATE, ekf.TURN_RATE]), None)
@@ -226,12 +226,12 @@ def _flight(motion: Motion, view: View) -> Flight | None:
 
 
 def _along(motion: Motion, view: View) -> Array:
-    """The unit sight line [3] in the frame."""
+    """The unit line of sight [3] in the frame."""
     return rotation.unit(motion.t_m - view.t_frame_cam_m)
 
 
 def _taken_over(target: Target, spare: list[Estimate], lens: Lens, view: View) -> bool:
-    """Whether an estimate outside the gate has lain under the target's box long enough to become it."""
+    """Whether estimates outside the gate lay in the target's box for PERSISTENT frames: it is then restarted there."""
     box = _box(target, view, lens)
     rivals = [e for e in spare if iou(e.box_xyxy_px, box) > SAME_BOX_IOU]
     target.position_disagreements = target.position_disagreements + 1 if rivals else 0

@@ -1,7 +1,7 @@
-"""The camera in the filter's frame at one instant, and how far off what the own ship told of itself may be.
+"""The camera pose in the filter's frame at one instant, and the own ship's errors.
 
-The own ship's figures are what a small aircraft's autopilot usually achieves, not measurements of one: messages give
-attitude and position without their errors.
+The own ship's errors are typical values for a small aircraft's autopilot, not measurements: the messages give attitude
+and position without their uncertainty.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ FrameKind = Literal["ned", "ned_relative", "cam"]
 NS_PER_S = 1e9
 
 ATTITUDE_JITTER_RAD = 1e-3  # from frame to frame: vibration of the mount, rounding
-EXPOSURE_STD_S = 0.005  # of the camera's stamps; times the turning, an error of attitude
-RATE_GAP_MAX_S = 0.5  # frames further apart do not tell how fast the camera turns
+EXPOSURE_STD_S = 0.005  # of the camera's timestamps; times the turn rate, an error of attitude
+RATE_GAP_MAX_S = 0.5  # frames further apart do not give the camera's turn rate
 
 # Slow errors, common to all frames: they move a track in ned, but nothing in `cam`.
 TILT_STD_RAD = float(np.deg2rad(0.7))
@@ -36,11 +36,11 @@ class View:
     time_ns: int
     R_frame_cam: Array  # [3, 3]
     t_frame_cam_m: Array  # [3]
-    v_frame_cam_mps: Array | None  # [3]; zero in the frames that move with the own ship, None: not known
+    v_frame_cam_mps: Array | None  # [3]; zero in the frames that move with the own ship; None: unknown
     nose_frame: Array | None = None  # [3], the own ship's; None in `cam`
-    turning_radps: float = 0.0  # how fast the camera turns
-    clock_std_s: float = EXPOSURE_STD_S  # of exposure against attitude and position
-    attitude_std_rad: float = 0.0  # of this frame's attitude, beyond what its clock and jitter make of it
+    turning_radps: float = 0.0  # the camera's turn rate
+    clock_std_s: float = EXPOSURE_STD_S  # of the exposure time relative to attitude and position
+    attitude_std_rad: float = 0.0  # of this frame's attitude, in addition to timing and jitter
     axes_epoch: int = 0  # see OwnShip
     origin_epoch: int = 0
 
@@ -66,19 +66,19 @@ class View:
         return cls("ned", time_ns, R_ned_cam, t_m, v_mps, nose, turning, *doubts)
 
     def same_frame(self, other: View) -> bool:
-        """Whether coordinates of one are coordinates of the other."""
+        """Whether both views use the same coordinate frame."""
         if self.kind != other.kind or self.kind == "cam":
             return self.kind == other.kind
         same_origin = self.kind == "ned_relative" or self.origin_epoch == other.origin_epoch
         return same_origin and self.axes_epoch == other.axes_epoch
 
     def linked_by_cam(self, other: View) -> bool:
-        """Whether only the camera's own axes are common to both."""
+        """Whether the two frames have only the camera's axes in common."""
         return "cam" in (self.kind, other.kind) or self.axes_epoch != other.axes_epoch
 
     @property
     def attitude_variance(self) -> float:
-        """Of the attitude from frame to frame, rad^2 about each axis; in `cam` it is not used."""
+        """Variance of one frame's attitude, rad^2 about each axis; 0 in `cam`, where attitude is not used."""
         if self.kind == "cam":
             return 0.0
         by_clock_rad = self.clock_std_s * self.turning_radps
@@ -92,9 +92,9 @@ class View:
         return replace(self, time_ns=time_ns, t_frame_cam_m=self.t_frame_cam_m + dt_s * self.v_frame_cam_mps)
 
     def own_ship_covariance(self, t_m: Array, v_mps: Array) -> Array:
-        """[9, 9] (position, velocity, rotation) of what the own ship's errors do to a target at t_m, v_mps in ned.
+        """[9, 9] (position, velocity, rotation), covariance of a target at t_m, v_mps in ned due to own-ship errors.
 
-        First order in the errors of attitude a, position p, velocity u and clock s: the target's position moves by
+        First order in the errors of attitude a, position p, velocity u and clock s: the target's position changes by
         a x (t - t_own) + p + u_own s, its velocity by a x (v - v_own) + u, its rotation by a.
         """
         velocity = np.zeros(3) if self.v_frame_cam_mps is None else self.v_frame_cam_mps
@@ -117,6 +117,6 @@ def _turning_radps(before: View | None, time_ns: int, R_ned_cam: Array) -> float
 
 
 def _moved_mps(before: View, time_ns: int, t_frame_cam_m: Array) -> Array | None:
-    """Velocity [3] by which the camera came here from an earlier view; None after a gap."""
+    """Mean velocity [3] of the camera since an earlier view; None after a gap."""
     dt_s = (time_ns - before.time_ns) / NS_PER_S
     return (t_frame_cam_m - before.t_frame_cam_m) / dt_s if 0.0 < dt_s <= RATE_GAP_MAX_S else None

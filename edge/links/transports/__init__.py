@@ -1,4 +1,4 @@
-"""How MAVLink's bytes travel: one file a medium behind one interface."""
+"""Transports of MAVLink's bytes: one file per medium behind one interface."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from edge.links.transports.udp import Udp, UdpCaller
 
 
 def open_transport(text: str) -> Transport:
-    """The transport of an endpoint. What can only be there later, a server, its name or a device, is waited for.
+    """The transport of an endpoint. A server, host name or device that is not available yet is retried later.
 
-    Raises LinkError if the text is no endpoint, or what is to be listened on is no address of ours or is taken.
+    Raises LinkError if the text is not an endpoint, or the address to listen on is not ours or is in use.
     """
     try:
         endpoint = parse_endpoint(text)

@@ -1,4 +1,4 @@
-"""When to try again what failed. Pure: every time comes in as an argument."""
+"""When to retry after a failure. Pure: every time is an argument."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 FIRST_WAIT_NS = 250_000_000
 LONGEST_WAIT_NS = 8_000_000_000
-STEADY_NS = 2_000_000_000  # a connection that lasted this long starts the waits afresh
+STEADY_NS = 2_000_000_000  # a connection that lasted this long resets the waits
 
 
 @dataclass(frozen=True)
 class Backoff:
-    """Waits of 0.25 s, 0.5 s, ... 8 s between attempts, from the first again after a connection that lasted."""
+    """Waits of 0.25 s, 0.5 s, ... 8 s between attempts, reset after a connection that lasted."""
 
     retry_at_ns: int = 0
     failures: int = 0

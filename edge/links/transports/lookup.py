@@ -1,4 +1,4 @@
-"""Where a peer's host is. Name service may take long to answer, or come up after the daemon: nobody waits for it."""
+"""Name resolution of a peer's host. It may be slow, or become available after the daemon: nothing waits for it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Places = list[tuple[socket.AddressFamily, Address]]
 
 
 class Lookup:
-    """One question at a time, each asked by a short thread; what is an address already needs none."""
+    """One query at a time, each in a short-lived thread; an address needs no query."""
 
     def __init__(self, endpoint: NetworkEndpoint, kind: socket.SocketKind) -> None:
         self._endpoint = endpoint
@@ -23,7 +23,8 @@ class Lookup:
         self._answers: queue.SimpleQueue[Places | LinkError] = queue.SimpleQueue()
 
     def answer(self) -> Places | LinkError | None:
-        """Where the host is, or why nobody can say; None: not known yet. What was answered is asked anew."""
+        """The host's addresses, or why they cannot be resolved; None: not known yet. The next call after an answer
+        queries again."""
         if not self._asked:
             self._asked = True
             try:

@@ -1,4 +1,4 @@
-"""What every medium has in common."""
+"""Common parts of all transports."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from msgs.mavlink import FrameReader
 
-Address = tuple[Any, ...]  # as the socket family writes it; of a serial port its device
+Address = tuple[Any, ...]  # in the socket family's form; for a serial port, its device
 
 DATAGRAM_MAX = 65_536  # bytes
 CHUNK_MAX = 4096  # bytes of a stream at once
-PENDING_MAX = 32_768  # bytes a byte stream may fall behind by, before whole messages are left out
-WAITING_MAX_NS = 200_000_000  # and how long a message may wait
+PENDING_MAX = 32_768  # bytes that may be pending on a byte stream before whole messages are dropped
+WAITING_MAX_NS = 200_000_000  # how long a message may wait before it is dropped
 
 
 class Received(NamedTuple):
     data: bytes
     sender: Address
-    reader: FrameReader  # of the connection the data came by
+    reader: FrameReader  # of the connection that the data came from
 
 
 class Transport(Protocol):
@@ -36,27 +36,27 @@ class Transport(Protocol):
 
     @property
     def port(self) -> int | None:
-        """The local port, where others may call."""
+        """The local port, if others can connect to it."""
 
     @property
     def peer(self) -> Address | None:
-        """Whom it talks with, if that is settled by the endpoint and there now."""
+        """The peer, if it is determined by the endpoint and available now."""
 
     @property
     def finds_peers(self) -> bool:
-        """Whether anybody may call, so that the peer must show who it is."""
+        """Whether anybody can connect, so that a peer must identify itself first."""
 
     def filenos(self) -> Sequence[int]:
-        """What may become readable."""
+        """File descriptors to poll for reading."""
 
     def tick(self, now_ns: int) -> None:
-        """Let time pass: connect, flush."""
+        """Periodic work: connect, flush."""
 
     def receive(self) -> Received | None:
-        """The next bytes; None if nothing waits."""
+        """The next bytes; None if there are none."""
 
     def send(self, data: bytes, peer: Address) -> bool:
-        """Send a whole message; False if it could not be sent now, and then nothing of it is."""
+        """Send a whole message; False if it cannot be sent now, and then no part of it is."""
 
     def reaches(self, peer: Address) -> bool:
         """Whether a peer found earlier can still be sent to."""
@@ -67,11 +67,11 @@ class Transport(Protocol):
 def resolve(
     endpoint: NetworkEndpoint, kind: socket.SocketKind, flags: int = 0
 ) -> list[tuple[socket.AddressFamily, Address]]:
-    """Family and address of an endpoint, all that its host has. Raises LinkError for a host without one."""
+    """Families and addresses of an endpoint: all that its host has. Raises LinkError for a host without any."""
     try:
         found = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind, flags=flags)
     except (OSError, UnicodeError) as error:
-        # Of 192.168..10, or a part of more than 63 characters, Python does not even ask.
+        # Python rejects 192.168..10, or a label of more than 63 characters, without a query.
         reason = error.strerror if isinstance(error, OSError) else "no host can have this name"
         raise LinkError(
             f"MAVLink endpoint {endpoint.text}: host {endpoint.host!r} cannot be resolved: {reason}"
@@ -83,7 +83,7 @@ def resolve(
 def opening(
     endpoint: NetworkEndpoint, family: socket.AddressFamily, kind: socket.SocketKind
 ) -> Iterator[socket.socket]:
-    """A socket, while it is made ready to be called. It is closed, and LinkError raised, if something will not do."""
+    """A socket while it is prepared for listening. On any error it is closed and LinkError raised."""
     with ExitStack() as unready:
         try:
             yield unready.enter_context(socket.socket(family, kind))
@@ -98,17 +98,17 @@ def local_port(bound: socket.socket) -> int:
 
 
 class Outbox:
-    """Messages for a stream that the medium has not taken yet.
+    """Messages for a stream that the medium has not accepted yet.
 
-    One goes in whole or not at all, and comes out soon or never: on a line that is too slow, or was cut for a while,
-    poses would pile up and arrive when they are true no more.
+    A message is accepted whole or not at all, and sent soon or never: on a line that is too slow or was interrupted,
+    poses would accumulate and arrive outdated.
     """
 
     def __init__(self) -> None:
-        self.expired = 0  # messages left out because they had waited too long
-        self._waiting: deque[tuple[int, bytes]] = deque()  # put ns, message
+        self.expired = 0  # messages dropped because they had waited too long
+        self._waiting: deque[tuple[int, bytes]] = deque()  # time of put (ns), message
         self._pending_bytes = 0
-        self._begun = b""  # what is left of a message that is partly handed on: it must be ended
+        self._begun = b""  # the rest of a partly written message, which must be completed
 
     def put(self, data: bytes, now_ns: int) -> bool:
         self._forget(now_ns)
@@ -119,7 +119,7 @@ class Outbox:
         return True
 
     def flush(self, write: Callable[[bytes], int], room_bytes: int, now_ns: int) -> None:
-        """Hand on what `write(bytes) -> count` takes, until `room_bytes` are passed. Raises its OSError but for "would
+        """Write what `write(bytes) -> count` accepts, until `room_bytes` are exceeded. Raises its OSError except "would
         block"."""
         self._forget(now_ns)
         while room_bytes > 0 and (self._begun or self._waiting):
@@ -142,5 +142,5 @@ class Outbox:
 
 
 def unsent_bytes(fileno: int) -> int:
-    """What the kernel still holds of what was written to a tty, or of a TCP connection is not acknowledged."""
+    """Written bytes that are still in the kernel (tty) or not acknowledged (TCP)."""
     return int.from_bytes(fcntl.ioctl(fileno, termios.TIOCOUTQ, bytes(4)), sys.byteorder)

@@ -1,4 +1,4 @@
-"""A serial port, opened again for ever when it is absent or pulled out."""
+"""A serial port, reopened indefinitely if it is absent or unplugged."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from msgs.mavlink import FrameReader
 log = logging.getLogger(__name__)
 
 BITS_PER_BYTE = 10  # with start and stop
-QUEUES_PER_S = 10  # the kernel is given no more than goes out in a tenth of a second
+QUEUES_PER_S = 10  # the kernel's queue is limited to what is sent in a tenth of a second
 QUEUE_MIN = 280  # bytes: the longest message
 
 
 class SerialPort:
-    """pyserial opens and sets the port; bytes go by its file descriptor, as pyserial's writes may wait."""
+    """pyserial opens and configures the port; data use its file descriptor, as pyserial's writes may block."""
 
     finds_peers = False
     port = None
@@ -115,7 +115,7 @@ class SerialPort:
 
 
 def _tell_silence_from_absence(fileno: int) -> None:
-    """Let reads say "would block" when nothing waits, and nothing at all only when the device is gone."""
+    """Make reads fail with "would block" if there is no data, and return nothing only if the device is gone."""
     os.set_blocking(fileno, False)
     attributes = termios.tcgetattr(fileno)
     attributes[6][termios.VMIN] = 1

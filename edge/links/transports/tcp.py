@@ -1,4 +1,4 @@
-"""TCP, IPv4 and IPv6: a client that connects again for ever, and a server."""
+"""TCP, IPv4 and IPv6: a client that reconnects indefinitely, and a server."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_NS = 5_000_000_000
 CALLERS_MAX = 8
 UNANSWERED_MAX_NS = 1_000_000_000
-UNANSWERED_MAX_BYTES = 4096  # about half a second of what is said of one target
+UNANSWERED_MAX_BYTES = 4096  # about half a second of messages for one target
 
 
 class Connection:
@@ -92,7 +92,7 @@ class Connection:
         return count
 
     def _abort(self) -> None:
-        """Part with what the connection holds: it would come out when the link is whole again, however old."""
+        """Discard the connection's buffered data, which would be sent, outdated, once the link works again."""
         log.warning("mavlink: %s does not answer", self.address)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.close()
@@ -103,9 +103,9 @@ class Connection:
 
 
 class TcpClient:
-    """Connects to a server and, when that fails or the connection is lost, again after a growing wait.
+    """Connects to a server; if that fails or the connection is lost, again after a growing wait.
 
-    Its host is looked up anew for each attempt; of several addresses each has its turn.
+    The host is resolved for each attempt; several addresses are tried in turn.
     """
 
     finds_peers = False
@@ -125,7 +125,7 @@ class TcpClient:
         return self._address if self._connection is not None else None
 
     def filenos(self) -> Sequence[int]:
-        # A connection may have closed since anybody looked: the other side is gone, and sending found it.
+        # The connection may have been closed meanwhile by a send that found the peer gone.
         connection = self._connection
         return (connection.fileno(),) if connection is not None and connection.open else ()
 
@@ -209,8 +209,8 @@ class TcpClient:
 
 
 class TcpServer:
-    """Takes up to CALLERS_MAX callers, who must show who they are; with more, one that was not heeded goes: the oldest
-    of the host that has most.
+    """Accepts up to CALLERS_MAX connections, which must identify themselves. For one more, the oldest connection of the
+    host that has most is closed, but never that of the accepted peer.
 
     Raises LinkError if the port cannot be opened.
     """
@@ -243,12 +243,12 @@ class TcpServer:
         self._forget_closed()
 
     def receive(self) -> Received | None:
-        self._forget_closed()  # first: one that never stops must not keep those that have gone
+        self._forget_closed()  # first, so that one that sends without end does not prevent it
         self._accept()
         for caller in list(self._callers.values()):
             received = caller.receive()
             if received is not None:
-                # Next time the others come first: one that never stops must not silence them.
+                # Next time the others come first: one that sends without end must not block them.
                 self._callers[caller.address] = self._callers.pop(caller.address)
                 return received
         return None
@@ -271,13 +271,13 @@ class TcpServer:
         try:
             connected, address = self._socket.accept()
         except OSError:
-            return  # nobody calls, or has gone again
+            return  # no connection, or it is closed again
         if len(self._callers) >= CALLERS_MAX:
             self._callers.pop(self._spare()).close()
         self._callers[address] = Connection(connected, address)
 
     def _spare(self) -> Address:
-        """Whom to part with for another: a host that calls and calls displaces itself alone."""
+        """The connection to close for a new one: a host that keeps connecting only displaces itself."""
         unheeded = [known for known in self._callers if known != self._heeded]
         calls = Counter(known[0] for known in unheeded)
         return max(unheeded, key=lambda known: calls[known[0]])

@@ -1,4 +1,4 @@
-"""UDP, IPv4 and IPv6: `udpin` is bound and answers whom it comes to trust, `udpout` talks to one address at a time."""
+"""UDP, IPv4 and IPv6: `udpin` is bound and sends to an accepted peer, `udpout` sends to one address at a time."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from msgs.mavlink import FrameReader
 log = logging.getLogger(__name__)
 
 RECEIVE_BUFFER = 1 << 20
-SILENT_NS = 5_000_000_000  # nothing heard for so long: the host may have another address by now
+SILENT_NS = 5_000_000_000  # after this silence the host may have another address
 
 
 def _bound(endpoint: NetworkEndpoint, family: socket.AddressFamily, address: Address) -> socket.socket:
-    """Raises LinkError if that cannot be."""
+    """A bound socket. Raises LinkError if that fails."""
     with opening(endpoint, family, socket.SOCK_DGRAM) as opened:
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
@@ -48,13 +48,13 @@ class Udp:
         return (self._socket.fileno(),)
 
     def tick(self, now_ns: int) -> None:
-        """Whoever calls knows where we are."""
+        """Nothing to do: peers send to us first."""
 
     def receive(self) -> Received | None:
         try:
             data, sender = self._socket.recvfrom(DATAGRAM_MAX)
         except OSError:
-            # Nothing waits, or a peer's port is closed (ICMP): both mean no datagram.
+            # No data, or a peer's port is closed (ICMP): both mean no datagram.
             return None
         return Received(data, sender, self._reader)
 
@@ -73,9 +73,9 @@ class Udp:
 
 
 class UdpCaller:
-    """`udpout`: one host, looked up until it has an address, and again after each SILENT_NS without a word from there.
+    """`udpout`: one host, resolved until it has an address, and again after each SILENT_NS without data from there.
 
-    Of several addresses each then has its turn.
+    Several addresses are then tried in turn.
     """
 
     finds_peers = False
@@ -88,7 +88,7 @@ class UdpCaller:
         self._reader = FrameReader(datagram=True)
         self._socket: socket.socket | None = None
         self._heard = self._told = False
-        self._called_ns: dict[Address, int] = {}  # each of the host's addresses, when its turn was
+        self._called_ns: dict[Address, int] = {}  # by address of the host: when it was last tried
         now_ns = clock.monotonic_ns()
         self._look_at_ns = now_ns
         self.tick(now_ns)
@@ -139,10 +139,9 @@ class UdpCaller:
             self._socket.close()
 
     def _call_next(self, places: Places, now_ns: int) -> None:
-        """Call whom was called longest ago: name service tells several addresses in any order.
+        """Use the address tried longest ago, as name resolution returns several in any order.
 
-        One that this host cannot call at all, as where no way leads there, leaves its turn to the next. Raises
-        LinkError if that is so of all.
+        One that this host cannot reach at all, for lack of a route, is skipped. Raises LinkError if all are.
         """
         before_ns = self._called_ns
         self._called_ns = {address: before_ns.get(address, -1) for _, address in places}
@@ -154,7 +153,7 @@ class UdpCaller:
             except LinkError as error:
                 failed = error
                 continue
-            # Else told already: where somebody only listens, addresses are called by turns for ever.
+            # Otherwise logged already: for a peer that never sends, addresses are tried in turn indefinitely.
             if address not in before_ns or self._told:
                 log.info("mavlink: %s: calling %s", self.endpoint, address)
                 self._told = False
@@ -163,9 +162,9 @@ class UdpCaller:
             raise failed
 
     def _call(self, family: socket.AddressFamily, address: Address) -> None:
-        """Raises LinkError if this host cannot call there at all."""
+        """Raises LinkError if this host cannot reach the address at all."""
         with opening(self._named, family, socket.SOCK_DGRAM) as probe:
-            probe.connect(address)  # sends nothing, and fails where no way leads there
+            probe.connect(address)  # sends nothing, and fails if there is no route
         probe.close()
         if self._socket is None or self._socket.family != family:
             opened = _bound(self._named, family, ("", 0))
