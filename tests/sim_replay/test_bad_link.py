@@ -69,7 +69,7 @@ def test_what_is_no_share_is_said(capsys: pytest.CaptureFixture[str], tmp_path: 
     assert refused.value.code == 2
     assert "'1.5' is not a number from 0 to 1" in capsys.readouterr().err
     assert main(["play", "--lockstep", "--link-delay-ms", "5", "--out", str(tmp_path)]) == 2
-    assert "real time alone" in capsys.readouterr().err
+    assert "only in real time, not in lock-step" in capsys.readouterr().err
 
 
 class Link:
