@@ -89,6 +89,7 @@ class LossConfig(Section):
     depth: float = Field(20.0, ge=0, description="mu_1, on log Z")
     planar: float = Field(50.0, ge=0, description="mu_2, on T_xy / Z")
     depth_beta: float = Field(1.0, gt=0, description="where SmoothL1 of log Z turns from square to linear")
+    size_beta: float = Field(0.1, gt=0, description="where SmoothL1 of log w and log h turns from square to linear")
     rotation_6d: float = Field(5.0, ge=0, description="eta")
     hypothesis: float = Field(0.0, ge=0, description="cross-entropy of the rotation hypotheses")
     center: float = Field(0.0, ge=0, description="soft-argmax centre, in cells")

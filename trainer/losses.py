@@ -170,7 +170,7 @@ def pose_terms(out: Decoded, labels: Labels, weights: LossConfig, ray: bool = Tr
 
     share = hypothesis_share(R_allo_true, logits.shape[-1])
     terms = {
-        "size": F.smooth_l1_loss(log_size, true_log_size, reduction="none", beta=0.1).sum(-1),
+        "size": F.smooth_l1_loss(log_size, true_log_size, reduction="none", beta=weights.size_beta).sum(-1),
         "depth": F.smooth_l1_loss(log_Z, torch.log(Z), reduction="none", beta=weights.depth_beta),
         "planar": F.smooth_l1_loss(t_xy, t[:, :2], reduction="none").sum(-1) / Z,
         "geodesic": (share * eq.rotation_angle(R_ego_k, labels.R_cam_target[:, None])).sum(-1) / math.pi,

@@ -115,6 +115,15 @@ def test_geodesic_term_is_the_angle_over_pi() -> None:
     assert terms["geodesic"].item() == pytest.approx(0.6 / math.pi, rel=1e-4)
 
 
+@pytest.mark.parametrize(("beta", "cost"), [(0.1, 2 * 0.5 * 0.04**2 / 0.1), (0.02, 2 * (0.04 - 0.01))])
+def test_size_costs_its_square_below_beta_and_itself_above(beta: float, cost: float) -> None:
+    labels = labels_at((40.0, 25.0), (30.0, 12.0))
+    out = perfect(labels)
+    loss = tiny.config().loss.model_copy(update={"size_beta": beta})
+    terms = pose_terms(out._replace(log_size=out.log_size + 0.04), labels, loss)
+    assert terms["size"].item() == pytest.approx(cost, rel=1e-4)
+
+
 def test_each_hypothesis_answers_for_its_own_heading() -> None:
     anchors = eq.gram_schmidt(eq.heading_anchors(8))
     share = hypothesis_share(anchors, 8)
