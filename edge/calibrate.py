@@ -31,14 +31,14 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
         for path in list_pictures(source):
             gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
             if gray is None:
-                raise InputError(f"{path} is not a readable picture")
+                raise InputError(f"{path} is not a readable image")
             yield path.name, np.asarray(gray, dtype=np.uint8)
         return
     if not source.is_file():
         raise InputError(f"{source} does not exist")
     video = open_video(str(source))
     if not video.isOpened():
-        raise InputError(f"{source} is neither a folder of pictures nor a readable video")
+        raise InputError(f"{source} is neither a folder of images nor a readable video")
     every = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // PICTURES_MAX, 1)
     index = 0
     while video.grab():
@@ -56,7 +56,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
     for name, gray in pictures_of(source):
         seen_wh = (gray.shape[1], gray.shape[0])
         if size_wh is not None and seen_wh != size_wh:
-            raise InputError(f"{source}: {name} is {seen_wh[0]}x{seen_wh[1]}, those before {size_wh[0]}x{size_wh[1]}")
+            raise InputError(f"{source}: {name} is {seen_wh[0]}x{seen_wh[1]}, earlier images {size_wh[0]}x{size_wh[1]}")
         size_wh, pictures = seen_wh, pictures + 1
         view = detector.detect(gray)
         boards += view is not None
@@ -64,10 +64,10 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
             views.append(view)
         _tell_progress(pictures, boards, len(views))
     if size_wh is None or boards == 0:
-        raise InputError(f"{source}: no picture shows the whole board as described by --pattern and --squares")
+        raise InputError(f"{source}: no image shows the whole board as described by --pattern and --squares")
     if len(views) < VIEWS_MIN:
         raise InputError(
-            f"{source}: {boards} of {pictures} pictures show the board, but only {len(views)} views of it differ; "
+            f"{source}: {boards} of {pictures} images show the board, but only {len(views)} views of it differ; "
             f"{VIEWS_MIN} are needed: move and tilt the board more"
         )
     found = calibration_of(views, size_wh, coefficients, boards, pictures)
@@ -113,15 +113,15 @@ def report(found: Calibration, out: Path) -> list[str]:
         f"{out}: {found.image_size_wh[0]}x{found.image_size_wh[1]}, focal length {fx:.1f} x {fy:.1f} px, "
         f"centre {cx:.1f}, {cy:.1f}",
         f"reprojection error {found.rms_px:.3f} px RMS over {found.views} views "
-        f"({found.boards} of {found.pictures} pictures show the board)",
-        f"focal length to {100 * found.focal_sigma:.2f} % (1 sigma); "
-        f"boards were seen in {100 * found.covered:.0f} % of the picture",
+        f"({found.boards} of {found.pictures} images show the board)",
+        f"focal length uncertainty {100 * found.focal_sigma:.2f} % (1 sigma); "
+        f"the views cover {100 * found.covered:.0f} % of the image",
         f"distortion ({found.model}) " + " ".join(f"{value:.5f}" for value in found.distortion),
     ]
     if found.without_ray >= TOLD_MIN:
         lines.append(
-            f"{100 * found.without_ray:.1f} % of the picture, in its corners, has no ray and is not seen: "
-            "more views of the board there may mend it"
+            f"{100 * found.without_ray:.1f} % of the image, in its corners, cannot be undistorted, "
+            "and nothing is detected there: more views of the board there may correct this"
         )
     return lines
 
@@ -147,4 +147,4 @@ def to_json(found: Calibration) -> str:
 
 def _tell_progress(pictures: int, boards: int, views: int) -> None:
     if sys.stderr.isatty():
-        print(f"\r{pictures} pictures, {boards} with the board, {views} different", end="", file=sys.stderr, flush=True)
+        print(f"\r{pictures} images, {boards} with the board, {views} different", end="", file=sys.stderr, flush=True)

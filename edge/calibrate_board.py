@@ -93,7 +93,7 @@ def charuco_board(settings: BoardSettings) -> cv2.aruco.CharucoBoard:
     if number is None:
         raise InputError(f"--dictionary: OpenCV has no {settings.dictionary}; try 5X5_100")
     if not 0.3 <= settings.marker_share <= 0.95:
-        raise InputError("--marker-share takes a number from 0.3 to 0.95")
+        raise InputError("--marker-share must be a number from 0.3 to 0.95")
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     markers = settings.squares[0] * settings.squares[1] // 2
     if markers > len(dictionary.bytesList):
@@ -126,5 +126,5 @@ def board_squares(text: str) -> Size:
     """`9x6` as (9, 6). Raises InputError."""
     match = re.fullmatch(r"(\d{1,2})x(\d{1,2})", text)
     if match is None:
-        raise InputError(f"--squares: '{text}' is not ACROSSxDOWN, as 9x6")
+        raise InputError(f"--squares: '{text}' is not COLUMNSxROWS, such as 9x6")
     return int(match[1]), int(match[2])

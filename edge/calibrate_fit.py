@@ -191,14 +191,14 @@ def _covered(views: list[View], size_wh: Size) -> float:
 def _no_model(chosen: Fit, fits: dict[Coefficients, Fit]) -> str | None:
     if chosen.rms_px <= RMS_MAX_PX or _better_model(chosen, fits) is not None:
         return None
-    missed = f"misses the corners by {chosen.rms_px:.2f} px" if np.isfinite(chosen.rms_px) else "comes to no numbers"
+    found = f"the reprojection error is {chosen.rms_px:.2f} px" if np.isfinite(chosen.rms_px) else "the fit failed"
     fewer = _or_fewer(_no_worse(chosen, fits))
-    return f"the fit {missed}; is the board flat, --squares right, and the lens no fisheye?{fewer.removeprefix('.')}"
+    return f"{found}; check that the board is flat, --squares correct, and the lens not a fisheye{fewer}"
 
 
 def _poor_views(covered: float, tilted: int, views: int) -> str | None:
     if covered < COVERED_MIN:
-        return f"the board was seen in {100 * covered:.0f} % of the picture; show it in the corners too"
+        return f"the views cover only {100 * covered:.0f} % of the image; show the board in the corners too"
     if tilted < TILTED_MIN:
         return _too_alike(f"{tilted} of {views} are tilted")
     return None
@@ -206,8 +206,8 @@ def _poor_views(covered: float, tilted: int, views: int) -> str | None:
 
 def _too_alike(how: str) -> str:
     return (
-        f"the views are too alike to tell focal length from distance ({how}): "
-        "tilt the board by 30 degrees and more, to all sides"
+        f"the views are too similar to separate focal length and distance ({how}): "
+        "tilt the board by 30 degrees or more, in all directions"
     )
 
 
@@ -219,8 +219,8 @@ def _better_model(chosen: Fit, fits: dict[Coefficients, Fit]) -> str | None:
     if better is chosen:
         return None
     return (
-        f"{chosen.coefficients} coefficients miss the corners by {chosen.rms_px:.2f} px, {better.coefficients} by "
-        f"{better.rms_px:.2f} px: use --coefficients {better.coefficients}"
+        f"the reprojection error is {chosen.rms_px:.2f} px with {chosen.coefficients} coefficients, "
+        f"{better.rms_px:.2f} px with {better.coefficients}: use --coefficients {better.coefficients}"
     )
 
 
@@ -230,7 +230,7 @@ def _unsettled(chosen: Fit, fits: dict[Coefficients, Fit]) -> str | None:
     if np.isfinite(chosen.focal_sigma):
         return _too_alike(f"1 sigma {100 * chosen.focal_sigma:.1f} %")
     advice = _or_fewer([less for less in _no_worse(chosen, fits) if less.settled])
-    return f"the views do not settle {chosen.coefficients} coefficients; show the board in more places{advice}"
+    return f"the views do not determine {chosen.coefficients} coefficients; show the board in more places{advice}"
 
 
 def _folded(chosen: Fit, fits: dict[Coefficients, Fit], size_wh: Size) -> str | None:
@@ -238,8 +238,8 @@ def _folded(chosen: Fit, fits: dict[Coefficients, Fit], size_wh: Size) -> str | 
     if without_ray <= WITHOUT_RAY_MAX:
         return None
     whole = [less for less in _no_worse(chosen, fits) if less.without_ray(size_wh) <= WITHOUT_RAY_MAX]
-    share = f"in its corners, {100 * without_ray:.1f} % of it"
-    return f"the fitted distortion folds the picture over itself {share}; show the board there{_or_fewer(whole)}"
+    share = f"in its corners ({100 * without_ray:.1f} % of it)"
+    return f"the fitted distortion folds the image over itself {share}; show the board there{_or_fewer(whole)}"
 
 
 def _no_worse(chosen: Fit, fits: dict[Coefficients, Fit]) -> list[Fit]:
@@ -249,4 +249,4 @@ def _no_worse(chosen: Fit, fits: dict[Coefficients, Fit]) -> list[Fit]:
 
 
 def _or_fewer(choice: list[Fit]) -> str:
-    return f". Or fit fewer: --coefficients {choice[-1].coefficients}" if choice else ""
+    return f". Or use fewer: --coefficients {choice[-1].coefficients}" if choice else ""

@@ -34,8 +34,8 @@ def check(file: ConfigFile) -> list[str]:
         f"model    {model.path.name}: {contract.name} {contract.precision}, {stages}, sha256 {model.sha256[:12]}",
         f"runs on  {model.provider}" + (f": {model.fallback_reason}" if model.fallback_reason else ""),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
-        + (f", {len(camera.distortion)} coefficients of distortion" if any(camera.distortion) else ", no distortion")
-        + ("" if opened else "; it does not answer now and will be tried again"),
+        + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
+        + ("" if opened else "; not reachable now, the daemon will keep trying"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
         f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",
         f"mavlink  {', '.join(config.mavlink.endpoints) if config.mavlink.enabled else 'off'}",

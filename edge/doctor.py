@@ -28,10 +28,10 @@ TIMED_RUNS = 10
 LIVE_FRAMES = 20
 STAMPS = "camera_stamps"
 ADVICE = {  # by the kind of edge.health.Reason
-    STAMPS: "docs/cameras.md says what a timestamp means; so do pictures that come in bursts",
-    "camera_frozen": "does it look at anything that moves? else plug it in again",
+    STAMPS: "see docs/cameras.md on timestamps; images that arrive in bursts also cause this",
+    "camera_frozen": "point it at something that moves; if it stays frozen, unplug it and plug it in again",
 }
-ADVICE_CAMERA = "is it on, plugged in, and reachable from here?"
+ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"
 
 
 def doctor(file: ConfigFile, as_json: bool) -> int:
@@ -45,7 +45,7 @@ def doctor(file: ConfigFile, as_json: bool) -> int:
     if as_json:
         print(json.dumps({"well": not failed, "findings": [asdict(finding) for finding in found]}))
     else:
-        print(f"{len(failed)} wrong" if failed else "nothing is wrong")
+        print(f"{len(failed)} failed" if failed else "no check failed")
     return 1 if failed else 0
 
 
@@ -66,11 +66,11 @@ def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float 
     of_camera = [(kind, text) for kind, text in told_reasons(running) if kind.startswith(CAMERA_REASONS)]
     if of_camera:
         said = "; ".join(text for _, text in of_camera)
-        yield wrong("camera", f"the daemon, which has it, says: {said}", _advice(of_camera)), None
+        yield wrong("camera", f"reported by the running daemon: {said}", _advice(of_camera)), None
         return
     rate_hz = running.get("frame_rate_hz")
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
-    yield good("camera", f"{running['camera']}{rate}, as the daemon says, which has it"), rate_hz
+    yield good("camera", f"{running['camera']}{rate} (reported by the running daemon)"), rate_hz
 
 
 def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
@@ -83,7 +83,7 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
     try:
         source, info, opened = open_source(camera)
     except InputError as error:
-        yield wrong("camera", str(error), "mend what is named in [camera]"), None
+        yield wrong("camera", str(error), "correct this in [camera]"), None
         return
     name = info.name
     capture = Capture(source, opened)
@@ -92,15 +92,15 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         seen_ns, size_wh = _see_frames(capture)
         reasons = [(one.kind, one.text) for one in capture.reasons(time.monotonic_ns())]
     except InputError as error:
-        yield wrong("camera", str(error), "mend what is named in [camera]"), None
+        yield wrong("camera", str(error), "correct this in [camera]"), None
         return
     finally:
         capture.stop()
     said = "; ".join(text for _, text in reasons)
     if size_wh is None:
-        advice = "is it on, plugged in, in no other program's hands, and reachable from here?"
+        advice = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
         why = f": {said}" if said else ""
-        yield wrong("camera", f"{name}: no picture within {FRAME_S:.0f} s{why}", advice), None
+        yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
     rate_hz = (len(seen_ns) - 1) / ((seen_ns[-1] - seen_ns[0]) / 1e9) if len(seen_ns) > 2 else None
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
@@ -136,7 +136,7 @@ def _model(file: ConfigFile, frame_ms: float | None) -> Iterator[Finding]:
     try:
         model = load_configured(file)
     except InputError as error:
-        yield wrong("model", str(error), "give a file that `uavpose-trainer export` wrote, or leave [model] path out")
+        yield wrong("model", str(error), "set [model] path to a file written by `uavpose-trainer export`, or omit it")
         return
     if model.fallback_reason is not None:
         yield wrong("provider", model.fallback_reason, 'install what is missing, or set [model] provider = "cpu"')
@@ -147,8 +147,8 @@ def _model(file: ConfigFile, frame_ms: float | None) -> Iterator[Finding]:
     text = f"{contract.name} {contract.precision} {model.sha256[:12]} on {model.provider}: {told}"
     steady_ms = times.get("track", times["acquire"])
     if frame_ms is not None and steady_ms > frame_ms:
-        advice = "lower [camera] fps, raise [model] threads, take the INT8 model, or stop what else runs"
-        yield poor("model", f"{text}; a frame comes every {frame_ms:.0f} ms", advice)
+        advice = "lower [camera] fps, raise [model] threads, use the INT8 model, or stop other programs"
+        yield poor("model", f"{text}; frames arrive every {frame_ms:.0f} ms", advice)
     else:
         yield good("model", text)
 

@@ -31,7 +31,9 @@ from msgs.session import client_config, peer_config
 
 CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # prefixes of the kinds of edge.health.Reason about it
 NO_AUTOPILOT = "no_attitude"
-ADVICE_AUTOPILOT = "is the autopilot on, its port set to MAVLink 2 at this speed, its stream sent to this address?"
+ADVICE_AUTOPILOT = (
+    "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
+)
 HEARING_S = 4.0
 LOOK_S = 0.1
 
@@ -39,15 +41,15 @@ LOOK_S = 0.1
 def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator[Finding]:
     """`running`: the running daemon's `info`, if any: its endpoints are then in use and not tried."""
     if running is not None:
-        said = f"the daemon runs (process {running['pid']}) and is {running.get('state', 'starting')}"
+        said = f"running (process {running['pid']}), state {running.get('state', 'starting')}"
         others = {kind: text for kind, text in told_reasons(running) if not kind.startswith(CAMERA_REASONS)}
         if NO_AUTOPILOT in others:
             yield wrong("daemon", f"{said}: {'; '.join(others.values())}", ADVICE_AUTOPILOT)
         elif others:
-            advice = "`uavpose-edge status` has its counters, `journalctl -u uavpose-edge` what came before"
+            advice = "`uavpose-edge status` shows its counters, `journalctl -u uavpose-edge` its log"
             yield poor("daemon", f"{said}: {'; '.join(others.values())}", advice)
         else:
-            yield good("daemon", f"{said}; its links are not tried from here")
+            yield good("daemon", f"{said}; its links are not tested by this command")
         return
     if config.zenoh.enabled:
         yield from _zenoh(config.zenoh)
@@ -74,16 +76,18 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
     tls = settings.tls.files() if settings.tls is not None else None
     try:
         zenoh.open(peer_config(settings.listen, [], tls=tls)).close()
-        yield good("zenoh", f"{', '.join(settings.listen) or 'nothing'} can be listened on")
+        yield good(
+            "zenoh", f"can listen on {', '.join(settings.listen)}" if settings.listen else "no address to listen on"
+        )
     except zenoh.ZError:
-        advice = "another program has one of them: `ss -ltnup` shows which; or change [zenoh] listen"
-        yield wrong("zenoh", f"{', '.join(settings.listen)} cannot be listened on", advice)
+        advice = "stop the program that uses one of them (`ss -ltnup` shows which), or change [zenoh] listen"
+        yield wrong("zenoh", f"cannot listen on {', '.join(settings.listen)}", advice)
     for endpoint in settings.connect:
         try:
             zenoh.open(client_config([endpoint], tls=tls)).close()
             yield good("ground", f"{endpoint} answers")
         except zenoh.ZError:
-            advice = "start `uavpose-ground router` there, check address, firewall, certificates"
+            advice = "start `uavpose-ground router` there; check address, firewall and certificates"
             yield poor("ground", f"{endpoint} does not answer", advice)
 
 
@@ -101,11 +105,9 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
                 resolve(named, socket.SOCK_DGRAM)
             except InputError as error:
                 if kind in ("udpin", "tcpin"):
-                    yield wrong(
-                        "mavlink", str(error), "give it an address of this computer, or 0.0.0.0 for all of them"
-                    )
+                    yield wrong("mavlink", str(error), "use an address of this computer, or 0.0.0.0 for all of them")
                     return
-                yield poor("host", str(error), f"`getent hosts {named.host}` shows the same; give it an address")
+                yield poor("host", str(error), f"test it with `getent hosts {named.host}`, or use a numeric address")
     own_ship = OwnShipBuffer()
     camera = CameraInfo("doctor", (640, 480), np.eye(3), None)
     try:
@@ -113,7 +115,9 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         link.start()
     except InputError as error:
         yield wrong(
-            "mavlink", str(error), "another program has it: `ss -lunp` shows which; or change [mavlink] endpoints"
+            "mavlink",
+            str(error),
+            "stop the program that uses it (`ss -lunp` shows which), or change [mavlink] endpoints",
         )
         return
     try:
@@ -122,7 +126,7 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         link.stop()
     where = ", ".join(settings.endpoints)
     if counters.get("received_HEARTBEAT", 0):
-        yield good("mavlink", f"{where}: a heartbeat is heard")
+        yield good("mavlink", f"{where}: heartbeat received")
         return
     refused = ", ".join(f"{name} {count}" for name, count in counters.items() if name.startswith("refused_") and count)
     counted = f" ({refused})" if refused else ""
@@ -133,14 +137,14 @@ def signing_finding(state: Path) -> Finding:
     """Whether the daemon can store the last timestamp used for signing, and the stored one is not in the future."""
     advice = "set [mavlink] signing_state to a file in a folder of its own, such as /var/lib/uavpose/mavlink.timestamp"
     if os.path.isdir(state):  # Path.is_dir raises if a parent folder may not be entered
-        return wrong("signing", f"{state} is a folder: after a restart old messages would pass as new", advice)
+        return wrong("signing", f"{state} is a folder: after a restart, replayed messages would be accepted", advice)
     with suppress(OSError), tempfile.TemporaryFile(dir=state.parent):  # it is replaced, so the folder's rights decide
         ahead = ahead_of_clock(state, clock.utc_ns())
         if ahead is None:
-            return good("signing", f"the last timestamp is kept in {state}")
-        clock_advice = "set the clock; if it is right, and was wrong when that was written, remove the file"
-        return poor("signing", f"{ahead}: an autopilot that knows the time may be refused", clock_advice)
-    return wrong("signing", f"{state} cannot be written: after a restart old messages would pass as new", advice)
+            return good("signing", f"the last timestamp is stored in {state}")
+        clock_advice = "set the clock; if it is right now and was wrong when the file was written, delete the file"
+        return poor("signing", f"{ahead}: an autopilot with the correct time may be rejected", clock_advice)
+    return wrong("signing", f"{state} cannot be written: after a restart, replayed messages would be accepted", advice)
 
 
 def _wait(look: Callable[[], dict[str, int]], done: Callable[[dict[str, int]], bool]) -> dict[str, int]:

@@ -35,9 +35,9 @@ def cpu_finding(cpuinfo: str, machine: str) -> Finding:
     wanted = DOT_PRODUCT.get(machine, ())
     have = [flag for flag in wanted if flag in flags]
     if have:
-        return good("processor", f"{machine} with {', '.join(have)}: made for the INT8 model")
+        return good("processor", f"{machine} with {', '.join(have)}: accelerates the INT8 model")
     names = " or ".join(wanted) or "8-bit dot products"
-    advice = "compare models with `uavpose-edge bench`: INT8 gains little here; a Raspberry Pi 5 or newer has them"
+    advice = "INT8 gains little here: compare models with `uavpose-edge bench`; a Raspberry Pi 5 or newer has them"
     return poor("processor", f"{machine} without {names}", advice)
 
 
@@ -45,21 +45,25 @@ def _cores(threads: int) -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0))
     if threads > cores:
         advice = f"set [model] threads = {cores}"
-        yield poor("cores", f"{cores} for this process, but [model] threads is {threads}", advice)
+        yield poor("cores", f"{cores} available to this process, but [model] threads is {threads}", advice)
     else:
-        yield good("cores", f"{cores} for this process, {threads} for one inference")
+        yield good("cores", f"{cores} available to this process, {threads} used per inference")
     if GOVERNOR.exists() and (governor := GOVERNOR.read_text().strip()) in ("powersave", "conservative"):
         advice = "sudo cpupower frequency-set -g performance, or schedutil"
-        yield poor("governor", f"the processor's clock is held by '{governor}'", advice)
+        yield poor("governor", f"the CPU frequency governor is '{governor}'", advice)
 
 
 def clock_finding(state: int) -> Finding:
     """From adjtimex's return value, -1 if it is not available."""
     if state == TIME_ERROR:
-        advice = "install chrony, with GPS or the ground's time; stamps are judged by age, and poses refused without it"
+        advice = (
+            "install chrony, with GPS or the ground's clock as source: receivers reject poses by their timestamp's age"
+        )
         return poor("clock", "UTC is not synchronised", advice)
     if state < 0:
-        return poor("clock", "this system does not say whether UTC is synchronised", "compare `date -u` on both ends")
+        return poor(
+            "clock", "this system does not report whether UTC is synchronised", "compare `date -u` on both ends"
+        )
     return good("clock", "UTC is synchronised")
 
 
@@ -73,21 +77,22 @@ def _clock_state() -> int:
 def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Finding:
     """Space for recordings; the folder is created by the first one, so its nearest parent is checked. `from_start`
     False: only the ground starts recordings."""
-    bad, of_what = (wrong, "") if from_start else (poor, "a recording that the ground asks for will fail: ")
+    bad, of_what = (wrong, "") if from_start else (poor, "a recording requested by the ground will fail: ")
     # Path.exists and Path.is_dir raise if a parent folder may not be searched. Even a broken link counts as existing.
     there = next((parent for parent in (folder, *folder.parents) if os.path.lexists(parent)), Path("/"))
     needed = os.W_OK | os.X_OK | (os.R_OK if there == folder else 0)  # the recorder lists its earlier files
     if os.path.isdir(there) and os.statvfs(there).f_flag & os.ST_RDONLY:
         advice = (
-            "mount it to be written (`findmnt -T` shows what it is; a failing card is made read-only), or name another"
+            "mount it writable (`findmnt -T` shows the mount; a failing card is made read-only), "
+            "or choose another in [recorder] folder"
         )
         return bad("disk", f"{of_what}{folder} is on a disk that is mounted read-only", advice)
     if not os.path.isdir(there) or not os.access(there, needed):
-        advice = f"sudo install -d -o $USER {folder}, or name another in [recorder] folder"
+        advice = f"sudo install -d -o $USER {folder}, or choose another in [recorder] folder"
         return bad("disk", f"{of_what}{folder} cannot be written by this user", advice)
     free = shutil.disk_usage(there).free
     if free < free_min_bytes:
         advice = "remove old recordings, or lower [recorder] free_min_mb"
-        said = f"{of_what}{folder}: {free / 1e6:.0f} MB free, {free_min_bytes / 1e6:.0f} to be left free"
+        said = f"{of_what}{folder}: {free / 1e6:.0f} MB free, at least {free_min_bytes / 1e6:.0f} MB must stay free"
         return bad("disk", said, advice)
     return good("disk", f"{folder}: {free / 1e9:.1f} GB free")

@@ -39,13 +39,13 @@ def wrong(what: str, says: str, advice: str) -> Finding:
 
 def device_fault(path: Path, group: str) -> tuple[str, str] | None:
     """Why a device file cannot be used by this user, and what to do; None if it can."""
-    forbidden = f"{path} may not be read and written by this user"
+    forbidden = f"{path} is not readable and writable by this user"
     try:
         path.stat()
     except PermissionError:
-        return forbidden, f"`namei -l {path}` shows the folder that this user may not enter"
+        return forbidden, f"`namei -l {path}` shows which folder this user cannot access"
     except (OSError, ValueError):
-        return f"{path} is not there", f"plug it in, or name another; `ls {path.parent}` shows what there is"
+        return f"{path} does not exist", f"plug it in, or choose another; `ls {path.parent}` lists what exists"
     if not os.access(path, os.R_OK | os.W_OK):
         return forbidden, f"sudo usermod -aG {group} $USER, then log in again"
     return None

@@ -47,7 +47,7 @@ def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] 
         with zenoh.open(client_config([endpoint], tls=tls)) as session:
             vehicles = {str(info.get("vehicle")): info for info in _answers(session, uav, "info")}
             if len(vehicles) > 1:
-                raise InputError(f"{' and '.join(sorted(vehicles))} answer at {endpoint}: say which with --vehicle")
+                raise InputError(f"{' and '.join(sorted(vehicles))} answer at {endpoint}: select one with --vehicle")
             # Of this vehicle only: the first answer to `*` may be another's.
             answers = {
                 what: next(_answers(session, name, what), None) for name in vehicles for what in ("config", "model")
@@ -81,7 +81,7 @@ def for_a_person(answer: dict[str, Any]) -> str:
     ]
     if "state" not in info:
         return "\n".join(lines)
-    stale = f"; {info['age_s']:.0f} s OLD: the loop stands still" if info["age_s"] >= STALE_S else ""
+    stale = f"; {info['age_s']:.0f} s OLD: the main loop has stalled" if info["age_s"] >= STALE_S else ""
     lines += [f"  targets   {info['tracks']}", f"  frames    {info['frame_rate_hz']:.1f} a second{stale}", ""]
     lines.append(f"  {'stage':12} {'p50 ms':>8} {'p95 ms':>8} {'p99 ms':>8}")
     lines += [
@@ -117,7 +117,7 @@ def _address(config: Path | None, connect: str | None, vehicle: str | None) -> t
         settings, uav = loaded.zenoh, vehicle or loaded.vehicle.name
         tls = settings.tls.files() if settings.tls is not None else None
         if not settings.enabled:
-            raise InputError(f"{config}: [zenoh] enabled is false: the daemon answers nobody; look at its log")
+            raise InputError(f"{config}: [zenoh] enabled is false: the daemon cannot be queried; see its log")
     try:
         key_of(uav, "info")
         if connect is not None:
@@ -126,7 +126,7 @@ def _address(config: Path | None, connect: str | None, vehicle: str | None) -> t
         raise InputError(str(error)) from error
     here = loopback_endpoints(settings)
     if not here:
-        raise InputError(f"{config}: [zenoh] listen names no loopback address to ask at; give --connect")
+        raise InputError(f"{config}: [zenoh] listen has no loopback address to query; use --connect")
     return here[0], uav, tls
 
 

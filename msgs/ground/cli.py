@@ -40,7 +40,7 @@ def _still_calls() -> bool:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uavpose-ground",
-        description="The ground's end: route, watch, view and record what vehicles tell over zenoh.",
+        description="Ground station tools: watch, view, record and command vehicles over zenoh, and run their router.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
@@ -55,59 +55,75 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_watch(commands: Commands) -> None:
-    watch = commands.add_parser("watch", help="a live table of vehicles and their targets")
+    watch = commands.add_parser("watch", help="show a live table of vehicles and their targets")
     _connection(watch)
-    watch.add_argument("--json", action="store_true", help="one JSON object a line: pose, health, event, vehicle, link")
     watch.add_argument(
-        "--max-age", type=_not_negative, default=2.0, metavar="S", help="older poses are refused (default 2)"
+        "--json", action="store_true", help="print one JSON object per line: pose, health, event, vehicle, link"
     )
-    watch.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    watch.add_argument(
+        "--max-age", type=_not_negative, default=2.0, metavar="S", help="reject poses older than this (default 2)"
+    )
+    watch.add_argument("--seconds", type=_positive, help="stop after this many seconds (default: on Ctrl-C)")
     watch.set_defaults(act=_watch)
 
 
 def _add_view(commands: Commands) -> None:
     view = commands.add_parser(
         "view",
-        help="pictures, a 3-D scene and plots, live or of recordings (Rerun)",
-        description="Opens Rerun's viewer with what vehicles tell, or with recordings. The box of a target has the "
-        "size that --target-size says: its true size is not told.",
+        help="show images, a 3-D scene and plots in Rerun, live or from recordings",
+        description="Show live data from vehicles, or recordings, in Rerun's viewer. The boxes of targets are drawn "
+        "with --target-size: vehicles do not send a target's size.",
     )
     view.add_argument("recordings", type=Path, nargs="*", metavar="MCAP", help="recordings (default: live)")
     _connection(view)
     where = view.add_mutually_exclusive_group()
     where.add_argument(
-        "--web", type=int, nargs="?", const=9090, metavar="PORT", help="serve to a browser on this machine (9090)"
+        "--web",
+        type=int,
+        nargs="?",
+        const=9090,
+        metavar="PORT",
+        help="serve a page to browsers on this machine (PORT defaults to 9090)",
     )
     where.add_argument("--save", type=Path, metavar="RRD", help="write a file for the viewer instead")
     view.add_argument(
         "--target-size", type=_positive, nargs=3, default=(8.0, 12.0, 2.5), metavar=("LENGTH", "WIDTH", "HEIGHT"),
-        help="metres, of the boxes drawn (default 8 12 2.5)",
+        help="size of the boxes drawn, in metres (default 8 12 2.5)",
     )  # fmt: skip
     view.add_argument(
-        "--max-age", type=_not_negative, default=2.0, metavar="S", help="older poses are refused (default 2)"
+        "--max-age", type=_not_negative, default=2.0, metavar="S", help="reject poses older than this (default 2)"
     )
-    view.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    view.add_argument("--seconds", type=_positive, help="stop after this many seconds (default: on Ctrl-C)")
     view.set_defaults(act=_view)
 
 
 def _add_record(commands: Commands) -> None:
-    record = commands.add_parser("record", help="write what vehicles tell as MCAP files")
+    record = commands.add_parser("record", help="record the messages of vehicles in MCAP files")
     _connection(record)
     record.add_argument("--dir", type=Path, default=Path("recordings"), help="folder (default: recordings)")
-    record.add_argument("--file-mb", type=_positive, default=256.0, help="then the next file begins (default 256)")
-    record.add_argument("--file-minutes", type=_positive, default=10.0, help="then the next file begins (default 10)")
-    record.add_argument("--total-mb", type=_positive, help="of all files; then the oldest go (default: the disk's end)")
     record.add_argument(
-        "--free-mb", type=_not_negative, default=1000.0, help="left on the disk for others (default 1000)"
+        "--file-mb", type=_positive, default=256.0, help="size at which a new file begins (default 256)"
     )
-    record.add_argument("--when-full", choices=("oldest", "stop"), default="oldest", help="remove the oldest, or stop")
-    record.add_argument("--seconds", type=_positive, help="end after so long (default: on Ctrl-C)")
+    record.add_argument(
+        "--file-minutes", type=_positive, default=10.0, help="duration after which a new file begins (default 10)"
+    )
+    record.add_argument("--total-mb", type=_positive, help="limit for all files together (default: only --free-mb)")
+    record.add_argument(
+        "--free-mb", type=_not_negative, default=1000.0, help="space to leave free on the disk (default 1000)"
+    )
+    record.add_argument(
+        "--when-full",
+        choices=("oldest", "stop"),
+        default="oldest",
+        help="at a limit: remove the oldest files (default), or stop",
+    )
+    record.add_argument("--seconds", type=_positive, help="stop after this many seconds (default: on Ctrl-C)")
     record.set_defaults(act=_record)
 
 
 def _add_command(commands: Commands) -> None:
     command = commands.add_parser(
-        "command", help="tell one vehicle to track, select, stop, reload, record or send less"
+        "command", help="command one vehicle: track, select, stop, reload, record or limit its rate"
     )
     _endpoint(command)
     command.add_argument("uav", help="the vehicle's name")
@@ -119,37 +135,41 @@ def _add_command(commands: Commands) -> None:
 
 
 def _add_router(commands: Commands) -> None:
-    router = commands.add_parser("router", help="what vehicles and tools connect to; no other zenoh router is needed")
+    router = commands.add_parser(
+        "router", help="run the router that vehicles and tools connect to; no other zenoh router is needed"
+    )
     router.add_argument("--config", type=Path, required=True, help="TOML file: listen, [tls], [access]")
     router.set_defaults(act=_router)
 
 
 def _add_keys(commands: Commands) -> None:
-    keys = commands.add_parser("keys", help="certificates for TLS and QUIC").add_subparsers(
+    keys = commands.add_parser("keys", help="create and list certificates for TLS and QUIC").add_subparsers(
         required=True, metavar="ACTION"
     )
-    init = keys.add_parser("init", help="make the authority: ca.pem and ca.key")
-    issue = keys.add_parser("issue", help="make NAME.pem and NAME.key, signed by the authority in the folder")
+    init = keys.add_parser("init", help="create the certificate authority: ca.pem and ca.key")
+    issue = keys.add_parser("issue", help="create NAME.pem and NAME.key, signed by the authority in the folder")
     issue.add_argument("name", help="identity: a vehicle's name, an operator, the router")
     issue.add_argument(
         "--host",
         action="append",
         default=[],
         metavar="HOST",
-        help="DNS name or IP address it is reached at; repeatable",
+        help="DNS name or IP address at which it is reached; repeatable",
     )
-    show = keys.add_parser("list", help="say until when each certificate in the folder is valid")
+    show = keys.add_parser("list", help="list the certificates in the folder and until when each is valid")
     show.set_defaults(act=_keys_list)
     for action in (init, issue, show):
         action.add_argument("--dir", type=Path, default=Path("keys"), help="folder of the keys (default: keys)")
-    init.add_argument("--days", type=int, default=3650, help="validity (default: ten years)")
-    issue.add_argument("--days", type=int, default=825, help="validity (default: 825)")
+    init.add_argument("--days", type=int, default=3650, help="days of validity (default 3650)")
+    issue.add_argument("--days", type=int, default=825, help="days of validity (default 825)")
     init.set_defaults(act=_keys_init)
     issue.set_defaults(act=_keys_issue)
 
 
 def _add_tools(commands: Commands) -> None:
-    bench = commands.add_parser("bench", help="time encoding and decoding a pose, beside rosbags if it is installed")
+    bench = commands.add_parser(
+        "bench", help="measure encoding and decoding of a pose, compared with rosbags if it is installed"
+    )
     bench.add_argument("--calls", type=int, default=2000, help="calls in each of seven rounds (default 2000)")
     bench.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
     bench.set_defaults(act=_bench)
@@ -168,7 +188,7 @@ def _positive(text: str) -> float:
 def _not_negative(text: str) -> float:
     value = _number(text)
     if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 0 on")
+        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
     return value
 
 
@@ -208,7 +228,7 @@ def _tls(options: argparse.Namespace) -> TlsFiles | None:
     if not any(given):
         return None
     if not all(given):
-        raise InputError("--ca, --cert and --key belong together")
+        raise InputError("--ca, --cert and --key must be given together")
     return TlsFiles(*given)
 
 
@@ -239,7 +259,7 @@ def _view(options: argparse.Namespace) -> int:
     from msgs.ground.view.command import ViewOptions, view
 
     if options.web is not None and not 0 < options.web < 65535:
-        raise InputError(f"--web {options.web}: must be a port from 1 to 65534; the next one is taken too")
+        raise InputError(f"--web {options.web}: must be a port from 1 to 65534; the next port is used too")
     asked = ViewOptions(
         options.recordings,
         options.connect,
@@ -266,7 +286,7 @@ def _record(options: argparse.Namespace) -> int:
         when_full=options.when_full,
     )
     if options.total_mb is not None and options.total_mb < 2 * options.file_mb:
-        raise InputError("--total-mb must hold two files of --file-mb, or nothing is left when one begins")
+        raise InputError("--total-mb must be at least twice --file-mb: otherwise nothing is left when a file begins")
     stop, uavs = _stop_on_signal(options.seconds), [_uav(name) for name in options.uav]
     return record(options.connect, _tls(options), uavs, options.domain, options.dir, limits, stop, _say_aside)
 
@@ -282,7 +302,7 @@ def _bench(options: argparse.Namespace) -> int:
     from msgs.ground.bench import bench, table, to_json
 
     if options.calls < 1:
-        raise InputError("--calls takes a whole number from 1 on")
+        raise InputError("--calls must be an integer of at least 1")
     timings = bench(options.calls)
     print(to_json(timings) if options.json else table(timings))
     return 0

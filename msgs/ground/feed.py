@@ -52,7 +52,7 @@ def session(
     except ValueError as error:
         raise InputError(str(error)) from error
     if tls is not None and (doubt := tls.doubt()) is not None:
-        say(f"there may be no link: {doubt}")
+        say(f"the link may fail: {doubt}")
     waiting = False
     while not stop.is_set():
         opened = _connected(endpoint, tls, stop)
@@ -62,7 +62,7 @@ def session(
             return
         if not waiting and not stop.is_set():
             # zenoh does not report why there is no link.
-            why = ": not there, or one end refuses the other's certificate" if endpoint.startswith(SECURE) else ""
+            why = ": not running, or one end refuses the other's certificate" if endpoint.startswith(SECURE) else ""
             say(f"waiting for {endpoint}{why}")
             waiting = True
         stop.wait(RETRY_S)

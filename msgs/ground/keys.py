@@ -60,7 +60,7 @@ def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 82
     missing, the identity exists, or a name is invalid.
     """
     if not _IDENTITY.fullmatch(identity) or identity == AUTHORITY:
-        raise InputError(f"'{identity}' is no identity: a letter, then letters, digits, '_', '-' or '.'")
+        raise InputError(f"'{identity}' is not a valid identity: a letter, then letters, digits, '_', '-' or '.'")
     files = TlsFiles(folder / f"{AUTHORITY}.pem", folder / f"{identity}.pem", folder / f"{identity}.key")
     authority, authority_key = _read_authority(folder)
     _require_new(files.private_key, files.certificate)
@@ -105,7 +105,7 @@ def listing(folder: Path) -> list[str]:
             hosts = ""
         lines.append(f"{path.stem:16} {state} {until:%Y-%m-%d}  {hosts}".rstrip())
     if not lines:
-        raise InputError(f"{folder}: no certificates there; `keys init` makes the authority")
+        raise InputError(f"{folder}: contains no certificates; `keys init` creates the authority")
     return lines
 
 
@@ -113,7 +113,7 @@ def _builder(
     subject: x509.Name, issuer: x509.Name, public_key: ec.EllipticCurvePublicKey, days: int
 ) -> x509.CertificateBuilder:
     if not 1 <= days <= DAYS_MAX:
-        raise InputError(f"a certificate is valid for 1 to {DAYS_MAX} days, not {days}")
+        raise InputError(f"a certificate can be valid for 1 to {DAYS_MAX} days, not {days}")
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
@@ -143,9 +143,9 @@ def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePri
         certificate = x509.load_pem_x509_certificate(certificate_path.read_bytes())
         key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
     except OSError as error:
-        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); `keys init` makes it") from error
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); `keys init` creates it") from error
     except ValueError as error:
-        raise InputError(f"{folder}: {AUTHORITY}.pem or {AUTHORITY}.key is no PEM file: {error}") from error
+        raise InputError(f"{folder}: {AUTHORITY}.pem or {AUTHORITY}.key is not a PEM file: {error}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise InputError(f"{key_path}: is not the key of {certificate_path.name}")
     return certificate, key
@@ -160,7 +160,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 def _require_new(*paths: Path) -> None:
     for path in paths:
         if os.path.lexists(path):  # an inaccessible path is reported on writing
-            raise InputError(f"{path}: is there already; move it away first, so that no key is lost")
+            raise InputError(f"{path}: already exists; move it away first, so that no key is lost")
 
 
 def _write_new(path: Path, data: bytes, mode: int = 0o644) -> None:

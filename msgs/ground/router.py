@@ -62,7 +62,7 @@ class RouterSettings(Section):
             except ValueError as error:
                 raise ValueError(f"listen: {error}") from error
         if self.access is not None and self.tls is None:
-            raise ValueError("[access] tells identities by their certificates and needs [tls]")
+            raise ValueError("[access] identifies clients by their certificates and needs [tls]")
         return self
 
 
@@ -102,7 +102,7 @@ def _from_folder(folder: Path, path: Path) -> Path:
     try:
         return folder / path.expanduser()
     except RuntimeError as error:  # home folder unknown
-        raise InputError(f"[tls] '{path}' leads nowhere: {error}") from error
+        raise InputError(f"[tls] '{path}' cannot be resolved: {error}") from error
 
 
 def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
@@ -112,7 +112,7 @@ def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
     with open_router(settings, folder) as session:
         tls = _tls_files(settings, folder)
         if tls is not None and (doubt := tls.doubt()) is not None:
-            say(f"vehicles may not link over tls and quic: {doubt}")
+            say(f"links of vehicles over tls and quic may fail: {doubt}")
 
         def seen(sample: zenoh.Sample) -> None:
             vehicle = alive_uav(str(sample.key_expr))

@@ -118,7 +118,7 @@ def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path
     still = film(tmp_path / "still", "charuco", poses(0.5, 1.0)[:2] * 3)
     done = cli("calibrate", still)
     assert done.returncode == 2
-    assert "6 of 6 pictures show the board, but only 2 views of it differ" in done.stderr
+    assert "6 of 6 images show the board, but only 2 views of it differ" in done.stderr
     assert not (tmp_path / "camera.yaml").exists()
 
 
@@ -126,7 +126,7 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
     flat = film(tmp_path / "flat", "charuco", poses(0.0, 1.0))
     done = cli("calibrate", flat)
     assert done.returncode == 2
-    assert "too alike to tell focal length from distance (0 of" in done.stderr
+    assert "too similar to separate focal length and distance (0 of" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -135,12 +135,12 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
     [
         ([], "calibrate needs a video, a folder of images"),
         (["nowhere"], "nowhere does not exist"),
-        (["notes.txt"], "neither a folder of pictures nor a readable video"),
-        (["grey"], "no picture shows the whole board"),
-        (["grey", "--squares", "9 by 6"], "--squares: '9 by 6' is not ACROSSxDOWN"),
+        (["notes.txt"], "neither a folder of images nor a readable video"),
+        (["grey"], "no image shows the whole board"),
+        (["grey", "--squares", "9 by 6"], "--squares: '9 by 6' is not COLUMNSxROWS"),
         (["grey", "--dictionary", "3X3_7"], "--dictionary: OpenCV has no 3X3_7"),
         (["grey", "--squares", "30x30", "--dictionary", "4X4_50"], "fewer markers than the 450"),
-        (["mixed"], "is 320x240, those before 640x480"),
+        (["mixed"], "is 320x240, earlier images 640x480"),
         (["grey", "--pattern", "chessboard", "--squares", "3x9"], "a chessboard needs at least 4x4 squares"),
         (["grey", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners, and a view needs 8"),
         (["--draw", "board.png", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners"),
@@ -170,4 +170,4 @@ def test_a_drawn_board_is_one_that_is_found(cli: Cli, tmp_path: Path, pattern: s
     (tmp_path / "one").mkdir()
     (tmp_path / "board.png").rename(tmp_path / "one" / "board.png")
     done = cli("calibrate", "one", *board)
-    assert "1 of 1 pictures show the board" in done.stderr
+    assert "1 of 1 images show the board" in done.stderr

@@ -90,12 +90,14 @@ def test_who_follows_the_advice_ends_with_the_camera_however_wide_it_is(view_deg
     found = calibrated(seen, 4)
     while isinstance(found, str):
         advice = re.fullmatch(
-            r"(\d) coefficients miss the corners by ([\d.]+) px, (\d) by ([\d.]+) px: use --coefficients \3", found
+            r"the reprojection error is ([\d.]+) px with (\d) coefficients, ([\d.]+) px with (\d): "
+            r"use --coefficients \4",
+            found,
         )
         assert advice is not None, found
-        assert float(advice[4]) <= 0.75 * float(advice[2]) + 0.01
-        assert advice[3] > advice[1]
-        found = calibrated(seen, int(advice[3]))  # type: ignore[arg-type]
+        assert float(advice[3]) <= 0.75 * float(advice[1]) + 0.01
+        assert advice[4] > advice[2]
+        found = calibrated(seen, int(advice[4]))  # type: ignore[arg-type]
     assert found.K[0][0] == pytest.approx(focal_px(view_deg), rel=0.003)
     assert np.median(error_deg(found, view_deg)) < 0.05
     write_calibration(found, "wide", tmp_path / "wide.yaml")
@@ -114,7 +116,7 @@ def test_what_no_model_describes_is_refused_and_a_fisheye_is_thought_of() -> Non
     seen = views(equidistant(60), 60, noises_px=(4.0,))
     for coefficients in (4, 5, 8):
         assert re.match(
-            r"the fit misses the corners by \d\.\d\d px; is .*flat, --squares right, and the lens no fisheye",
+            r"the reprojection error is \d\.\d\d px; check .*flat, --squares correct, and the lens not a fisheye",
             str(calibrated(seen, coefficients)),  # type: ignore[arg-type]
         )
 
@@ -135,8 +137,8 @@ def test_corners_without_a_ray_are_told_when_few_and_refused_when_many(
     assert (share > WITHOUT_RAY_MAX) == refused
     said = reason_against(8, {**fits, 8: ending}, used, SIZE_WH)
     if refused:
-        told = r".* folds .* \d\.\d % of it; show the board there"
-        assert re.fullmatch(f"{told}. Or fit fewer: --coefficients 5", str(said))
+        told = r".* folds .* \(\d\.\d % of it\); show the board there"
+        assert re.fullmatch(f"{told}. Or use fewer: --coefficients 5", str(said))
         # Fewer coefficients that describe the views worse are no advice.
         worse = {n: replace(fits[n], rms_px=2 * ending.rms_px) for n in (4, 5)}
         assert str(reason_against(8, {**worse, 8: ending}, used, SIZE_WH)).endswith("; show the board there")
@@ -145,7 +147,7 @@ def test_corners_without_a_ray_are_told_when_few_and_refused_when_many(
     found = calibrated(used, 8)
     assert isinstance(found, Calibration)
     found = replace(found, distortion=list(ending.distortion), without_ray=share)
-    told = f"{100 * share:.1f} % of the picture, in its corners, has no ray and is not seen"
+    told = f"{100 * share:.1f} % of the image, in its corners, cannot be undistorted, and nothing is detected there"
     assert any(told in line for line in report(found, tmp_path)) == (share > 0)
     write_calibration(found, "ends", tmp_path / "ends.yaml")
     assert load_intrinsics(IntrinsicsSettings(file=tmp_path / "ends.yaml")).distortion[0] == pytest.approx(
@@ -169,9 +171,9 @@ def test_views_that_do_not_settle_so_many_coefficients_are_told_as_that() -> Non
     assert reason_against(8, fits, used, SIZE_WH) is None
     loose = {**fits, 8: replace(fits[8], focal_sigma=np.inf)}
     assert reason_against(8, loose, used, SIZE_WH) == (
-        "the views do not settle 8 coefficients; show the board in more places. Or fit fewer: --coefficients 5"
+        "the views do not determine 8 coefficients; show the board in more places. Or use fewer: --coefficients 5"
     )
     lost = {**fits, 8: replace(fits[8], rms_px=10.0)}
-    assert str(reason_against(8, lost, used, SIZE_WH)).endswith("no fisheye? Or fit fewer: --coefficients 5")
+    assert str(reason_against(8, lost, used, SIZE_WH)).endswith("not a fisheye. Or use fewer: --coefficients 5")
     # What is not settled is no reason to refuse what is.
     assert reason_against(4, {**loose, 8: replace(loose[8], rms_px=0.0)}, used, SIZE_WH) is None

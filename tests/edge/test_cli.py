@@ -121,7 +121,7 @@ def test_a_device_that_is_not_plugged_in_is_told_as_the_picture_that_is_asked_of
     )
     checked = cli("check", "--config", "config.toml")
     assert checked.returncode == 0, checked.stderr
-    told = "/dev/video-none: 960x540, focal length 1000.0 x 1000.0 px, 5 coefficients of distortion; it does not answer"
+    told = "/dev/video-none: 960x540, focal length 1000.0 x 1000.0 px, 5 distortion coefficients; not reachable now"
     assert told in checked.stdout
 
 
@@ -201,7 +201,7 @@ def test_a_command_that_a_person_interrupts_ends_without_a_traceback(tmp_path: P
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as doctor:
         assert doctor.stdout is not None
-        assert any("listened on" in line for line in doctor.stdout)  # it now listens for an autopilot, for seconds
+        assert any("can listen on" in line for line in doctor.stdout)  # it now listens for an autopilot, for seconds
         doctor.send_signal(signal.SIGINT)
         _, said = doctor.communicate(timeout=60)
     assert doctor.returncode == 130

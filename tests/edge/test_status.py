@@ -97,7 +97,7 @@ def test_of_several_vehicles_behind_one_router_status_wants_to_know_which(cli: C
             router.declare_queryable(key_of(name, what), handler)
         asked = cli("status", "--connect", endpoint, "--json")
         assert asked.returncode == 2
-        assert asked.stderr == f"uav1 and uav2 answer at {endpoint}: say which with --vehicle\n"
+        assert asked.stderr == f"uav1 and uav2 answer at {endpoint}: select one with --vehicle\n"
         asked = cli("status", "--connect", endpoint, "--vehicle", "uav2", "--json")
     answers = json.loads(asked.stdout)
     assert (asked.returncode, {one["vehicle"] for one in answers.values()}) == (0, {"uav2"})

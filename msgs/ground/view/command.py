@@ -77,7 +77,7 @@ def _check_recordings(options: ViewOptions) -> None:
     for path in options.recordings:
         check_opens(path)
         if options.save is not None and os.path.exists(options.save) and options.save.samefile(path):
-            raise InputError(f"--save {options.save}: is the recording {path} itself")
+            raise InputError(f"--save {options.save}: is the same file as the recording {path}")
 
 
 @contextmanager

@@ -51,6 +51,6 @@ def _blame(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except McapError as error:
         why = str(error) or "it ends early"
-        raise InputError(f"{path}: is no whole MCAP file ({why}); `mcap recover` may help") from error
+        raise InputError(f"{path}: is not a complete MCAP file ({why}); `mcap recover` may help") from error
     except Exception as error:  # the reader may raise anything on corrupt bytes
-        raise InputError(f"{path}: is damaged, not all of it can be read; `mcap recover` may help") from error
+        raise InputError(f"{path}: is damaged and cannot be read completely; `mcap recover` may help") from error

@@ -45,7 +45,7 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: 
     """
     whole = Path(os.path.realpath(path))  # keeps a symbolic link
     if os.path.exists(whole) and not whole.is_file():
-        raise InputError(f"--save {path}: is there and is no file")
+        raise InputError(f"--save {path}: exists and is not a regular file")
     unfinished, replaces = whole.with_name(f".{whole.name}.part"), os.path.exists(whole)
     try:
         unfinished.touch()
@@ -76,7 +76,7 @@ def saved(rec: rr.RecordingStream, path: Path, stop: threading.Event, complete: 
             raise broken
         if kept:
             raise InputError(
-                f"--save {path}: ended before all was drawn, or nothing was; the file that was there stays"
+                f"--save {path}: stopped before everything was drawn, or nothing was drawn; the existing file is kept"
             )
     finally:
         rec.disconnect()

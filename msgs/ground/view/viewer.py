@@ -24,7 +24,7 @@ _LOOK_EVERY_S = 0.05
 _LOOK_AGAIN_S = 0.5
 _SETTLE_S = 1.0  # a viewer without a display accepts connections for a moment before it exits
 _SERVER_MEMORY = "1GiB"  # kept for browsers that join later; the oldest data is dropped first
-_NO_WINDOW = "Rerun's viewer has no window here: view with --web for a browser, or with --save for another machine"
+_NO_WINDOW = "Rerun's viewer cannot open a window here: use --web for a browser, or --save for another machine"
 
 
 @contextmanager
@@ -56,7 +56,7 @@ def page(
 ) -> Iterator[None]:
     """A page for browsers on this machine; `stays`: even after all is drawn, until `stop` is set. Raises InputError if
     the ports are not available, or the server exits."""
-    ended = f"--web {web_port}: Rerun's server ended by itself"
+    ended = f"--web {web_port}: Rerun's server exited unexpectedly"
     with (
         server(web_port) as process,
         _fed(rec, web_port + 1, lambda: process.poll() is None, stop, ended, stays=stays) as gone,
@@ -73,7 +73,7 @@ def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
     ports = (web_port, web_port + 1)
     for port in ports:
         if answers(port):
-            raise InputError(f"--web {web_port}: port {port} is taken")
+            raise InputError(f"--web {web_port}: port {port} is already in use")
     process = subprocess.Popen(
         _command(ports[1], "--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY),
         stdout=subprocess.DEVNULL,
@@ -82,7 +82,7 @@ def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
     )
     try:
         if not _started(process, ports):
-            raise InputError(f"--web {web_port}: Rerun's server does not start there")
+            raise InputError(f"--web {web_port}: Rerun's server does not start at this port")
         yield process
     finally:
         with suppress(ProcessLookupError):  # both have already exited

@@ -206,7 +206,7 @@ def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path
         ("[access]\n", "listen: is missing"),
         ('listen = ["udp/0.0.0.0:7447"]', "'udp/0.0.0.0:7447' is not tcp/HOST:PORT, tls/HOST:PORT or quic/HOST:PORT"),
         ('listen = ["quic/0.0.0.0:7447"]', "router.toml: listen: 'quic/0.0.0.0:7447' needs tls"),
-        ('listen = ["tcp/0.0.0.0:7447"]\n[access]\nvehicles = ["uav1"]', "[access] tells identities by their"),
+        ('listen = ["tcp/0.0.0.0:7447"]\n[access]\nvehicles = ["uav1"]', "[access] identifies clients by their"),
         ('listen = ["tcp/0.0.0.0:7447"]\n[access]\nvehicles = ["uav/1"]', "access.vehicles.0: "),
         (
             'listen = ["tls/0.0.0.0:7447"]\n[tls]\nroot_ca = "none.pem"\ncertificate = "a"\nprivate_key = "b"',
@@ -214,7 +214,7 @@ def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path
         ),
         (
             'listen = ["tls/0.0.0.0:7447"]\n[tls]\nroot_ca = "~nosuchuser/a"\ncertificate = "a"\nprivate_key = "b"',
-            "[tls] '~nosuchuser/a' leads nowhere: ",
+            "[tls] '~nosuchuser/a' cannot be resolved: ",
         ),
         ("listen = [", "not valid TOML"),
     ],

@@ -312,7 +312,7 @@ def test_what_is_told_live_is_drawn_until_told_to_stop(network: Network, tmp_pat
     ("arguments", "sentence"),
     [
         (["missing.mcap", "--save", "out.rrd"], "missing.mcap: cannot be read: No such file or directory"),
-        (["torn.mcap", "--save", "out.rrd"], "torn.mcap: is no whole MCAP file"),
+        (["torn.mcap", "--save", "out.rrd"], "torn.mcap: is not a complete MCAP file"),
         (["--save", "no/folder/out.rrd"], "--save no/folder/out.rrd: cannot be written: No such file or directory"),
         (["--web", "65535", "-e", free_endpoint()], "--web 65535: must be a port"),
     ],

@@ -81,7 +81,7 @@ def test_a_server_that_ends_at_once_is_told_and_no_traceback(monkeypatch: pytest
     unwilling = shutil.which("false")
     assert unwilling is not None
     monkeypatch.setattr(sys, "executable", unwilling)
-    with pytest.raises(InputError, match="Rerun's server does not start there"), server(two_free_ports()):
+    with pytest.raises(InputError, match="Rerun's server does not start at this port"), server(two_free_ports()):
         pass
 
 
@@ -93,7 +93,7 @@ def test_a_server_that_ends_in_the_middle_is_told_and_no_traceback(tmp_path: Pat
         (child,) = Path(f"/proc/{server.pid}/task/{server.pid}/children").read_text().split()
         os.killpg(int(child), signal.SIGKILL)
         said = server.stderr.read()
-    assert said.endswith("Rerun's server ended by itself\n")
+    assert said.endswith("Rerun's server exited unexpectedly\n")
     assert "Traceback" not in said
     assert server.returncode == 2
 

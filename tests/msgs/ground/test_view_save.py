@@ -50,12 +50,12 @@ def test_the_recording_itself_is_not_overwritten(flight: Path, capsys: pytest.Ca
     link.symlink_to(flight)
     for save in (flight, flight.parent / "." / flight.name, link):
         assert main(["view", str(flight), "--save", str(save)]) == 2
-        assert f"--save {save}: is the recording {flight} itself" in capsys.readouterr().err
+        assert f"--save {save}: is the same file as the recording {flight}" in capsys.readouterr().err
     assert flight.read_bytes() == whole
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [("flihgt.mcap", "cannot be read: No such file"), ("out.rrd", "is no whole")]
+    ("name", "words"), [("flihgt.mcap", "cannot be read: No such file"), ("out.rrd", "is not a complete")]
 )
 def test_a_recording_that_does_not_open_is_told_before_anything_is_drawn(
     flight: Path, capsys: pytest.CaptureFixture[str], name: str, words: str
@@ -87,7 +87,7 @@ def test_a_recording_broken_off_replaces_no_old_file_and_a_live_view_does(flight
     out, stop = flight.with_name("out.rrd"), threading.Event()
     out.unlink() if not old else None
     rec = rr.RecordingStream("broken_off")
-    with pytest.raises(InputError, match="the file that was there stays") if old else nullcontext():  # noqa: SIM117
+    with pytest.raises(InputError, match="the existing file is kept") if old else nullcontext():  # noqa: SIM117
         with saved(rec, out, stop, complete=lambda: False):
             rec.log("a", rr.TextLog("one"))
     assert (out.read_bytes() == OLD) == old
@@ -101,7 +101,7 @@ def test_a_view_of_nothing_replaces_no_old_file(flight: Path, capsys: pytest.Cap
     nobody = ["-e", free_endpoint(), "--seconds", "0.2"]
     for heard in (nobody, [str(flight), "--uav", "uav9"]):
         assert main(["view", *heard, "--save", str(out)]) == 2
-        assert "nothing was; the file that was there stays" in capsys.readouterr().err
+        assert "nothing was drawn; the existing file is kept" in capsys.readouterr().err
         assert out.read_bytes() == OLD
     assert main(["view", *nobody, "--save", str(flight.with_name("new.rrd"))]) == 0
 
@@ -126,7 +126,7 @@ def test_what_is_no_file_is_not_replaced(flight: Path, capsys: pytest.CaptureFix
     folder = flight.with_name("folder")
     folder.mkdir()
     assert main(["view", str(flight), "--save", str(folder)]) == 2
-    assert f"--save {folder}: is there and is no file" in capsys.readouterr().err
+    assert f"--save {folder}: exists and is not a regular file" in capsys.readouterr().err
     assert main(["view", str(flight), "--save", str(folder / "no" / "out.rrd")]) == 2
     assert "cannot be written: No such file or directory" in capsys.readouterr().err
 

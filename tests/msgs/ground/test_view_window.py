@@ -56,7 +56,7 @@ def test_where_no_window_opens_a_sentence_ends_it(
     monkeypatch.setattr(viewer, "WINDOW_PORT", free_port())
     record(tmp_path / "flight.mcap", 5)
     assert main(["view", str(tmp_path / "flight.mcap")]) == 2
-    assert "view with --web" in capsys.readouterr().err
+    assert "use --web" in capsys.readouterr().err
 
 
 @pytest.mark.timeout(200)

@@ -333,7 +333,7 @@ def test_what_is_no_number_from_nought_on_is_a_sentence(
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([*option.split(), number, "--seconds", "0.1"])
-    assert f"argument {option.split()[1]}: {number} is not a number from 0 on" in capsys.readouterr().err
+    assert f"argument {option.split()[1]}: {number} is not a number of at least 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("domain", ["-1", "233", "0.5", "uav1", ""])
