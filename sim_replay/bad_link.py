@@ -35,10 +35,10 @@ class LinkFaults:
 def add_options(parser: argparse._ActionsContainer) -> None:
     """One option per fault, `--link-delay-ms` and so on."""
     words = {
-        "delay_ms": ("MS", "every datagram takes so long"),
-        "jitter_ms": ("MS", "and up to so much more, by chance"),
-        "loss": ("SHARE", "so many never arrive, 0 to 1"),
-        "reorder": ("SHARE", "so many are overtaken by the next, 0 to 1"),
+        "delay_ms": ("MS", f"delay of every datagram, 0 to {DELAY_MS_MAX:g}"),
+        "jitter_ms": ("MS", "additional random delay, uniform from 0 to MS"),
+        "loss": ("SHARE", "share of datagrams that are lost, 0 to 1"),
+        "reorder": ("SHARE", "share of datagrams that the next one overtakes, 0 to 1"),
     }
     for one in fields(LinkFaults):
         metavar, text = words[one.name]

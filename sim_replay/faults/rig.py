@@ -109,7 +109,7 @@ class Rig:
         """Raises InputError if it has ended, so that there is nothing to act on."""
         process = self.processes[who]
         if process.exit_code is not None:
-            raise InputError(f"the {who} does not run any more: the timeline must `start` it before it acts upon it")
+            raise InputError(f"the {who} is not running: the timeline must `start` it before acting on it")
         return process
 
     @property
@@ -210,7 +210,7 @@ class Rig:
         picture = read_scene(self.settings.scene)[0]
         image = cv2.imread(str(picture.path))
         if image is None:
-            raise InputError(f"{picture.path} is not a readable picture")
+            raise InputError(f"{picture.path} is not a readable image")
         height, width = image.shape[:2]
         K = picture.K
         return "\n".join([

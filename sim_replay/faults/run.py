@@ -84,17 +84,23 @@ def register(commands: Any) -> None:
     """Add the command to what add_subparsers() returned; it sets `run`, a function of the parsed arguments."""
     parser = commands.add_parser(
         "faults",
-        help="break cameras, links, disks and peers of the real daemon by a timeline, and see it recover",
-        description="Start the daemon with a camera, an autopilot, a zenoh router and a subscriber, act on them as the "
-        "timeline says, and wait for what it expects. Looks at each message that a peer received: none may be stale. "
-        f"Timelines that come with it: {', '.join(bundled())}. Writes faults.json and daemon.log. "
-        "Exit code 0 if all was as expected, 1 if not.",
+        help="inject faults into the real daemon's camera, links, disk and peers, and verify its recovery",
+        description="Start the daemon with a camera, an autopilot, a zenoh router and a subscriber, carry out the "
+        "acts of the timeline and wait for the reactions that it expects. Every message that a peer received is "
+        f"checked: none may be stale. Bundled timelines: {', '.join(bundled())}. Writes faults.json and daemon.log. "
+        "Exit code 0 if everything was as expected, 1 if not, 2 for an invalid timeline.",
     )
     parser.add_argument(
-        "--timeline", required=True, action="append", metavar="FILE", help="TOML, or a bundled name; may be repeated"
+        "--timeline",
+        required=True,
+        action="append",
+        metavar="FILE",
+        help="TOML file, or name of a bundled timeline; may be repeated",
     )
-    parser.add_argument("--out", type=Path, default=Path("out") / "faults", metavar="DIR", help="folder to write to")
-    parser.add_argument("--scene", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="BOP scene to play")
+    parser.add_argument("--out", type=Path, default=Path("out") / "faults", metavar="DIR", help="output folder")
+    parser.add_argument(
+        "--scene", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="BOP scene folder that the camera plays"
+    )
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
     parser.set_defaults(run=run)
 
@@ -108,10 +114,10 @@ def run(args: argparse.Namespace) -> int:
     """Play the timelines one after the other on one rig. Raises InputError for an invalid timeline."""
     timelines = [load_timeline(timeline_path(name)) for name in args.timeline]
     if not args.model.is_file():
-        raise InputError(f"--model {args.model}: is no file")
+        raise InputError(f"--model {args.model}: is not a file")
     for name, timeline in zip(args.timeline, timelines, strict=True):
         if timeline.signed != timelines[0].signed:
-            raise InputError(f"{name}: signed differs from that of {args.timeline[0]}: they need a run each")
+            raise InputError(f"{name}: signed differs from that of {args.timeline[0]}: run them separately")
     on_volume = [name for name, timeline in zip(args.timeline, timelines, strict=True) if timeline.volume]
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / REPORT).unlink(missing_ok=True)  # of an earlier run: this one may end without
@@ -129,9 +135,10 @@ def run(args: argparse.Namespace) -> int:
         "wrong": wrong,
     }
     (args.out / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    oldest = ", ".join(f"{peer} {'–' if ms is None else f'{ms:.0f}'}" for peer, ms in oldest_ms.items())
     for text in wrong:
-        print(f"WRONG: {text}")
-    print(f"{len(rig.witness.poses)} poses received, oldest on receipt {oldest_ms} ms; {len(wrong)} wrong")
+        print(f"FAILED: {text}")
+    print(f"{len(rig.witness.poses)} poses received, maximum age on receipt {oldest} ms; {len(wrong)} failures")
     return EXIT_UNMET if wrong else 0
 
 
@@ -140,5 +147,5 @@ def timeline_path(name: str) -> Path:
     if name in bundled():
         return TIMELINES / f"{name}.toml"
     if not Path(name).is_file():
-        raise InputError(f"{name}: is no file, nor a timeline that comes with this: {', '.join(bundled())}")
+        raise InputError(f"{name}: is neither a file nor a bundled timeline: {', '.join(bundled())}")
     return Path(name)

@@ -40,7 +40,7 @@ def _expression(pattern: str) -> str:
     try:
         re.compile(pattern)
     except re.error as error:
-        raise ValueError(f"is no regular expression: {error}") from error
+        raise ValueError(f"is not a regular expression: {error}") from error
     return pattern
 
 
@@ -58,15 +58,17 @@ class Hold(Section):
 class Start(Section):
     do: Literal["start"]
     who: Who
-    system_id: int = Field(default=1, ge=1, le=255, description="autopilot: its MAVLink system")
-    rebooted: bool = Field(default=False, description="autopilot: its boot clock begins now")
-    clock_ahead_s: float = Field(default=0.0, ge=-60, le=60, description="autopilot: boot clock against the last one's")
+    system_id: int = Field(default=1, ge=1, le=255, description="autopilot: its MAVLink system id")
+    rebooted: bool = Field(default=False, description="autopilot: its boot clock starts at 0")
+    clock_ahead_s: float = Field(
+        default=0.0, ge=-60, le=60, description="autopilot: its boot clock minus the previous one's"
+    )
 
     @model_validator(mode="after")
     def _does_something(self) -> Start:
         of_autopilot = self.model_fields_set & {"system_id", "rebooted", "clock_ahead_s"}
         if self.who != "autopilot" and of_autopilot:
-            raise ValueError(f"{min(of_autopilot)} is an autopilot's, not the {self.who}'s")
+            raise ValueError(f"{min(of_autopilot)} applies to an autopilot, not to the {self.who}")
         return self
 
 
@@ -82,9 +84,11 @@ class Camera(Section):
     """How the camera behaves from now on; what is left out returns to normal."""
 
     do: Literal["camera"]
-    frozen: bool = Field(default=False, description="the same picture, stamped anew")
+    frozen: bool = Field(default=False, description="the same image with new stamps")
     stamp_offset_s: float = Field(default=0.0, ge=-60, le=60, description="added to each stamp")
-    stamp_jitter_s: float = Field(default=0.0, ge=0, le=60, description="added and taken off, frame by frame")
+    stamp_jitter_s: float = Field(
+        default=0.0, ge=0, le=60, description="alternately added and subtracted, frame by frame"
+    )
 
 
 class Link(Section):
@@ -95,20 +99,20 @@ class Link(Section):
     cut: bool = False
     delay_ms: float = Field(default=0.0, ge=0, le=10_000)
     corrupt: float = Field(default=0.0, ge=0, le=1, description="share of packets with a flipped bit")
-    drop: list[str] = Field(default_factory=list, description="MAVLink messages by name that do not get through")
+    drop: list[str] = Field(default_factory=list, description="names of the MAVLink messages that the link drops")
 
     @field_validator("drop")
     @classmethod
     def _known(cls, names: list[str]) -> list[str]:
         for name in names:
             if not hasattr(dialect, f"MAVLINK_MSG_ID_{name}"):
-                raise ValueError(f"{name} is no MAVLink message")
+                raise ValueError(f"{name} is not a MAVLink message")
         return names
 
     @model_validator(mode="after")
     def _does_something(self) -> Link:
         if self.which == "zenoh" and self.drop:
-            raise ValueError("drop names MAVLink messages: none passes the zenoh link")
+            raise ValueError("drop lists MAVLink messages, which the zenoh link does not carry")
         return self
 
 
@@ -117,9 +121,9 @@ class Flood(Section):
 
     do: Literal["flood"]
     what: Literal["random", "hostile", "replay"] = Field(
-        description="random bytes; sound frames with absurd content; what the autopilot said before, again"
+        description="random bytes; well-formed frames with absurd content; a replay of what the autopilot sent"
     )
-    sender: Literal["autopilot", "stranger"] = Field(description="from the address that is heeded, or another")
+    sender: Literal["autopilot", "stranger"] = Field(description="from the address that the daemon accepts, or another")
     total_bytes: int = Field(gt=0, le=1_000_000_000)
 
 
@@ -134,7 +138,7 @@ class Disk(Section):
     """What the recorder's disk accepts from now on; what is left out returns to normal."""
 
     do: Literal["disk"]
-    full: bool = Field(default=False, description="no byte more on the volume; needs `volume = true`")
+    full: bool = Field(default=False, description="no space left on the volume; needs `volume = true`")
     read_only: bool = Field(default=False, description="mounted read-only; needs `volume = true`")
     file_max_bytes: int | None = Field(default=None, gt=0, description="no file grows beyond this (RLIMIT_FSIZE)")
 
@@ -176,7 +180,7 @@ class ExpectState(Section):
 
     do: Literal["expect_state"]
     pattern: Pattern = Field(
-        description="regular expression, of the state as diagnostics have it, e.g. 'fault; no frame'"
+        description="regular expression, matched against the state in the diagnostics, e.g. 'fault; no frame'"
     )
     within_s: Seconds = WITHIN_S
 
@@ -209,7 +213,7 @@ class ExpectStill(Section):
 
 class ExpectExit(Section):
     do: Literal["expect_exit"]
-    code: int = Field(description="of the daemon; of a signal, minus its number")
+    code: int = Field(description="of the daemon; minus the signal's number if a signal ended it")
     within_s: Seconds = WITHIN_S
 
 
@@ -239,8 +243,8 @@ class Timeline(Section):
     """It begins once both peers receive poses."""
 
     title: str
-    signed: bool = Field(default=False, description="daemon and autopilot sign all that they say")
-    volume: bool = Field(default=False, description="recordings go to a small volume of their own (needs unshare)")
+    signed: bool = Field(default=False, description="daemon and autopilot sign everything that they send")
+    volume: bool = Field(default=False, description="recordings go to a separate small volume (needs unshare)")
     step: list[Step] = Field(min_length=1)
 
     @model_validator(mode="after")

@@ -106,9 +106,9 @@ def differences(expected: Iterable[Record], actual: Iterable[Record]) -> list[Di
     for key in sorted(old.keys() | new.keys(), key=lambda key: (key[1], str(key))):
         where = _where(old.get(key) or new[key])
         if key not in new:
-            found.append(Difference(where, "expected, and did not come"))
+            found.append(Difference(where, "expected, but missing"))
         elif key not in old:
-            found.append(Difference(where, "came, and was not expected"))
+            found.append(Difference(where, "present, but not expected"))
         else:
             found += [Difference(where, text) for text in _off(old[key], new[key])]
     return found
@@ -141,7 +141,7 @@ def _off(expected: Record, actual: Record) -> list[str]:
     told = []
     for field in sorted((expected.keys() | actual.keys()) - set(_names(expected))):
         if field not in expected or field not in actual:
-            told.append(f"{field} {'is new' if field in actual else 'is gone'}")
+            told.append(f"{field} {'is new' if field in actual else 'is missing'}")
             continue
         text = _field_off(expected["kind"], field, expected[field], actual[field])
         if text is not None:

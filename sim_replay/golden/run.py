@@ -66,7 +66,7 @@ def read_golden(name: str) -> tuple[str, list[Record]]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: is no golden file: {error!r}") from error
+        raise InputError(f"{path}: is not a golden file: {error!r}") from error
 
 
 def compare(name: str, outputs: Outputs) -> list[Difference]:
@@ -77,7 +77,7 @@ def compare(name: str, outputs: Outputs) -> list[Difference]:
 def report(name: str, found: list[Difference]) -> str:
     """Readable: one line per difference, the first of them in time."""
     if not found:
-        return f"{name}: as accepted"
+        return f"{name}: no differences"
     lines = [f"{name}: {len(found)} differences", *(f"  {difference}" for difference in found[:SHOWN])]
     if len(found) > SHOWN:
         lines.append(f"  and {len(found) - SHOWN} more")
@@ -88,14 +88,14 @@ def register(commands: Any) -> None:
     """Add the command to what add_subparsers() returned; it sets `run`, a function of the parsed arguments."""
     parser = commands.add_parser(
         "golden",
-        help="hold the daemon's outputs on a few sequences to what was accepted, field by field",
+        help="regression test: compare the daemon's outputs on a few sequences with the accepted ones, field by field",
         description="Play each case in lock-step through the real daemon and compare poses and MAVLink messages with "
-        f"the golden files, within tolerances. Cases: {', '.join(CASES)}. Exit code 0 if all is as accepted, 1 if not. "
-        "--accept makes what comes out the new golden files.",
+        f"the golden files, within tolerances. Cases: {', '.join(CASES)}. Exit code 0 if there is no difference, "
+        "1 if there is. --accept makes the output the new golden files.",
     )
-    parser.add_argument("case", nargs="*", metavar="CASE", help="which (default: all)")
-    parser.add_argument("--accept", action="store_true", help="write what came out as what is expected from now on")
-    parser.add_argument("--out", type=Path, default=Path("out") / "golden", metavar="DIR", help="folder to write to")
+    parser.add_argument("case", nargs="*", metavar="CASE", help="case to play (default: all)")
+    parser.add_argument("--accept", action="store_true", help="write the output as the new golden files")
+    parser.add_argument("--out", type=Path, default=Path("out") / "golden", metavar="DIR", help="output folder")
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
     parser.set_defaults(run=run)
 
@@ -104,12 +104,12 @@ def run(args: argparse.Namespace) -> int:
     """Compare, or accept, the requested cases."""
     unknown = [name for name in args.case if name not in CASES]
     if unknown:
-        raise InputError(f"golden {unknown[0]}: no such case; there are {', '.join(CASES)}")
+        raise InputError(f"golden {unknown[0]}: no such case; the cases are {', '.join(CASES)}")
     sha256 = load_model(args.model, threads=1).sha256
     differs = False
     for name in args.case or CASES:
         if not args.accept and read_golden(name)[0] != sha256:
-            print(f"{name}: was accepted with another model ({read_golden(name)[0][:8]}…, this is {sha256[:8]}…)")
+            print(f"{name}: accepted with a different model ({read_golden(name)[0][:8]}…, now {sha256[:8]}…)")
         outputs = play_case(name, args.out / name, args.model)
         try:
             found = compare(name, outputs)
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
             if not args.accept:
                 raise
             found = []
-            print(f"{error}; it is written anew", flush=True)
+            print(f"{error}; writing a new one", flush=True)
         differs |= bool(found)
         if args.accept:
             accept(name, outputs, args.model)

@@ -28,15 +28,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `play` besides sequence, model and output folder."""
     group = parser.add_argument_group(
         "lock-step",
-        "the daemon's clock is the sequence's, and the next frame comes when the outputs of the last one are there; "
-        "writes poses.jsonl and mavlink.jsonl, the same each time. Each of the other options asks for it too",
+        "The daemon's clock is the sequence's, and the next frame is given when the outputs of the last one have "
+        "reached both peers. Writes poses.jsonl and mavlink.jsonl, identical each time. Each of these options "
+        "implies lock-step.",
     )
-    group.add_argument("--lockstep", action="store_true", help="play so, as fast as the machine can")
-    group.add_argument("--speed", type=_speed, metavar="X", help=f"{SLOWEST} or more times real time, or max")
+    group.add_argument("--lockstep", action="store_true", help="play in lock-step, as fast as the machine can")
+    group.add_argument(
+        "--speed",
+        type=_speed,
+        metavar="X",
+        help=f"speed relative to real time, at least {SLOWEST}, or max (default: max)",
+    )
     group.add_argument("--start", type=float, metavar="S", help="begin S seconds into the sequence")
-    group.add_argument("--loop", type=int, metavar="N", help="play it N times over, in one flight")
-    group.add_argument("--pause", type=int, metavar="FRAME", help=f"stop before FRAME; Enter shows it, {GO_ON} goes on")
-    group.add_argument("--step", action="store_true", help=f"stop before every frame; Enter shows it, {GO_ON} goes on")
+    group.add_argument("--loop", type=int, metavar="N", help="play the sequence N times in one flight")
+    group.add_argument(
+        "--pause", type=int, metavar="FRAME", help=f"stop before FRAME; Enter plays it, {GO_ON} continues"
+    )
+    group.add_argument(
+        "--step", action="store_true", help=f"stop before every frame; Enter plays it, {GO_ON} continues"
+    )
 
 
 def asked_for(args: argparse.Namespace) -> bool:
@@ -50,7 +60,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     sequence = open_sequence(args.sequence, args.out, console)
     settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=_rounds(args.loop))
     if args.pause is not None and args.pause not in settings.frames:
-        raise InputError(f"--pause {args.pause}: is none of the frames {settings.frames[0]} to {settings.frames[-1]}")
+        raise InputError(
+            f"--pause {args.pause}: is not one of the frames {settings.frames[0]} to {settings.frames[-1]}"
+        )
     gate = Gate(sequence.fps, args.speed, args.pause, args.step, console.input)
     told = args.step or args.pause is not None
     remove_flight(args.out)
@@ -70,7 +82,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if settings.frames == list(range(len(sequence.scene.images))):  # after a part only, the rest would count as missed
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
-        files += "; uavpose-replay score takes it" if sequence.scene.truths else ""
+        files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.truths else ""
     text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.mavlink)} MAVLink messages"
     console.print(f"{text}; written to {args.out}: {files}", highlight=False, soft_wrap=True)
     return 0
@@ -120,7 +132,7 @@ def _speed(text: str) -> float:
     except ValueError:
         value = 0.0
     if not SLOWEST <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a number from {SLOWEST} up nor max")
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of at least {SLOWEST} nor max")
     return value
 
 
@@ -129,7 +141,7 @@ def _start(seconds: float | None, sequence: PlayedSequence) -> int:
         return 0
     last_s = (len(sequence.scene.images) - 1) / sequence.fps
     if not 0.0 <= seconds <= last_s:
-        raise InputError(f"--start {seconds}: the sequence's frames are from 0 to {last_s:.3f} s")
+        raise InputError(f"--start {seconds}: must be from 0 to {last_s:.3f} s, the times of the sequence's frames")
     return round(seconds * sequence.fps)
 
 

@@ -34,7 +34,7 @@ class Control:
                 self._daemon, _ = self._listening.accept()
             except TimeoutError:
                 if not alive() or time.monotonic() > deadline_s:
-                    raise PlayError("the daemon never called for its first step") from None
+                    raise PlayError("the daemon did not connect to the player for its first step") from None
         self._daemon.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._daemon.settimeout(STEP_TIMEOUT_S)
         self._expect("ready")
@@ -45,7 +45,7 @@ class Control:
         try:
             self._daemon.sendall(f"{word} {number}\n".encode())
         except OSError as error:
-            raise PlayError(f"the daemon hung up before {word} {number}") from error
+            raise PlayError(f"the daemon closed its connection before {word} {number}") from error
         self._expect("ok")
 
     def close(self) -> None:

@@ -114,7 +114,7 @@ class Subscriber:
             try:
                 key, payload, attachment = self._came.get(timeout=max(deadline_s - time.monotonic(), 0.0))
             except queue.Empty:
-                raise PlayError(f"what the daemon says of frame {frame} did not reach the subscriber") from None
+                raise PlayError(f"the daemon's outputs for frame {frame} did not reach the subscriber") from None
             self._take(key, payload, attachment, now_ns)
         names = sorted(self._frames.pop(now_ns))
         records = [self._record(frame, self._poses.pop((now_ns, name))) for name in names]

@@ -104,7 +104,7 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
             raise _because(daemon, said, error) from error
         control.close()
         if (code := daemon.reap()) != 0:
-            raise PlayError(f"the daemon ended with exit code {code}: {said[-1] if said else 'it said nothing'}")
+            raise PlayError(f"the daemon ended with exit code {code}: {said[-1] if said else 'no output'}")
         return flight.outputs
 
 
@@ -113,7 +113,7 @@ def _because(daemon: Process, said: Sequence[str], error: PlayError) -> InputErr
     if daemon.wait(ENDING_S) is None:
         return error
     code = daemon.reap()
-    last = said[-1] if said else "it said nothing"
+    last = said[-1] if said else "no output"
     return InputError(last) if code == EXIT_BAD_INPUT else PlayError(f"{error}: {last}")
 
 

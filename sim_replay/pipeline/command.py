@@ -30,29 +30,37 @@ def register(commands: Any) -> None:
     """Add them to what argparse's add_subparsers() returned."""
     bench = commands.add_parser(
         "bench-pipeline",
-        help="fly a sequence round and round through the daemon and hold it to its budgets",
+        help="play a sequence in a loop through the daemon and compare latency, CPU and memory with the budgets",
         description="Start the daemon on a looped sequence with a simulated autopilot (MAVLink over UDP) and a zenoh "
-        "subscriber, in real time, and print latency by stage, drops, CPU and memory beside the budgets.",
+        "subscriber, in real time, and print latency by stage, dropped frames, CPU and memory beside the budgets. "
+        "Writes pipeline.json.",
     )
     _add_arguments(bench, 10.0, "pipeline")
     bench.set_defaults(run=run)
     soak = commands.add_parser(
         "soak",
-        help="fly a sequence round and round for long, and fail if anything grows or the poses stop",
-        description="Like bench-pipeline, but set early against late: memory, open descriptors, threads, log, dropped "
-        "frames, age of what the autopilot gets, poses. Writes soak.json. Exit code 0 if all is flat, 1 if something "
-        "grows or poses do not come.",
+        help="play a sequence in a loop for a long time, and fail if resource usage or age grows or the poses stop",
+        description="Like bench-pipeline, but compare the beginning of the run, after a warm-up, with its end: memory, "
+        "open descriptors, threads, log volume, dropped frames, age of the poses at the autopilot, and whether each "
+        "peer receives poses. Writes soak.json. Exit code 0 if nothing has grown by more than allowed and poses "
+        "arrived to the end, 1 if not.",
     )
     _add_arguments(soak, 60.0, "soak")
     soak.set_defaults(run=run_soak)
 
 
 def _add_arguments(parser: argparse.ArgumentParser, minutes: float, out: str) -> None:
-    parser.add_argument("--sequence", type=Path, default=BUNDLED_SEQUENCE, metavar="DIR", help="scene folder")
-    parser.add_argument("--minutes", type=float, default=minutes, help="how long (default %(default)s)")
-    parser.add_argument("--fps", type=float, help="pictures a second (default: the sequence's own rate)")
+    parser.add_argument(
+        "--sequence",
+        type=Path,
+        default=BUNDLED_SEQUENCE,
+        metavar="DIR",
+        help="scene folder (default: the bundled sequence)",
+    )
+    parser.add_argument("--minutes", type=float, default=minutes, help="duration (default %(default)g)")
+    parser.add_argument("--fps", type=float, help="frames per second (default: the sequence's own rate)")
     parser.add_argument("--model", type=Path, default=SHIPPED_MODEL, help="ONNX file (default: the shipped one)")
-    parser.add_argument("--out", type=Path, default=Path("out") / out, metavar="DIR", help="folder to write to")
+    parser.add_argument("--out", type=Path, default=Path("out") / out, metavar="DIR", help="output folder")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
 
 
@@ -81,19 +89,21 @@ def run_soak(args: argparse.Namespace) -> int:
 def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
     """Fly; returns the report and the flight."""
     if not 0.0 < args.minutes <= 24 * 60:
-        raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most a day")
+        raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most 1440, a day")
     model = load_model(args.model, threads=1)
     sequence = read_sequence(args.sequence)
     fps = sequence.fps if args.fps is None else args.fps
     if not 1.0 <= fps <= FPS_MAX:
         raise InputError(f"--fps {fps:g}: must be from 1 to {FPS_MAX:g}")
     if sequence.gimbal is not None and fps != sequence.fps:
-        raise InputError(f"--fps {fps:g}: {args.sequence} was filmed from a gimbal, whose turning is of its own rate")
+        raise InputError(
+            f"--fps {fps:g}: {args.sequence} was filmed from a gimbal, whose motion has the sequence's own rate"
+        )
     settings = FlightSettings(sequence, args.out, args.minutes, args.model, fps)
     load_before = os.getloadavg()[0]
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task("flying", total=1.0)
+        task = progress.add_task("playing", total=1.0)
         flight = fly(settings, lambda done: progress.update(task, completed=done))
     result = {
         "sequence": settings.sequence.scene.name,

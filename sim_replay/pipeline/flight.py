@@ -190,7 +190,7 @@ def _check_all_run(flight: Flight, daemon: Process, peers: Sequence[Process]) ->
     for process, words in ((daemon, flight.said), *((peer, flight.complaints) for peer in peers)):
         if process.exit_code is not None:
             code = process.reap()
-            last = words[-1] if words else "it said nothing"
+            last = words[-1] if words else "no output"
             if process is daemon and code == EXIT_BAD_INPUT:
                 raise InputError(last)
             raise PlayError(f"{'the daemon' if process is daemon else 'a peer'} ended with exit code {code}: {last}")

@@ -172,7 +172,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    yield f"{'':40} {'budget':>8} {'here':>8}"
+    yield f"{'':40} {'budget':>8} {'value':>8}"
     words = {True: "met", False: "MISSED", None: "not judged"}
     for budget in result["budgets"]:
         value = "-" if budget["value"] is None else f"{budget['value']:.1f}"
@@ -186,12 +186,12 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
     yield ""
     yield f"{result['captured']} frames, {result['poses_mavlink']} poses at the autopilot"
     if result["poses_withheld"]:
-        yield f"{result['poses_withheld']} more were too old to be sent to it: no latency to MAVLink tells of them"
+        yield f"{result['poses_withheld']} more were too old to be sent to it: latencies to MAVLink exclude them"
     if result["cpu_cores"] is not None:
         waited = result["cpu_cores_waited_for"]
-        yield f"{result['cpu_cores']:.2f} cores busy, {waited:.2f} waited for while other processes had them"
+        yield f"{result['cpu_cores']:.2f} cores busy, {waited:.2f} waited for while other processes used them"
         if waited > result["cpu_cores"]:
-            yield "This machine was busy with other work: latencies and drops are the machine's, not the daemon's."
+            yield "The machine was busy with other work: latencies and drops are due to its load, not to the daemon."
 
 
 def _percentiles(values: Sequence[float]) -> dict[str, float]:

@@ -27,7 +27,7 @@ class Channel:
     @property
     def what(self) -> str:
         """In words."""
-        rate = "no limit" if self.rate_bps is None else f"{self.rate_bps / 1e3:g} kbit/s"
+        rate = "unlimited rate" if self.rate_bps is None else f"{self.rate_bps / 1e3:g} kbit/s"
         jitter = f" + 0…{self.jitter_s * 1e3:g} ms" if self.jitter_s else ""
         outage = f", {self.outage_s:g} s outage" if self.outage_s else ""
         return f"{rate}, {self.delay_s * 1e3:g} ms{jitter}, {self.loss:.0%} loss{outage}"

@@ -96,7 +96,7 @@ class Vehicle:
 
         with self._came:
             if not self._came.wait_for(lambda: found() or self._process.exit_code is not None, START_S) or not found():
-                raise PlayError(f"the vehicle {self.uav} did not tell its {key}: {self._said or 'it said nothing'}")
+                raise PlayError(f"the vehicle {self.uav} did not report `{key}`: {self._said or 'no output'}")
             return found()[0]
 
     def _hear(self, line: str, _: int) -> None:

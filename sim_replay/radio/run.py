@@ -22,34 +22,53 @@ def register(commands: Any) -> None:
     """Add the commands to what add_subparsers() returned; each sets `run`, a function of the parsed arguments."""
     radio = commands.add_parser(
         "radio",
-        help="fly the daemon's zenoh link over slow, lossy and interrupted radios and look at every pose shown",
-        description="A vehicle's zenoh session, a router with certificates, and between them a relay on loopback that "
-        "behaves like a radio. Prints the share of poses delivered and how old they truly were when shown. "
+        help="run the daemon's zenoh link over simulated slow, lossy and interrupted radios and check every pose shown",
+        description="Connect a vehicle's zenoh session to a router with certificates through a relay on loopback that "
+        "behaves like a radio. Prints the share of poses delivered and their true age when shown. "
         "Links: " + "; ".join(f"{name}: {one.what}" for name, one in CHANNELS.items()) + ". "
-        "Exit code 0 if no late pose was shown as good, 1 if one was.",
+        "Exit code 0 if no pose older than --max-age was shown as valid, 1 if one was.",
     )
-    radio.add_argument("--link", action="append", choices=list(CHANNELS), help="default: all; repeatable")
-    radio.add_argument("--transport", action="append", choices=get_args(Transport), help="default: both; repeatable")
     radio.add_argument(
-        "--tool", action="append", choices=get_args(Tool), help="who listens (default: both); repeatable"
+        "--link", action="append", choices=list(CHANNELS), help="radio link (default: all); may be repeated"
     )
-    radio.add_argument("--seconds", type=_seconds, default=30.0, help="of each trial (default 30)")
-    radio.add_argument("--fps", type=_seconds, default=20.0, help="poses a second (default 20)")
-    radio.add_argument("--max-age", type=_seconds, default=1.0, metavar="S", help="the client refuses older ones")
+    radio.add_argument(
+        "--transport", action="append", choices=get_args(Transport), help="transport (default: both); may be repeated"
+    )
+    radio.add_argument(
+        "--tool",
+        action="append",
+        choices=get_args(Tool),
+        help="receiver on the ground: a program that takes poses only, or what `uavpose-ground watch` "
+        "takes (default: both); may be repeated",
+    )
+    radio.add_argument("--seconds", type=_seconds, default=30.0, help="duration of each trial (default 30)")
+    radio.add_argument("--fps", type=_seconds, default=20.0, help="poses per second (default 20)")
+    radio.add_argument(
+        "--max-age",
+        type=_seconds,
+        default=1.0,
+        metavar="S",
+        help="the client refuses poses older than S seconds (default 1)",
+    )
     radio.add_argument("--json", action="store_true", help="print one JSON array instead of a table")
     radio.set_defaults(run=run_radio)
     fleet = commands.add_parser(
         "fleet",
-        help="put many simulated vehicles on one router and watch them all",
-        description="Each vehicle is a process with the daemon's zenoh session and a certificate of its own; router "
-        "and watcher share one process. Exit code 0 if no late pose was shown as good, 1 if one was.",
+        help="connect many simulated vehicles to one router and watch them all",
+        description="Start each vehicle as a process with the daemon's zenoh session and its own certificate; router "
+        "and watcher share one process. Exit code 0 if no pose older than 1 s was shown as valid, 1 if one was.",
     )
     fleet.add_argument(
-        "--vehicles", type=int, choices=range(1, 65), default=10, metavar="N", help="default 10, up to 64"
+        "--vehicles",
+        type=int,
+        choices=range(1, 65),
+        default=10,
+        metavar="N",
+        help="number of vehicles, up to 64 (default 10)",
     )
-    fleet.add_argument("--transport", choices=get_args(Transport), default="quic", help="default quic")
-    fleet.add_argument("--seconds", type=_seconds, default=30.0, help="default 30")
-    fleet.add_argument("--fps", type=_seconds, default=20.0, help="poses a second of each vehicle (default 20)")
+    fleet.add_argument("--transport", choices=get_args(Transport), default="quic", help="transport (default quic)")
+    fleet.add_argument("--seconds", type=_seconds, default=30.0, help="duration (default 30)")
+    fleet.add_argument("--fps", type=_seconds, default=20.0, help="poses per second of each vehicle (default 20)")
     fleet.add_argument("--json", action="store_true", help="print one JSON object instead of a line")
     fleet.set_defaults(run=run_fleet)
 
@@ -88,8 +107,8 @@ def run_fleet(args: argparse.Namespace) -> int:
         print(
             f"{one.vehicles} vehicles over {one.transport} at {one.fps:g} Hz for {one.seconds:g} s: {one.shown_hz:.0f} "
             f"poses/s shown, {one.delivered:.1%} delivered (worst vehicle {one.delivered_min:.1%}), age {ages} ms "
-            f"p50/p95/p99/max, {one.refused} refused, {one.late_shown} late shown, router and watcher together "
-            f"{one.processor_share:.0%} of a core"
+            f"p50/p95/p99/max, {one.refused} refused, {one.late_shown} shown too late, router and watcher together "
+            f"used {one.processor_share:.0%} of a core"
         )
     return EXIT_LATE if one.late_shown else 0
 
@@ -102,8 +121,8 @@ def _need_certificates() -> None:
 def table(outcomes: Sequence[Outcome], head: bool = True) -> str:
     """Markdown; ages in milliseconds."""
     lines = [
-        "| link | transport | tool | sent | delivered | p50 | p95 | p99 | max ms | refused | late shown "
-        "| longest gap s | again after s | up kbit/s |",
+        "| link | transport | tool | sent | delivered | p50 | p95 | p99 | max ms | refused | shown too late "
+        "| longest gap s | recovered after s | uplink kbit/s |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for one in outcomes:

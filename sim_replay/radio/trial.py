@@ -87,7 +87,7 @@ class Ledger:
     def wait_for_first(self) -> None:
         with self.changed:
             if not self.changed.wait_for(lambda: self.rows, START_S):
-                raise PlayError(f"no pose came within {START_S:.0f} s")
+                raise PlayError(f"no pose received within {START_S:.0f} s")
 
     def offered(self, sent: int) -> int:
         """Number of poses that could have been shown since the first one shown, of `sent` in all."""

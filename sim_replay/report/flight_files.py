@@ -82,7 +82,9 @@ def read_flight(folder: Path) -> RecordedFlight:
         )
         sequence, model, speed = Path(about["sequence"]), dict(about["model"]), float(about["speed"])
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; is {folder} what a replay wrote?") from error
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror}; is {folder} the output folder of a replay?"
+        ) from error
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]!r} is missing") from error
     except (ValueError, TypeError) as error:
@@ -116,6 +118,6 @@ def _check(record: Record, recording: Recording) -> None:
     if pose.t_cam_target_m.shape != (3,) or pose.R_cam_target.shape != (3, 3):
         raise ValueError("its pose is not three metres and a quaternion")
     if pose.covariance is not None and pose.covariance.shape != (6, 6):
-        raise ValueError("its covariance is not of six by six")
+        raise ValueError("its covariance is not a 6×6 matrix")
     if not np.isfinite([*pose.t_cam_target_m, latency_ms, float(recording.capture_ns(record))]).all():
         raise ValueError("a number is not finite")

@@ -79,14 +79,14 @@ def pose_over_time(matches: Sequence[Match], frames: int, fps: float) -> str:
         for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
             unit = " m" if k < 3 else "°"
             rms = root_mean_square(errors[:, k])
-            told = "nothing received" if rms is None else f"RMSE {rms:.2f}{unit}"
+            told = "no values" if rms is None else f"RMSE {rms:.2f}{unit}"
             axes.set_title(f"{name}  ·  {told}")
             axes.set_ylabel(unit)
             axes.set_xlim(0.0, frames / fps)
         for axes in panels[3:]:
             axes.set_xlabel("time, s")
-        handles = [Patch(color=TRUTH_COLOR, label="truth"), Patch(color=ESTIMATE_COLOR, label="received")]
-        handles.append(Patch(color=ESTIMATE_COLOR, alpha=0.18, label="±2σ as the daemon says"))
+        handles = [Patch(color=TRUTH_COLOR, label="ground truth"), Patch(color=ESTIMATE_COLOR, label="received")]
+        handles.append(Patch(color=ESTIMATE_COLOR, alpha=0.18, label="±2σ of the received covariance"))
         figure.legend(handles=handles, loc="outside upper right", ncols=3)
         return _svg(figure, "pose")
 
@@ -123,7 +123,7 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
         curves = [(_east_north_up(own, in_ned), OWN_COLOR, "own ship", "")] if in_ned else []
         for k, target in enumerate(_by_target(matches)):
             true, seen = _places(target, scene, in_ned)
-            curves.append((_east_north_up(true, in_ned), TRUTH_COLOR, "target, truth" if k == 0 else "", ""))
+            curves.append((_east_north_up(true, in_ned), TRUTH_COLOR, "target, ground truth" if k == 0 else "", ""))
             curves.append((_east_north_up(seen, in_ned), ESTIMATE_COLOR, "target, received" if k == 0 else "", "."))
         for points, color, label, marker in curves:
             style: dict[str, Any] = {
@@ -143,7 +143,7 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
             axis.set_major_locator(MaxNLocator(5))
         solid.view_init(elev=24, azim=-62)
         above.set(xlabel=f"{across}, m", ylabel=f"{along}, m")
-        above.set_title("from above  ·  ○ where it begins")
+        above.set_title("top view  ·  ○ start")
         above.set_aspect("equal", adjustable="datalim")
         if curves:
             above.legend(loc="best")
@@ -188,7 +188,7 @@ def ages(peers: Mapping[str, Sequence[tuple[int, float]]], fps: float) -> str:
         if over_time.has_data():
             over_time.legend(loc="best")
         spread.set(xlabel="age on receipt, ms", ylabel="share of poses, %", xlim=(0, None), ylim=(0, 102))
-        spread.set_title("cumulative")
+        spread.set_title("cumulative distribution")
         return _svg(figure, "ages")
 
 

@@ -65,12 +65,12 @@ def test_a_camera_whose_clock_is_slow_does_not_make_an_old_pose_young() -> None:
     [
         ('title = "x"\n[[step]]\ndo = "explode"\n', "step 1"),
         ('title = "x"\n[[step]]\ndo = "hold"\nfor_s = 1\nsoftly = true\n', "softly: unknown key"),
-        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "mavlink"\ndrop = ["NONE"]\n', "NONE is no MAVLink message"),
+        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "mavlink"\ndrop = ["NONE"]\n', "NONE is not a MAVLink message"),
         ("title = \n", "not valid TOML"),
-        ('title = "x"\n[[step]]\ndo = "expect_said"\npattern = "no frame ("\n', "pattern: is no regular expression"),
+        ('title = "x"\n[[step]]\ndo = "expect_said"\npattern = "no frame ("\n', "pattern: is not a regular expression"),
         ('title = "x"\n[[step]]\ndo = "disk"\nfull = true\n', "step 1: full and read_only need `volume = true`"),
-        ('title = "x"\n[[step]]\ndo = "start"\nwho = "camera"\nrebooted = true\n', "rebooted is an autopilot's"),
-        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "zenoh"\ndrop = ["HEARTBEAT"]\n', "drop names MAVLink messages"),
+        ('title = "x"\n[[step]]\ndo = "start"\nwho = "camera"\nrebooted = true\n', "rebooted applies to an autopilot"),
+        ('title = "x"\n[[step]]\ndo = "link"\nwhich = "zenoh"\ndrop = ["HEARTBEAT"]\n', "drop lists MAVLink messages"),
     ],
 )
 def test_a_bad_timeline_is_told_by_file_and_key(tmp_path: Path, text: str, words: str) -> None:
@@ -123,7 +123,7 @@ def test_what_was_not_seen_is_told_as_it_was(rig: Rig, tmp_path: Path) -> None:
 def test_to_act_upon_what_does_not_run_any_more_is_refused_by_name(rig: Rig, tmp_path: Path) -> None:
     killed = '[[step]]\ndo = "signal"\nwho = "camera"\nname = "KILL"\n'
     for step in ('do = "camera"\nfrozen = true\n', 'do = "signal"\nwho = "camera"\nname = "STOP"\n'):
-        with pytest.raises(InputError, match=r"^the camera does not run any more"):
+        with pytest.raises(InputError, match=r"^the camera is not running"):
             play_steps(rig, tmp_path, f"{killed}[[step]]\n{step}")
         rig.start(Start(do="start", who="camera"))
 
@@ -134,7 +134,7 @@ def test_the_command_takes_bundled_timelines_by_name_and_refuses_a_missing_one(t
     for name in run.bundled():
         load_timeline(run.TIMELINES / f"{name}.toml")
     args = parser.parse_args(["faults", "--timeline", str(tmp_path / "none.toml"), "--out", str(tmp_path)])
-    with pytest.raises(InputError, match=r"none\.toml: is no file, nor .*: all-at-once, .*, zenoh-cut"):
+    with pytest.raises(InputError, match=r"none\.toml: is neither a file nor .*: all-at-once, .*, zenoh-cut"):
         args.run(args)
 
 

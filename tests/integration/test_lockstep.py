@@ -57,7 +57,7 @@ def test_the_same_frames_give_the_same_files_at_any_speed_and_by_hand(tmp_path: 
 def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
     played = replay("golden", case, "--out", tmp_path)
     assert played.returncode == 0, f"{played.stdout}\n{played.stderr}\naccept it: uavpose-replay golden --accept"
-    assert played.stdout.strip().endswith(f"{case}: as accepted")
+    assert played.stdout.strip().endswith(f"{case}: no differences")
 
 
 def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
@@ -67,7 +67,7 @@ def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
     golden.golden_file("two_targets").write_text("<<<<<<< HEAD\n")  # as a merge leaves it
     play = ["golden", "two_targets", "--out", str(tmp_path / "out")]
     assert main(play) == 2
-    assert "two_targets.jsonl: is no golden file" in capsys.readouterr().err
+    assert "two_targets.jsonl: is not a golden file" in capsys.readouterr().err
     assert main([*play, "--accept"]) == 0
     assert {"pose", "TARGET_RELATIVE"} <= {record["kind"] for record in golden.read_golden("two_targets")[1]}
 
@@ -75,11 +75,11 @@ def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["play", "--start", "9"], "--start 9.0: the sequence's frames are from 0 to 4.967 s"),
+        (["play", "--start", "9"], "--start 9.0: must be from 0 to 4.967 s, the times of the sequence's frames"),
         (["play", "--loop", "0"], "--loop 0: must be at least 1"),
-        (["play", "--pause", "150"], "--pause 150: is none of the frames 0 to 149"),
-        (["play", "--speed", "0.1"], "'0.1' is neither a number from 0.25 up nor max"),
-        (["golden", "crosing"], "golden crosing: no such case; there are crossing, away_and_back, two_targets"),
+        (["play", "--pause", "150"], "--pause 150: is not one of the frames 0 to 149"),
+        (["play", "--speed", "0.1"], "'0.1' is neither a number of at least 0.25 nor max"),
+        (["golden", "crosing"], "golden crosing: no such case; the cases are crossing, away_and_back, two_targets"),
     ],
 )
 def test_what_cannot_be_played_is_said_in_a_sentence(

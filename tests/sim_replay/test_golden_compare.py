@@ -104,9 +104,9 @@ def test_a_covariance_of_nothing_but_depth_is_found_at_both_peers() -> None:
 def test_what_is_missing_and_what_is_new_is_named_in_the_order_of_time() -> None:
     later = held(frame=8, t_ns=800_000_000)
     assert told([*held(), later[0]], held(target="t1")) == [
-        "+0.700 s pose frame 7 t0: expected, and did not come",
-        "+0.700 s pose frame 7 t1: came, and was not expected",
-        "+0.800 s pose frame 8 t0: expected, and did not come",
+        "+0.700 s pose frame 7 t0: expected, but missing",
+        "+0.700 s pose frame 7 t1: present, but not expected",
+        "+0.800 s pose frame 8 t0: expected, but missing",
     ]
 
 
@@ -126,7 +126,7 @@ def test_a_count_is_exact_and_a_field_that_goes_is_told() -> None:
     del other[0]["std"]
     assert told(expected, other) == [
         "+0.700 s STATUSTEXT from 1/191: severity is 4, expected 6",
-        "+0.700 s pose frame 7 t0: std is gone",
+        "+0.700 s pose frame 7 t0: std is missing",
     ]
 
 

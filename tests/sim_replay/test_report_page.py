@@ -219,7 +219,7 @@ def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_fi
     assert score["overall"]["recall"] == 0.0
     assert "<video" not in page
     assert page.count('alt="still ') == moments.STILLS
-    assert "nothing received" in page
+    assert "no pose received" in page
     assert "nan" not in page.split("<details>")[0].split("</svg>")[-1].lower()
 
 

@@ -54,7 +54,7 @@ def test_a_pose_that_is_one_is_taken(flight: Path) -> None:
         ({"q_cam_target_wxyz": [0.0, 0.0, 0.0, 0.0]}, "a zero or non-finite quaternion is not a rotation"),
         ({"t_cam_target_m": [1.0, 2.0]}, "its pose is not three metres and a quaternion"),
         ({"t_cam_target_m": [0.0, 0.0, float("inf")]}, "a number is not finite"),
-        ({"covariance": [[1.0]]}, "its covariance is not of six by six"),
+        ({"covariance": [[1.0]]}, "its covariance is not a 6×6 matrix"),
     ],
 )
 def test_a_pose_that_is_none_is_told_with_its_line(flight: Path, change: dict[str, Any], words: str) -> None:
