@@ -10,6 +10,7 @@ with connect("tcp/127.0.0.1:7447") as session, subscribe(session, "uav1") as pos
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
 from collections import Counter
@@ -25,19 +26,33 @@ from msgs.session import TlsFiles, client_config
 from msgs.wire import Refusal
 
 FAILURES_MAX = 64  # distinct exception messages that are counted separately
+_opened: list[zenoh.Session] = []  # by `connect`, and not known to be closed
+_opened_lock = threading.Lock()
 
 
 def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
-    """Open a session with a router or daemon, e.g. `tcp/127.0.0.1:7447`; close it, or use it as a context.
+    """Open a session with a router or daemon, e.g. `tcp/127.0.0.1:7447`; close it, or use it as a context. One that is
+    still open when the program ends is closed then.
 
     Raises ConnectionError if the endpoint is malformed or nothing answers there: immediately if the host is reachable,
     after about four seconds if it is not, after ten over `quic/`.
     """
     try:
-        return zenoh.open(client_config([endpoint], tls=tls))
+        session = zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
         reason = str(error).partition(" at /")[0].strip()  # cuts off the location in zenoh's source
         raise ConnectionError(f"no zenoh session with {endpoint}: {reason}") from error
+    with _opened_lock:
+        _opened[:] = [*(one for one in _opened if not one.is_closed()), session]
+    return session
+
+
+@atexit.register
+def _close_sessions() -> None:
+    # A callback on zenoh's thread that outlives the interpreter aborts the process; closing waits for it.
+    for session in _opened:
+        with suppress(zenoh.ZError):
+            session.close()
 
 
 class PoseSubscription:

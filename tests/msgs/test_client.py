@@ -266,18 +266,27 @@ with connect(sys.argv[1]) as session, subscribe(session, "uav1") as poses:
 """
 
 FORGETFUL_READER = """
-import sys, threading
+import sys, threading, time
 from msgs.client import connect, subscribe_all
 taken = threading.Event()
+def on_pose(pose):
+    taken.set()
+    time.sleep(0.3)
+class SlowToEnd:
+    def __del__(self, sleep=time.sleep):
+        sleep(0.6)
+sys.slow_to_end = SlowToEnd()
 session = connect(sys.argv[1])
-counts = subscribe_all(session, "uav1", lambda pose: taken.set())
+counts = subscribe_all(session, "uav1", on_pose)
 print("ready", flush=True)
 taken.wait()
 print("t0 250.0", flush=True)
 """
 
 
-@pytest.mark.parametrize("program", [READER, FORGETFUL_READER], ids=["bare installation", "session left open"])
+@pytest.mark.parametrize(
+    "program", [READER, FORGETFUL_READER], ids=["bare installation", "session left open, callback under way"]
+)
 def test_a_reader_program_runs_and_ends(network: Network, program: str) -> None:
     with Node(network.daemon, "uav1") as node:
         publisher = node.publisher(POSE, "t0")
