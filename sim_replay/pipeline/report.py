@@ -44,6 +44,7 @@ def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[
         "fps": fps,
         "captured": counters.get("captured"),
         "dropped": counters.get("dropped"),
+        "dropped_tracking": dropped_tracking(flight, counters.get("dropped"), fps, period_s),
         "poses_mavlink": len(flight.targets),
         "poses_zenoh": len(flight.poses_ns),
         "poses_withheld": poses_withheld(flight, fps, period_s),
@@ -69,7 +70,7 @@ def budgets(result: dict[str, Any]) -> list[Budget]:
         _budget("capture to MAVLink, tracking, p99", 33.0 if fast else 25.0, steady.get("p99"), "ms"),
         _budget("poses withheld by MAVLink, tracking", 0.0, result["poses_withheld"], ""),
         _budget("inference in the loop, p50 (track)", 8.0, result["stages_ms"].get("inference", {}).get("p50"), "ms"),
-        _budget("frames dropped", 0.0, result["dropped"], ""),
+        _budget("frames dropped, tracking", 0.0, result["dropped_tracking"], ""),
         _budget("resident memory, largest", 400.0, memory.get("max"), "MB"),
         Budget("resident memory, growth an hour", 1.0, growth, "MB", None)
         if growth is None or result["minutes"] < FLAT_FROM_MINUTES
@@ -92,6 +93,16 @@ def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, f
     return {"all": _percentiles(ms), "steady": _percentiles(steady)}
 
 
+def dropped_tracking(flight: Flight, dropped: int | None, fps: float, period_s: float) -> int | None:
+    """How many of the `dropped` frames, at most, were dropped while tracking: no more than there are frames without a
+    pose at the subscriber, from the first that has one to the last, without SETTLE_S after each restart."""
+    if not dropped:
+        return dropped
+    had = set(_frames(flight, flight.poses_utc_ns, fps))
+    flown = range(min(had), max(had) + 1) if had else range(0)
+    return min(dropped, sum(frame not in had for frame in flown if _is_steady(frame, fps, period_s)))
+
+
 def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
     """Poses that the subscriber received and the autopilot did not: too old for MAVLink, whose limit is the lower one.
     Latencies do not include them.
@@ -102,13 +113,20 @@ def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
     if fps > SENT_MAX_HZ:
         return None
     told_utc_ns = [record["capture_utc_us"] * 1000 for record in flight.targets]
-    had, told = (
-        Counter(round((utc_ns - flight.utc_minus_monotonic_ns - flight.start_at_ns) * 1e-9 * fps) for utc_ns in stamps)
-        for stamps in (flight.poses_utc_ns, told_utc_ns)
-    )
+    had, told = (Counter(_frames(flight, stamps, fps)) for stamps in (flight.poses_utc_ns, told_utc_ns))
     flown = range(min(told), max(told) + 1) if told else range(max(had, default=0) + 1)  # while both were receiving
     missed = had - told
-    return sum(count for frame, count in missed.items() if frame in flown and frame / fps % period_s >= SETTLE_S)
+    return sum(count for frame, count in missed.items() if frame in flown and _is_steady(frame, fps, period_s))
+
+
+def _frames(flight: Flight, exposures_utc_ns: Iterable[int], fps: float) -> Iterator[int]:
+    """The number of each pose's frame, counted on through the rounds."""
+    start_utc_ns = flight.start_at_ns + flight.utc_minus_monotonic_ns
+    return (round((utc_ns - start_utc_ns) * 1e-9 * fps) for utc_ns in exposures_utc_ns)
+
+
+def _is_steady(frame: int, fps: float, period_s: float) -> bool:
+    return frame / fps % period_s >= SETTLE_S
 
 
 def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[str, dict[str, float]]:
@@ -184,7 +202,8 @@ def _lines(result: dict[str, Any]) -> Iterator[str]:
         if ms:
             yield f"{name:40} {ms['p50']:8.2f} {ms['p95']:8.2f} {ms['p99']:8.2f}"
     yield ""
-    yield f"{result['captured']} frames, {result['poses_mavlink']} poses at the autopilot"
+    poses = result["poses_mavlink"]
+    yield f"{result['captured']} frames captured, {result['dropped']} dropped; {poses} poses at the autopilot"
     if result["poses_withheld"]:
         yield f"{result['poses_withheld']} more were too old to be sent to it: latencies to MAVLink exclude them"
     if result["cpu_cores"] is not None:

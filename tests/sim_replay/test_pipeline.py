@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,11 @@ def heard(captures_s: list[float], latency_ms: list[float]) -> Flight:
     return flight
 
 
+def poses_at(frames: Iterable[int], fps: float = 30.0) -> list[int]:
+    """Exposure times, UTC, of the poses that the subscriber had of these frames."""
+    return [UTC_NS + START_NS + round(frame / fps * 1e9) for frame in frames]
+
+
 def run(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [str(Path(sys.executable).parent / "uavpose-edge"), "bench", "--pipeline", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=cwd)
@@ -99,13 +105,36 @@ def test_processor_time_and_waiting_are_told_apart() -> None:
 
 def test_budgets_are_met_missed_or_not_judged() -> None:
     flight = heard([0.3, 2.0, 3.0], [9.0, 20.0, 22.0])
+    flight.poses_utc_ns = poses_at(frame for frame in range(150) if frame not in (40, 41, 100))
     flight.diagnostics = [{"values": {"dropped": "3", "captured": "90", "latency_ms/inference/p50": "4.5"}}]
     judged = {budget["name"]: budget["met"] for budget in report(flight, 30.0, PERIOD_S, 2.0)["budgets"]}
     assert judged["capture to MAVLink, tracking, p50"] is False
     assert judged["capture to MAVLink, tracking, p99"] is True
-    assert judged["frames dropped"] is False
+    assert judged["frames dropped, tracking"] is False
     assert judged["cold start to first pose"] is True
     assert judged["resident memory, largest"] is None
+
+
+@pytest.mark.parametrize(
+    ("without_pose", "dropped", "tracking"),
+    [
+        ((), 4, 0),
+        ((3, 29, 150, 179), 4, 0),  # in the first second of a round
+        ((30, 149, 180), 3, 3),
+        ((30, 31, 32, 33), 2, 2),  # the other two showed no target
+        ((30, 31), 5, 2),
+        ((30, 31), 0, 0),
+    ],
+)
+def test_frames_dropped_when_the_target_jumps_are_not_dropped_while_tracking(
+    without_pose: tuple[int, ...], dropped: int, tracking: int
+) -> None:
+    flight = heard([], [])
+    flight.poses_utc_ns = poses_at(frame for frame in range(300) if frame not in without_pose)
+    flight.diagnostics = [{"values": {"dropped": str(dropped), "captured": "300"}}]
+    result = report(flight, 30.0, PERIOD_S, 2.0)
+    assert (result["dropped"], result["dropped_tracking"]) == (dropped, tracking)
+    assert f"{dropped} dropped" in table(result)
 
 
 def test_what_was_too_old_for_the_autopilot_is_counted_since_no_latency_tells_of_it() -> None:
