@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edge.tracking import so3
+from edge.tracking.boxes import RANGE_MIN_M
 from edge.tracking.range_scale import RangeScale, corrected, in_metres, rates_of
 from edge.tracking.view import NS_PER_S, FrameKind, View
 from edge.types import Array, Estimate
@@ -33,6 +34,9 @@ DIMENSION = 7
 ACCELERATION = {"ned": 3.0, "ned_relative": 6.0}  # m/s^1.5; relative: the own ship manoeuvres too
 VERTICAL_SHARE = 0.5  # of that, for the vertical axis
 APPARENT_ACCELERATION = 0.3  # rad/s^1.5 times range: the camera's own turning, not separable in `cam`
+# In `cam`, along the line of sight: a target passing at this speed, not seen to pass if the camera follows it, has the
+# range acceleration v^2 / range for about the time range / v.
+PASSING_SPEED_MPS = 60.0
 TURN_RATE_WALK = 0.1  # rad/s^1.5
 
 # Initial uncertainty of what one measurement does not determine.
@@ -367,7 +371,8 @@ def _acceleration_density(motion: Motion) -> Array:
     range_m = float(np.linalg.norm(motion.t_m))
     along = np.outer(motion.t_m, motion.t_m) / max(range_m**2, 1.0)
     across = (APPARENT_ACCELERATION * range_m) ** 2 * (so3.IDENTITY - along)
-    return ACCELERATION["ned_relative"] ** 2 * along + across
+    passing = 2.0 * PASSING_SPEED_MPS**3 / max(range_m, RANGE_MIN_M)
+    return (ACCELERATION["ned_relative"] ** 2 + passing) * along + across
 
 
 def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:

@@ -85,10 +85,11 @@ def test_a_target_that_comes_head_on_is_not_told_farther_than_it_is(closing_mps:
         assert max(abs(np.log(told_m / true_m)) for told_m, true_m in last_m) < 0.07
 
 
-@pytest.mark.parametrize("position_known", [True, False], ids=["ned", "ned_relative"])
+@pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
 @pytest.mark.parametrize("abeam_m", [100.0, 150.0])
-def test_a_target_that_passes_abeam_is_told_where_it_is(abeam_m: float, position_known: bool) -> None:
-    """Its range stands still there, and was twice as far a second ago: frames that are right must not be outvoted."""
+def test_a_target_that_passes_abeam_is_told_where_it_is(abeam_m: float, kind: str) -> None:
+    """Its range stands still there, and was twice as far a second ago: frames that are right must not be outvoted.
+    Without own attitude, a camera that follows it does not see that it passes."""
     velocity_mps, own_mps = np.array([-80.0, 0.0, 0.0]), np.array([20.0, 0.0, 0.0])
     for seed in range(3):
         tracker = Tracker(1, Mount(np.eye(3), np.zeros(3)))
@@ -98,9 +99,10 @@ def test_a_target_that_passes_abeam_is_told_where_it_is(abeam_m: float, position
             R_ned_cam = looking_at(target_m - own_m)
             t_cam = R_ned_cam.T @ (target_m - own_m)
             own = OwnShip(1 + round(t_s * 1e9), R_ned_cam, own_m, own_mps, None)
-            if not position_known:
+            if kind == "ned_relative":
                 own = replace(own, t_ned_body_m=None, v_ned_body_mps=None)
-            (track,) = tracker.update(own.time_ns, [sight(t_cam, float(error))], own, K, SIZE_WH)
+            told = None if kind == "cam" else own
+            (track,) = tracker.update(own.time_ns, [sight(t_cam, float(error))], told, K, SIZE_WH)
             told_m, true_m = np.linalg.norm([track.t_cam_target_m, t_cam], axis=1)
             assert t_s < 0.5 or abs(np.log(told_m / true_m)) < 0.07
 
