@@ -68,6 +68,7 @@ class MavlinkLink:
         self._condition: Condition | None = None
         self._events: deque[tuple[int, str, bool]] = deque(maxlen=EVENTS_WAITING)
         self._replaced = self._lost_events = 0
+        self._sleep = clock.SleepWatch()
         self._stopping = threading.Event()
         self._wake, self._woken = socket.socketpair()
         self._thread: threading.Thread | None = None
@@ -223,9 +224,10 @@ class MavlinkLink:
             self._send(self._station.event(severity, text, now_ns, of_state))
 
     def _in_time(self, report: Report, now_ns: int) -> Iterator[Letter]:
-        """The report's messages one by one; ends if the process was held up after the report's age was checked."""
+        """The report's messages one by one; ends if the process was held up after the report's age was checked, or the
+        computer has slept since the last report."""
         for letter in self._station.report(report, now_ns):
-            if clock.monotonic_ns() - now_ns > HELD_UP_MAX_NS:
+            if self._sleep.slept_ns() or clock.monotonic_ns() - now_ns > HELD_UP_MAX_NS:
                 self._station.counters["held_up"] += 1
                 return
             yield letter

@@ -79,6 +79,7 @@ class ZenohLink:
         self._recorder = recorder
         self._vehicle_name = vehicle_name
         self._mount = mount
+        self._sleep = clock.SleepWatch()
         self._waiting = threading.Condition()
         self._mailbox = Mailbox()
         self._counters: Counter[str] = Counter()
@@ -213,8 +214,15 @@ class ZenohLink:
                         return
 
     def _deliver(self, desk: Desk, mail: Mailbox) -> Counter[str]:
-        """Send each item independently: one that fails, for whatever reason, stops neither the link nor the others."""
+        """Send each item independently: one that fails, for whatever reason, stops neither the link nor the others.
+
+        What was seen before the computer slept is not sent.
+        """
         puts: list[Callable[[], None]] = []
+        if self._sleep.slept_ns():
+            desk.counted["too_late"] += (mail.report is not None) + len(mail.pictures)
+            mail.report = None
+            mail.pictures.clear()
         if mail.report is not None:
             puts.append(partial(desk.put_report, mail.report))
         if mail.snapshot is not None:

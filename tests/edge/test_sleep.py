@@ -15,8 +15,14 @@ from edge.clock import SLEPT_NS, SleepWatch
 from edge.daemon import Pipeline
 from edge.estimator.model import load_model
 from edge.types import Estimate, Frame, FrameMeta, TrackState
+from tests.waiting import until
 
 from .looping import HELD, PERIOD_NS, Gated, frame, looping
+from .mavlink_peer import Peer, meet
+from .mavlink_peer import linked as mavlink
+from .reports import make_report, make_track
+from .test_zenoh_link import free_endpoint
+from .test_zenoh_link import linked as zenoh
 from .toy_scene import SIZE_WH, K
 
 HOUR_NS = 3_600_000_000_000
@@ -72,6 +78,25 @@ def test_a_frame_that_the_computer_slept_over_is_not_told(
         monkeypatch.setattr(gated, "track", track_asleep)
         loop._process(frame(6, HELD))
         assert len(ear.reports) == told
+
+
+def test_a_report_that_the_computer_slept_over_in_a_link_is_not_sent(sleep: Sleep) -> None:
+    with mavlink() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        link.publish(make_report(make_track(time.monotonic_ns())))
+        peer.named("TARGET_RELATIVE")
+        sleep(HOUR_NS)
+        link.publish(make_report(make_track(time.monotonic_ns(), track_id=5)))
+        until(lambda: link.counters().get("held_up") == 1, what="withholding")
+        link.publish(make_report(make_track(time.monotonic_ns(), track_id=6)))
+        assert peer.named("TARGET_RELATIVE").id == 6
+    with zenoh(free_endpoint()) as link:
+        sleep(HOUR_NS)
+        link.publish(make_report(make_track(time.monotonic_ns())))
+        until(lambda: link.counters().get("too_late") == 1, what="withholding")
+        assert "sent_pose" not in link.counters()
+        link.publish(make_report(make_track(time.monotonic_ns())))
+        until(lambda: link.counters().get("sent_pose") == 1, what="the next report")
 
 
 def test_a_computer_that_is_held_up_has_not_slept(sleep: Sleep) -> None:
