@@ -20,7 +20,9 @@ from edge.errors import InputError
 from edge.types import Array
 
 PICTURES_MAX = 150  # of a video, evenly spaced: more show nothing new
-VIEWS_MAX = 60  # with more, a fit takes long and gains little
+# With more, a fit takes long and gains little. They are chosen from all that differ: the first ones may all be of the
+# image's middle.
+VIEWS_MAX = 60
 DIFFERENT_SHARE = 0.03  # of the image diagonal: mean movement of the corners from which on a view is different
 TOLD_MIN = 0.0005  # of the image: shares that would be rounded to zero are not reported
 
@@ -60,7 +62,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
         size_wh, pictures = seen_wh, pictures + 1
         view = detector.detect(gray)
         boards += view is not None
-        if view is not None and len(views) < VIEWS_MAX and all(differ(view, other, size_wh) for other in views):
+        if view is not None and all(differ(view, other, size_wh) for other in views):
             views.append(view)
         _tell_progress(pictures, boards, len(views))
     if size_wh is None or boards == 0:
@@ -70,7 +72,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
             f"{source}: {boards} of {pictures} images show the board, but only {len(views)} views of it differ; "
             f"{VIEWS_MIN} are needed: move and tilt the board more"
         )
-    found = calibration_of(views, size_wh, coefficients, boards, pictures)
+    found = calibration_of(spread(views), size_wh, coefficients, boards, pictures)
     if isinstance(found, str):
         raise InputError(f"{source}: {found}")
     return found
@@ -83,6 +85,13 @@ def differ(view: View, other: View, size_wh: Size) -> bool:
         return True
     moved_px = np.linalg.norm(view.pixels[mine] - other.pixels[others], axis=1).mean()
     return bool(moved_px > DIFFERENT_SHARE * np.hypot(*size_wh))
+
+
+def spread(views: list[View]) -> list[View]:
+    """At most VIEWS_MAX of the views, evenly spaced from the first to the last."""
+    if len(views) <= VIEWS_MAX:
+        return views
+    return [views[index] for index in np.linspace(0, len(views) - 1, VIEWS_MAX).round().astype(int)]
 
 
 def camera_info_yaml(found: Calibration, name: str) -> str:
