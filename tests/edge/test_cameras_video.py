@@ -95,6 +95,14 @@ def test_where_a_video_has_no_times_or_those_of_another_clock_frames_follow_at_i
         assert told_ms == [40.0 * k for k in range(len(stamps_ms))]
 
 
+@pytest.mark.parametrize("wrong_ms", [0, 360, 359, 200, 9_000_000])
+def test_one_frame_of_a_video_without_a_time_or_with_a_wrong_one_does_not_move_those_after_it(wrong_ms: int) -> None:
+    times = VideoTimes(FPS)
+    for index in range(20):
+        times.take((wrong_ms if index == 10 else 40 * index) * 1_000_000)
+        assert times.last_ns == 40_000_000 * index
+
+
 def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_shown(tmp_path: Path) -> None:
     path = turned(write_film(tmp_path / "flight.mp4", [0, 40, 80], bright=np.s_[:60]))
     seen = [frame.image_bgr[..., 0] for frame in play(source_of(path))]
