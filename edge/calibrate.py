@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -42,13 +42,22 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
     if not video.isOpened():
         raise InputError(f"{source} is neither a folder of images nor a readable video")
     every = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // PICTURES_MAX, 1)
+    frames = yield from _every(video, every)
+    # Recorders that count in milliseconds may state 1000 frames a second, from which the number of frames is guessed.
+    if frames // every < PICTURES_MAX // 2 and every > 1:
+        yield from _every(open_video(str(source)), max(frames // PICTURES_MAX, 1), but=every)
+
+
+def _every(video: cv2.VideoCapture, step: int, but: int | None = None) -> Generator[tuple[str, Gray], None, int]:
+    """Names and gray pictures of each `step`th frame but those of each `but`th; returns the number of all frames."""
     index = 0
     while video.grab():
-        if index % every == 0:
+        if index % step == 0 and (but is None or index % but != 0):
             read, image_bgr = video.retrieve()
             if read:
                 yield f"frame {index}", np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         index += 1
+    return index
 
 
 def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) -> Calibration:
