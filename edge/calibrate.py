@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -20,7 +20,9 @@ from edge.errors import InputError
 from edge.types import Array
 
 PICTURES_MAX = 150  # of a video, evenly spaced: more show nothing new
-VIEWS_MAX = 60  # with more, a fit takes long and gains little
+# With more, a fit takes long and gains little. They are chosen from all that differ: the first ones may all be of the
+# image's middle.
+VIEWS_MAX = 60
 DIFFERENT_SHARE = 0.03  # of the image diagonal: mean movement of the corners from which on a view is different
 TOLD_MIN = 0.0005  # of the image: shares that would be rounded to zero are not reported
 
@@ -40,13 +42,22 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
     if not video.isOpened():
         raise InputError(f"{source} is neither a folder of images nor a readable video")
     every = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // PICTURES_MAX, 1)
+    frames = yield from _every(video, every)
+    # Recorders that count in milliseconds may state 1000 frames a second, from which the number of frames is guessed.
+    if frames // every < PICTURES_MAX // 2 and every > 1:
+        yield from _every(open_video(str(source)), max(frames // PICTURES_MAX, 1), but=every)
+
+
+def _every(video: cv2.VideoCapture, step: int, but: int | None = None) -> Generator[tuple[str, Gray], None, int]:
+    """Names and gray pictures of each `step`th frame but those of each `but`th; returns the number of all frames."""
     index = 0
     while video.grab():
-        if index % every == 0:
+        if index % step == 0 and (but is None or index % but != 0):
             read, image_bgr = video.retrieve()
             if read:
                 yield f"frame {index}", np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         index += 1
+    return index
 
 
 def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) -> Calibration:
@@ -60,7 +71,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
         size_wh, pictures = seen_wh, pictures + 1
         view = detector.detect(gray)
         boards += view is not None
-        if view is not None and len(views) < VIEWS_MAX and all(differ(view, other, size_wh) for other in views):
+        if view is not None and all(differ(view, other, size_wh) for other in views):
             views.append(view)
         _tell_progress(pictures, boards, len(views))
     if size_wh is None or boards == 0:
@@ -70,7 +81,7 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
             f"{source}: {boards} of {pictures} images show the board, but only {len(views)} views of it differ; "
             f"{VIEWS_MIN} are needed: move and tilt the board more"
         )
-    found = calibration_of(views, size_wh, coefficients, boards, pictures)
+    found = calibration_of(spread(views), size_wh, coefficients, boards, pictures)
     if isinstance(found, str):
         raise InputError(f"{source}: {found}")
     return found
@@ -83,6 +94,13 @@ def differ(view: View, other: View, size_wh: Size) -> bool:
         return True
     moved_px = np.linalg.norm(view.pixels[mine] - other.pixels[others], axis=1).mean()
     return bool(moved_px > DIFFERENT_SHARE * np.hypot(*size_wh))
+
+
+def spread(views: list[View]) -> list[View]:
+    """At most VIEWS_MAX of the views, evenly spaced from the first to the last."""
+    if len(views) <= VIEWS_MAX:
+        return views
+    return [views[index] for index in np.linspace(0, len(views) - 1, VIEWS_MAX).round().astype(int)]
 
 
 def camera_info_yaml(found: Calibration, name: str) -> str:

@@ -110,13 +110,15 @@ class VideoTimes:
     """Times of a video's frames, relative to the first.
 
     If the file's timestamps are those of its frame rate except for rounding, the exact times are used. A frame without
-    a timestamp (the last ones of some files) or with one of another clock (joined videos) follows at that rate.
+    a timestamp (the last ones of some files) or with one of another clock (joined videos) follows at that rate. One
+    wrong timestamp changes no other frame's time.
     """
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
         self._period_ns = self._step_ns = round(1e9 / fps)
-        self._stamp_ns = self._told_ns = 0  # of the last frame: its timestamp in the file, and the sum since the first
+        self._stamp_ns = self._told_ns = 0  # of the last frame: its timestamp in the file, and its time by them
+        self._sure_stamp_ns = self._sure_ns = 0  # the same of the last frame whose timestamp was believed
         self.index = -1  # of the last frame
         self.last_ns = 0
 
@@ -130,8 +132,16 @@ class VideoTimes:
         self.index += 1
         since_ns, self._stamp_ns = stamp_ns - self._stamp_ns, stamp_ns
         if self.index == 0:
+            self._sure_stamp_ns = stamp_ns
             return
-        self._told_ns += since_ns if 0 < since_ns <= GAP_MAX_NS else self._period_ns
+        if 0 < (since_sure_ns := stamp_ns - self._sure_stamp_ns) <= GAP_MAX_NS:
+            self._told_ns = self._sure_ns + since_sure_ns
+            self._sure_stamp_ns, self._sure_ns = stamp_ns, self._told_ns
+        elif 0 < since_ns <= GAP_MAX_NS:  # the second one of another clock
+            self._told_ns += since_ns
+            self._sure_stamp_ns, self._sure_ns = stamp_ns, self._told_ns
+        else:
+            self._told_ns += self._period_ns
         by_rate_ns = round(self.index * 1e9 / self._fps)
         time_ns = by_rate_ns if abs(self._told_ns - by_rate_ns) <= ROUNDING_NS else self._told_ns
         time_ns = max(time_ns, self.last_ns + 1)

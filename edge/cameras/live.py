@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from edge.cameras.intrinsics import Intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
+from edge.clock import SleepWatch
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 
@@ -30,6 +31,7 @@ class LiveSource(ABC):
         self._capture: cv2.VideoCapture | None = None
         self._sequence = 0
         self._fitted = intrinsics
+        self._sleep = SleepWatch()
         self.counts: Counter[str] = Counter(unstamped=0, undecodable=0)
 
     def nominal(self) -> CameraInfo:
@@ -52,13 +54,14 @@ class LiveSource(ABC):
             capture.release()
             raise
         self._capture = capture
+        self._sleep.slept_ns()  # until now, nothing has waited to be read
         fps = capture.get(cv2.CAP_PROP_FPS)
         return self._info(self._fitted, fps if fps > 0 else None)
 
     def read(self, stop: threading.Event) -> Frame:
         """The next frame that can be decoded; others are skipped and counted, and use up sequence numbers.
 
-        Raises SourceLost if none arrives, or none that can be decoded.
+        Raises SourceLost if none arrives, or none that can be decoded, or if the computer has slept meanwhile.
         """
         assert self._capture is not None
         why = ""
@@ -69,6 +72,9 @@ class LiveSource(ABC):
                 raise EndOfStream
             if not grabbed:
                 raise SourceLost("the camera gives no more frames")
+            if (slept_ns := self._sleep.slept_ns()) > 0:
+                # What waited meanwhile, here or in a stream's server, is old, but not by the monotonic clock.
+                raise SourceLost(f"the computer has slept for {slept_ns / 1e9:.1f} s")
             position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
             image_bgr, why = _retrieved(self._capture)
             sequence = self._sequence

@@ -79,7 +79,7 @@ class SequenceSource:
         """The next exposed frame. Raises EndOfStream after the last, InputError on an unreadable picture."""
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns()
-        index = self._next
+        index = self._next + self._rounds_missed(self._next) * len(self._frames)
         while self._exists(index + 1) and self._exposure_ns(index + 1) <= time.monotonic_ns():
             index += 1
         if not self._exists(index):
@@ -132,6 +132,13 @@ class SequenceSource:
     def _exposure_ns(self, index: int) -> int:
         assert self._start_ns is not None
         return self._start_ns + round(self._frame(index) * 1e9 / self._settings.fps)
+
+    def _rounds_missed(self, index: int) -> int:
+        """Whole rounds of a loop since the exposure of picture `index`. Looking for the newest one frame by frame would
+        take minutes in a loop that began weeks ago."""
+        late_ns = time.monotonic_ns() - self._exposure_ns(index)
+        round_ns = (self._frames[-1] + 1) * 1e9 / self._settings.fps
+        return max(int(late_ns / round_ns), 0) if self._settings.loop else 0
 
     def _decode_ahead(self, index: int) -> None:
         assert self._decoder is not None

@@ -84,7 +84,8 @@ class StreamClock:
     """
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
+        self._last_ns: int | None = None  # stamp, of the last frame whose stamp increased
+        self._back_ns: int | None = None  # stamp of the frame just before, if it did not increase
         self._fastest: tuple[int, int] | None = None  # (arrival, arrival - stamp)
         self._began_ns = 0
         self._slow = SlowClock()
@@ -94,13 +95,20 @@ class StreamClock:
         self.caught_up = False  # whether the stream is current; before that, its timestamps are too young
 
     def monotonic_ns(self, stamp_ns: int, arrival_ns: int) -> int | None:
-        """The frame's time on our clock, never later than its arrival; None if the timestamp does not increase."""
+        """The frame's time on our clock, never later than its arrival; None if the timestamp does not increase.
+
+        A stream whose timestamps increase again from there has started over. A single one that is wrong, as some
+        cameras send, changes nothing: frames after it may have been held back, and keep their age.
+        """
         self._look_whether_caught_up(arrival_ns, arrival_ns - stamp_ns)
-        last_ns, self._last_ns = self._last_ns, stamp_ns
-        if last_ns is not None and stamp_ns <= last_ns:
+        back_ns, self._back_ns = self._back_ns, None
+        if self._last_ns is not None and stamp_ns <= self._last_ns:
+            if back_ns is None or stamp_ns <= back_ns:
+                self._back_ns = stamp_ns
+                return None
             self._fastest, self._slow = None, SlowClock()
             self._recent.clear()
-            return None
+        self._last_ns = stamp_ns
         delay_ns = arrival_ns - stamp_ns
         self._slow.take(arrival_ns, delay_ns)
         if self._fastest is None:

@@ -31,8 +31,15 @@ SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
 PUBLISHER_SILENT_NS = 1_000_000_000  # then another may replace it
+# 200 MB when decoded, more than any camera's: a PNG of 200 kB may unpack to gigabytes, which end the process.
+PIXELS_MAX = 2**26
+PNG_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # then width and height
+# JPEG: the markers of a frame's header, and those without a length.
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD9)})
 # A picture rotated according to its EXIF data would not fit the calibration.
 DECODING = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+UNDECODABLE = f"cannot be decoded, or has more than 8 bits a channel or {PIXELS_MAX // 10**6} megapixels"
 
 
 class _UnusableError(Exception):
@@ -134,7 +141,7 @@ class ZenohSource:
             raise _UnusableError("undecodable", "is no sensor_msgs/CompressedImage") from error
         image_bgr = decode_picture(message.data)
         if image_bgr is None:
-            raise _UnusableError("undecodable", "cannot be decoded, or has more than 8 bits a channel")
+            raise _UnusableError("undecodable", UNDECODABLE)
         fitted = self._fit((image_bgr.shape[1], image_bgr.shape[0]))
         stamp_ns = self._clock.monotonic_ns(message.stamp_ns)
         if not self._stamps.believes(stamp_ns, arrival_ns):
@@ -164,12 +171,34 @@ class ZenohSource:
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8] | None:
-    """JPEG or PNG of 8 bits to [H, W, 3] BGR as the sensor read it out, or None.
+    """JPEG or PNG of 8 bits and at most PIXELS_MAX to [H, W, 3] BGR as the sensor read it out, or None.
 
     The brightness scale of deeper pictures is unknown: 12 bits in 16 would be nearly black.
     """
+    size_wh = picture_size_wh(data)
+    if size_wh is None or size_wh[0] * size_wh[1] > PIXELS_MAX:
+        return None
     try:
         image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), DECODING)
     except cv2.error:
         return None
     return None if image_bgr is None or image_bgr.dtype != np.uint8 else np.asarray(image_bgr, dtype=np.uint8)
+
+
+def picture_size_wh(data: bytes) -> tuple[int, int] | None:
+    """Width and height in pixels from the header of a JPEG or PNG, without decoding it; None if it is neither."""
+    if data.startswith(PNG_HEADER):
+        at = len(PNG_HEADER)
+        return (_big_endian(data, at, 4), _big_endian(data, at + 4, 4)) if at + 8 <= len(data) else None
+    at = 2 if data.startswith(b"\xff\xd8") else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker in JPEG_FRAMES:
+            return _big_endian(data, at + 7, 2), _big_endian(data, at + 5, 2)
+        # A marker may follow any number of bytes 0xFF.
+        at += 1 if marker == 0xFF else 2 if marker in JPEG_BARE else 2 + _big_endian(data, at + 2, 2)
+    return None
+
+
+def _big_endian(data: bytes, at: int, size: int) -> int:
+    return int.from_bytes(data[at : at + size], "big")

@@ -7,13 +7,15 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from edge.calibrate import report, write_calibration
-from edge.calibrate_board import View
+from edge import calibrate
+from edge.calibrate import VIEWS_MAX, report, write_calibration
+from edge.calibrate_board import BoardSettings, View
 from edge.calibrate_fit import WITHOUT_RAY_MAX, Calibration, Coefficients, calibration_of, fit, reason_against
 from edge.cameras.intrinsics import load_intrinsics
 from edge.config_camera import IntrinsicsSettings
@@ -50,14 +52,21 @@ def plumb_bob(focal: float, distortion: tuple[float, ...]) -> Bend:
     return bend
 
 
-def views(bend: Bend, view_deg: float, count: int = 20, noises_px: tuple[float, ...] = (NOISE_PX,)) -> list[View]:
-    """Boards held to all places of the picture, tilted to all sides; the noise of their corners is each in turn's."""
+def views(
+    bend: Bend,
+    view_deg: float,
+    count: int = 20,
+    noises_px: tuple[float, ...] = (NOISE_PX,),
+    ranges: tuple[float, float] = (8.0, 14.0),
+) -> list[View]:
+    """Boards held to all places of the picture, tilted to all sides; the noise of their corners is each in turn's.
+    `ranges`: from the nearest to the farthest, in squares."""
     random, found = np.random.default_rng(6), list[View]()
     while len(found) < count:
         place = np.radians(view_deg) * random.uniform((-0.45, -0.25), (0.45, 0.25))
         turn, _ = cv2.Rodrigues(np.array([-place[1], place[0], 0.0]))
         tilt, _ = cv2.Rodrigues(random.normal(0, 0.4, 3))
-        points = (tilt @ turn @ BOARD.T).T + random.uniform(8, 14) * turn[:, 2]
+        points = (tilt @ turn @ BOARD.T).T + random.uniform(*ranges) * turn[:, 2]
         px = bend(points)
         seen = np.all((px > 2) & (px < np.array(SIZE_WH) - 3), axis=1)
         if seen.sum() >= 20:
@@ -65,6 +74,16 @@ def views(bend: Bend, view_deg: float, count: int = 20, noises_px: tuple[float, 
             ids = np.flatnonzero(seen)
             found.append(View(ids, BOARD[seen].astype(np.float32), (px[seen] + noise).astype(np.float32)))
     return found
+
+
+def filmed(monkeypatch: pytest.MonkeyPatch, seen: list[View]) -> Calibration:
+    """What `calibrate` makes of a video whose frames show these views."""
+    frames = [(f"frame {index}", np.zeros((SIZE_WH[1], SIZE_WH[0]), np.uint8)) for index in range(len(seen))]
+    monkeypatch.setattr(calibrate, "pictures_of", lambda _: iter(frames))
+    remaining = iter(seen)
+    detector = SimpleNamespace(detect=lambda _: next(remaining))
+    monkeypatch.setattr(calibrate, "detector_of", lambda _: detector)
+    return calibrate.calibrate(Path("board.mp4"), BoardSettings("charuco", (9, 6), "5X5_100", 0.75), 5)
 
 
 def calibrated(seen: list[View], coefficients: Coefficients) -> Calibration | str:
@@ -163,6 +182,18 @@ def test_a_view_that_does_not_agree_is_left_out_and_those_told_are_those_of_the_
     assert found.views == 21
     # The mean square of the noise of 3 poor views and 18 good ones, in x and y.
     assert found.rms_px == pytest.approx(np.sqrt(2 * (3 * poor**2 + 18 * 0.05**2) / 21), rel=0.15)
+
+
+def test_a_long_video_is_used_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board that is filmed in the middle first, in more places than are used, and then in the corners."""
+    lens = plumb_bob(1500, (-0.2, 0.05, 0.001, -0.001))
+    middle, everywhere = (views(lens, deg, count, ranges=(18.0, 24.0)) for deg, count in ((16, 600), (65, 75)))
+    found = filmed(monkeypatch, [*middle, *everywhere])
+    assert found.views <= VIEWS_MAX
+    rays = np.array([[x, y, 1.0] for x in (-0.6, 0.0, 0.6) for y in (-0.34, 0.0, 0.34)])
+    told, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.array(found.K), np.array(found.distortion))
+    assert np.abs(told.reshape(-1, 2) - lens(rays)).max() < 2.0
+    assert found.covered > 0.9
 
 
 def test_views_that_do_not_settle_so_many_coefficients_are_told_as_that() -> None:

@@ -63,6 +63,21 @@ def test_a_sequence_entered_late_begins_where_a_camera_would_be(tmp_path: Path) 
     assert capture.counters()["dropped"] == frame.meta.sequence
 
 
+def test_a_loop_that_began_long_ago_is_at_once_where_it_is_now(tmp_path: Path) -> None:
+    """As with `start_at_ns = 0` on a computer that has been up for weeks."""
+    scene = write_scene(tmp_path / "000001", 4)
+    start_ns = time.monotonic_ns() - 20 * 86_400 * 1_000_000_000
+    source = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=30, loop=True, start_at_ns=start_ns))
+    with closing(source):
+        source.open()
+        asked_ns = time.monotonic_ns()
+        frame = source.read(threading.Event())
+        # Searched frame by frame, it was found after 23 s.
+        assert time.monotonic_ns() - asked_ns < 2_000_000_000
+        assert abs(frame.meta.capture_ns - asked_ns) < 2_000_000_000
+        assert frame.meta.capture_ns == start_ns + round(frame.meta.sequence * 1e9 / 30)
+
+
 def test_a_looping_sequence_goes_on_in_time(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "000001", frames=3)
     source = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=20, loop=True))

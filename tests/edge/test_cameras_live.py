@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import queue
+import struct
 import threading
 import time
+import zlib
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -16,13 +18,14 @@ import numpy as np
 import pytest
 import zenoh
 
+from edge.cameras import zenoh_topic
 from edge.cameras.capture import Capture
 from edge.cameras.device import complaints
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.intrinsics import read_calibration
 from edge.cameras.source import EndOfStream, SourceLost
 from edge.cameras.watch import FrameWatch
-from edge.cameras.zenoh_topic import ZenohSource
+from edge.cameras.zenoh_topic import ZenohSource, decode_picture, picture_size_wh
 from edge.config_camera import DeviceCamera, FolderCamera, ZenohCamera
 from edge.errors import InputError
 from edge.estimator.pace import Pace
@@ -57,6 +60,18 @@ def turned_jpeg(index: int) -> bytes:
     body = b"Exif\0\0" + orientation
     data = jpeg.tobytes()
     return bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
+
+
+def empty_png(size_wh: tuple[int, int]) -> bytes:
+    """Small, whatever its size: all black."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    width, height = size_wh
+    pixels = zlib.compress(bytes((width + 1) * height))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
 
 
 @contextmanager
@@ -140,6 +155,28 @@ def test_what_is_no_picture_on_the_topic_is_counted_and_what_is_lost_shows_as_a_
         later = put_until_read(source, publisher, message(4, stamp_ns=5))
         assert later.meta.sequence - first.meta.sequence >= 4
         assert later.meta.capture_ns < first.meta.capture_ns  # an old picture is not told as a new one
+
+
+def test_a_small_file_that_would_unpack_to_more_than_the_memory_is_not_decoded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert decode_picture(empty_png((64, 36))) is not None
+    huge = empty_png((8200, 8200))  # 200 MB, from 70 kB
+    assert len(huge) < 100_000
+    assert decode_picture(huge) is None
+    # The size is known before anything is decoded, whatever the encoder writes before it.
+    _, jpeg = cv2.imencode(".jpg", picture(1))
+    _, progressive = cv2.imencode(
+        ".jpg", picture(1)[..., 0], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
+    )
+    pictures = [jpeg.tobytes(), progressive.tobytes(), turned_jpeg(1), message(1)[message(1).index(b"\x89PNG") :]]
+    for data in pictures:
+        assert picture_size_wh(data) == SIZE_WH
+        assert decode_picture(data) is not None
+        for cut_short in range(0, min(len(data), 2000), 7):
+            picture_size_wh(data[:cut_short])
+    monkeypatch.setattr(zenoh_topic, "PIXELS_MAX", SIZE_WH[0] * SIZE_WH[1] - 1)
+    assert [decode_picture(data) for data in pictures] == [None] * len(pictures)
 
 
 def test_of_two_cameras_on_one_topic_one_alone_is_looked_through_until_it_is_gone() -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.calibrate import pictures_of
+from edge.calibrate import PICTURES_MAX, pictures_of
 from edge.cameras.file import FileSource, VideoTimes
 from edge.config_camera import FileCamera
 from edge.errors import InputError
@@ -95,6 +95,14 @@ def test_where_a_video_has_no_times_or_those_of_another_clock_frames_follow_at_i
         assert told_ms == [40.0 * k for k in range(len(stamps_ms))]
 
 
+@pytest.mark.parametrize("wrong_ms", [0, 360, 359, 200, 9_000_000])
+def test_one_frame_of_a_video_without_a_time_or_with_a_wrong_one_does_not_move_those_after_it(wrong_ms: int) -> None:
+    times = VideoTimes(FPS)
+    for index in range(20):
+        times.take((wrong_ms if index == 10 else 40 * index) * 1_000_000)
+        assert times.last_ns == 40_000_000 * index
+
+
 def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_shown(tmp_path: Path) -> None:
     path = turned(write_film(tmp_path / "flight.mp4", [0, 40, 80], bright=np.s_[:60]))
     seen = [frame.image_bgr[..., 0] for frame in play(source_of(path))]
@@ -103,6 +111,16 @@ def test_a_video_is_seen_as_its_sensor_read_it_out_however_it_says_it_is_to_be_s
     for image in (*seen, *calibrated):
         assert image[:60].mean() > 150
         assert image[60:].mean() < 50
+
+
+def test_of_a_video_that_claims_a_thousand_frames_a_second_as_many_are_examined_as_of_another(tmp_path: Path) -> None:
+    """As recorders that count in milliseconds may write them: the number of frames is guessed from the rate."""
+    for suffix, count in (("mp4", 300), ("avi", 300), ("avi", 20)):
+        names = [
+            name for name, _ in pictures_of(write_film(tmp_path / f"board.{suffix}", [40 * k for k in range(count)]))
+        ]
+        assert len(set(names)) == len(names)
+        assert min(count, PICTURES_MAX) <= len(names) <= 2 * PICTURES_MAX
 
 
 def test_a_video_of_jpeg_whose_recorder_never_ended_it_has_its_times_all_the_same(tmp_path: Path) -> None:

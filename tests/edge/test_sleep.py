@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge import clock
+from edge.cameras.source import SourceLost
+from edge.cameras.stream import StreamSource
 from edge.clock import SLEPT_NS, SleepWatch
+from edge.config_camera import StreamCamera
 from edge.daemon import Pipeline
 from edge.estimator.model import load_model
 from edge.types import Estimate, Frame, FrameMeta, TrackState
@@ -21,6 +26,7 @@ from .looping import HELD, PERIOD_NS, Gated, frame, looping
 from .mavlink_peer import Peer, meet
 from .mavlink_peer import linked as mavlink
 from .reports import make_report, make_track
+from .test_stamps import INTRINSICS, Fed
 from .test_zenoh_link import free_endpoint
 from .test_zenoh_link import linked as zenoh
 from .toy_scene import SIZE_WH, K
@@ -97,6 +103,25 @@ def test_a_report_that_the_computer_slept_over_in_a_link_is_not_sent(sleep: Slee
         assert "sent_pose" not in link.counters()
         link.publish(make_report(make_track(time.monotonic_ns())))
         until(lambda: link.counters().get("sent_pose") == 1, what="the next report")
+
+
+def test_what_waited_in_a_stream_while_the_computer_slept_is_not_told_as_that_of_now(
+    sleep: Sleep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server sends on waking what it could not send before: frames an hour old, at the decoder's speed."""
+    awake, waited = 60, 30
+    arrivals_ns = [*(k * PERIOD_NS for k in range(awake)), *((awake + k / 10) * PERIOD_NS for k in range(waited))]
+    times_ns = iter(arrivals_ns)
+    monkeypatch.setattr("edge.cameras.live.time", SimpleNamespace(monotonic_ns=lambda: round(next(times_ns))))
+    source = StreamSource(StreamCamera(type="stream", url="udp://127.0.0.1:9", intrinsics=INTRINSICS))
+    monkeypatch.setattr(source, "_connect", lambda: Fed([k * PERIOD_NS / 1e6 for k in range(awake + waited)]))
+    sleep(HOUR_NS)  # before it was opened: nothing had waited
+    source.open()
+    while source.read(threading.Event()).meta.sequence < awake - 1:
+        pass
+    sleep(HOUR_NS)
+    with pytest.raises(SourceLost, match=r"the computer has slept for 3600\.0 s"):
+        source.read(threading.Event())
 
 
 def test_a_computer_that_is_held_up_has_not_slept(sleep: Sleep) -> None:

@@ -67,6 +67,21 @@ def test_what_a_stalled_stream_held_back_keeps_its_age(stall_s: float, drain_s: 
         assert abs(stamp_ns - exposed_ns) < 10_000_000
 
 
+@pytest.mark.parametrize("glitch_ns", [0, -1, -PERIOD_NS // 2, -5 * S])
+def test_one_stamp_that_does_not_increase_leaves_those_after_it_their_age(glitch_ns: int) -> None:
+    """As cheap cameras send them now and then; here while a stall's frames are read."""
+    clock, held_from, wrong = StreamClock(), 200, 230
+    for k in range(400):
+        exposed_ns = 10 * S + k * PERIOD_NS
+        arrival_ns = max(exposed_ns, 10 * S + held_from * PERIOD_NS + 2 * S if k >= held_from else 0)
+        stamp_ns = clock.monotonic_ns((wrong - 1) * PERIOD_NS + glitch_ns if k == wrong else k * PERIOD_NS, arrival_ns)
+        if k == wrong:
+            assert stamp_ns is None
+        else:
+            assert stamp_ns is not None
+            assert abs(stamp_ns - exposed_ns) < 10_000_000
+
+
 @example(waited_s=0.109375, fps=5, speed=2.0, jitter_s=0.03, seed=14550)
 @given(
     waited_s=st.floats(0.1, 4.0),
