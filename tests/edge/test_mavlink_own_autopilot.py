@@ -224,6 +224,18 @@ def test_nothing_is_said_of_a_vehicle_that_is_not_known_but_what_is_wrong_when_i
     assert told == [(SYSTEM_ID, 4, "model: runs on the CPU"), (SYSTEM_ID, 4, "degraded: no own attitude")]
 
 
+def test_a_configured_id_does_not_lose_what_was_wrong_before_anybody_was_there() -> None:
+    with linked("udpin:127.0.0.1:0", system_id=SYSTEM_ID) as (link, _):
+        link.event(4, "model: runs on the CPU")
+        link.event(4, "degraded: no own attitude", of_state=True)
+        until(lambda: link.counters().get("sent_STATUSTEXT", 0) == 2, what="texts to nobody")
+        with Peer(link.ports[0]) as peer:
+            meet(link, peer)
+            peer.settle(lambda: sum(m.get_type() == "STATUSTEXT" for m in peer.received) == 2, "what was wrong")
+            told = [(m.severity, m.text) for m in peer.received if m.get_type() == "STATUSTEXT"]
+    assert told == [(4, "model: runs on the CPU"), (4, "degraded: no own attitude")]
+
+
 def test_a_state_that_is_over_before_anybody_hears_of_it_is_not_told() -> None:
     station = Station(MavlinkSettings(), OwnShipBuffer(), CAMERA, RequestQueue())
     station.event(4, "degraded: no frame for 3 s", BEGAN_NS, of_state=True)
