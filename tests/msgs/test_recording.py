@@ -275,6 +275,22 @@ def test_nothing_is_removed_where_that_would_not_make_room(tmp_path: Path, monke
     assert sorted(tmp_path.iterdir()) == old
 
 
+def test_what_a_file_at_the_limit_holds_is_not_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    limits = RecordingLimits(total_bytes_max=50_000, free_bytes_min=0, when_full="stop")
+    recorder, put = Recorder(tmp_path, "uav1", limits, lambda *_: None), 0
+    recorder.start()
+    while recorder.recording:
+        record_some(recorder, [bytes(5000)])
+        put += 1
+        time.sleep(0.001)
+    recorder.stop()
+    held = sum(len(read(path)) for path in tmp_path.iterdir())
+    counters = recorder.counters()
+    assert counters["recorded"] == held > 5
+    assert held + counters.get("lost", 0) == put
+
+
 def test_switching_off_ends_the_file_and_on_begins_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     recorder = Recorder(tmp_path, "uav1", ROOM, print)
