@@ -197,6 +197,23 @@ def test_who_speaks_for_another_aircraft_alone_does_not_keep_the_port() -> None:
         assert port.tilt_deg(now_ns) == LEVEL_DEG
 
 
+def test_a_ground_station_alone_does_not_keep_the_port() -> None:
+    """A router that has lost our autopilot forwards the ground station, and ours comes from another address."""
+    mav = MAVLink(None, srcSystem=255, srcComponent=190)
+    ground = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    with contextlib.closing(Port()) as port:
+        for now_ns in range(BEGAN_NS, BEGAN_NS + 40 * S, 20 * MS):
+            second = (now_ns - BEGAN_NS) / S
+            port.tick(now_ns)
+            if now_ns % S == 0:
+                port.hear([bytes(ground.pack(mav))], BEFORE, now_ns)
+            if second < 12.0 or second >= 30.0:
+                port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE if second < 12.0 else OTHERS, now_ns)
+        assert port.heeded[29.0] == BEFORE, "the ground station is still sent to"
+        assert port.heeded[32.0] == port.heeded[39.0] == OTHERS
+        assert port.tilt_deg(now_ns) == LEVEL_DEG
+
+
 def test_nothing_is_said_of_a_vehicle_that_is_not_known_but_what_is_wrong_when_it_is() -> None:
     ground = Udp(0)
     with (
