@@ -81,9 +81,7 @@ class _Stream:
     and closing does not try to write again."""
 
     def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        # The lock tells other recorders that this file was not left by a crash.
-        fcntl.flock(self._fd, fcntl.LOCK_EX)
+        self._fd = _locked(path)
         self._at = 0
 
     def write(self, data: bytes) -> int:
@@ -105,6 +103,16 @@ class _Stream:
 
     def close(self) -> None:
         os.close(self._fd)
+
+
+def _locked(path: Path) -> int:
+    """Descriptor of a new file. Its lock tells other recorders that it was not left by a crash."""
+    while True:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if os.fstat(descriptor).st_nlink:
+            return descriptor
+        os.close(descriptor)  # before it was locked, another recorder took it for an empty one and removed it
 
 
 def is_written(path: Path) -> bool:

@@ -160,8 +160,7 @@ class Recorder:
                     # Usually a full disk; but no error may silently end the recorder thread.
                     self._fail(error, sum(map(len, runs)))
                     break
-                with self._changed:
-                    self._counters["recorded"] += len(runs.pop(0))
+                runs.pop(0)
             if stopping:
                 return
 
@@ -176,8 +175,9 @@ class Recorder:
         log.warning("%s", text)
         self._tell(logging.WARNING, text)
 
-    def _turn(self, samples: Sequence[Sample], go_on: bool) -> None:
-        """Write the samples and flush them to disk; start a new file if limits or a clock step require it."""
+    def _turn(self, samples: list[Sample], go_on: bool) -> None:
+        """Write the samples and flush them to disk, which removes them from the list: whatever fails afterwards, they
+        are not lost. Start a new file if limits or a clock step require it."""
         if samples and abs(samples[0].clock_ns - self._clock_ns) > CLOCK_STEP_NS:
             self._end_file()
         if samples or (self._failure is not None and go_on):
@@ -187,13 +187,17 @@ class Recorder:
         for sample in samples:
             self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
         self._file.flush()
-        if samples:
+        written = len(samples)
+        if written:
             self._holds_samples = True
+            with self._changed:
+                self._counters["recorded"] += written
+            samples.clear()
             self._tell_going()
         aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
         if not go_on or aged or self._file.size >= self._limits.file_bytes_max:
             self._end_file()
-        elif samples:
+        elif written:
             self._store.make_room()
 
     def _end_file(self) -> None:

@@ -177,7 +177,7 @@ class MavlinkLink:
         if now_ns >= self._next_tick_ns:
             self._next_tick_ns = now_ns + round(TICK_S * 1e9)
             for endpoint in self._endpoints:
-                yield partial(endpoint.tick, now_ns)
+                yield partial(self._maintain, endpoint, now_ns)
             yield partial(self._tick, now_ns)
             self._counted = self._count()
 
@@ -239,6 +239,10 @@ class MavlinkLink:
             now_ns = clock.monotonic_ns()
             messages = endpoint.believed(received, now_ns)
             self._send(self._station.take(messages, number, now_ns), [endpoint])
+
+    def _maintain(self, endpoint: Endpoint, now_ns: int) -> None:
+        endpoint.tick(now_ns)
+        self._station.counters["send_failed"] += endpoint.transport.dropped()
 
     def _tick(self, now_ns: int) -> None:
         was = self._station.vehicle.contact

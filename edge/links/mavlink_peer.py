@@ -2,8 +2,9 @@
 
 A peer that connects to us (`udpin`, `tcpin`) is accepted once it sends the heartbeat of an autopilot that may be ours,
 until it is silent or sends messages of other aircraft only; before, nothing is sent to it. A peer that we connect to is
-accepted from the start. If the accepted peer is another aircraft that was taken for ours, or, with signing, one that
-delays our autopilot's messages and replays them later, it is replaced when ours itself is received.
+accepted from the start. If the accepted peer no longer brings our autopilot, is another aircraft that was taken for
+ours, or, with signing, delays our autopilot's messages and replays them later, it is replaced when ours itself is
+received.
 """
 
 from __future__ import annotations

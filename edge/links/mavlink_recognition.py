@@ -59,8 +59,9 @@ class Recognition:
 
     def displaces(self, message: Any, now_ns: int) -> bool:
         """Whether a message from an address other than the accepted peer's is a heartbeat for which it replaces that
-        peer: one of the system that was our own before, or, with signing, one whose signature proves that the peer
-        delays messages. Another aircraft's is remembered as such."""
+        peer: one of our own autopilot that the peer no longer brings, one of the system that was our own before, or,
+        with signing, one whose signature proves that the peer delays messages. Another aircraft's is remembered as
+        such."""
         if not is_autopilot_heartbeat(message):
             return False
         system = message.get_srcSystem()
@@ -68,7 +69,10 @@ class Recognition:
             self._notice(system, now_ns)
         if not self._may_be_ours(message):
             return False
-        return self._vehicle.was_own(system) if self._signing is None else self._signing.outruns(message, now_ns)
+        if self._signing is not None:
+            return self._signing.outruns(message, now_ns)
+        lost = system == self._vehicle.system_id and self._vehicle.contact is Contact.LOST
+        return lost or self._vehicle.was_own(system)
 
     def heard(self, message: Any, link: int, now_ns: int) -> None:
         """An authentic message received on a link; those of our autopilot show which links it is on."""

@@ -98,7 +98,7 @@ class Station:
         self._health: tuple[Condition, int] | None = None
         self._sight: Sight | None = None
         self._text_id = 0
-        # Held until the vehicle's id is known: the last warnings, and the daemon's state.
+        # Held until the autopilot is received: the last warnings, and the daemon's state.
         self._held_texts: deque[tuple[int, str]] = deque(maxlen=TEXTS_HELD)
         self._held_state: tuple[int, str] | None = None
         self._news = Allowance(NEWS_AT_ONCE, NEWS_NS)
@@ -137,7 +137,7 @@ class Station:
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_ONBOARD_CONTROLLER, condition)))
             out.everywhere.append(self._letter(words.heartbeat(dialect.MAV_TYPE_CAMERA, condition), camera=True))
             self._namesakes.sent(out.everywhere)
-        if self.vehicle.system_id is not None:
+        if self.vehicle.contact is not Contact.WAITING:
             out.everywhere += self._held()
         frameless = self._sight is not None and not self._in_sight(now_ns)
         if frameless and self._schedule.due(IMAGE_STATUS, 0, now_ns):
@@ -184,14 +184,16 @@ class Station:
         """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. Warnings and errors are always sent; lesser ones
         (an operator who drags a point over the image causes many) are rate-limited, for the sake of radios.
 
-        Nothing is sent before the vehicle's id is known. Once it is, the last warnings are sent, and of the reports on
-        the daemon's state (`of_state`) the latest, if it is a warning."""
+        Nothing is sent before the vehicle's id is known. Once the autopilot is received, the last warnings are sent,
+        and of the reports on the daemon's state (`of_state`) the latest, if it is a warning: even with a configured id,
+        as nobody may have been there to receive them before."""
         wrong = severity <= dialect.MAV_SEVERITY_WARNING
-        if self.vehicle.system_id is None:
+        if self.vehicle.contact is Contact.WAITING:
             if of_state:
                 self._held_state = (severity, text) if wrong else None
             elif wrong:
                 self._held_texts.append((severity, text))
+        if self.vehicle.system_id is None:
             return []
         if not wrong and not self._news.take(now_ns):
             self.counters["news_left_out"] += 1

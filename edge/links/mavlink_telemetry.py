@@ -27,6 +27,7 @@ from msgs.mavlink import dialect
 
 BOOT_WRAP_MS = 2**32
 SAME_CLOCK_MS = 2000
+HELD_BACK_MAX_MS = 30_000  # longer than any backlog of a link lasts
 # After a jump, data of that kind are ignored for this long, so that frames without them carry the tracks over.
 JUMP_REST_NS = 300_000_000
 FALLBACK_NS = 1_000_000_000  # silence of the better source after which the other one is used
@@ -70,8 +71,10 @@ def uptime_ms(boot_ms: int, offset_ns: int | None, now_ns: int) -> int:
         return boot_ms
     up_ms = (now_ns + offset_ns) // 1_000_000
     unwrapped_ms = boot_ms + round((up_ms - boot_ms) / BOOT_WRAP_MS) * BOOT_WRAP_MS
-    # Some peers answer TIMESYNC from a clock other than that of their timestamps: it says nothing about the wrap.
-    return unwrapped_ms if unwrapped_ms >= 0 and abs(unwrapped_ms - up_ms) <= SAME_CLOCK_MS else boot_ms
+    # Some peers answer TIMESYNC from a clock other than that of their timestamps: it says nothing about the wrap. A
+    # message that a link held back is stamped earlier.
+    same_clock = -SAME_CLOCK_MS <= up_ms - unwrapped_ms <= HELD_BACK_MAX_MS
+    return unwrapped_ms if unwrapped_ms >= 0 and same_clock else boot_ms
 
 
 class Telemetry:

@@ -35,7 +35,7 @@ def access_control(access: Access, domain: int) -> dict[str, Any]:
         rules.extend(allowed)
         policies.append({"subjects": [subject["id"]], "rules": [rule["id"] for rule in allowed]})
 
-    for vehicle in access.vehicles:
+    for vehicle in dict.fromkeys(access.vehicles):  # zenoh refuses a rule that is given twice
         gives = _rule(f"{vehicle} gives", "ingress", _GIVES, vehicle_keys(vehicle, domain))
         asked = _rule(f"{vehicle} is asked", "egress", _LOOKS, _all_keys(domain))
         allow({"id": f"vehicle {vehicle}", "cert_common_names": [vehicle]}, gives, asked)

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import pty
 import socket
 import time
+import tty
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.links.mavlink_endpoints import NetworkEndpoint
+from edge import clock
+from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint
 from edge.links.transports.medium import PENDING_MAX, WAITING_MAX_NS, Outbox, Received
+from edge.links.transports.serial_port import SerialPort
 from edge.links.transports.tcp import TcpServer
 from tests.waiting import until
 
@@ -117,3 +122,50 @@ def test_a_connection_whose_far_end_does_not_answer_is_parted_with_what_it_holds
             server.tick(time.monotonic_ns())
 
         until(lambda: not server.reaches(peer), tell, what="the end of the connection")
+
+
+def test_every_message_that_a_serial_line_does_not_take_is_counted(stepped: int) -> None:
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    device = os.ttyname(theirs)
+    port = SerialPort(SerialEndpoint(device, 57600, f"serial:{device}:57600"))
+    with contextlib.closing(port):
+        port.tick(stepped)
+        os.close(theirs)
+        os.set_blocking(ours, False)
+        sent, length, refused, dropped, read = 600, 280, 0, 0, 0
+        for number in range(sent):  # nobody reads: the line is full before the end
+            clock.step_to(stepped + number * TICK_NS)
+            refused += not port.send(message(number, length), (device,))
+            if number % 5 == 0:
+                port.tick(clock.monotonic_ns())
+                dropped += port.dropped()
+        clock.step_to(stepped + sent * TICK_NS + 2 * WAITING_MAX_NS)
+
+        def accounted() -> bool:
+            nonlocal read, dropped
+            with contextlib.suppress(BlockingIOError):
+                read += len(os.read(ours, 65536))
+            port.tick(clock.monotonic_ns())  # a message that was begun is ended
+            dropped += port.dropped()
+            return read // length + refused + dropped == sent
+
+        until(accounted, what="all messages")
+    os.close(ours)
+    assert 0 < read < sent * length
+
+
+def test_what_a_connection_still_holds_at_its_end_is_counted() -> None:
+    server = TcpServer(NetworkEndpoint("tcpin", "127.0.0.1", 0, "tcpin:127.0.0.1:0"))
+    with contextlib.closing(server), socket.create_connection(("127.0.0.1", server.port)) as caller:
+        caller.send(b"hello")
+        heard: list[Received] = []
+        until(lambda: heard, lambda: heard.extend(filter(None, [server.receive()])), what="the caller")
+        peer = heard[0].sender
+        while server.send(bytes(250), peer):  # nobody reads: then no more fits
+            pass
+        assert server.dropped() == 0
+        caller.close()  # with unread data: a reset
+        until(lambda: not server.reaches(peer), lambda: server.receive(), what="the end of the connection")
+        assert server.dropped() >= PENDING_MAX // 250
+        assert server.dropped() == 0

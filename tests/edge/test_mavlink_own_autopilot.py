@@ -197,6 +197,23 @@ def test_who_speaks_for_another_aircraft_alone_does_not_keep_the_port() -> None:
         assert port.tilt_deg(now_ns) == LEVEL_DEG
 
 
+def test_a_ground_station_alone_does_not_keep_the_port() -> None:
+    """A router that has lost our autopilot forwards the ground station, and ours comes from another address."""
+    mav = MAVLink(None, srcSystem=255, srcComponent=190)
+    ground = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    with contextlib.closing(Port()) as port:
+        for now_ns in range(BEGAN_NS, BEGAN_NS + 40 * S, 20 * MS):
+            second = (now_ns - BEGAN_NS) / S
+            port.tick(now_ns)
+            if now_ns % S == 0:
+                port.hear([bytes(ground.pack(mav))], BEFORE, now_ns)
+            if second < 12.0 or second >= 30.0:
+                port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE if second < 12.0 else OTHERS, now_ns)
+        assert port.heeded[29.0] == BEFORE, "the ground station is still sent to"
+        assert port.heeded[32.0] == port.heeded[39.0] == OTHERS
+        assert port.tilt_deg(now_ns) == LEVEL_DEG
+
+
 def test_nothing_is_said_of_a_vehicle_that_is_not_known_but_what_is_wrong_when_it_is() -> None:
     ground = Udp(0)
     with (
@@ -222,6 +239,18 @@ def test_nothing_is_said_of_a_vehicle_that_is_not_known_but_what_is_wrong_when_i
     ground.close()
     told = [(m.get_srcSystem(), m.severity, m.text) for m in heard if m.get_type() == "STATUSTEXT"]
     assert told == [(SYSTEM_ID, 4, "model: runs on the CPU"), (SYSTEM_ID, 4, "degraded: no own attitude")]
+
+
+def test_a_configured_id_does_not_lose_what_was_wrong_before_anybody_was_there() -> None:
+    with linked("udpin:127.0.0.1:0", system_id=SYSTEM_ID) as (link, _):
+        link.event(4, "model: runs on the CPU")
+        link.event(4, "degraded: no own attitude", of_state=True)
+        until(lambda: link.counters().get("sent_STATUSTEXT", 0) == 2, what="texts to nobody")
+        with Peer(link.ports[0]) as peer:
+            meet(link, peer)
+            peer.settle(lambda: sum(m.get_type() == "STATUSTEXT" for m in peer.received) == 2, "what was wrong")
+            told = [(m.severity, m.text) for m in peer.received if m.get_type() == "STATUSTEXT"]
+    assert told == [(4, "model: runs on the CPU"), (4, "degraded: no own attitude")]
 
 
 def test_a_state_that_is_over_before_anybody_hears_of_it_is_not_told() -> None:

@@ -108,6 +108,40 @@ def test_own_attitude_goes_on_when_the_autopilots_milliseconds_wrap_after_49_day
     assert station.vehicle.reboots == (0 if synced else 1)
 
 
+def test_data_held_back_by_the_link_is_not_a_reboot_after_49_days() -> None:
+    own_ship = OwnShipBuffer()
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
+    mav, start_ns, ms = MAVLink(None, srcSystem=1, srcComponent=1), 1_000_000_000_000, 1_000_000
+
+    def up_ns(at_ns: int) -> int:
+        return at_ns - start_ns + 2**32 * ms + 1_000_000_000_000
+
+    def tell(message: Any, now_ns: int) -> None:
+        station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns)
+
+    def attitude(at_ns: int, now_ns: int) -> None:
+        turned = Rotation.from_euler("z", 0.1 * (at_ns - start_ns) / 1e9)
+        q = np.roll(turned.as_quat(), 1).tolist()
+        tell(dialect.MAVLink_attitude_quaternion_message(up_ns(at_ns) // ms % 2**32, *q, 0.0, 0.0, 0.1), now_ns)
+
+    for now_ns in range(start_ns, start_ns + 3_000 * ms, 20 * ms):
+        if now_ns % (1_000 * ms) == 0:
+            tell(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3), now_ns)
+        for question in (m for m in on_the_wire(station.tick(now_ns).home) if m.get_type() == "TIMESYNC"):
+            tell(dialect.MAVLink_timesync_message(up_ns(now_ns), question.ts1), now_ns)
+        attitude(now_ns, now_ns)
+    # The link then delivers nothing for 4 s, and after that everything at once.
+    cut_ns, now_ns = start_ns + 3_000 * ms, start_ns + 7_000 * ms
+    attitude(cut_ns, now_ns)
+    assert own_ship.at(now_ns) is None, "an attitude of four seconds ago passes for the current one"
+    for at_ns in range(cut_ns + 20 * ms, now_ns + 1, 20 * ms):
+        attitude(at_ns, now_ns)
+    assert station.vehicle.reboots == 0
+    then = own_ship.at(start_ns + 5_000 * ms)
+    assert then is not None
+    np.testing.assert_allclose(then.R_ned_body, Rotation.from_euler("z", 0.5).as_matrix(), atol=1e-4)
+
+
 def test_rates_are_asked_for_with_zeros_and_again_when_they_fall() -> None:
     with linked(attitude_rate_hz=50.0) as (link, _), Peer(link.ports[0]) as peer:
         link.set_health(TRACKING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import signal
@@ -273,6 +274,39 @@ def test_nothing_is_removed_where_that_would_not_make_room(tmp_path: Path, monke
     recorder.stop()
     assert told == [(40, "recording stopped: no room left for recordings")]
     assert sorted(tmp_path.iterdir()) == old
+
+
+def test_what_a_file_at_the_limit_holds_is_not_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    limits = RecordingLimits(total_bytes_max=50_000, free_bytes_min=0, when_full="stop")
+    recorder, put = Recorder(tmp_path, "uav1", limits, lambda *_: None), 0
+    recorder.start()
+    while recorder.recording:
+        record_some(recorder, [bytes(5000)])
+        put += 1
+        time.sleep(0.001)
+    recorder.stop()
+    held = sum(len(read(path)) for path in tmp_path.iterdir())
+    counters = recorder.counters()
+    assert counters["recorded"] == held > 5
+    assert held + counters.get("lost", 0) == put
+
+
+def test_a_file_that_another_recorder_removes_before_it_is_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, real_lock, others = tmp_path / "uav1_000000_20260101T000000Z.mcap", fcntl.flock, [finish_unfinished]
+
+    def lock(descriptor: int, operation: int) -> None:
+        if others:
+            others.pop()(path)
+        real_lock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", lock)
+    file = McapFile(path)
+    file.write("uav1/target/t0/pose", topics.POSE.ros_type, b"pose", 1, 1)
+    file.close()
+    assert [data for *_, data, _ in read(path)] == [b"pose"]
 
 
 def test_switching_off_ends_the_file_and_on_begins_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,6 +58,9 @@ class Transport(Protocol):
     def send(self, data: bytes, peer: Address) -> bool:
         """Send a whole message; False if it cannot be sent now, and then no part of it is."""
 
+    def dropped(self) -> int:
+        """Number of messages since the last call that `send` took, but that the medium then did not."""
+
     def reaches(self, peer: Address) -> bool:
         """Whether a peer found earlier can still be sent to."""
 
@@ -105,7 +108,8 @@ class Outbox:
     """
 
     def __init__(self) -> None:
-        self.expired = 0  # messages dropped because they had waited too long
+        self.expired = 0  # messages dropped because they had waited too long, or the medium was gone
+        self._told = 0
         self._waiting: deque[tuple[int, bytes]] = deque()  # time of put (ns), message
         self._pending_bytes = 0
         self._begun = b""  # the rest of a partly written message, which must be completed
@@ -134,6 +138,17 @@ class Outbox:
             room_bytes -= count
             if count == 0:
                 return
+
+    def close(self) -> None:
+        """The medium is gone: drop everything."""
+        self.expired += len(self._waiting) + bool(self._begun)
+        self._waiting.clear()
+        self._pending_bytes, self._begun = 0, b""
+
+    def dropped(self) -> int:
+        """Number of messages dropped since the last call."""
+        count, self._told = self.expired - self._told, self.expired
+        return count
 
     def _forget(self, now_ns: int) -> None:
         while self._waiting and now_ns - self._waiting[0][0] > WAITING_MAX_NS:

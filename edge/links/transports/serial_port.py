@@ -69,10 +69,12 @@ class SerialPort:
     def send(self, data: bytes, peer: Address) -> bool:
         if self._port is None:
             return False
-        expired = self._outbox.expired
         fits = self._outbox.put(data, clock.monotonic_ns())
         self._flush()
-        return fits and self._port is not None and self._outbox.expired == expired
+        return fits
+
+    def dropped(self) -> int:
+        return self._outbox.dropped()
 
     def reaches(self, peer: Address) -> bool:
         return self._port is not None
@@ -92,7 +94,7 @@ class SerialPort:
                 log.warning("mavlink: %s: %s; trying again", self.endpoint, error)
             self._backoff = self._backoff.failed(now_ns)
             return
-        self._reader, self._outbox = FrameReader(datagram=False), Outbox()
+        self._reader = FrameReader(datagram=False)
         self._backoff = self._backoff.opened(now_ns)
         log.info("mavlink: %s: open", self.endpoint)
 
@@ -111,6 +113,7 @@ class SerialPort:
         log.warning("mavlink: %s: lost: %s", self.endpoint, error.strerror)
         self._port.close()
         self._port = None
+        self._outbox.close()
         self._backoff = self._backoff.failed(time.monotonic_ns())
 
 

@@ -67,10 +67,12 @@ class Connection:
     def send(self, data: bytes) -> bool:
         if not self.open:
             return False
-        expired = self._outbox.expired
         fits = self._outbox.put(data, clock.monotonic_ns())
         self.flush()
-        return fits and self.open and self._outbox.expired == expired
+        return fits
+
+    def dropped(self) -> int:
+        return self._outbox.dropped()
 
     def flush(self) -> None:
         if not self.open:
@@ -99,6 +101,7 @@ class Connection:
 
     def close(self) -> None:
         self.open = False
+        self._outbox.close()
         self._socket.close()
 
 
@@ -119,6 +122,7 @@ class TcpClient:
         self._backoff = Backoff()
         self._connecting: tuple[socket.socket, int] | None = None
         self._connection: Connection | None = None
+        self._dropped = 0  # by earlier connections
 
     @property
     def peer(self) -> Address | None:
@@ -149,6 +153,10 @@ class TcpClient:
 
     def send(self, data: bytes, peer: Address) -> bool:
         return self._connection is not None and self._connection.send(data)
+
+    def dropped(self) -> int:
+        count, self._dropped = self._dropped, 0
+        return count + (self._connection.dropped() if self._connection is not None else 0)
 
     def reaches(self, peer: Address) -> bool:
         return self._connection is not None
@@ -204,6 +212,7 @@ class TcpClient:
     def _part_if_closed(self, now_ns: int) -> None:
         if self._connection is not None and not self._connection.open:
             log.warning("mavlink: %s: connection lost", self.endpoint)
+            self._dropped += self._connection.dropped()
             self._connection = None
             self._backoff = self._backoff.failed(now_ns)
 
@@ -222,6 +231,7 @@ class TcpServer:
         self.endpoint = endpoint.text
         self._callers: dict[Address, Connection] = {}
         self._heeded: Address | None = None
+        self._dropped = 0  # by connections that were closed
         family, address = resolve(endpoint, socket.SOCK_STREAM)[0]
         with opening(endpoint, family, socket.SOCK_STREAM) as self._socket:
             self._socket.setblocking(False)
@@ -258,6 +268,10 @@ class TcpServer:
         caller = self._callers.get(peer)
         return caller is not None and caller.send(data)
 
+    def dropped(self) -> int:
+        count, self._dropped = self._dropped, 0
+        return count + sum(caller.dropped() for caller in self._callers.values())
+
     def reaches(self, peer: Address) -> bool:
         caller = self._callers.get(peer)
         return caller is not None and caller.open
@@ -283,4 +297,5 @@ class TcpServer:
         return max(unheeded, key=lambda known: calls[known[0]])
 
     def _forget_closed(self) -> None:
+        self._dropped += sum(caller.dropped() for caller in self._callers.values() if not caller.open)
         self._callers = {address: caller for address, caller in self._callers.items() if caller.open}

@@ -65,6 +65,9 @@ class Udp:
             return False
         return True
 
+    def dropped(self) -> int:
+        return 0  # no datagram waits
+
     def reaches(self, peer: Address) -> bool:
         return True
 
@@ -130,6 +133,9 @@ class UdpCaller:
             return self._socket is not None and self._socket.sendto(data, peer) > 0
         except OSError:
             return False
+
+    def dropped(self) -> int:
+        return 0
 
     def reaches(self, peer: Address) -> bool:
         return peer == self.peer

@@ -183,6 +183,18 @@ def test_every_name_that_a_vehicle_may_have_can_be_issued_and_gets_in(tmp_path: 
         until(lambda: seen[publisher.key] >= 3, lambda: publisher.put(pose_now().encode()))
 
 
+def test_a_vehicle_that_is_listed_twice_gets_in_as_one(tmp_path: Path, keys: dict[str, TlsFiles]) -> None:
+    secure, loopback = free_endpoint().replace("tcp/", "tls/"), free_endpoint()
+    access = 'vehicles = ["uav1", "uav2", "uav1"]\nloopback_reads = true\n'
+    path = write_router_config(tmp_path, [secure, loopback], keys["ground"], access)
+    with ExitStack() as stack:
+        stack.enter_context(open_router(load_router(path), tmp_path))
+        session = stack.enter_context(zenoh.open(peer_config([], [secure], tls=keys["uav1"])))
+        publisher = stack.enter_context(Node(session, "uav1")).publisher(topics.POSE, "t0")
+        seen = watch(stack.enter_context(client.connect(loopback)), "0/*/target/**")
+        until(lambda: seen[publisher.key] >= 3, lambda: publisher.put(pose_now().encode()))
+
+
 def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path: Path) -> None:
     endpoint, path = free_endpoint(), tmp_path / "router.toml"
     path.write_text(f'listen = ["{endpoint}"]\n')
