@@ -89,8 +89,6 @@ def test_a_frame_that_the_computer_slept_over_is_not_told(
 def test_a_report_that_the_computer_slept_over_in_a_link_is_not_sent(sleep: Sleep) -> None:
     with mavlink() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
-        link.publish(make_report(make_track(time.monotonic_ns())))
-        peer.named("TARGET_RELATIVE")
         sleep(HOUR_NS)
         link.publish(make_report(make_track(time.monotonic_ns(), track_id=5)))
         until(lambda: link.counters().get("held_up") == 1, what="withholding")
