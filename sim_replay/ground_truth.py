@@ -210,7 +210,7 @@ def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> Gimb
     if len(known) < max(len(R_cam_ned), 2):
         path = folder / "scene_camera.json"
         raise InputError(f"{path}: 'cam_R_w2c' is missing: it says how the gimbal was turned at every frame")
-    return track_of([known[k] for k in _newest(frames)], frame0_ns, fps)
+    return track_of(known, frame0_ns, fps, frames)
 
 
 @contextmanager
