@@ -107,6 +107,9 @@ class Dataset:
             frames = scene.pictured
             if len(frames) < len(scene.frames):
                 _log.warning("%s: %d listed pictures are missing", scene.folder, len(scene.frames) - len(frames))
+            if scene.pictures_without_camera:
+                told = "%s: %d pictures are left out: no file gives their camera matrix"
+                _log.warning(told, scene.folder, scene.pictures_without_camera)
             for frame in frames:
                 indices: Sequence[int] = range(len(frame.targets))
                 if wanted is not None and _is_test(scene):

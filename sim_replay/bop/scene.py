@@ -64,6 +64,11 @@ class BopScene:
             raise BopError(f"{self.folder} holds no picture of those that it lists in rgb/ or gray/")
         return frames
 
+    @property
+    def pictures_without_camera(self) -> int:
+        """Number of images that are not among the frames, as nothing gives their K. Raises BopError."""
+        return len(self._pictures.keys() - {frame.image_id for frame in self.frames})
+
     def image_path(self, frame: BopFrame) -> Path:
         """Path of the frame's image. Raises BopError if there is none."""
         path = self._pictures.get(frame.image_id)
