@@ -122,7 +122,7 @@ class BopScene:
         path = self._masks.get((kind, frame.image_id, target_index))
         if path is None:
             return None
-        values = _pixels(path, cv2.IMREAD_GRAYSCALE)
+        values = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
         return values > values.max() // 2  # the format defines 255 as set; some datasets write 1
 
 
