@@ -126,6 +126,14 @@ def test_the_overlay_gets_each_frames_own_pose_and_latency(sequence: PlayedSeque
     assert views[4].match is None
 
 
+def test_the_overlay_gets_every_target_of_a_frame(sequence: PlayedSequence, recording: Recording) -> None:
+    beside_m = np.array([-10.0, 0.0, 200.0])
+    truths = [*sequence.scene.truths, Truth(0, np.eye(3), beside_m, 1, 12.0)]
+    two = replace(sequence, scene=replace(sequence.scene, truths=truths))
+    views = frame_views(two, judge(two, recording))
+    assert [len(view.others) for view in views] == [1, 0, 0, 0, 0]
+
+
 def test_the_live_line_follows_the_records(sequence: PlayedSequence, recording: Recording) -> None:
     figures = LiveFigures(sequence)
     assert figures.cells()["frame"] == "waiting"
