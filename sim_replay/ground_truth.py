@@ -63,6 +63,11 @@ class SceneTruth:
         """Whether all frames are known to show no target."""
         return self.truth_known and not self.shows_target
 
+    @property
+    def can_be_scored(self) -> bool:
+        """Whether poses can be compared with it: it has targets, or is known to show none."""
+        return bool(self.truths) or self.truth_known
+
     def undistorted_bgr(self, index: int) -> Image:
         """The frame's image [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
         return read_undistorted_bgr(self.images[index], self.K[index], self.distortions[index])
