@@ -100,7 +100,10 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         seen: Counter[int] = Counter()
         for target in picture.targets:
             if target.object_id not in models:
-                raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
+                raise InputError(
+                    f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models; "
+                    f"if it has none, give its diameter_m under [objects.{target.object_id}] in model_frame.toml"
+                )
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
             truths.append(Truth(index, R, t_m, *known, instance=seen[target.object_id], visible=is_seen(target)))
