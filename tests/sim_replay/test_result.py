@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,14 @@ def test_the_overlay_gets_every_target_of_a_frame(sequence: PlayedSequence, reco
     two = replace(sequence, scene=replace(sequence.scene, truths=truths))
     views = frame_views(two, judge(two, recording))
     assert [len(view.others) for view in views] == [1, 0, 0, 0, 0]
+
+
+def test_a_frame_that_was_not_recorded_shows_the_boxes_of_the_picture_before(
+    sequence: PlayedSequence, recording: Recording
+) -> None:
+    partly = replace(sequence, scene=replace(sequence.scene, unrecorded=frozenset({1, 3})))
+    views = frame_views(partly, judge(partly, recording))
+    assert [view is before for before, view in pairwise(views)] == [True, False, True, False]
 
 
 def test_the_live_line_follows_the_records(sequence: PlayedSequence, recording: Recording) -> None:
