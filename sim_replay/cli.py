@@ -137,7 +137,7 @@ def _check_score_options(args: argparse.Namespace) -> None:
 def _score_flight(args: argparse.Namespace, console: Console) -> int:
     flight = read_flight(args.flight)
     sequence = read_sequence(args.sequence or flight.sequence)
-    if not sequence.scene.truths:
+    if not sequence.scene.can_be_scored:
         raise InputError(f"{sequence.scene.folder}: there is no ground truth to score against")
     sequence = replace(sequence, fps=sequence.fps * flight.speed)
     told = Console(stderr=True, quiet=True) if args.json else console

@@ -8,6 +8,8 @@ from pathlib import Path
 from msgs.settings import toml_value
 from sim_replay.ground_truth import PlayedSequence
 
+EVERY_IMAGE_HZ = 240.0  # the largest; at the sequence's own rate, an exposure rounded down to a nanosecond is too early
+
 
 def sequence_config(
     sequence: PlayedSequence,
@@ -48,7 +50,7 @@ def sequence_config(
     if to_px4:
         tables["mavlink"]["target_relative_to_px4"] = True
     if recordings is not None:
-        recorder = {"enabled": True, "folder": str(recordings.resolve()), "image_max_hz": sequence.fps}
+        recorder = {"enabled": True, "folder": str(recordings.resolve()), "image_max_hz": EVERY_IMAGE_HZ}
         tables["recorder"] = {**recorder, "free_min_mb": 0.0}
     lines = []
     for name, table in tables.items():

@@ -107,6 +107,9 @@ class Dataset:
             frames = scene.pictured
             if len(frames) < len(scene.frames):
                 _log.warning("%s: %d listed pictures are missing", scene.folder, len(scene.frames) - len(frames))
+            if scene.pictures_without_camera:
+                told = "%s: %d pictures are left out: no file gives their camera matrix"
+                _log.warning(told, scene.folder, scene.pictures_without_camera)
             for frame in frames:
                 indices: Sequence[int] = range(len(frame.targets))
                 if wanted is not None and _is_test(scene):
@@ -288,8 +291,16 @@ def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame,
         return replace(target, visible_px=0)
     if points_cam[:, 2].min() <= 0:
         return target
-    lens = np.zeros(5) if frame.distortion is None else np.array(frame.distortion)
-    pixels, _ = cv2.projectPoints(points_cam[:, None], np.zeros(3), np.zeros(3), frame.K, lens)
+    rays = points_cam / points_cam[:, 2:]
+    lens = lens_of(frame.K, frame.distortion or ())
+    if lens is not None:
+        # Beyond this radius the lens's polynomial folds back: it would show the target where it is not.
+        radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
+        if radius.min() >= lens.radius_max:
+            return replace(target, visible_px=0)
+        rays[:, :2] *= lens.radius_max / np.maximum(radius, lens.radius_max)
+    coefficients = np.array(frame.distortion or np.zeros(5))
+    pixels, _ = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), frame.K, coefficients)
     low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
     edge_low, edge_high = np.full(2, -0.5), np.array(size_wh) - 0.5
     inside = np.concatenate([np.maximum(low, edge_low), np.minimum(high, edge_high)])

@@ -135,7 +135,7 @@ def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
         recording = play(settings, view.on_record)
     flight = RecordedFlight(sequence.scene.folder, method_of(loaded), recording)
     write_flight(out, flight)
-    if sequence.scene.truths:
+    if sequence.scene.can_be_scored:
         report_flight(sequence, flight, out, console)
     else:
         told = f"{len(recording.poses)} poses over zenoh, {len(recording.targets)} by MAVLink"
@@ -168,6 +168,7 @@ def summary_table(score: dict[str, Any]) -> Table:
         "Pose@10°/5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
         "capture to MAVLink, p50 / p95 / p99": _percentiles(score["latency_ms"]),
         "withheld by MAVLink, unconfirmed or too old": _text(score["latency_ms"]["tracks_withheld"], "{:d}"),
+        "poses that match no target": _text(overall["false_poses"], "{:d}"),
         "frames dropped": _text(score["dropped_frames"], "{:d}"),
     }
     rows["model"] = f"{score['model']['file']} ({score['model']['precision']})"

@@ -36,9 +36,15 @@ class GimbalTrack:
         return q_wxyz_from_R(R_a @ so3_exp(share * so3_log(R_a.T @ R_b)))
 
 
-def track_of(R_cam_ned: Sequence[Array], frame0_ns: int, fps: float) -> GimbalTrack:
-    """The gimbal that gives the camera this attitude at each frame; R_cam_ned [3, 3] for each, as in cam_R_w2c."""
-    t_ns = frame0_ns + np.round(np.arange(len(R_cam_ned)) * 1e9 / fps).astype(np.int64)
+def track_of(
+    R_cam_ned: Sequence[Array], frame0_ns: int, fps: float, frames: Sequence[int] | None = None
+) -> GimbalTrack:
+    """The gimbal that gives the camera this attitude at each frame; R_cam_ned [3, 3] for each, as in cam_R_w2c.
+
+    `frames` has their numbers, increasing; None: all from 0.
+    """
+    numbers = np.arange(len(R_cam_ned)) if frames is None else np.asarray(frames)
+    t_ns = frame0_ns + np.round(numbers * 1e9 / fps).astype(np.int64)
     q_wxyz = [q_wxyz_from_R(R.T @ R_GIMBAL_CAM.T) for R in R_cam_ned]
     return GimbalTrack(t_ns, np.array(q_wxyz))
 

@@ -63,6 +63,11 @@ class SceneTruth:
         """Whether all frames are known to show no target."""
         return self.truth_known and not self.shows_target
 
+    @property
+    def can_be_scored(self) -> bool:
+        """Whether poses can be compared with it: it has targets, or is known to show none."""
+        return bool(self.truths) or self.truth_known
+
     def undistorted_bgr(self, index: int) -> Image:
         """The frame's image [H, W, 3] as the pinhole camera K sees it. Raises InputError."""
         return read_undistorted_bgr(self.images[index], self.K[index], self.distortions[index])
@@ -95,7 +100,10 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         seen: Counter[int] = Counter()
         for target in picture.targets:
             if target.object_id not in models:
-                raise InputError(f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models")
+                raise InputError(
+                    f"{folder / 'scene_gt.json'}: obj_id {target.object_id} is not among the models; "
+                    f"if it has none, give its diameter_m under [objects.{target.object_id}] in model_frame.toml"
+                )
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
             truths.append(Truth(index, R, t_m, *known, instance=seen[target.object_id], visible=is_seen(target)))
@@ -210,7 +218,7 @@ def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> Gimb
     if len(known) < max(len(R_cam_ned), 2):
         path = folder / "scene_camera.json"
         raise InputError(f"{path}: 'cam_R_w2c' is missing: it says how the gimbal was turned at every frame")
-    return track_of([known[k] for k in _newest(frames)], frame0_ns, fps)
+    return track_of(known, frame0_ns, fps, frames)
 
 
 @contextmanager

@@ -49,9 +49,10 @@ class FrameView:
     """Everything that is drawn for one frame, except its pixels."""
 
     K: Array  # [3, 3], pixel centres at integers
-    match: Match | None  # None: the frame has no target
+    match: Match | None  # of the target in the inset and the charts; None: the frame has no target
     extents: Extents | None  # of that target
     latency_ms: float | None
+    others: tuple[tuple[Match, Extents], ...] = ()  # the frame's other targets
 
 
 def project(points_cam_m: ArrayLike, K: Array) -> Array | None:
@@ -129,9 +130,10 @@ class Overlay:
     def _draw_poses(self, canvas: Image, view: FrameView, K: Array, thickness: int) -> None:
         if view.match is None or view.extents is None:
             return
-        draw_pose(canvas, K, view.match.truth, view.extents, TRUTH_BGR, thickness + self._px(1))
-        if view.match.estimate is not None:
-            draw_pose(canvas, K, view.match.estimate, view.extents, ESTIMATE_BGR, thickness)
+        for match, extents in ((view.match, view.extents), *view.others):
+            draw_pose(canvas, K, match.truth, extents, TRUTH_BGR, thickness + self._px(1))
+            if match.estimate is not None:
+                draw_pose(canvas, K, match.estimate, extents, ESTIMATE_BGR, thickness)
 
     def _inset(self, view: FrameView, image_bgr: Image) -> Image | None:
         """The target's surroundings enlarged, with boxes drawn at the inset's own resolution."""

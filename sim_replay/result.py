@@ -11,7 +11,7 @@ import numpy as np
 from msgs.geometry import Array, R_from_q_wxyz
 from sim_replay.evaluation.instances import instances
 from sim_replay.ground_truth import PlayedSequence, SceneTruth
-from sim_replay.overlay import FrameView
+from sim_replay.overlay import Extents, FrameView
 from sim_replay.play import Record, Recording
 from sim_replay.report.peer import peer_figures, percentiles
 from sim_replay.score import Match, TargetPose, Truth, frame_of, latency_statistics, match_poses, statistics
@@ -138,7 +138,9 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
             name: {
                 "poses": len(peer.ages) + peer.strays,
                 "stray_poses": peer.strays,
-                **peer_figures(frames, sequence.fps, peer.matches, peer.false_poses, peer.ages),
+                **peer_figures(
+                    frames, sequence.fps, peer.matches, peer.false_poses, peer.ages, sequence.scene.unrecorded
+                ),
                 "age_ms": percentiles([age_ms for _, age_ms in told_ages(peer, recording)]),
             }
             for name, peer in zip(PEERS, (subscriber, result.autopilot), strict=True)
@@ -163,14 +165,21 @@ def _latency_ms(recording: Recording) -> dict[str, float | None]:
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
-    """Overlay data of each frame: its first target, as the subscriber received it."""
-    by_frame: dict[int, Match] = {}
-    for match in result.subscriber.matches:
-        by_frame.setdefault(match.truth.frame, match)
+    """Overlay data of each frame: its targets, as the subscriber received them.
+
+    A frame that was not recorded shows the image of the one before, and has its data.
+    """
+    by_frame: dict[int, list[tuple[Match, Extents]]] = {}
+    for found in result.subscriber.matches:
+        shown = (found, sequence.scene.extents[found.truth.object_id])
+        by_frame.setdefault(found.truth.frame, []).append(shown)
     latencies_ms = result.latencies_ms
-    views = []
+    views: list[FrameView] = []
     for frame, K in enumerate(sequence.scene.K):
-        seen = by_frame.get(frame)
-        extents = None if seen is None else sequence.scene.extents[seen.truth.object_id]
-        views.append(FrameView(K, seen, extents, latencies_ms.get(frame)))
+        if frame in sequence.scene.unrecorded:
+            views.append(views[-1])
+            continue
+        seen = by_frame.get(frame, [])
+        match, extents = seen[0] if seen else (None, None)
+        views.append(FrameView(K, match, extents, latencies_ms.get(frame), tuple(seen[1:])))
     return views

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edge.errors import InputError
 from msgs.geometry import R_from_euler
-from sim_replay.airframes import AIRFRAMES, Airframe, airframe_id
+from sim_replay.airframes import AIRFRAMES, Airframe, airframe_id, airframe_of
 from sim_replay.render.renderer import Renderer
 from sim_replay.render.scene import Camera, Environment, Scene, Target, environment_from_seed
 
@@ -129,7 +129,7 @@ def sheet(airframes: Sequence[Airframe], out: Path, livery_seed: int = 0) -> Non
 def run(args: argparse.Namespace) -> int:
     """`uavpose-replay sheet` without --dataset. Raises InputError."""
     try:
-        chosen = [AIRFRAMES[airframe_id(name)] for name in args.airframe] if args.airframe else AIRFRAMES
+        chosen = [airframe_of(airframe_id(name)) for name in args.airframe] if args.airframe else AIRFRAMES
     except ValueError as error:
         raise InputError(f"--airframe: {error}") from error
     sheet(chosen, args.out, args.livery_seed)

@@ -52,7 +52,7 @@ class FileSource:
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         if not math.isfinite(fps) or not 0 < fps <= 1000:
             raise InputError(f"{path} does not say its frame rate")
-        if not _tells_times(path):
+        if not tells_times(path):
             raise InputError(
                 f"{path} does not say when its frames were taken; put it into a file that does, "
                 f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -c copy {path.stem}.mp4"
@@ -148,7 +148,7 @@ class VideoTimes:
         self._step_ns, self.last_ns = time_ns - self.last_ns, time_ns
 
 
-def _tells_times(path: Path) -> bool:
+def tells_times(path: Path) -> bool:
     """Whether a video's frames have timestamps, or it has only one. H.264 and JPEG without a container have none."""
     capture = open_video(str(path))
     stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if capture.grab()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import InputError
-from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
+from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, find_scenes, object_names
+from sim_replay.evaluation.judge import is_seen
 
 Image = NDArray[np.uint8]
 COLUMNS, ROWS = 4, 5
@@ -22,10 +24,6 @@ MAX_BYTES = 300_000
 BOX_BGR = (255, 255, 0)
 TEXT_BGR = (255, 255, 255)
 FONT_PX = 13
-
-
-def _box(frame: BopFrame, k: int) -> NDArray[np.float64] | None:
-    return frame.targets[k].box_visible_xyxy_px
 
 
 def _inset(image_bgr: Image, box: NDArray[np.float64]) -> Image:
@@ -44,7 +42,8 @@ def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
     """A thumbnail [225, 400, 3] of the frame [H, W, 3]: boxes, the first target enlarged, its name and range."""
     scale = np.array(TILE_WH_PX) / image_bgr.shape[1::-1]
     out = np.asarray(cv2.resize(image_bgr, TILE_WH_PX, interpolation=cv2.INTER_AREA), np.uint8)
-    boxes = [box for k in range(len(frame.targets)) if (box := _box(frame, k)) is not None]
+    seen = [target for target in frame.targets if is_seen(target)]  # BOP lists hidden ones too
+    boxes = [target.box_visible_xyxy_px for target in seen if target.box_visible_xyxy_px is not None]
     for box in boxes:
         corners = np.round((box.reshape(2, 2) + 0.5) * scale - 0.5 + [[-2, -2], [2, 2]]).astype(int)
         cv2.rectangle(out, [int(v) for v in corners[0]], [int(v) for v in corners[1]], BOX_BGR, 1)
@@ -54,16 +53,16 @@ def tile(image_bgr: Image, frame: BopFrame, names: Mapping[int, str]) -> Image:
         left = TILE_WH_PX[0] - INSET_PX if middle[0] < 0.5 * TILE_WH_PX[0] else 0
         top = TILE_WH_PX[1] - INSET_PX if middle[1] < 0.5 * TILE_WH_PX[1] else 0
         out[top : top + INSET_PX, left : left + INSET_PX] = _inset(image_bgr, boxes[0])
-    _caption(out, _words(frame, names))
+    _caption(out, _words(seen, names))
     return out
 
 
-def _words(frame: BopFrame, names: Mapping[int, str]) -> str:
-    if not frame.targets:
+def _words(seen: Sequence[BopTarget], names: Mapping[int, str]) -> str:
+    if not seen:
         return "no target"
-    first = frame.targets[0]
+    first = seen[0]
     name = names.get(first.object_id, f"object {first.object_id}")
-    more = f" and {len(frame.targets) - 1} more" if len(frame.targets) > 1 else ""
+    more = f" and {len(seen) - 1} more" if len(seen) > 1 else ""
     return f"{name} {np.linalg.norm(first.t_cam_target_m):.0f} m{more}"
 
 
@@ -92,8 +91,8 @@ def contact_sheet(dataset: Path) -> Image:
     """The grid [H, W, 3]. Raises InputError."""
     try:
         scenes = find_scenes(dataset)
-        names = object_names(scenes[0].root)
-        tiles = [tile(scene.image_bgr(frame), frame, names) for scene, frame in _chosen(scenes)]
+        names_of = cache(object_names)  # by dataset: the same number is another object in each
+        tiles = [tile(scene.image_bgr(frame), frame, names_of(scene.root)) for scene, frame in _chosen(scenes)]
     except BopError as error:
         raise InputError(str(error)) from error
     if not tiles:

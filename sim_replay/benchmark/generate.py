@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 from rich.console import Console
 
 from edge.errors import InputError
@@ -104,9 +105,12 @@ def _backdrops(folder: Path | None) -> tuple[Path, ...]:
         return ()
     if not folder.is_dir():
         raise InputError(f"--backdrops: {folder} is not a folder")
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".hdr", ".exr"))
+    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".hdr"))
     if not found:
-        raise InputError(f"--backdrops: {folder} holds no .jpg, .png, .hdr or .exr file")
+        raise InputError(f"--backdrops: {folder} holds no .jpg, .png or .hdr file")
+    for path in found:  # now, and not hours later in the first sequence that uses it
+        if not cv2.haveImageReader(str(path)):
+            raise InputError(f"--backdrops: {path} is not a readable picture")
     return tuple(path.resolve() for path in found)
 
 

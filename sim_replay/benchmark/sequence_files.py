@@ -47,9 +47,13 @@ class Job:
 
     def film(self, plan: SequencePlan) -> Film:
         """The flown sequence."""
-        number = plan.environment_seed // 2
-        backdrop = self.backdrops[number % len(self.backdrops)] if self.backdrops and number % 2 else None
-        return fly(plan, self.preset, self.focal_px[plan.index], self.undistorted, backdrop)
+        return fly(plan, self.preset, self.focal_px[plan.index], self.undistorted, self.backdrop(plan))
+
+    def backdrop(self, plan: SequencePlan) -> Path | None:
+        """The photograph behind a sequence; None: sky and ground are drawn."""
+        if not self.backdrops or plan.environment_seed // 2 % 2 == 0:
+            return None
+        return self.backdrops[plan.environment_seed // 4 % len(self.backdrops)]
 
 
 @dataclass(frozen=True)

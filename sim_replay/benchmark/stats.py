@@ -6,6 +6,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ class _Counts:
     focal_px: list[float] = field(default_factory=list)  # one per scene
     box_share: list[float] = field(default_factory=list)
     visible_fraction: list[float] = field(default_factory=list)
-    below_camera: list[bool] = field(default_factory=list)
+    below_camera: list[bool] = field(default_factory=list)  # where the world is known to be local NED
     distorted: int = 0  # scenes
 
 
@@ -60,9 +61,9 @@ def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) 
     counts = _Counts()
     try:
         scenes = find_scenes(root)
-        names = object_names(scenes[0].root)
+        names_of = cache(object_names)  # by dataset: the same number is another object in each
         for scene in scenes:
-            _take_scene(counts, scene, names)
+            _take_scene(counts, scene, names_of(scene.root))
             on_scene()
     except BopError as error:
         raise InputError(str(error)) from error
@@ -80,9 +81,9 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
     counts.pictures[size] += 1
     counts.focal_px.append(float(np.sqrt(frames[0].K[0, 0] * frames[0].K[1, 1])))
     counts.distorted += frames[0].distortion is not None
-    for frame in frames:
-        _take_frame(counts, split, frame, size[0] * size[1], names)
     flown = _toml(scene.folder / "sequence.toml")
+    for frame in frames:
+        _take_frame(counts, split, frame, size[0] * size[1], names, in_ned=bool(flown))
     if flown.get("airframe") and "flight_seed" in flown:
         seed = flown["flight_seed"]
         if not isinstance(seed, int):
@@ -90,7 +91,9 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
         counts.flights[split].add((str(flown["airframe"]), seed))
 
 
-def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str]) -> None:
+def _take_frame(
+    counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str], *, in_ned: bool
+) -> None:
     seen = [target for target in frame.targets if is_seen(target) or _is_uncounted(target)]  # BOP lists hidden ones too
     counts.targets_in_frame[len(seen)] += 1
     for k, target in enumerate(seen):
@@ -100,8 +103,8 @@ def _take_frame(counts: _Counts, split: str, frame: BopFrame, area_px: int, name
             counts.box_share.append(float(np.prod(box[2:] - box[:2])) / area_px)
         if target.whole_px:
             counts.visible_fraction.append((target.visible_px or 0) / target.whole_px)
-        if frame.R_cam_world is not None:
-            # This project's worlds are local NED: a target further down than the camera is seen against the ground.
+        if in_ned and frame.R_cam_world is not None:
+            # A target further down than the camera is seen against the ground.
             counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
         counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
 

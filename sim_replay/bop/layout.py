@@ -15,8 +15,7 @@ from sim_replay.bop.records import BopError
 from sim_replay.bop.scene import BopScene, ImagewiseScene, imagewise_keys
 
 _SCENE_FILES = ("scene_camera.json", "scene_gt.json")
-_DEEPEST = 4  # levels between the given folder and a scene
-_LEVELS_UP = 3  # from a scene to its dataset: ROOT/SPLIT/SCENE, and one more for deeper layouts
+_DEEPEST = 4  # levels between the given folder and a scene, and from a scene up to its dataset
 TARGETS_FILE = "test_targets_bop19.json"
 
 
@@ -46,11 +45,11 @@ def read_scene(folder: Path) -> BopScene:
 def find_root(folder: Path) -> Path | None:
     """The dataset that a folder belongs to: the nearest one up with models, model_frame.toml or a list of targets."""
     here = _absolute(folder)
-    for candidate in (here, *here.parents[:_LEVELS_UP]):
+    for candidate in (here, *here.parents[:_DEEPEST]):
         named = (candidate / name for name in (MODEL_FRAME_FILE, TARGETS_FILE))
         if models_folder(candidate) is not None or any(path.is_file() for path in named):
             return candidate
-    return next((c for c in (here, *here.parents[:2]) if (c / "camera.json").is_file()), None)
+    return next((c for c in (here, *here.parents[:_DEEPEST]) if (c / "camera.json").is_file()), None)
 
 
 def dataset_of(scene: BopScene) -> Path | None:

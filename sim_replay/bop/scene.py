@@ -64,6 +64,11 @@ class BopScene:
             raise BopError(f"{self.folder} holds no picture of those that it lists in rgb/ or gray/")
         return frames
 
+    @property
+    def pictures_without_camera(self) -> int:
+        """Number of images that are not among the frames, as nothing gives their K. Raises BopError."""
+        return len(self._pictures.keys() - {frame.image_id for frame in self.frames})
+
     def image_path(self, frame: BopFrame) -> Path:
         """Path of the frame's image. Raises BopError if there is none."""
         path = self._pictures.get(frame.image_id)
@@ -117,7 +122,7 @@ class BopScene:
         path = self._masks.get((kind, frame.image_id, target_index))
         if path is None:
             return None
-        values = _pixels(path, cv2.IMREAD_GRAYSCALE)
+        values = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
         return values > values.max() // 2  # the format defines 255 as set; some datasets write 1
 
 

@@ -58,7 +58,7 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
         if model is None:
             raise InputError(
                 f"{picture.scene.folder}: obj_id {target.object_id} is not among the dataset's models; "
-                "without models, give its diameter_m in model_frame.toml"
+                f"if it has none, give its diameter_m under [objects.{target.object_id}] in model_frame.toml"
             )
         truths.append(
             Truth(

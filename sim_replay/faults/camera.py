@@ -16,13 +16,16 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import zenoh
 
 from edge.cameras.sequence import read_scene
+from edge.cameras.zenoh_topic import decode_picture
 from msgs import topics
 from msgs.cdr import CompressedImage
 from msgs.publish import Node
 from msgs.session import router_config
+from sim_replay.bop.scene import read_picture_bgr
 
 NODE = "nose"
 TOPIC = f"{NODE}/{topics.IMAGE.name}"
@@ -66,6 +69,7 @@ def to_and_fro(number: int, count: int) -> int:
 def play(scene: Path, listen: str, fps: float, control: Control) -> None:
     """Publish until standard input ends."""
     pictures = [picture.path for picture in read_scene(scene)]
+    as_stored = decode_picture(pictures[0].read_bytes()) is not None
     with zenoh.open(router_config([listen])) as session, Node(session, NODE, name="driver") as node:
         publisher = node.publisher(topics.IMAGE)
         _emit({"event": "ready"})
@@ -76,12 +80,18 @@ def play(scene: Path, listen: str, fps: float, control: Control) -> None:
                 index = to_and_fro(number, len(pictures))
             exposed_ns = time.time_ns()
             stamp_ns = manners.stamp_ns(exposed_ns, number)
-            kind = "png" if pictures[index].suffix.lower() == ".png" else "jpeg"
-            image = CompressedImage(stamp_ns, "camera_optical_frame", kind, pictures[index].read_bytes())
+            image = CompressedImage(stamp_ns, "camera_optical_frame", *_coded(pictures[index], as_stored))
             # Printed before the frame is published, so that its reader knows the frame before any pose from it arrives.
             _emit({"event": "frame", "stamp_utc_ns": stamp_ns, "exposed_utc_ns": exposed_ns, "frozen": manners.frozen})
             publisher.put(image.encode())
             number = max(number + 1, int((time.monotonic() - begun_s) * fps))
+
+
+def _coded(picture: Path, as_stored: bool) -> tuple[str, bytes]:
+    """Format and bytes of an image: `as_stored`, otherwise as a PNG of 8 bits, since drivers publish no other kind."""
+    if as_stored:
+        return "png" if picture.suffix.lower() == ".png" else "jpeg", picture.read_bytes()
+    return "png", cv2.imencode(".png", read_picture_bgr(picture), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 def _emit(record: dict[str, object]) -> None:

@@ -82,7 +82,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if settings.frames == list(range(len(sequence.scene.images))):  # after a part only, the rest would count as missed
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
-        files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.truths else ""
+        files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.can_be_scored else ""
     text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.mavlink)} MAVLink messages"
     console.print(f"{text}; written to {args.out}: {files}", highlight=False, soft_wrap=True)
     return 0

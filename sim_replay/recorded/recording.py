@@ -1,8 +1,8 @@
 """A recording of the daemon (`[recorder] image_max_hz`) as a scene: its images, and the own ship from its transforms.
 
-Images are played at a constant rate, each in the slot nearest its exposure, and the telemetry's times are warped so
-that the attitude at every image's exposure is the recorded one. Images before the first and after the last attitude
-are left out. An image's number is its slot: a missing number was not recorded, and is a dropped frame.
+Images are played at a constant rate, each in the slot nearest its exposure that is free, and the telemetry's times are
+warped so that the attitude at every image's exposure is the recorded one. Images before the first and after the last
+attitude are left out. An image's number is its slot: a missing number was not recorded, and is a dropped frame.
 A recording made on the ground may contain other vehicles, which are ignored.
 """
 
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from edge.errors import InputError
 from edge.tracking.geodesy import lat_lon_alt_from_ned
@@ -33,6 +34,8 @@ from sim_replay.telemetry import Telemetry, write_telemetry
 ORIGIN_DEG_M = (0.0, 0.0, 0.0)  # of ned: recordings do not contain its position on Earth
 GAP_S_MAX = 10.0  # between two images of one flight
 FPS_MAX = 240.0
+_PARTS_MAX = 4  # frames between two images that lie as near as most do
+_IRREGULAR_MAX = 0.2  # how far the intervals may be from multiples of a period, root mean square, in periods
 _FIXED_RAD = 1e-4  # a mount that moves less is a fixed one
 _NEIGHBOURS = 5  # window of the median of velocities: removes jumps where the autopilot resets its position
 
@@ -66,12 +69,10 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
     covered = np.flatnonzero((picture_ns >= own_ns[0] - within_ns) & (picture_ns <= own_ns[-1] + within_ns))
     if len(covered) < 2:
         raise InputError(f"{paths[0]}: holds no pictures of the time in which the own ship's attitude was recorded")
-    slots = np.round((picture_ns[covered] - picture_ns[covered[0]]) * 1e-9 * fps).astype(np.int64)
-    slots, first = np.unique(slots, return_index=True)
-    kept = covered[first]
+    slots = _slots(picture_ns[covered], fps)
     gimballed = any(np.linalg.norm(so3_log(mounts[0].R_body_cam.T @ m.R_body_cam)) > _FIXED_RAD for m in mounts)
     with SceneWriter(folder, JPEG_QUALITY) as writer:
-        of_picture = dict(zip(kept.tolist(), slots.tolist(), strict=True))
+        of_picture = dict(zip(covered.tolist(), slots.tolist(), strict=True))
 
         def write(index: int, image: CompressedImage) -> None:
             if index in of_picture:
@@ -80,7 +81,7 @@ def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[
                 on_picture()
 
         _read(paths, write)
-    bent_ns = _bend(own_ns, picture_ns[kept], slots, fps)
+    bent_ns = _bend(own_ns, picture_ns[covered], slots, fps)
     write_telemetry(folder / "telemetry.csv", _telemetry(recorded, own_ns, places_m, bent_ns))
     write_sequence_toml(folder, paths[0], fps, 0, mounts[0], gimballed)
 
@@ -123,8 +124,34 @@ def _check(paths: Sequence[Path], recorded: Recorded) -> None:
 
 
 def _rate_hz(picture_ns: Array) -> float:
-    """The camera's rate, from the median interval between two images."""
-    return min(round(1e9 / float(np.median(np.diff(picture_ns))), 3), FPS_MAX)
+    """The camera's rate, averaged over all its frames from the first image to the last, recorded or not."""
+    return min(round(1e9 / _period_ns(np.diff(picture_ns).astype(np.float64)), 6), FPS_MAX)
+
+
+def _period_ns(apart_ns: Array) -> float:
+    """The period of which the intervals between images are multiples, averaged over the whole time.
+
+    [recorder] image_max_hz need not divide the camera's rate: of 20 out of 30 a second, every other interval is twice
+    the one before. The median interval if there is no such period, as where the stamps have a network's jitter.
+    """
+    usual_ns = float(np.quantile(apart_ns, 0.25))
+    off = {}
+    for parts in range(1, _PARTS_MAX + 1):
+        frames = apart_ns * parts / usual_ns
+        off[parts] = float(np.sqrt(np.mean((frames - np.round(frames)) ** 2)))
+    best = min(off, key=off.__getitem__)
+    regular = off[best] <= _IRREGULAR_MAX and usual_ns >= apart_ns.mean() / _PARTS_MAX
+    period_ns = usual_ns / best if regular else float(np.median(apart_ns))
+    for _ in range(2):  # the first average counts the frames of long intervals better
+        period_ns = float(apart_ns.sum() / np.round(apart_ns / period_ns).sum())
+    return period_ns
+
+
+def _slots(picture_ns: Array, fps: float) -> NDArray[np.int64]:
+    """Frame number of each image, increasing: the nearest to its exposure, or the next one that is free."""
+    nearest = np.floor((picture_ns - picture_ns[0]) * 1e-9 * fps + 0.5).astype(np.int64)
+    order = np.arange(len(nearest))
+    return np.maximum.accumulate(nearest - order) + order
 
 
 def _add(
@@ -177,7 +204,7 @@ def _camera_at(recorded: Recorded, own_ns: Array, places_m: Array, at_ns: int) -
     return R_ned_body @ _R(camera), places_m[nearest] + R_ned_body @ np.asarray(camera.t_frame_child_m)
 
 
-def _bend(own_ns: Array, picture_ns: Array, slots: Array, fps: float) -> Array:
+def _bend(own_ns: Array, picture_ns: Array, slots: NDArray[np.int64], fps: float) -> Array:
     """Stamps [N] warped as the images are moved into their slots; t = 0 at the first image."""
     slot_ns = slots * 1e9 / fps
     inside = np.interp(own_ns - picture_ns[0], picture_ns - picture_ns[0], slot_ns)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from pydantic import Field, ValidationError
 
-from edge.cameras.file import VideoTimes
+from edge.cameras.file import VideoTimes, tells_times
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.video import open_video
 from edge.config import MountSettings
@@ -66,7 +66,8 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         if not capture.isOpened():
             raise InputError(f"{path}: video: {flight.video} is not a readable video")
         fps = flight.fps or capture.get(cv2.CAP_PROP_FPS)
-        if not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
+        told = flight.fps is not None or tells_times(flight.video)  # otherwise the rate is a guess of ffmpeg's
+        if not told or not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
         frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: unknown
         check_spans(telemetry, flight.telemetry, flight.t0_ns, frames, fps)

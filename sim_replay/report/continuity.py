@@ -6,7 +6,7 @@ than the target's last one; a fragment is each time that poses of a visible targ
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,11 +15,12 @@ import numpy as np
 from sim_replay.score import Match
 
 
-def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
+def continuity(matches: Sequence[Match], fps: float, unrecorded: Collection[int] = ()) -> dict[str, Any]:
     """The figures over all targets, and each target's own under "targets"; seconds from frame numbers.
 
     Args:
         matches: Of all visible targets of all frames; a frame is an index that increases by one every 1 / fps.
+        unrecorded: Frames without an image, in which no target could be seen: nothing begins or ends there.
 
     Returns:
         JSON's types. `time_to_acquire_s` counts from a target's first visible frame to the first with a pose of it;
@@ -29,7 +30,7 @@ def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
     by_target: dict[tuple[int, int], list[Match]] = {}
     for match in sorted(matches, key=lambda match: match.truth.frame):
         by_target.setdefault((match.truth.object_id, match.truth.instance), []).append(match)
-    targets = [target_continuity(seen, fps) for seen in by_target.values()]
+    targets = [target_continuity(seen, fps, unrecorded) for seen in by_target.values()]
     acquired = [target["time_to_acquire_s"] for target in targets if target["time_to_acquire_s"] is not None]
     losses = [loss for target in targets for loss in target["losses"]]
     regained = [loss["lasted_s"] for loss in losses if loss["regained"]]
@@ -45,23 +46,28 @@ def continuity(matches: Sequence[Match], fps: float) -> dict[str, Any]:
     }
 
 
-def target_continuity(seen: Sequence[Match], fps: float) -> dict[str, Any]:
+def target_continuity(seen: Sequence[Match], fps: float, unrecorded: Collection[int] = ()) -> dict[str, Any]:
     """The same for one target, from its matches in the order of their frames."""
     tracks = [match.estimate.track for match in seen if match.estimate is not None]
     switches = sum(after != before for before, after in pairwise(tracks))
-    runs = list(_missing(seen))
+    frames = [match.truth.frame for match in seen]
+    in_view = [k > 0 and follows(frames[k - 1], frames[k], unrecorded) for k in range(len(frames))]  # since the last
+    runs = list(_missing(seen, in_view))
     first = next((k for k, match in enumerate(seen) if match.estimate is not None), None)
     losses = [(start, stop) for start, stop in runs if first is not None and start > first]
-    told = [
-        {
-            "frame": seen[start].truth.frame,
-            "lasted_s": round((stop - start) / fps, 4),
-            "regained": stop < len(seen) and _follows(seen, stop),
-            "while_in_view": _follows(seen, start),
-        }
-        for start, stop in losses
-    ]
-    acquired = None if first is None else (seen[first].truth.frame - seen[0].truth.frame) / fps
+    told = []
+    for start, stop in losses:
+        regained = stop < len(seen) and in_view[stop]
+        until = frames[stop] if regained else frames[stop - 1] + 1
+        told.append(
+            {
+                "frame": frames[start],
+                "lasted_s": round((until - frames[start]) / fps, 4),
+                "regained": regained,
+                "while_in_view": in_view[start],
+            }
+        )
+    acquired = None if first is None else (frames[first] - frames[0]) / fps
     return {
         "target": seen[0].truth.airframe_label,
         "instance": seen[0].truth.instance,
@@ -70,18 +76,16 @@ def target_continuity(seen: Sequence[Match], fps: float) -> dict[str, Any]:
         "tracks": list(dict.fromkeys(tracks)),
         "time_to_acquire_s": None if acquired is None else round(acquired, 4),
         "identity_switches": switches,
-        "fragments": sum(
-            loss["regained"] and _follows(seen, start) for loss, (start, _) in zip(told, losses, strict=True)
-        ),
+        "fragments": sum(loss["regained"] and loss["while_in_view"] for loss in told),
         "losses": told,
     }
 
 
-def _missing(seen: Sequence[Match]) -> Iterator[tuple[int, int]]:
+def _missing(seen: Sequence[Match], in_view: Sequence[bool]) -> Iterator[tuple[int, int]]:
     """Runs [start, stop) of matches without a pose; split where the target is out of view in between."""
     start = None
     for k, match in enumerate(seen):
-        if start is not None and (match.estimate is not None or not _follows(seen, k)):
+        if start is not None and (match.estimate is not None or not in_view[k]):
             yield start, k
             start = None
         if start is None and match.estimate is None:
@@ -90,9 +94,9 @@ def _missing(seen: Sequence[Match]) -> Iterator[tuple[int, int]]:
         yield start, len(seen)
 
 
-def _follows(seen: Sequence[Match], k: int) -> bool:
-    """Whether the frame of the k-th match directly follows that of the one before."""
-    return k > 0 and seen[k].truth.frame == seen[k - 1].truth.frame + 1
+def follows(before: int, after: int, unrecorded: Collection[int]) -> bool:
+    """Whether a frame is the next after another that has an image."""
+    return all(frame in unrecorded for frame in range(before + 1, after))
 
 
 def _spread(seconds: Sequence[float]) -> dict[str, float | None]:

@@ -36,15 +36,15 @@ def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any],
     )
     environment.filters["figure"] = _figure
     matches = result.subscriber.matches
-    frames, fps = len(sequence.scene.images), sequence.fps
+    frames, fps, unrecorded = len(sequence.scene.images), sequence.fps, sequence.scene.unrecorded
     video, stills = film(drawn / "overlay.mp4")
     received = zip(PEERS, (result.subscriber, result.autopilot), strict=True)
     ages = {name: told_ages(peer, result.recording) for name, peer in received}
     svg = {
-        "pose": plots.pose_over_time(matches, frames, fps),
+        "pose": plots.pose_over_time(matches, frames, fps, unrecorded),
         "trajectory": plots.trajectory(matches, sequence.scene),
         "ages": plots.ages(ages, fps),
-        "timeline": plots.timeline(health_of(result.recording), matches, frames, fps),
+        "timeline": plots.timeline(health_of(result.recording), matches, frames, fps, unrecorded),
         "range": plots.errors_over_range(matches),
     }
     return environment.get_template(TEMPLATE).render(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from msgs.geometry import Array, euler_from_R
 from sim_replay import metrics
-from sim_replay.report.continuity import continuity
+from sim_replay.report.continuity import continuity, follows
 from sim_replay.score import Match, TargetPose, stacked, statistics
 
 COORDINATES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
@@ -26,6 +26,7 @@ def peer_figures(
     matches: Sequence[Match],
     false_poses: Sequence[TargetPose],
     ages: Sequence[tuple[int, float]],
+    unrecorded: Collection[int] = (),
 ) -> dict[str, Any]:
     """JSON's types: shares 0..1, degrees, metres, milliseconds, seconds; None where there is no data.
 
@@ -34,6 +35,7 @@ def peer_figures(
         matches: Of every visible target of every frame.
         false_poses: Those of a frame that belong to no target.
         ages: Of each pose in the order of arrival: its frame, and ms from exposure to arrival.
+        unrecorded: Frames without an image.
     """
     return {
         **statistics(frames, matches, false_poses),
@@ -41,8 +43,8 @@ def peer_figures(
         "range_error_m": range_error_m(matches),
         "nees": nees(matches),
         "age_ms": percentiles([age_ms for _, age_ms in ages]),
-        "longest_silence_s": longest_silence_s(matches, ages, fps),
-        "continuity": continuity(matches, fps),
+        "longest_silence_s": longest_silence_s(matches, ages, fps, unrecorded),
+        "continuity": continuity(matches, fps, unrecorded),
         "tracks": tracks(matches, false_poses),
     }
 
@@ -141,13 +143,16 @@ def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
     return {name: round(float(v), 3) for name, v in zip(("p50", "p95", "p99", "max"), found, strict=True)}
 
 
-def longest_silence_s(matches: Sequence[Match], ages: Sequence[tuple[int, float]], fps: float) -> float | None:
+def longest_silence_s(
+    matches: Sequence[Match], ages: Sequence[tuple[int, float]], fps: float, unrecorded: Collection[int] = ()
+) -> float | None:
     """The longest time without a pose while a target was visible, from the first pose on; None: there was no pose."""
     arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages)
     if not arrivals:
         return None
     frames = np.unique([match.truth.frame for match in matches])
-    spans = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1) if len(frames) else []
+    gone = [not follows(int(before), int(after), unrecorded) for before, after in pairwise(frames)]
+    spans = np.split(frames, np.flatnonzero(gone) + 1) if len(frames) else []
     views_s = [(span[0] / fps, (span[-1] + 1) / fps) for span in spans]
     bounds = [*arrivals, max([arrivals[-1], *(stop for _, stop in views_s)])]
     silences = [min(after, stop) - max(before, start) for before, after in pairwise(bounds) for start, stop in views_s]

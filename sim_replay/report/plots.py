@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import matplotlib as mpl
@@ -14,9 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from msgs.geometry import Array
 from sim_replay.ground_truth import SceneTruth
+from sim_replay.report.continuity import follows
 from sim_replay.report.peer import coordinate_errors, coordinates, pairs, root_mean_square
 from sim_replay.score import Match
 
@@ -67,13 +70,17 @@ class HealthSample:
     dropped: int | None
 
 
-def pose_over_time(matches: Sequence[Match], frames: int, fps: float) -> str:
-    """X, Y, Z in `cam` and roll, pitch, yaw against the camera's axes, with RMSE and the covariance's ±2 sigma."""
+def pose_over_time(matches: Sequence[Match], frames: int, fps: float, unrecorded: Collection[int] = ()) -> str:
+    """X, Y, Z in `cam` and roll, pitch, yaw against the camera's axes, with RMSE and the covariance's ±2 sigma.
+
+    Curves run on over frames without an image (`unrecorded`).
+    """
+    recorded = np.setdiff1d(np.arange(frames), list(unrecorded))
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.6, 5.6), layout="constrained")
         panels = figure.subplots(2, 3, sharex=True).ravel()
         for target in _by_target(matches):
-            _pose_of_target(panels, target, frames, fps)
+            _pose_of_target(panels, target, recorded, fps)
         errors = coordinate_errors(pairs(matches))
         names = ("X, right", "Y, down", "Z, forward", "roll", "pitch", "yaw")
         for k, (axes, name) in enumerate(zip(panels, names, strict=True)):
@@ -91,19 +98,20 @@ def pose_over_time(matches: Sequence[Match], frames: int, fps: float) -> str:
         return _svg(figure, "pose")
 
 
-def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], frames: int, fps: float) -> None:
-    t_s = np.arange(frames) / fps
-    true, estimated, sigma = (np.full((frames, 6), np.nan) for _ in range(3))
-    true[[m.truth.frame for m in target]] = coordinates([m.truth for m in target])
-    for match in target:
+def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], recorded: NDArray[np.int64], fps: float) -> None:
+    t_s = recorded / fps
+    true, estimated, sigma = (np.full((len(recorded), 6), np.nan) for _ in range(3))
+    rows = np.searchsorted(recorded, [m.truth.frame for m in target])
+    true[rows] = coordinates([m.truth for m in target])
+    for row, match in zip(rows, target, strict=True):
         if match.estimate is not None:
-            estimated[match.truth.frame] = coordinates([match.estimate])[0]
+            estimated[row] = coordinates([match.estimate])[0]
             if match.estimate.covariance is not None:
-                sigma[match.truth.frame, :3] = np.sqrt(np.diagonal(match.estimate.covariance)[:3])
+                sigma[row, :3] = np.sqrt(np.diagonal(match.estimate.covariance)[:3])
     for k, axes in enumerate(panels):
         wrapped = k >= 3
         axes.plot(t_s, _unjoined(true[:, k], wrapped), color=TRUTH_COLOR, lw=2.4, alpha=0.85)
-        marker = "." if frames <= MARKED_MAX else ""
+        marker = "." if len(recorded) <= MARKED_MAX else ""
         axes.plot(t_s, _unjoined(estimated[:, k], wrapped), color=ESTIMATE_COLOR, marker=marker, ms=2.5, lw=1.1)
         if np.isfinite(sigma[:, k]).any():
             low, high = estimated[:, k] - _SIGMAS * sigma[:, k], estimated[:, k] + _SIGMAS * sigma[:, k]
@@ -192,8 +200,13 @@ def ages(peers: Mapping[str, Sequence[tuple[int, float]]], fps: float) -> str:
         return _svg(figure, "ages")
 
 
-def timeline(health: Sequence[HealthSample], matches: Sequence[Match], frames: int, fps: float) -> str:
-    """The daemon's state each second, when each target was in view, and when poses of it arrived."""
+def timeline(
+    health: Sequence[HealthSample], matches: Sequence[Match], frames: int, fps: float, unrecorded: Collection[int] = ()
+) -> str:
+    """The daemon's state each second, when each target was in view, and when poses of it arrived.
+
+    A bar runs on over frames without an image (`unrecorded`).
+    """
     targets = _by_target(matches)
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(11.6, 1.5 + 0.42 * (1 + 2 * len(targets))), layout="constrained")
@@ -207,7 +220,9 @@ def timeline(health: Sequence[HealthSample], matches: Sequence[Match], frames: i
         for target in targets:
             name = target[0].truth.airframe_label
             seen = [match.truth.frame for match in target]
-            axes.broken_barh(_runs(seen, fps), (len(labels) - 0.3, 0.6), color=TRUTH_COLOR, alpha=0.45, lw=0)
+            axes.broken_barh(
+                _runs(seen, fps, unrecorded), (len(labels) - 0.3, 0.6), color=TRUTH_COLOR, alpha=0.45, lw=0
+            )
             labels.append(f"{name}: in view")
             tracks: dict[str, list[int]] = {}
             for match in target:
@@ -215,7 +230,7 @@ def timeline(health: Sequence[HealthSample], matches: Sequence[Match], frames: i
                     tracks.setdefault(match.estimate.track, []).append(match.truth.frame)
             for k, (track, came) in enumerate(tracks.items()):
                 color = ESTIMATE_COLOR if k % 2 == 0 else "#7c3aed"
-                axes.broken_barh(_runs(came, fps), (len(labels) - 0.3, 0.6), color=color, alpha=0.75, lw=0)
+                axes.broken_barh(_runs(came, fps, unrecorded), (len(labels) - 0.3, 0.6), color=color, alpha=0.75, lw=0)
                 axes.text(came[0] / fps, len(labels), f" {track}", va="center", color="white", fontsize=8)
             labels.append("poses received")
         axes.set_yticks(range(len(labels)), labels)
@@ -265,11 +280,12 @@ def _by_target(matches: Sequence[Match]) -> list[list[Match]]:
     return list(groups.values())
 
 
-def _runs(frames: Sequence[int], fps: float) -> list[tuple[float, float]]:
-    """(start, length) in seconds of each run of consecutive frames."""
+def _runs(frames: Sequence[int], fps: float, unrecorded: Collection[int]) -> list[tuple[float, float]]:
+    """(start, length) in seconds of each run of frames with no other image in between."""
     ordered = np.unique(frames)
-    parts = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-    return [(float(part[0]) / fps, len(part) / fps) for part in parts if len(part)]
+    ends = [not follows(int(before), int(after), unrecorded) for before, after in pairwise(ordered)]
+    parts = np.split(ordered, np.flatnonzero(ends) + 1)
+    return [(float(part[0]) / fps, float(part[-1] + 1 - part[0]) / fps) for part in parts if len(part)]
 
 
 def _unjoined(values: Array, wrapped: bool) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import shutil
 import signal
 import socket
 import threading
@@ -12,6 +13,8 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from edge.errors import InputError
@@ -118,6 +121,21 @@ def test_what_was_not_seen_is_told_as_it_was(rig: Rig, tmp_path: Path) -> None:
     rig.processes["camera"].send_signal(signal.SIGCONT)
     assert "captured_ (which the daemon has not told of) stood still" in outcome.seen[0]["seen"]
     assert outcome.wrong[0].startswith("no silence of 90 s within 3 s, but of ")
+
+
+def test_a_scene_of_another_picture_format_is_shown_as_a_camera_would(
+    small_scene: Path, toy_model: Path, tmp_path: Path
+) -> None:
+    """BOP datasets have TIFF files of 16 bits too; the daemon takes only what drivers publish."""
+    scene = tmp_path / "000001"
+    (scene / "gray").mkdir(parents=True)
+    for path in sorted((small_scene / "rgb").iterdir())[:8]:
+        pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16) * 257
+        cv2.imwrite(str(scene / "gray" / f"{path.stem}.tif"), pixels)
+    shutil.copy(small_scene / "scene_camera.json", scene)
+    with Rig(RigSettings(tmp_path / "rig", scene, toy_model)) as rig:
+        steps = '[[step]]\ndo = "expect_poses"\nwithin_s = 30.0\n'
+        assert play_steps(rig, tmp_path, steps).wrong == []
 
 
 def test_to_act_upon_what_does_not_run_any_more_is_refused_by_name(rig: Rig, tmp_path: Path) -> None:

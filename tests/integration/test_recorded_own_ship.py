@@ -13,8 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rich.console import Console
 
+from edge.pictures import Rate
 from msgs import topics
-from msgs.cdr import TFMessage
+from msgs.cdr import CompressedImage, TFMessage
 from msgs.geometry import R_from_euler, q_wxyz_from_R
 from sim_replay.cli import main
 from sim_replay.recorded.opened import open_sequence
@@ -129,6 +130,33 @@ def test_another_vehicle_in_the_recording_does_not_move_this_one(recorded: Path,
     alone, beside = opened(recorded, tmp_path / "alone"), opened(both, tmp_path / "beside")
     np.testing.assert_array_equal(beside.t_ns, alone.t_ns)
     np.testing.assert_array_equal(beside.values, alone.values)
+
+
+@pytest.mark.parametrize(("camera_hz", "image_max_hz", "resolution_ns"), [(30, 20, 1), (25, 10, 1), (60, 60, 10**6)])
+def test_pictures_recorded_at_no_whole_fraction_of_the_cameras_rate_all_keep_their_frames(
+    camera_hz: int, image_max_hz: int, resolution_ns: int, recorded: Path, tmp_path: Path
+) -> None:
+    limit = Rate(image_max_hz)
+    exposed_ns = [round(k * 1e9 / camera_hz) for k in range(80)]
+    frames = [k for k, t_ns in enumerate(exposed_ns) if limit.due(t_ns)][:30]
+    left = iter(exposed_ns[k] // resolution_ns * resolution_ns for k in frames)
+    begun_ns: list[int] = []
+
+    def restamped(topic: str, data: bytes) -> Iterator[tuple[str, bytes]]:
+        if not topic.endswith("/image/compressed"):
+            yield topic, data
+            return
+        image = CompressedImage.decode(data)
+        if not begun_ns:
+            begun_ns.append((image.stamp_ns + 500_000_000) // resolution_ns * resolution_ns)  # own attitude is known
+        if (since_ns := next(left, None)) is not None:
+            yield topic, replace(image, stamp_ns=begun_ns[0] + since_ns).encode()
+
+    sequence = open_sequence(
+        rewritten(recorded, tmp_path / "few.mcap", restamped), tmp_path / "out", Console(quiet=True)
+    )
+    assert sequence.fps == pytest.approx(camera_hz, rel=5e-3)
+    assert sorted(int(path.stem) for path in (tmp_path / "out/sequence/rgb").iterdir()) == frames
 
 
 def test_where_rows_of_telemetry_are_missing_no_own_attitude_is_made_up(toy_model: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 from sim_replay.benchmark.plan import plan_dataset
-from sim_replay.benchmark.preset import parse_preset
+from sim_replay.benchmark.preset import load_preset, parse_preset
+from sim_replay.benchmark.sequence_files import Job
 from sim_replay.cli import main
 
 PRESET = """
@@ -46,7 +48,7 @@ def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
     (tmp_path / "mine.toml").write_text(PRESET)
     photographs = tmp_path / "photographs"
     photographs.mkdir()
-    (photographs / "torn.jpg").write_bytes(b"\xff\xd8 no more")
+    (photographs / "torn.jpg").write_bytes(b"\xff\xd8\xff no more")
     preset = parse_preset("mine.toml", PRESET)
     # Half of the sequences take a photograph; here is a seed of one that does.
     seed = next(s for s in range(20) if plan_dataset(preset, s)[0].environment_seed // 2 % 2)
@@ -55,6 +57,34 @@ def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
     told = capsys.readouterr().err
     assert "torn.jpg is not a readable picture" in told
     assert "--resume" not in told
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("page.jpg", r"page\.jpg is not a readable picture"), ("sky.exr", r"holds no \.jpg, \.png or \.hdr file")],
+)
+def test_what_is_no_photograph_is_told_before_anything_is_flown(
+    name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text(PRESET)
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "photographs" / name).write_text("<html>moved</html>")
+    words = ["generate", "--preset", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "data")]
+    assert main([*words, "--backdrops", str(tmp_path / "photographs")]) == 2
+    assert re.search(told, capsys.readouterr().err)
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_every_photograph_is_used_and_half_of_the_sequences_use_none(count: int) -> None:
+    preset = load_preset("fw-uav6d")
+    plans = plan_dataset(preset, 0)
+    photographs = tuple(Path(f"{number}.jpg") for number in range(count))
+    job = Job(preset, Path("data"), "", {}, backdrops=photographs)
+    used = Counter(job.backdrop(plan) for plan in plans)
+    assert 0.4 < used.pop(None) / len(plans) < 0.6
+    assert used.keys() == set(photographs)
+    assert max(used.values()) < 2 * min(used.values())
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sim_replay.benchmark.contact_sheet import contact_sheet
 from sim_replay.cli import main
 
 # Scene: split, focal length, airframe, flight seed; of each frame the targets' (object id, z in m, box, seen of all).
@@ -101,7 +103,7 @@ def test_what_is_hidden_is_listed_and_not_shown(dataset: Path, capsys: pytest.Ca
         assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
-    before = statistics()
+    before, sheet_before = statistics(), contact_sheet(dataset)
     for folder in sorted(dataset.glob("*/0*")):
         for kind, entry in (
             ("gt", {"obj_id": 3, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 4.1e5]}),
@@ -111,6 +113,7 @@ def test_what_is_hidden_is_listed_and_not_shown(dataset: Path, capsys: pytest.Ca
             pictures = json.loads(path.read_text())
             path.write_text(json.dumps({key: [entry, *targets] for key, targets in pictures.items()}))
     assert statistics() == before
+    np.testing.assert_array_equal(contact_sheet(dataset), sheet_before)
     camera = json.loads((folder / "scene_camera.json").read_text())
     path = folder / "scene_gt.json"
     (folder / "scene_gt_info.json").unlink()  # then nobody says that it is hidden, but where it lies may
@@ -155,6 +158,33 @@ def test_objects_of_others_are_not_called_by_our_airframes_names(
     (dataset / "models" / "models_info.json").write_text('{"1": {"diameter": 9000}, "4": {"diameter": 8000}}')
     assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["airframes"]["train"] == {"object 1": 1, "object 4": 1}
+
+
+def test_two_datasets_at_once_keep_their_own_names(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("hawks", "kites"):
+        shutil.copytree(dataset, tmp_path / "both" / name)
+    (tmp_path / "both/kites/models/models_info.json").write_text('{"1": {"name": "box_kite"}}')
+    assert main(["stats", "--dataset", str(tmp_path / "both"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["airframes"]["train"]
+    assert told == {"box_kite": 1, "light_aircraft": 1, "male_v_tail": 1, "object 4": 1}
+
+
+def test_up_and_down_are_told_only_where_the_axes_of_the_world_are_known(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """BOP leaves them to each dataset; in most of them z points up."""
+
+    def below() -> Any:
+        assert main(["stats", "--dataset", str(dataset), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)["below_camera_share"]
+
+    (dataset / "test/000002/sequence.toml").unlink()
+    assert below() == 0.0  # of the two scenes of training, filmed upwards
+    for path in dataset.glob("train/*/sequence.toml"):
+        path.unlink()
+    assert below() is None
 
 
 def test_the_size_is_of_the_first_picture_that_is_there(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:

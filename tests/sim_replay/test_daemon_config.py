@@ -6,9 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from edge.config import load_config
 from edge.config_camera import SequenceCamera
+from edge.pictures import Rate
 from sim_replay.daemon_config import sequence_config
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
@@ -34,3 +36,11 @@ def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     assert config.mavlink.endpoints == ["udpin:127.0.0.1:14001"]
     np.testing.assert_allclose(config.mount.mount().R_body_cam, sequence.mount.R_body_cam, atol=1e-9)
     np.testing.assert_allclose(config.mount.mount().t_body_cam_m, sequence.mount.t_body_cam_m)
+
+
+@pytest.mark.parametrize("fps", [10.0, 15.0, 24.0, 30.0, 60.0, 120.0])
+def test_every_image_of_a_sequence_is_recorded(fps: float, tmp_path: Path) -> None:
+    sequence, path = replace(read_sequence(BUNDLED_SEQUENCE), fps=fps), tmp_path / "config.toml"
+    path.write_text(sequence_config(sequence, "uav1", None, "tcp/127.0.0.1:7001", 14001, {}, tmp_path))
+    limit = Rate(load_config(path).config.recorder.image_max_hz)
+    assert all(limit.due(round(frame * 1e9 / fps)) for frame in range(300))

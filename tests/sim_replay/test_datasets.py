@@ -186,6 +186,17 @@ def test_listed_pictures_that_are_missing_are_left_out_and_told(root: Path, capl
         list(open_dataset(root, "train").frames())
 
 
+def test_pictures_of_an_unknown_camera_are_left_out_and_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = root / "train_pbr" / "000007" / "scene_camera.json"
+    cameras = json.loads(path.read_text())
+    write_json(path, {key: cameras[key] for key in ("3", "1041")})
+    assert ids(open_dataset(root, "train")) == [(7, 3), (7, 1041)]
+    assert "000007: 1 pictures are left out: no file gives their camera matrix" in caplog.text
+    caplog.clear()
+    assert ids(open_dataset(root, "test")) == [(2, 1), (2, 12), (48, 5)]
+    assert caplog.text == ""
+
+
 def test_pictures_whose_truth_is_kept_back_are_not_taken_for_empty_ones(
     root: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -97,6 +97,20 @@ def test_a_gimbal_sequence_without_the_cameras_attitude_is_refused(gimbal_sequen
         read_sequence(gimbal_sequence)
 
 
+def test_over_frames_that_were_not_recorded_it_turns_on(gimbal_sequence: Path) -> None:
+    with (gimbal_sequence / "sequence.toml").open("a") as file:
+        file.write('source = "flight.mcap"\n')
+    for frame in range(FRAMES):
+        if frame % 3:
+            (gimbal_sequence / "rgb" / f"{frame:06d}.png").unlink()
+    track = read_sequence(gimbal_sequence).gimbal
+    assert track is not None
+    t_s = np.linspace(0.0, (FRAMES - 3) / FPS, 200)
+    told = np.array([np.roll(track.at(round(t * 1e9)), -1) for t in t_s])
+    turned = R_ned_cam(t_s) * R_AHEAD_CAM.inv()
+    assert np.degrees((Rotation.from_quat(told).inv() * turned).magnitude()).max() < 0.1
+
+
 @settings(deadline=None)
 @given(st.integers(2, 12), st.integers(0, 10**9), st.floats(0.0, 1.0), st.integers(0, 2**32 - 1))
 def test_between_frames_it_turns_as_scipy_says(count: int, frame0_ns: int, place: float, seed: int) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from sim_replay.bop import BopError, find_scenes
 from sim_replay.datasets import Dataset, open_dataset
-from tests.sim_replay.test_datasets import write_models_info, write_scene
+from tests.sim_replay.test_datasets import K, write_json, write_models_info, write_scene
 
 
 def numbers(dataset: Dataset) -> dict[str, int]:
@@ -47,6 +47,25 @@ def test_a_split_is_the_first_folder_below_the_dataset_however_deep_its_scenes_l
         assert (opened.split, opened.root, opened.models[1].diameter_m) == ("train", root, 6.0)
     with pytest.raises(BopError, match=r"no split 'part1'; it has test, train"):
         open_dataset(root, "part1")
+
+
+def test_scenes_by_date_and_flight_are_read_with_the_models_and_axes_of_their_dataset(tmp_path: Path) -> None:
+    root, scene = tmp_path / "kites", tmp_path / "kites" / "train" / "2026-05-01" / "morning" / "000003"
+    write_scene(scene)
+    write_models_info(root)
+    (root / "model_frame.toml").write_text("R_body_model = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]\n")
+    for dataset in (open_dataset(root), open_dataset(root, "train"), open_dataset(scene)):
+        assert (dataset.split, dataset.root, dataset.models[1].diameter_m) == ("train", root, 6.0)
+        (target,) = next(dataset.frames()).targets
+        assert target.R_cam_target.diagonal().tolist() == [1.0, -1.0, -1.0]
+
+
+def test_a_camera_for_all_holds_for_scenes_by_date_and_flight(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "kites" / "train" / "2026-05-01" / "morning" / "000003")
+    (scene / "scene_camera.json").unlink()
+    write_json(tmp_path / "kites" / "camera.json", {"fx": K[0], "fy": K[4], "cx": K[2], "cy": K[5]})
+    frame = next(open_dataset(tmp_path / "kites", "train").frames())
+    assert frame.K.ravel().tolist() == K
 
 
 def test_an_imagewise_split_may_lie_deeper_too(root: Path) -> None:

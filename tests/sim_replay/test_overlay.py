@@ -99,6 +99,17 @@ def test_truth_is_cyan_and_estimate_magenta_on_the_frame_and_in_the_inset() -> N
         assert drawn(image[inset], color).sum() > 100
 
 
+def test_every_target_of_a_frame_is_boxed() -> None:
+    other = view(0, 25.0, (-15.0, 5.0, 60.0)).match
+    assert other is not None
+    both = replace(view(0, 25.0), others=((other, EXTENTS),))
+    images = (Overlay([one], SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8)) for one in (view(0, 25.0), both))
+    alone, together = (image[215:300, 40:150] for image in images)
+    for color in (TRUTH_BGR, ESTIMATE_BGR):
+        assert not drawn(alone, color).any()
+        assert drawn(together, color).sum() > 50
+
+
 def test_a_missed_target_shows_its_truth_alone() -> None:
     image = Overlay([view(0, None)], SIZE_WH).draw(0, np.zeros((360, 640, 3), np.uint8))
     centre = image[120:240, 220:420]

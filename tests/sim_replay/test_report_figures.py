@@ -62,6 +62,24 @@ def test_out_of_view_is_no_loss_and_coming_back_is_a_reacquisition() -> None:
     assert held["time_to_reacquire_s"]["max"] == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize("pattern", ["---00---0011-1--", "0000     --00", "0-0 -0"])
+def test_what_was_not_recorded_is_no_loss_and_ends_none(pattern: str) -> None:
+    """Every third frame has an image, as a recording of 10 out of 30 a second has them."""
+
+    def third(match: Match) -> Match:
+        return Match(replace(match.truth, frame=3 * match.truth.frame), match.estimate)
+
+    seen = matches(pattern)
+    few, between = [third(match) for match in seen], {frame for frame in range(3 * len(pattern)) if frame % 3}
+    all_of_them, told = continuity(seen, FPS), continuity(few, 3 * FPS, between)
+    for name in all_of_them.keys() - {"targets"}:
+        assert told[name] == all_of_them[name], name
+    ages = [(match.truth.frame, 20.0) for match in seen if match.estimate is not None]
+    tripled = [(3 * frame, age_ms) for frame, age_ms in ages]
+    silence_s = longest_silence_s(few, tripled, 3 * FPS, between)
+    assert silence_s == pytest.approx(longest_silence_s(seen, ages, FPS), abs=0.07)  # two frames at the end
+
+
 def test_two_targets_that_swap_names_are_two_switches() -> None:
     swapped = matches("000111", object_id=1) + matches("111000", object_id=2)
     assert continuity(swapped, FPS)["identity_switches"] == 2

@@ -223,6 +223,25 @@ def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_fi
     assert "nan" not in page.split("<details>")[0].split("</svg>")[-1].lower()
 
 
+def test_an_empty_sky_is_scored_by_the_poses_received_in_it(
+    flown: PlayedSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = recording(flown, {0, 2})
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    write_flight(folder, RecordedFlight(flown.scene.folder, MODEL, made))
+    labels = flown.scene.folder / "scene_gt.json"
+    labels.write_text("{}")
+    assert main(["score", str(folder)]) == 0
+    assert re.search(r"poses that match no target +│ 2 ", capsys.readouterr().out)
+    score = json.loads((folder / "score.json").read_text())
+    assert (score["overall"]["false_poses"], score["overall"]["false_positives_per_1000"]) == (2, 400.0)
+    assert "0 views, 2 false poses" in (folder / "report.html").read_text()
+    labels.unlink()
+    assert main(["score", str(folder)]) == 2
+    assert "there is no ground truth to score against" in capsys.readouterr().err
+
+
 def test_a_flight_that_is_none_or_is_damaged_is_named(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

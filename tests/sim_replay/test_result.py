@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,22 @@ def test_the_overlay_gets_each_frames_own_pose_and_latency(sequence: PlayedSeque
     assert [view.match is not None and view.match.estimate is not None for view in views] == [1, 0, 1, 0, 0]
     assert [view.latency_ms is not None for view in views] == [1, 0, 1, 0, 0]
     assert views[4].match is None
+
+
+def test_the_overlay_gets_every_target_of_a_frame(sequence: PlayedSequence, recording: Recording) -> None:
+    beside_m = np.array([-10.0, 0.0, 200.0])
+    truths = [*sequence.scene.truths, Truth(0, np.eye(3), beside_m, 1, 12.0)]
+    two = replace(sequence, scene=replace(sequence.scene, truths=truths))
+    views = frame_views(two, judge(two, recording))
+    assert [len(view.others) for view in views] == [1, 0, 0, 0, 0]
+
+
+def test_a_frame_that_was_not_recorded_shows_the_boxes_of_the_picture_before(
+    sequence: PlayedSequence, recording: Recording
+) -> None:
+    partly = replace(sequence, scene=replace(sequence.scene, unrecorded=frozenset({1, 3})))
+    views = frame_views(partly, judge(partly, recording))
+    assert [view is before for before, view in pairwise(views)] == [True, False, True, False]
 
 
 def test_the_live_line_follows_the_records(sequence: PlayedSequence, recording: Recording) -> None:

@@ -10,13 +10,21 @@ import cv2
 import numpy as np
 import pytest
 
-from sim_replay.bop import BopError, read_scene
+from sim_replay.bop import DISTORTION_KEY, BopError, read_scene
 from sim_replay.bop.scene import picture_size_wh
 from sim_replay.cli import main
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import truths_of
 from sim_replay.ground_truth import read_scene_truth
-from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
+from tests.sim_replay.test_datasets import (
+    BOX_EDGES,
+    SIZE_WH,
+    UNIT,
+    silhouette,
+    write_json,
+    write_models_info,
+    write_scene,
+)
 
 
 @pytest.fixture
@@ -54,6 +62,14 @@ def test_a_side_of_nil_is_one_pixel_where_pixels_are_counted(scene: Path) -> Non
 def test_a_box_that_is_none_is_of_a_hidden_target(scene: Path, info: dict[str, Any]) -> None:
     hidden = seen(scene, **info)
     assert (hidden.box_visible_xyxy_px, hidden.visible_px) == (None, 0)
+
+
+@pytest.mark.parametrize("value", [1, 65535])
+def test_a_mask_of_16_bits_shows_what_it_marks(scene: Path, value: int) -> None:
+    (scene / "mask_visib").mkdir()
+    cv2.imwrite(str(scene / "mask_visib" / "000000_000000.png"), (silhouette() > 0).astype(np.uint16) * value)
+    (target,) = open_dataset(scene).labelled_frames()[0].targets
+    np.testing.assert_array_equal(target.box_visible_xyxy_px, BOX_EDGES)
 
 
 def test_what_is_seen_lies_before_the_camera(scene: Path) -> None:
@@ -125,6 +141,23 @@ def test_each_picture_of_a_scene_cuts_its_targets_at_its_own_edge(scene: Path) -
         np.testing.assert_allclose(boxes[k], [198.8, 139.2, 241.4, 181.2], atol=1.5)
     np.testing.assert_allclose(boxes[3], [79.8, 59.8, 104.5, 82.5], atol=0.3)
     np.testing.assert_allclose(boxes[5], [79.8, 59.8, 104.5, 100.2], atol=0.3)
+
+
+def test_a_target_beyond_what_a_lens_describes_is_not_seen_where_its_formula_folds_back(scene: Path) -> None:
+    wide_K, lens = np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 1]]), np.array([-0.25, 0.0, 0.0, 0.0, 0.0])
+    write_json(scene / "scene_camera.json", {"0": {"cam_K": wide_K.ravel().tolist(), DISTORTION_KEY: lens.tolist()}})
+    rays = np.array([[0.3, 0.1, 1.0], [1.9, 0.0, 1.0]])  # the second 62 degrees off the axis
+    folded, _ = cv2.projectPoints(rays[1:], np.zeros(3), np.zeros(3), wide_K, lens)
+    assert (folded > 0).all()
+    assert (folded < SIZE_WH).all()
+    poses = [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": (1e5 * ray).tolist()} for ray in rays]
+    write_json(scene / "scene_gt.json", {"0": poses})
+    half_mm = {f"{kind}_{axis}": value for axis in "xyz" for kind, value in (("min", -2e3), ("size", 4e3))}
+    write_models_info(scene.parents[1], **half_mm)
+    seen, beyond = open_dataset(scene).labelled_frames()[0].targets
+    assert seen.box_visible_xyxy_px is not None
+    assert (beyond.box_visible_xyxy_px, beyond.visible_px) == (None, 0)
+    assert [truth.visible for truth in read_scene_truth(scene).truths] == [True, False]
 
 
 def test_a_picture_with_much_written_in_its_head_has_a_size(tmp_path: Path) -> None:

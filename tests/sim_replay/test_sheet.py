@@ -12,6 +12,7 @@ import pytest
 from edge.errors import InputError
 from sim_replay import sheet
 from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes.invented import dataset_names
 from sim_replay.benchmark import commands
 
 
@@ -51,6 +52,14 @@ def test_paint_follows_the_seed() -> None:
     chosen = [AIRFRAMES[0]]
     assert np.array_equal(sheet.sheet_image(chosen, 1), sheet.sheet_image(chosen, 1))
     assert not np.array_equal(sheet.sheet_image(chosen, 1), sheet.sheet_image(chosen, 2))
+
+
+def test_an_invented_aircraft_is_drawn_by_its_name(tmp_path: Path) -> None:
+    """As `stats` tells it of a dataset that shows some."""
+    (name,) = dataset_names(1, [airframe_id("biplane"), airframe_id("glider")])
+    out = tmp_path / "one.jpg"
+    assert _run("--airframe", name, "--out", str(out)) == 0
+    assert cv2.imread(str(out)).shape[0] == sheet.HEADING_PX + sheet.TILE_HEIGHT_PX
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from rich.console import Console
 from edge.errors import InputError
 from sim_replay.recorded.opened import open_sequence
 from sim_replay.telemetry import Telemetry, write_telemetry
-from tests.edge.test_cameras_video import turned, write_film
+from tests.edge.test_cameras_video import bare_jpeg, turned, write_film
 
 LENS = "{ fx = 300.0, fy = 300.0, cx = 31.5, cy = 23.5, width = 64, height = 48 }"
 
@@ -61,6 +61,21 @@ def test_a_video_of_a_rate_that_varies_is_refused_unless_its_rate_is_told(film: 
     assert not any((tmp_path / "out").glob("*"))
     film.write_text("fps = 20.0\n" + film.read_text())
     assert len(open_sequence(film, tmp_path / "out", Console(quiet=True)).scene.images) == 6
+
+
+@pytest.mark.parametrize("suffix", [".h264", ".mjpeg"])
+def test_a_video_that_says_no_rate_is_not_given_one(suffix: str, film: Path, tmp_path: Path) -> None:
+    """Without a container there are no times; ffmpeg takes 25 a second for granted."""
+    bare = tmp_path / f"film{suffix}"
+    write_film(bare, [0, 33, 67, 100], "libx264") if suffix == ".h264" else bare_jpeg(bare)
+    text = (
+        film.read_text().replace("film.mp4", bare.name).replace("width = 64, height = 48", "width = 320, height = 180")
+    )
+    film.write_text(text)
+    with pytest.raises(InputError, match="fps: is missing"):
+        open_sequence(film, tmp_path / "out", Console(quiet=True))
+    film.write_text(f"fps = 30.0\n{text}")
+    assert open_sequence(film, tmp_path / "out", Console(quiet=True)).fps == 30.0
 
 
 def test_a_video_is_unpacked_as_its_sensor_read_it_out(film: Path, tmp_path: Path) -> None:
