@@ -85,7 +85,7 @@ class DatasetSampler:
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None and box is not None:
             self._label(out, frame, chosen, box, to_window)
-        for k, other in enumerate(boxes):
+        for k, other in enumerate([*boxes, *frame.undistorted_boxes_xyxy_px(frame_wh, frame.unlisted)]):
             if other is not None and k != chosen:
                 _mark(out.others[0], other, to_window)
         return out

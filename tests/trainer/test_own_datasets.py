@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from tests.trainer.test_trained_on import discs, on_dataset
 from trainer.checkpoint import load_model
 from trainer.cli import main
+from trainer.dataset_windows import DatasetSampler
 
 
 def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
@@ -20,3 +22,12 @@ def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_a
     assert load_model(run)[2]["samples"] == 4
     assert main([*command, "--samples", "8", "--resume"]) == 0
     assert load_model(run)[2]["samples"] == 8
+
+
+def test_an_aircraft_that_the_list_of_targets_leaves_out_is_not_learnt_as_background(tmp_path: Path) -> None:
+    """Of two aircraft in each picture the list has one, which is in the window or not; the other is never judged."""
+    discs(tmp_path / "test" / "000001", 1500.0, (200.0, 260.0), beside_px=(-8, 8))
+    names = [{"scene_id": 1, "im_id": image, "obj_id": 1, "inst_count": 1} for image in (0, 1)]
+    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(names))
+    batch = DatasetSampler(tmp_path, "test", 1, 64, 0.0).batch(0, 8)
+    assert batch.others.any(axis=(1, 2)).all()
