@@ -5,6 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
+
+from edge.estimator.window import fit_frame
+from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from tests.trainer.test_trained_on import discs, on_dataset
 from trainer.checkpoint import load_model
 from trainer.cli import main
@@ -31,3 +36,16 @@ def test_an_aircraft_that_the_list_of_targets_leaves_out_is_not_learnt_as_backgr
     (tmp_path / "test_targets_bop19.json").write_text(json.dumps(names))
     batch = DatasetSampler(tmp_path, "test", 1, 64, 0.0).batch(0, 8)
     assert batch.others.any(axis=(1, 2)).all()
+
+
+def test_of_an_upright_picture_the_windows_are_reduced_as_the_daemon_reduces_it(tmp_path: Path) -> None:
+    """It is letterboxed, so its height decides: 448 of 640 rows are left, where 768 of 360 columns would enlarge it."""
+    K = np.array([[1500.0, 0, 180], [0, 1500, 320], [0, 0, 1]])
+    image = np.full((640, 360, 3), 128, np.uint8)
+    box = np.array([169.5, 309.5, 190.5, 330.5])
+    with SceneWriter(tmp_path / "train" / "000001") as writer:
+        writer.add(BopFrame(0, K, (BopTarget(1, np.eye(3), np.array([0, 0, 260.0]), box, box, 441, 441),)), image)
+    batch = DatasetSampler(tmp_path, "train", 1, 64, 1.0).batch(0, 60)
+    scales = batch.K[:, 0, 0] / K[0, 0]
+    flown = fit_frame(cv2.imread(str(tmp_path / "train" / "000001" / "rgb" / "000000.jpg")), (768, 448), "letterbox")[1]
+    assert scales.min() < flown.scale_xy[0] < scales.max()
