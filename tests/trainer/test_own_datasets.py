@@ -7,13 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import tiny
 
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from tests.trainer.test_trained_on import discs, on_dataset
 from trainer.checkpoint import load_model
 from trainer.cli import main
+from trainer.config import DatasetSource
 from trainer.dataset_windows import DatasetSampler
+from trainer.export import stage_sampler
 
 
 def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
@@ -49,3 +52,16 @@ def test_of_an_upright_picture_the_windows_are_reduced_as_the_daemon_reduces_it(
     scales = batch.K[:, 0, 0] / K[0, 0]
     flown = fit_frame(cv2.imread(str(tmp_path / "train" / "000001" / "rgb" / "000000.jpg")), (768, 448), "letterbox")[1]
     assert scales.min() < flown.scale_xy[0] < scales.max()
+
+
+def test_datasets_without_a_validation_split_leave_their_shares_to_the_others_in_proportion(tmp_path: Path) -> None:
+    """Of 0.8, 0.1 and 0.1 the first has none: half of what is validated on is of each other, not nearly all of one."""
+    depths_m = {"near": 100.0, "far": 300.0}
+    for name, depth_m in {**depths_m, "most": 200.0}.items():
+        for split in ("train", "val"):
+            discs(tmp_path / name / split / "000001", 1500.0, (depth_m,))
+    sources = [DatasetSource(path=tmp_path / "most", share=0.8)]
+    sources += [DatasetSource(path=tmp_path / name, share=0.1, validation_split="val") for name in depths_m]
+    data = tiny.config().data.model_copy(update={"datasets": sources})
+    Z_m = stage_sampler(data, 77, 64, 0.0)().batch(0, 20).t_cam_target_m[:, 2]
+    assert [int(np.sum(Z_m == depth_m)) for depth_m in depths_m.values()] == [10, 10]
