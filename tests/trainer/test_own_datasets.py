@@ -7,16 +7,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import tiny
 
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from tests.trainer.test_trained_on import discs, on_dataset
-from trainer.checkpoint import load_model
+from trainer.checkpoint import load_model, save_weights
 from trainer.cli import main
-from trainer.config import DatasetSource
+from trainer.config import DatasetSource, parse_config
 from trainer.dataset_windows import DatasetSampler
 from trainer.export import stage_sampler
+from trainer.held_out import Request, evaluate_file
 
 
 def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
@@ -65,3 +67,11 @@ def test_datasets_without_a_validation_split_leave_their_shares_to_the_others_in
     data = tiny.config().data.model_copy(update={"datasets": sources})
     Z_m = stage_sampler(data, 77, 64, 0.0)().batch(0, 20).t_cam_target_m[:, 2]
     assert [int(np.sum(Z_m == depth_m)) for depth_m in depths_m.values()] == [10, 10]
+
+
+def test_rendered_windows_are_rendered_for_a_checkpoint_of_a_dataset_that_is_no_longer_there(tmp_path: Path) -> None:
+    text = on_dataset(tmp_path / "moved")
+    assert parse_config(text, "own.toml").data.rendered_share == 0.0
+    save_weights(tmp_path / "run" / "weights.pt", tiny.network(), text, {"seed": 3, "samples": 0, "commit": "unknown"})
+    measured = evaluate_file(Request(tmp_path / "run", samples=16, seed=77, stage="track"))
+    assert measured["windows"] == pytest.approx(16.0)
