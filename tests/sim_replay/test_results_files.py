@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,11 +13,12 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
-from sim_replay.evaluation.table import consistency_line
+from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
 from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
 
@@ -122,6 +124,19 @@ def test_a_picture_that_shows_but_what_is_not_asked_for_is_not_empty(root: Path)
         overall = score_of(dataset, {}, frames)["overall"]
         assert overall["false_poses"] == 1
         assert overall["false_positives_per_1000"] == false_alarms
+
+
+def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
+    """Rich takes brackets for markup: it had left them out, and refused a closing one with a traceback."""
+    root = root.rename(root.with_name("hawks [v2]"))
+    write_json(root / "models" / "models_info.json", {"1": {"diameter": 6000.0, "name": "cub [/red]"}})
+    dataset = open_dataset(root)
+    console = Console(file=io.StringIO(), width=130)
+    console.print(score_table(score_of(dataset, {"file": "m [a].csv"}, judged(root, []))))
+    console.print(statistics_table(dataset_statistics(root)))
+    shown = console.file.getvalue()
+    assert "m [a].csv on hawks [v2], 2 frames" in shown
+    assert shown.count("cub [/red]") == 2
 
 
 def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:
