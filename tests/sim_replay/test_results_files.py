@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
-from sim_replay.evaluation.bop_results import file_answers
+from sim_replay.evaluation.bop_results import file_answers, write_results
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
@@ -79,6 +80,25 @@ def test_who_names_no_object_or_another_one_fills_what_is_left_by_score(root: Pa
     frames = judged(root, [(1, 0.2, LEFT, False), (7, 0.3, LEFT, True), (7, 0.9, RIGHT, True)])
     assert turns_deg(frames) == [180, 0]
     assert len(frames[0].false_poses) == 1
+
+
+def test_a_false_pose_is_not_written_as_one_of_an_object_that_a_dataset_numbers_0(root: Path) -> None:
+    """Read again, the surest pose would have taken the place of a right one."""
+    for path in (root / "test" / "000000" / "scene_gt.json", root / "models" / "models_info.json"):
+        path.write_text(path.read_text().replace('"obj_id": 1', '"obj_id": 0').replace('{"1":', '{"0":'))
+    dataset = open_dataset(root)
+    scores = {LEFT: 0.5, RIGHT: 0.5, 40.0: 0.9}
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        told = said(*scores if picture.image_id == 0 else ())(index, picture)
+        return Answer(tuple(replace(pose, score=scores[pose.t_cam_target_m[0]]) for pose in told.poses), None)
+
+    pictures = dataset.labelled_frames()
+    path = root.parent / "m_hawks-test.csv"
+    write_results(path, judge_frames(pictures, dataset.models, answer))
+    again = judge_frames(pictures, dataset.models, file_answers(path, dataset))
+    assert turns_deg(again) == [0, 0]
+    assert [pose.score for pose in again[0].false_poses] == [0.9]
 
 
 def test_poses_in_an_empty_picture_stay_false_alarms(root: Path) -> None:
