@@ -56,12 +56,15 @@ class DatasetFrame:
         """The image [H, W, 3] that the pinhole camera K would have taken. Raises BopError."""
         return read_undistorted_bgr(self.image_path, self.K, self.distortion)
 
-    def undistorted_boxes_xyxy_px(self, frame_wh: tuple[int, int]) -> list[Array | None]:
+    def undistorted_boxes_xyxy_px(
+        self, frame_wh: tuple[int, int], targets: Sequence[BopTarget] | None = None
+    ) -> list[Array | None]:
         """The visible box [4] of each target in undistorted_bgr() of size frame_wh; None: not visible there.
 
-        The original image may show more than the undistorted one, so boxes are clipped to its edges.
+        The original image may show more than the undistorted one, so boxes are clipped to its edges. `targets`: whose
+        boxes; None: those of `self.targets`.
         """
-        boxes = [target.box_visible_xyxy_px for target in self.targets]
+        boxes = [target.box_visible_xyxy_px for target in (self.targets if targets is None else targets)]
         lens = lens_of(self.K, self.distortion or ())
         return boxes if lens is None else [None if box is None else _straight(lens, box, frame_wh) for box in boxes]
 

@@ -100,7 +100,7 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
     Visible truths are matched first: a pose of a hidden target can only be a coincidence or a prediction.
 
     Association uses the bearing alone, so that a wrong depth or rotation counts as an error and not as a miss. A pose
-    nearer than one diameter is never matched: the target would contain the camera, so its bearing means nothing.
+    nearer than half a diameter is never matched: the target would contain the camera, so its bearing means nothing.
 
     Returns:
         One match for each truth, in their order, and the poses that belong to no target.
@@ -113,7 +113,7 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
         gate_deg = np.rad2deg(truth.diameter_m / np.linalg.norm(truth.t_cam_target_m))
         for estimate in by_frame.get(truth.frame, []):
             bearing_deg = float(metrics.bearing_error_deg(estimate.t_cam_target_m, truth.t_cam_target_m))
-            has_direction = np.linalg.norm(estimate.t_cam_target_m) >= truth.diameter_m
+            has_direction = np.linalg.norm(estimate.t_cam_target_m) >= 0.5 * truth.diameter_m
             if has_direction and bearing_deg <= gate_deg:
                 pairs.append((not truth.visible, bearing_deg, i, estimate))
     found: dict[int, TargetPose] = {}

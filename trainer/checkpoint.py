@@ -6,6 +6,7 @@ Both are written to a temporary file and renamed, so a crash leaves the last com
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from msgs.contract import samples_behind
 from trainer.config import ConfigError, TrainerConfig, parse_config
 from trainer.model import PoseNet
 
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
 TRAINING_ONLY_PREFIX = "head_dense."
+_log = logging.getLogger(__name__)
 
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
@@ -79,6 +82,24 @@ def load_file(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: not a checkpoint of this program: holds a {type(content).__name__}")
     return content
+
+
+def weights_to_start_from(path: Path, own: dict[str, Tensor]) -> tuple[dict[str, Tensor], str, int | None]:
+    """For a network whose weights are `own`: those of another run that fit by name and shape, what to call that run,
+    and the training samples behind it (None: unknown).
+
+    Warns of the parts of the network that nothing fits. Raises ConfigError if nothing fits at all.
+    """
+    content = load_file(path)
+    given = content.get("weights", {})
+    fitting = {key: value for key, value in given.items() if key in own and own[key].shape == value.shape}
+    if not fitting:
+        raise ConfigError(f"{path}: contains no weights that fit this network")
+    left = [key for key in own if key not in fitting]
+    if left:
+        parts = ", ".join(dict.fromkeys(key.partition(".")[0] for key in left))
+        _log.warning("%s: does not fit %d of %d weights, which begin untrained: %s", path, len(left), len(own), parts)
+    return fitting, f"weights {weights_sha256(given)[:16]}", samples_behind(content.get("training", {}))
 
 
 def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int | float], str]:

@@ -10,9 +10,10 @@ import sys
 from pathlib import Path
 
 from msgs.command_line import EXIT_BAD_INPUT, EXIT_INTERRUPTED, exit_code
+from msgs.settings import read_text
 from trainer import evaluate_command, results, score_command
 from trainer.arguments import count, positive, share, whole
-from trainer.config import ConfigError, RenderingError, load_config
+from trainer.config import ConfigError, RenderingError, load_config, parse_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
 
@@ -20,10 +21,10 @@ EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
 def _train(arguments: argparse.Namespace) -> None:
     from trainer.train import run_training
 
-    config = load_config(arguments.config)
+    text = read_text(arguments.config, ConfigError)
     run_training(
-        config,
-        arguments.config.read_text(encoding="utf-8"),
+        parse_config(text, str(arguments.config)),
+        text,
         arguments.out,
         budget_s=None if arguments.budget_minutes is None else 60.0 * arguments.budget_minutes,
         resume=arguments.resume,

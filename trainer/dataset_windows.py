@@ -23,7 +23,7 @@ from trainer.data import DENSE_STRIDE, Sampler, TrainingBatch, training_batch
 TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
 TRACK_ZOOM = (0.75, 1.33)
-ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame when the acquire stage sees it
+ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame, 16:9, when the acquire stage sees it
 VISIBLE_MIN = 0.35  # least share of the box inside the window for the target to be trained on
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ class DatasetSampler:
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None and box is not None:
             self._label(out, frame, chosen, box, to_window)
-        for k, other in enumerate(boxes):
+        for k, other in enumerate([*boxes, *frame.undistorted_boxes_xyxy_px(frame_wh, frame.unlisted)]):
             if other is not None and k != chosen:
                 _mark(out.others[0], other, to_window)
         return out
@@ -143,7 +143,9 @@ def _acquire_square(
     rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array, size_px: int
 ) -> tuple[Array, float]:
     """The same for a window of the reduced frame: at random around the box, or anywhere if there is none."""
-    side = size_px * frame_wh[0] / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
+    # A narrower frame is letterboxed: its height decides how much it is reduced.
+    width = max(frame_wh[0], frame_wh[1] * 16 / 9)
+    side = size_px * width / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
     around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
     low = around - rng.uniform(0.0, 1.0, 2) * side
     return np.where(frame_wh > side, np.clip(low, 0.0, np.maximum(frame_wh - side, 0.0)), low), side

@@ -123,7 +123,8 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
         table_console().print(score_table(evaluation.score))
     names = [path.name for path in files if not path.name.startswith("sequence_")]
     drawn = f"{len(files) - len(names)} sequence_*.png"
-    errors.print(f"written to {arguments.out}: {', '.join([*names, drawn])}", highlight=False, soft_wrap=True)
+    written = f"written to {arguments.out}: {', '.join([*names, drawn])}"
+    errors.print(written, markup=False, highlight=False, soft_wrap=True)
 
 
 def _on_windows(arguments: argparse.Namespace) -> None:

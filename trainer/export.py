@@ -92,6 +92,16 @@ def render_views(config: TrainerConfig, seed: int, samples: int, open_view: Open
     return Views(windows, render_once(open_view(seed + 1, acquire_px, 1.0), max(samples // 2, 16)))
 
 
+def _refuse_without_targets(comparison: Views) -> None:
+    """Raises ConfigError if a stage has windows, but none with a target."""
+    for stage, batches in zip(Views._fields, comparison, strict=True):
+        if batches and not any(batch.present.any() for batch in batches):
+            raise ConfigError(
+                f"INT8 cannot be compared with FP32: none of the held-out windows of the {stage} stage shows a target; "
+                "raise --samples, or give a validation_split with a larger share of images with targets"
+            )
+
+
 def _predict(predict: Predictor, views: Views) -> Measured:
     return Measured(predict_all(predict, views.track) if views.track else None, predict_all(predict, views.acquire))
 
@@ -268,6 +278,7 @@ def export_models(
     say("rendering windows for calibration and comparison")
     calibration = render_views(config, CALIBRATION_SEED, samples, trained_on)
     comparison = render_views(config, COMPARISON_SEED, samples, held_out)
+    _refuse_without_targets(comparison)
 
     unmeasured = float_path.with_suffix(".part")
     try:

@@ -56,7 +56,8 @@ def _checkpoint(path: Path) -> _Subject:
     track_px = track[0] if track else None
     thresholds = {"track": SCORE_THRESHOLD, "acquire": SCORE_THRESHOLD}
     acquire_px = acquire_window_px(config.contract)
-    return _Subject(torch_predictor(model), config.data, _seeds(training), track_px, acquire_px, thresholds, {})
+    rendered = config.data.model_copy(update={"datasets": []})
+    return _Subject(torch_predictor(model), rendered, _seeds(training), track_px, acquire_px, thresholds, {})
 
 
 def _model_file(path: Path, seed: int) -> _Subject:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import takewhile
@@ -283,7 +284,8 @@ def draw_history(history: Sequence[Mapping[str, Any]], path: Path) -> None:
             for key, style in zip(keys, ("-", "--"), strict=True):
                 x = [line["total_samples"] / 1000 for line in lines]
                 label = key if run == history[0]["run"] else None
-                axis.plot(x, [scale * line[key] for line in lines], style, color=f"C{keys.index(key)}", label=label)
+                y = [math.nan if line[key] is None else scale * line[key] for line in lines]
+                axis.plot(x, y, style, color=f"C{keys.index(key)}", label=label)
             axis.axvline(lines[0]["total_samples"] / 1000, color="0.85", linewidth=0.8)
         axis.set(title=title, xlabel="thousand training windows", ylim=(0, None))
         axis.legend(fontsize=7)

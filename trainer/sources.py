@@ -30,6 +30,8 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
             WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invention, view)
         )
         shares.append(1.0 - sum(shares))
+    # Datasets without a validation split leave their shares to the others in proportion.
+    shares = [share / sum(shares) for share in shares]
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
 
 

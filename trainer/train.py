@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from msgs.contract import samples_behind
 from trainer import equations as eq
-from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_sha256, write_atomic
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_to_start_from, write_atomic
 from trainer.config import ConfigError, ScheduleConfig, TrainerConfig, parse_config
 from trainer.data import Feed, Sampler, TrainingBatch, render_once
 from trainer.distributed import Group, joined_group
@@ -161,17 +160,10 @@ class Trainer:
         }
 
     def start_from(self, weights: Path) -> None:
-        """Load another run's weights where name and shape match. Raises ConfigError if none do."""
-        content = load_file(weights)
-        given = content.get("weights", {})
-        self.started_from = f"weights {weights_sha256(given)[:16]}"
-        own = self.model.state_dict()
-        fitting = {key: value for key, value in given.items() if key in own and own[key].shape == value.shape}
-        if not fitting:
-            raise ConfigError(f"{weights}: contains no weights that fit this network")
+        """Load another run's weights where name and shape match, and warn of others. Raises ConfigError if none do."""
+        fitting, self.started_from, self.samples_before = weights_to_start_from(weights, self.model.state_dict())
         for network in (self.model, self.average):
             network.load_state_dict(fitting, strict=False)
-        self.samples_before = samples_behind(content.get("training", {}))
 
     def restore(self, state: dict[str, Any]) -> None:
         """Restore the state of an earlier run with the same network."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
@@ -181,11 +182,11 @@ def _shared(flights: dict[str, set[tuple[str, int]]]) -> int:
 
 def statistics_table(s: dict[str, Any]) -> Table:
     """The statistics as a table, beside the paper's."""
-    table = Table(title=str(s["dataset"]), show_lines=False)
+    table = Table(title=escape(str(s["dataset"])), show_lines=False)
     for column in ("", "dataset", "paper"):
         table.add_column(column)
     for row in _rows(s):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table
 
 

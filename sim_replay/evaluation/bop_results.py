@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame, is_seen
 from sim_replay.score import TargetPose
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
-NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1
+NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1, though not every dataset does
 UNKNOWN_TIME_S = -1.0
 _ROTATION_TOLERANCE = 0.02
 _LARGEST = 1e15  # beyond it, squares and sums exceed what JSON can represent
@@ -138,15 +138,18 @@ def results_name(method: str, dataset: Dataset) -> str:
     return "{}_{}-{}.csv".format(*parts)
 
 
-def write_results(path: Path, judged: Iterable[JudgedFrame]) -> None:
-    """Write every pose, matched ones under their true obj_id (a model-free method names none), others under 0."""
+def write_results(path: Path, judged: Sequence[JudgedFrame]) -> None:
+    """Write every pose, matched ones under their true obj_id (a model-free method names none), others under 0, or a
+    negative number if an object has that one."""
+    there = {target.object_id for frame in judged for target in (*frame.picture.targets, *frame.picture.unlisted)}
+    no_object = NO_OBJECT if NO_OBJECT not in there else min(there) - 1
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for frame in judged:
             time_s = UNKNOWN_TIME_S if frame.time_ms is None else frame.time_ms * 1e-3
             found = [(m.truth.object_id, m.estimate) for m in frame.matches if m.estimate is not None]
-            for object_id, pose in [*found, *((NO_OBJECT, pose) for pose in frame.false_poses)]:
+            for object_id, pose in [*found, *((no_object, pose) for pose in frame.false_poses)]:
                 model = frame.picture.scene.models.of(object_id)
                 R = pose.R_cam_target @ model.R_body_model
                 t_mm = (pose.t_cam_target_m + pose.R_cam_target @ model.t_body_model_m) * MM_PER_M

@@ -19,7 +19,8 @@ from sim_replay.datasets import DatasetFrame
 
 PEAK_LEAST = 0.08  # below it are the noise peaks
 PEAKS_MOST = 8
-ON_TARGET, OFF_TARGET = 0.2, 0.05  # intersection over union with a truth's box; in between it counts as neither
+# Intersection over union with a true box. In between it counts as neither, nor on an aircraft that is not to be found.
+ON_TARGET, OFF_TARGET = 0.2, 0.05
 
 
 class Candidate(NamedTuple):
@@ -43,8 +44,12 @@ def candidates(
     model.warm_up()
     for picture in pictures:
         frame = Frame(FrameMeta(picture.image_id, 0, 0), picture.undistorted_bgr(), picture.K)
-        boxes = picture.undistorted_boxes_xyxy_px((frame.image_bgr.shape[1], frame.image_bgr.shape[0]))
-        yield from _in_frame(estimator, frame, [box for box in boxes if box is not None])
+        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        truth_boxes, other_boxes = (
+            [box for box in picture.undistorted_boxes_xyxy_px(frame_wh, targets) if box is not None]
+            for targets in (picture.targets, picture.unlisted)
+        )
+        yield from _in_frame(estimator, frame, truth_boxes, other_boxes)
         on_frame()
 
 
@@ -55,24 +60,30 @@ def _bare(model: Model) -> Model:
     return model
 
 
-def _in_frame(estimator: Estimator, frame: Frame, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:
+def _in_frame(
+    estimator: Estimator, frame: Frame, truth_boxes: Sequence[Array], other_boxes: Sequence[Array]
+) -> Iterator[Candidate]:
     contract = estimator.model.contract
     frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
     aspect = pixel_aspect(frame.K)
     whole_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, aspect=aspect)[1]
     for found in estimator.anywhere(frame, (), Counter()):
-        yield from _labelled(found, whole_map, truth_boxes)
+        yield from _labelled(found, whole_map, truth_boxes, other_boxes)
         if contract.track_size_wh is None:
             continue
         scale, size_wh = contract.track_window_scale, contract.track_size_wh
         window = window_around(found.box_xyxy_px, scale, size_wh, frame_wh, aspect=aspect)
         for seen in estimator.track(frame, [found.box_xyxy_px]):
             if seen is not None:
-                yield from _labelled(seen, window.pixel_map(size_wh), truth_boxes)
+                yield from _labelled(seen, window.pixel_map(size_wh), truth_boxes, other_boxes)
 
 
-def _labelled(found: Estimate, pixel_map: PixelMap, truth_boxes: Sequence[Array]) -> Iterator[Candidate]:
-    lies_on = max((iou(found.box_xyxy_px, box) for box in truth_boxes), default=0.0)
-    if lies_on >= ON_TARGET or lies_on <= OFF_TARGET:
+def _labelled(
+    found: Estimate, pixel_map: PixelMap, truth_boxes: Sequence[Array], other_boxes: Sequence[Array]
+) -> Iterator[Candidate]:
+    lies_on, lies_on_other = (
+        max((iou(found.box_xyxy_px, box) for box in boxes), default=0.0) for boxes in (truth_boxes, other_boxes)
+    )
+    if lies_on >= ON_TARGET or max(lies_on, lies_on_other) <= OFF_TARGET:
         size_px = (found.box_xyxy_px[2:] - found.box_xyxy_px[:2]) * np.array(pixel_map.scale_xy)
         yield Candidate(found.stage, found.score, shown_size_px(size_px, pixel_map), lies_on >= ON_TARGET)

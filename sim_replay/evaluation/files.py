@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def write_files(
 
 def frame_record(frame: JudgedFrame, root: Path) -> dict[str, Any]:
     """One line of frames.jsonl: the image, each true target with its match, and the poses that belong to no target."""
-    path = frame.picture.image_path
+    path, root = (Path(os.path.abspath(one)) for one in (frame.picture.image_path, root))
     return {
         "scene_id": frame.picture.scene_id,
         "im_id": frame.picture.image_id,

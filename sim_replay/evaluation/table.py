@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console, Group
+from rich.markup import escape
 from rich.table import Table
 
 WIDTH = 130  # of tables that are not written to a terminal
@@ -57,7 +58,7 @@ def score_table(score: dict[str, Any]) -> Group:
         caption += f"\n{consistency_line(score['consistency'])}"
     if score.get("filtering") is not None:
         caption += f"\n{_filtering(score['filtering'])}"
-    table = Table("", title=title, caption=caption, title_justify="left", caption_justify="left")
+    table = Table("", title=escape(title), caption=caption, title_justify="left", caption_justify="left")
     groups = {"all": overall}
     groups |= {f"{band} m": group for band, group in score["by_range"].items() if group["targets"]}
     for name in groups:
@@ -69,7 +70,7 @@ def score_table(score: dict[str, Any]) -> Group:
     for header in _AIRFRAME_COLUMNS.values():
         airframes.add_column(header, justify="right", no_wrap=True)
     for name, group in score["by_airframe"].items():
-        airframes.add_row(name, *(_ROWS[column](group) for column in _AIRFRAME_COLUMNS))
+        airframes.add_row(escape(name), *(_ROWS[column](group) for column in _AIRFRAME_COLUMNS))
     return Group(table, airframes)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import Literal
@@ -27,7 +27,7 @@ from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
 from msgs.geometry import so3_log
 from sim_replay.bop import BopFrame, BopScene
-from sim_replay.datasets import DatasetFrame
+from sim_replay.datasets import DatasetFrame, read_undistorted_bgr
 from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import TargetPose
@@ -49,6 +49,7 @@ class _Sequence:
     in_ned: bool
     places: dict[int, tuple[int, BopFrame]]  # by image id: its position among the scene's images
     frames: list[int]  # frame number in the sequence of each of them
+    unflown: Iterator[BopFrame]  # the scene's frames that have an image, from the first that the tracker has not seen
     errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
@@ -58,20 +59,30 @@ class _Sequence:
     def of(cls, scene: BopScene, own_ship: OwnShipTold) -> _Sequence:
         """Raises InputError on a sequence.toml without a usable fps."""
         places = {frame.image_id: (k, frame) for k, frame in enumerate(scene.frames)}
+        unflown = iter(scene.pictured)
         errors = OwnShipErrors.of_flight(scene.folder.name) if own_ship == "usual" else None
         path = scene.folder / "sequence.toml"
         if not path.is_file():
-            return cls(scene, DEFAULT_FPS, False, places, _by_number(list(places)), errors)
+            return cls(scene, DEFAULT_FPS, False, places, _by_number(list(places)), unflown, errors)
         try:
             fps = float(tomllib.loads(path.read_text(encoding="utf-8"))["fps"])
         except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: 'fps' is not a number that can be read") from error
         if not (np.isfinite(fps) and fps > 0):
             raise InputError(f"{path}: 'fps' is not above zero")
-        return cls(scene, fps, True, places, frames_of(scene.folder, list(places)), errors)
+        return cls(scene, fps, True, places, frames_of(scene.folder, list(places)), unflown, errors)
 
-    def capture_ns(self, image_id: int) -> int:
-        return FIRST_FRAME_NS + round(self.frames[self.places[image_id][0]] * 1e9 / self.fps)
+    def until(self, image_id: int) -> Iterator[BopFrame]:
+        """The unflown frames up to this image: the camera saw those that are not evaluated, too."""
+        for frame in self.unflown:
+            yield frame
+            if frame.image_id == image_id:
+                return
+
+    def meta(self, image_id: int) -> FrameMeta:
+        number = self.frames[self.places[image_id][0]]
+        capture_ns = FIRST_FRAME_NS + round(number * 1e9 / self.fps)
+        return FrameMeta(number, capture_ns, capture_ns)
 
     def own_ship(self, image_id: int) -> OwnShip | None:
         """The camera as a vehicle of its own: its body axes are the camera's, the mount is the identity."""
@@ -84,7 +95,7 @@ class _Sequence:
             turning_radps, velocity_mps = self._rates(k)
             R_ned_cam = self.errors.attitude(R_ned_cam, turning_radps)
             t_ned_cam_m = self.errors.position(t_ned_cam_m, velocity_mps)
-        return OwnShip(self.capture_ns(image_id), R_ned_cam, t_ned_cam_m, None, None)
+        return OwnShip(self.meta(image_id).capture_ns, R_ned_cam, t_ned_cam_m, None, None)
 
     def _rates(self, k: int) -> tuple[Array, Array]:
         """Angular rate [3], rad/s, and velocity [3], m/s, both in ned, between the frames before and after the k-th."""
@@ -117,6 +128,8 @@ def _place(frame: BopFrame) -> tuple[Array, Array] | None:
 def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
     """What the daemon would send for each image if it flew through its scene; images must come in their order.
 
+    It also sees the scene's images in between, which the dataset may not ask to evaluate.
+
     Raises InputError if the model does not run.
     """
     estimator = Estimator(model, _SETTINGS.max_targets)
@@ -126,23 +139,29 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
     def answer(index: int, picture: DatasetFrame) -> Answer:
         if not current or current[-1].scene is not picture.scene:
             current[:] = [_Sequence.of(picture.scene, own_ship)]
-        sequence = current[-1]
-        image_bgr = picture.undistorted_bgr()
-        capture_ns = sequence.capture_ns(picture.image_id)
-        frame = Frame(FrameMeta(index, capture_ns, capture_ns), image_bgr, picture.K)
-        size_wh = (image_bgr.shape[1], image_bgr.shape[0])
-        told_own_ship = sequence.own_ship(picture.image_id)
-        started_ns = time.monotonic_ns()
-        expected = sequence.tracker.predict(capture_ns, told_own_ship, picture.K, size_wh)
-        estimates = _estimate(estimator, sequence, frame, expected)
-        tracks = sequence.tracker.update(capture_ns, estimates, told_own_ship, picture.K, size_wh)
-        time_ms = (time.monotonic_ns() - started_ns) * 1e-6
-        report = Report(frame.meta, picture.K, size_wh, tracks, told_own_ship, model.sha256)
-        told = sendable(report, capture_ns, _MAX_AGE_MS)
+        for shown in current[-1].until(picture.image_id):
+            report, estimates, time_ms = _flown(estimator, current[-1], shown, model.sha256)
+        told = sendable(report, report.meta.capture_ns, _MAX_AGE_MS)
         known = [rotation_known(track) for track in told]
         return Answer(_poses(index, told, known), time_ms, _poses(index, estimates, [True] * len(estimates)))
 
     return answer
+
+
+def _flown(
+    estimator: Estimator, sequence: _Sequence, shown: BopFrame, model_sha256: str
+) -> tuple[Report, list[Estimate], float]:
+    """The tracker's report on the sequence's next frame, the estimates that it was given, and how long it took, ms."""
+    image_bgr = read_undistorted_bgr(sequence.scene.image_path(shown), shown.K, shown.distortion)
+    frame = Frame(sequence.meta(shown.image_id), image_bgr, shown.K)
+    size_wh = (image_bgr.shape[1], image_bgr.shape[0])
+    capture_ns, own_ship = frame.meta.capture_ns, sequence.own_ship(shown.image_id)
+    started_ns = time.monotonic_ns()
+    expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
+    estimates = _estimate(estimator, sequence, frame, expected)
+    tracks = sequence.tracker.update(capture_ns, estimates, own_ship, shown.K, size_wh)
+    time_ms = (time.monotonic_ns() - started_ns) * 1e-6
+    return Report(frame.meta, shown.K, size_wh, tracks, own_ship, model_sha256), estimates, time_ms
 
 
 def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) -> tuple[TargetPose, ...]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,12 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
-from sim_replay.evaluation.bop_results import file_answers
+from sim_replay.evaluation.bop_results import file_answers, write_results
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
-from sim_replay.evaluation.table import consistency_line
+from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
 from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
 
@@ -79,6 +82,25 @@ def test_who_names_no_object_or_another_one_fills_what_is_left_by_score(root: Pa
     assert len(frames[0].false_poses) == 1
 
 
+def test_a_false_pose_is_not_written_as_one_of_an_object_that_a_dataset_numbers_0(root: Path) -> None:
+    """Read again, the surest pose would have taken the place of a right one."""
+    for path in (root / "test" / "000000" / "scene_gt.json", root / "models" / "models_info.json"):
+        path.write_text(path.read_text().replace('"obj_id": 1', '"obj_id": 0').replace('{"1":', '{"0":'))
+    dataset = open_dataset(root)
+    scores = {LEFT: 0.5, RIGHT: 0.5, 40.0: 0.9}
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        told = said(*scores if picture.image_id == 0 else ())(index, picture)
+        return Answer(tuple(replace(pose, score=scores[pose.t_cam_target_m[0]]) for pose in told.poses), None)
+
+    pictures = dataset.labelled_frames()
+    path = root.parent / "m_hawks-test.csv"
+    write_results(path, judge_frames(pictures, dataset.models, answer))
+    again = judge_frames(pictures, dataset.models, file_answers(path, dataset))
+    assert turns_deg(again) == [0, 0]
+    assert [pose.score for pose in again[0].false_poses] == [0.9]
+
+
 def test_poses_in_an_empty_picture_stay_false_alarms(root: Path) -> None:
     dataset = open_dataset(root)
     score = score_of(dataset, {}, judged(root, [(1, 0.9, LEFT, True)], picture=1))
@@ -122,6 +144,19 @@ def test_a_picture_that_shows_but_what_is_not_asked_for_is_not_empty(root: Path)
         overall = score_of(dataset, {}, frames)["overall"]
         assert overall["false_poses"] == 1
         assert overall["false_positives_per_1000"] == false_alarms
+
+
+def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
+    """Rich takes brackets for markup: it had left them out, and refused a closing one with a traceback."""
+    root = root.rename(root.with_name("hawks [v2]"))
+    write_json(root / "models" / "models_info.json", {"1": {"diameter": 6000.0, "name": "cub [/red]"}})
+    dataset = open_dataset(root)
+    console = Console(file=io.StringIO(), width=130)
+    console.print(score_table(score_of(dataset, {"file": "m [a].csv"}, judged(root, []))))
+    console.print(statistics_table(dataset_statistics(root)))
+    shown = console.file.getvalue()
+    assert "m [a].csv on hawks [v2], 2 frames" in shown
+    assert shown.count("cub [/red]") == 2
 
 
 def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:

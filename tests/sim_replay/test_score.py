@@ -135,6 +135,14 @@ def test_a_pose_at_the_camera_itself_finds_no_target(t_m: list[float]) -> None:
     assert len(false_poses) == 1
 
 
+def test_a_large_aircraft_nearby_is_found() -> None:
+    """A tanker of 40 m at 30 m: nearer than its span, but not around the camera."""
+    tanker = replace(truth(0, 30.0), diameter_m=40.0)
+    matches, false_poses = match_poses([tanker], [estimate(tanker)])
+    assert matches[0].translation_error_m == 0.0
+    assert false_poses == []
+
+
 def test_two_targets_each_get_their_own_pose_and_a_duplicate_is_false() -> None:
     left, right = truth(0, x_m=-5.0), truth(0, x_m=5.0)
     poses = [estimate(right), estimate(left), estimate(right, stretched=1.2)]

@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edge.errors import InputError
+from edge.estimator.pace import Pace
 from edge.links import outgoing
 from sim_replay import metrics
 from sim_replay.datasets import open_dataset
@@ -162,6 +163,30 @@ def test_frames_left_out_of_a_scene_are_time_that_passed(
     errors_m = [frame.matches[0].translation_error_m for frame in results]
     assert all(error_m is not None and error_m < 3.0 for error_m in errors_m[3:]), errors_m
     assert told(results)[8:] == [True] * 6
+
+
+def test_the_tracker_sees_the_images_between_those_that_are_evaluated_too(
+    tmp_path: Path, dark_spot_model: Path
+) -> None:
+    """BOP's lists of targets leave out most images of a sequence; on every fourth alone no track is confirmed."""
+    write_scene(tmp_path / "data" / "test" / "000000", [0.5] * 8)
+    names = [{"scene_id": 0, "im_id": image, "obj_id": 1, "inst_count": 1} for image in (3, 7)]
+    (tmp_path / "data" / "test_targets_bop19.json").write_text(json.dumps(names))
+    results = flown(tmp_path / "data", dark_spot_model)
+    assert [frame.picture.image_id for frame in results] == [3, 7]
+    assert told(results) == [True, True]
+
+
+def test_where_frames_are_missing_the_camera_is_as_fast_as_elsewhere(
+    tmp_path: Path, dark_spot_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon evaluates each target twice if the camera is slow, not where frames were dropped."""
+    unhurried, noted = Pace.unhurried, []
+    monkeypatch.setattr(Pace, "unhurried", lambda pace, meta: noted.append(unhurried(pace, meta)) or noted[-1])
+    numbers = [*range(5), 11, 14]
+    write_gapped_scene(tmp_path / "data" / "test" / "000000", numbers, numbers)
+    flown(tmp_path / "data", dark_spot_model)
+    assert noted == [False] * len(numbers)
 
 
 @pytest.mark.parametrize("apart", [1, 12])

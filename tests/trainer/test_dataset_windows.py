@@ -114,8 +114,8 @@ def test_of_a_camera_whose_pixels_are_not_square_the_windows_are(tmp_path: Path,
     with SceneWriter(tmp_path / "train" / "000000", jpeg_quality=98) as writer:
         for image_id, centre in enumerate([(320, 180), (200, 120), (450, 240)]):
             image, mask = np.full((HEIGHT, WIDTH, 3), 128, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
-            cv2.ellipse(image, centre, (20, 10), 0, 0, 360, DOT_BGR, -1)
-            cv2.ellipse(mask, centre, (20, 10), 0, 0, 360, 255, -1)
+            cv2.ellipse(image, centre, (30, 15), 0, 0, 360, DOT_BGR, -1)
+            cv2.ellipse(mask, centre, (30, 15), 0, 0, 360, 255, -1)
             t = 260.0 * np.linalg.solve(squeezed_K, [*centre, 1.0])
             target = BopTarget(1, np.eye(3), t, box_of_mask(mask > 0), None, int((mask > 0).sum()))
             writer.add(BopFrame(image_id, squeezed_K, (target,)), image)

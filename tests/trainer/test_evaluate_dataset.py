@@ -154,6 +154,17 @@ def test_known_errors_score_their_known_values(
         assert cv2.imread(str(tmp_path / "out" / name)) is not None
 
 
+def test_images_are_named_from_the_dataset_on_wherever_it_is_given_from(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = write_results(tmp_path / "truth_plane-test.csv", [(0, *true_pose(0))])
+    for folder, told in ((dataset.parent, dataset.name), (dataset / "test", "000002")):
+        monkeypatch.chdir(folder)
+        evaluated(capsys, "--results", results, "--dataset", told, "--out", tmp_path / "out")
+        first = json.loads((tmp_path / "out" / "frames.jsonl").read_text().splitlines()[0])
+        assert first["image"] == "test/000002/rgb/000000.png"
+
+
 def test_the_results_file_that_is_written_scores_the_same(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -71,6 +72,11 @@ def test_a_rate_that_a_run_could_not_measure_stays_unknown(tmp_path: Path) -> No
     log = folder / "log.jsonl"
     log.write_text(log.read_text().replace('"windows": 256', '"windows": 256, "false_alarms": null'))
     assert gathered([], [folder])[0]["false_alarms"] is None
+    log.write_text(re.sub(r'("E_r_mean_deg"|"pose_10deg_5pct"): [\d.]+', r"\1: null", log.read_text()))
+    history = gathered([], [folder])
+    assert history[0]["E_r_mean_deg"] is None
+    draw_history(history, tmp_path / "learning.png")
+    assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_run_is_added_to_the_history_and_one_that_went_on_takes_its_place_and_all_after_it(tmp_path: Path) -> None:

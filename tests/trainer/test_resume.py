@@ -80,12 +80,18 @@ def test_the_weights_file_is_the_averaged_network_in_half_precision(whole: tuple
         torch.testing.assert_close(value, averaged[name], rtol=1e-3, atol=1e-4)
 
 
-def test_weights_of_another_run_start_a_network_with_another_head(whole: tuple[Path, Trainer], tmp_path: Path) -> None:
+def test_weights_of_another_run_start_a_network_with_another_head(
+    whole: tuple[Path, Trainer], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     out, earlier = whole
     text = tiny.TOML.replace("hypotheses = 4", "hypotheses = 2")
     started = Trainer(parse_config(text, "two.toml"), torch.device("cpu"))
     untouched = started.model.head_rot.weight.clone()
     started.start_from(out / "weights.pt")
+    assert caplog.messages[0].endswith("weights, which begin untrained: head_rot, head_hypothesis, head_refine")
+    caplog.clear()
+    Trainer(tiny.config(), torch.device("cpu")).start_from(out / "weights.pt")
+    assert caplog.messages == []  # all fit
     kept, given = started.model.state_dict(), earlier.average.state_dict()
     # The last is of a head that only training has, and that a run which goes on must not learn anew.
     for name in ("neck.fuse.0.weight", "head_dense.1.weight"):

@@ -186,6 +186,18 @@ def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_s
     assert [(one.stage, one.is_target) for one in seen] == [("acquire", True), ("track", True)]
 
 
+def test_a_peak_on_an_aircraft_that_the_list_of_targets_leaves_out_is_neither_right_nor_wrong(
+    tmp_path: Path, dark_spot_model: Path
+) -> None:
+    write_scene(tmp_path / "dataset" / "test" / "000000", spots=2, specks=1)
+    names = [{"scene_id": 0, "im_id": image, "obj_id": image, "inst_count": 1} for image in (1, 0, 2)]
+    (tmp_path / "dataset" / "test_targets_bop19.json").write_text(json.dumps(names))
+    pictures = open_dataset(tmp_path / "dataset", "test").boxed_frames()
+    assert [len(picture.targets) for picture in pictures] == [0, 1, 0]
+    seen = list(candidates(load_model(dark_spot_model, threads=1), pictures))
+    assert [one.is_target for one in seen] == [True, True, False, False]  # both stages; the speck is none
+
+
 def test_what_tells_no_targets_or_not_where_they_are_is_named_and_the_file_left(
     tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

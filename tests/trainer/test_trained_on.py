@@ -91,6 +91,15 @@ def test_where_every_window_shows_two_aircraft_int8_is_held_against_fp32_by_the_
     assert "track_pose_10deg_5pct" not in contract.metrics
 
 
+def test_an_export_whose_held_out_windows_show_no_target_says_so(tmp_path: Path) -> None:
+    """A validation split with a target in one of hundreds of images may give no window with it."""
+    for split, beside_px in (("train", (0,)), ("val", ())):
+        discs(tmp_path / "own" / split / "000001", 1500.0, (200.0, 260.0), beside_px)
+    with pytest.raises(ConfigError, match="none of the held-out windows of the track stage shows a target"):
+        exported(tmp_path, on_dataset(tmp_path / "own"))
+    assert not list((tmp_path / "models").iterdir())
+
+
 @pytest.mark.parametrize(("empty", "purpose"), [("train", "train"), ("val", "validate")])
 def test_pictures_that_show_no_target_are_refused_before_the_first_step(
     tmp_path: Path, empty: str, purpose: str

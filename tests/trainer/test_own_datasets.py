@@ -1,0 +1,77 @@
+"""Training on one's own datasets: odd files, cameras and splits that must change neither windows nor weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tiny
+
+from edge.estimator.window import fit_frame
+from sim_replay.bop import BopFrame, BopTarget, SceneWriter
+from tests.trainer.test_trained_on import discs, on_dataset
+from trainer.checkpoint import load_model, save_weights
+from trainer.cli import main
+from trainer.config import DatasetSource, parse_config
+from trainer.dataset_windows import DatasetSampler
+from trainer.export import stage_sampler
+from trainer.held_out import Request, evaluate_file
+
+
+def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
+    """Some editors put one before UTF-8; it had gone into the checkpoint, which then was not valid TOML."""
+    for split in ("train", "val"):
+        discs(tmp_path / "own" / split / "000001", 1500.0, (200.0, 260.0))
+    config, run = tmp_path / "own.toml", tmp_path / "run"
+    config.write_text("\ufeff" + on_dataset(tmp_path / "own"), encoding="utf-8")
+    command = ["train", "--config", str(config), "--out", str(run)]
+    assert main([*command, "--samples", "4"]) == 0
+    assert load_model(run)[2]["samples"] == 4
+    assert main([*command, "--samples", "8", "--resume"]) == 0
+    assert load_model(run)[2]["samples"] == 8
+
+
+def test_an_aircraft_that_the_list_of_targets_leaves_out_is_not_learnt_as_background(tmp_path: Path) -> None:
+    """Of two aircraft in each picture the list has one, which is in the window or not; the other is never judged."""
+    discs(tmp_path / "test" / "000001", 1500.0, (200.0, 260.0), beside_px=(-8, 8))
+    names = [{"scene_id": 1, "im_id": image, "obj_id": 1, "inst_count": 1} for image in (0, 1)]
+    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(names))
+    batch = DatasetSampler(tmp_path, "test", 1, 64, 0.0).batch(0, 8)
+    assert batch.others.any(axis=(1, 2)).all()
+
+
+def test_of_an_upright_picture_the_windows_are_reduced_as_the_daemon_reduces_it(tmp_path: Path) -> None:
+    """It is letterboxed, so its height decides: 448 of 640 rows are left, where 768 of 360 columns would enlarge it."""
+    K = np.array([[1500.0, 0, 180], [0, 1500, 320], [0, 0, 1]])
+    image = np.full((640, 360, 3), 128, np.uint8)
+    box = np.array([169.5, 309.5, 190.5, 330.5])
+    with SceneWriter(tmp_path / "train" / "000001") as writer:
+        writer.add(BopFrame(0, K, (BopTarget(1, np.eye(3), np.array([0, 0, 260.0]), box, box, 441, 441),)), image)
+    batch = DatasetSampler(tmp_path, "train", 1, 64, 1.0).batch(0, 60)
+    scales = batch.K[:, 0, 0] / K[0, 0]
+    flown = fit_frame(cv2.imread(str(tmp_path / "train" / "000001" / "rgb" / "000000.jpg")), (768, 448), "letterbox")[1]
+    assert scales.min() < flown.scale_xy[0] < scales.max()
+
+
+def test_datasets_without_a_validation_split_leave_their_shares_to_the_others_in_proportion(tmp_path: Path) -> None:
+    """Of 0.8, 0.1 and 0.1 the first has none: half of what is validated on is of each other, not nearly all of one."""
+    depths_m = {"near": 100.0, "far": 300.0}
+    for name, depth_m in {**depths_m, "most": 200.0}.items():
+        for split in ("train", "val"):
+            discs(tmp_path / name / split / "000001", 1500.0, (depth_m,))
+    sources = [DatasetSource(path=tmp_path / "most", share=0.8)]
+    sources += [DatasetSource(path=tmp_path / name, share=0.1, validation_split="val") for name in depths_m]
+    data = tiny.config().data.model_copy(update={"datasets": sources})
+    Z_m = stage_sampler(data, 77, 64, 0.0)().batch(0, 20).t_cam_target_m[:, 2]
+    assert [int(np.sum(Z_m == depth_m)) for depth_m in depths_m.values()] == [10, 10]
+
+
+def test_rendered_windows_are_rendered_for_a_checkpoint_of_a_dataset_that_is_no_longer_there(tmp_path: Path) -> None:
+    text = on_dataset(tmp_path / "moved")
+    assert parse_config(text, "own.toml").data.rendered_share == 0.0
+    save_weights(tmp_path / "run" / "weights.pt", tiny.network(), text, {"seed": 3, "samples": 0, "commit": "unknown"})
+    measured = evaluate_file(Request(tmp_path / "run", samples=16, seed=77, stage="track"))
+    assert measured["windows"] == pytest.approx(16.0)
