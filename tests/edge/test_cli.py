@@ -73,6 +73,22 @@ def test_a_certificate_of_another_day_is_told_by_check_and_keeps_nobody_from_fly
     assert "captured=" in flown.stderr.splitlines()[-1]
 
 
+def test_a_certificate_of_another_day_for_the_camera_is_told_by_check(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    _, ends = redate(tmp_path, "uav1", begins_days=-9, ends_days=-2)
+    text = (
+        '[camera]\ntype = "zenoh"\ntopic = "nose/image"\nconnect = "tls/127.0.0.1:1"\n'
+        'tls = { root_ca = "ca.pem", certificate = "uav1.pem", private_key = "uav1.key" }\n'
+        "intrinsics = { fx = 900, fy = 900, cx = 320, cy = 240, width = 640, height = 480 }\n"
+        f'[model]\npath = "{toy_model}"\n'
+    )
+    sentence = f"{tmp_path / 'uav1.pem'} expired on {ends:%Y-%m-%d}; today is "
+    assert f"config.toml:5: [camera] tls: {sentence}" in refusal(cli, tmp_path, text + OFF, "check")
+
+
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_model_that_does_not_do_is_named(cli: Cli, tmp_path: Path, text: str, toy_model: Path, command: str) -> None:
     corrupt, strange, single = (tmp_path / f"{name}.onnx" for name in ("corrupt", "strange", "single"))
