@@ -235,6 +235,24 @@ def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: P
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.parametrize("encoding", ["iso8859-1", "ascii"])
+def test_a_terminal_without_our_characters_gets_the_others(
+    cli: Cli, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", encoding)
+    folder = tmp_path / "полёт"
+    folder.mkdir()
+    (folder / "config.toml").write_text(text + OFF)
+    checked = cli("check", "--config", folder / "config.toml")
+    assert (checked.returncode, checked.stderr) == (0, "")
+    assert f"{tmp_path}/\\u043f" in checked.stdout
+    (folder / "config.toml").write_text(text.replace("toy.onnx", "none.onnx") + OFF)
+    looked = cli("doctor", "--config", folder / "config.toml")
+    assert (looked.returncode, looked.stderr) == (1, "")
+    assert "\\u2192 set [model] path to a file" in looked.stdout
+    assert looked.stdout.endswith("1 failed\n")
+
+
 def test_nobody_is_told_of_a_flight_by_the_library_that_runs_the_network(
     cli: Cli, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
