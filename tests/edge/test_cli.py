@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -251,6 +252,17 @@ def test_a_terminal_without_our_characters_gets_the_others(
     assert (looked.returncode, looked.stderr) == (1, "")
     assert "\\u2192 set [model] path to a file" in looked.stdout
     assert looked.stdout.endswith("1 failed\n")
+
+
+def test_a_signing_key_that_the_disk_has_no_room_for_leaves_no_empty_file(tmp_path: Path) -> None:
+    keygen = f"{shlex.quote(sys.executable)} -m edge.cli keygen --out mavlink.key"
+    for limit, code, words in (
+        ("ulimit -f 0", 2, "mavlink.key cannot be written: File too large\n"),
+        ("true", 0, ""),
+    ):
+        done = subprocess.run(["sh", "-c", f"{limit}; exec {keygen}"], cwd=tmp_path, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (code, words)
+    assert (tmp_path / "mavlink.key").stat().st_size == 32
 
 
 def test_nobody_is_told_of_a_flight_by_the_library_that_runs_the_network(
