@@ -112,8 +112,10 @@ def test_status_refuses_what_is_no_address(cli: Cli) -> None:
 
 @pytest.mark.usefixtures("daemon")
 def test_another_vehicle_s_name_is_not_answered(cli: Cli, ports: tuple[int, int]) -> None:
+    """As of a daemon that was given another name and not restarted: it is there all the same."""
     asked = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}", "--vehicle", "merlin")
     assert asked.returncode == 1
+    assert asked.stdout.startswith(f"kestrel and not merlin answers at tcp/127.0.0.1:{ports[0]}: ")
 
 
 @pytest.mark.usefixtures("daemon")
