@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+import pwd
 import socket
 import subprocess
 import sys
@@ -230,6 +232,11 @@ print(disk_finding(Path("{path}"), 0, from_start=True).line())
 """
 
 
+def nobody() -> str:
+    """Who looks in `looked_at_by_nobody`."""
+    return pwd.getpwuid(os.geteuid() or 65534).pw_name
+
+
 def looked_at_by_nobody(folder: Path, path: str) -> str:
     """What is said of `path`, from `folder`, as a device and as a folder for recordings."""
     folder.chmod(0o755)
@@ -238,13 +245,15 @@ def looked_at_by_nobody(folder: Path, path: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("mode", "words"), [(0o000, "usermod -aG video"), (0o444, "is not readable and writable"), (0o666, "may be used")]
+    ("mode", "words"),
+    [(0o000, "usermod -aG video {user},"), (0o444, "is not readable and writable"), (0o666, "may be used")],
 )
-def test_a_device_without_permission_names_the_group(tmp_path: Path, mode: int, words: str) -> None:
+def test_a_device_without_permission_names_the_group_and_who_lacks_it(tmp_path: Path, mode: int, words: str) -> None:
+    """With `sudo -u uavpose`, $USER of the person who follows the advice is another."""
     device = tmp_path / "video0"
     device.touch()
     device.chmod(mode)
-    assert words in looked_at_by_nobody(tmp_path, "video0")
+    assert words.format(user=nobody()) in looked_at_by_nobody(tmp_path, "video0")
 
 
 @pytest.mark.parametrize("path", ["home/rec", "home/rec/deep", "home/none", "link"])
@@ -259,14 +268,17 @@ def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_as_forbidden(tmp_
     assert f"WRONG  disk         {path} cannot be written by this user" in said
 
 
-@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, "cannot be"), (0o333, "cannot be")])
+ADVICE_FOLDER = "`sudo install -d -o {user} 'my rec'`"
+
+
+@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, ADVICE_FOLDER), (0o333, ADVICE_FOLDER)])
 def test_a_recorder_s_folder_must_be_one_to_write_and_to_look_into(tmp_path: Path, mode: int, words: str) -> None:
-    folder = tmp_path / "rec"
+    folder = tmp_path / "my rec"
     folder.mkdir()
     folder.chmod(mode)
-    said = looked_at_by_nobody(tmp_path, "rec")
+    said = looked_at_by_nobody(tmp_path, "my rec")
     folder.chmod(0o755)
-    assert words in said
+    assert words.format(user=nobody()) in said
 
 
 ON_A_READ_ONLY_DISK = 'mount -t tmpfs -o ro tmpfs "$1" && exec "$2" -c "$3" "$1"'
