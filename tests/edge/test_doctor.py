@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import pwd
 import socket
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
 from edge.doctor import camera_as_told
 from edge.doctor_links import signing_finding
@@ -80,21 +82,47 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
         taken.listen()
         text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
         text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0", "tcpout:autopilot.invalid:5760"]\n'
+        text += f"[health]\nprometheus_port = {taken.getsockname()[1]}\n"
         code, found = findings(cli, tmp_path, text)
     assert code == 1
     assert "cannot listen on" in found["zenoh"]["says"]
+    assert "stop the program" in found["zenoh"]["advice"]
     assert "no heartbeat" in found["mavlink"]["says"]
     assert "host 'autopilot.invalid' cannot be resolved" in found["host"]["says"]
+    assert "127.0.0.1 cannot be served: Address already in use" in found["prometheus"]["says"]
+    assert "stop the program" in found["prometheus"]["advice"]
 
 
-def test_a_name_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
+@pytest.mark.parametrize(
+    ("host", "said"),
+    [("ground..local", "host 'ground..local' cannot be resolved"), ("192.0.2.1", "Cannot assign requested address")],
+)
+def test_an_address_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
+    cli: Cli, tmp_path: Path, toy_model: Path, host: str, said: str
+) -> None:
+    text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
+    text = text.replace("127.0.0.1", "192.0.2.1") + f'[mavlink]\nendpoints = ["udpin:{host}:14550"]\n'
+    code, found = findings(cli, tmp_path, text)
+    assert code == 1
+    assert said in found["mavlink"]["says"]
+    assert "Cannot assign requested address" in found["zenoh"]["says"]
+    for what in ("mavlink", "zenoh"):
+        assert found[what]["advice"] == "use an address of this computer, or 0.0.0.0 for all of them"
+
+
+def test_a_serial_port_that_another_program_holds_is_not_taken_for_a_silent_autopilot(
     cli: Cli, tmp_path: Path, toy_model: Path
 ) -> None:
     text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
-    code, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["udpin:ground..local:14550"]\n')
-    assert code == 1
-    assert "host 'ground..local' cannot be resolved" in found["mavlink"]["says"]
-    assert found["mavlink"]["advice"] == "use an address of this computer, or 0.0.0.0 for all of them"
+    held, port = pty.openpty()
+    with serial.Serial(os.ttyname(port), exclusive=True):
+        code, found = findings(cli, tmp_path, text + f'[mavlink]\nendpoints = ["serial:{os.ttyname(port)}:57600"]\n')
+    assert (code, found["mavlink"]["says"]) == (1, f"{os.ttyname(port)} is used by another program")
+    assert f"fuser -v {os.ttyname(port)}" in found["mavlink"]["advice"]
+    for descriptor in (held, port):
+        os.close(descriptor)
+    _, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["serial:/dev/null:57600"]\n')
+    assert "serial:/dev/null:57600 does not open" in found["mavlink"]["says"]
 
 
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
