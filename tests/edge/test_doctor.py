@@ -8,24 +8,30 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
 import serial
 
-from edge.doctor import camera_as_told
+from edge.config import load_config
+from edge.doctor import _camera, camera_as_told
 from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.links.signing import timestamp_of
 from edge.status import ask
+from msgs.publish import TopicPublisher
 from sim_replay.faults.rig import can_mount
 from tests.waiting import until
 
 from . import pictures
 from .conftest import Cli
 from .flying import flying, free_port, toml, write_swaying_scene
+from .test_cameras_live import message, router
 from .test_cameras_stream import UdpCamera
 
 
@@ -123,6 +129,29 @@ def test_a_serial_port_that_another_program_holds_is_not_taken_for_a_silent_auto
         os.close(descriptor)
     _, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["serial:/dev/null:57600"]\n')
     assert "serial:/dev/null:57600 does not open" in found["mavlink"]["says"]
+
+
+def test_a_camera_whose_stamps_do_not_advance_has_no_rate(tmp_path: Path) -> None:
+    """As of a driver that stamps in whole seconds."""
+    port, over = pictures.free_port(), threading.Event()
+    intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
+    (tmp_path / "config.toml").write_text(
+        '[camera]\ntype = "zenoh"\ntopic = "nose/image/compressed"\n'
+        f'connect = "tcp/127.0.0.1:{port}"\nintrinsics = {intrinsics}\n'
+    )
+
+    def publish(publisher: TopicPublisher, stamp_ns: int) -> None:
+        index = count()
+        while not over.wait(0.02):
+            publisher.put(message(next(index), stamp_ns=stamp_ns))
+
+    with router(port) as publisher, ThreadPoolExecutor() as pool:
+        pool.submit(publish, publisher, time.time_ns())
+        try:
+            ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
+        finally:
+            over.set()
+    assert (found.says.partition(";")[0], rate_hz) == ("nose/image/compressed: 320x180", None)
 
 
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
