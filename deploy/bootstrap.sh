@@ -33,11 +33,18 @@ find_python() {
     say "Python 3.11, 3.12 or 3.13 is needed and none was found"; exit 2
 }
 
-if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+# Its commands name the folder that they were installed in: in a copied or moved checkout they would run the code of the
+# original, or none.
+made_elsewhere() {
+    [ ! -L .venv ] && [ -e .venv/bin/pip ] && ! head -n 2 .venv/bin/pip | grep -qF "$(pwd -P)/.venv/bin/"
+}
+
+if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2>&1 || made_elsewhere; then
     python=$(find_python)
     "$python" -c 'import ensurepip, venv' 2>/dev/null || apt_install "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
     say "making .venv with $("$python" --version)"
-    "$python" -m venv .venv
+    # What is left of one that another Python made, before an upgrade of the system, does not count as installed.
+    "$python" -m venv --clear .venv
 fi
 
 if [ "$use" = dev ]; then

@@ -29,14 +29,14 @@ TOLD_MIN = 0.0005  # of the image: shares that would be rounded to zero are not 
 
 def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
     """Names and gray pictures of a folder, or of a video, evenly spaced. Raises InputError that names the file."""
-    if source.is_dir():
+    if os.path.isdir(source):  # Path.is_dir raises if a parent folder may not be entered
         for path in list_pictures(source):
             gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
             if gray is None:
                 raise InputError(f"{path} is not a readable image")
             yield path.name, np.asarray(gray, dtype=np.uint8)
         return
-    if not source.is_file():
+    if not os.path.isfile(source):
         raise InputError(f"{source} does not exist")
     video = open_video(str(source))
     if not video.isOpened():
@@ -147,7 +147,7 @@ def report(found: Calibration, out: Path) -> list[str]:
 def refuse_unwritable(out: Path) -> None:
     """Raises InputError if `out` cannot be written, before time is spent on the pictures."""
     folder = out.absolute().parent
-    if out.is_dir() or not os.access(out if out.exists() else folder, os.W_OK):
+    if os.path.isdir(out) or not os.access(out if os.path.exists(out) else folder, os.W_OK):
         raise InputError(f"{out} cannot be written")
 
 

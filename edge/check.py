@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
+from edge.config_ground import ZenohTlsSettings
 from edge.errors import InputError
 from edge.reload import load_configured
 from edge.types import CameraInfo
@@ -17,7 +19,8 @@ Found = TypeVar("Found")
 def check(file: ConfigFile) -> list[str]:
     """Lines for a person that summarise the configuration. Raises InputError with one line for each faulty part."""
     config, faults = file.config, list[str]()
-    _tried(lambda: _check_certificates(file), faults)
+    for section, tls in (("zenoh", config.zenoh.tls), ("camera", getattr(config.camera, "tls", None))):
+        _tried(partial(_check_certificates, file, section, tls), faults)
     model = _tried(lambda: load_configured(file), faults)
     found = _tried(lambda: _camera(file), faults)
     if model is None or found is None or faults:
@@ -59,9 +62,9 @@ def _camera(file: ConfigFile) -> tuple[CameraInfo, bool]:
     return camera, opened
 
 
-def _check_certificates(file: ConfigFile) -> None:
-    tls = file.config.zenoh.tls
-    with file.blame("zenoh", "tls"):
+def _check_certificates(file: ConfigFile, section: str, tls: ZenohTlsSettings | None) -> None:
+    """Raises InputError."""
+    with file.blame(section, "tls"):
         doubt = None if tls is None else tls.files().doubt()
         if doubt is not None:
             raise InputError(doubt)

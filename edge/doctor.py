@@ -102,7 +102,9 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         why = f": {said}" if said else ""
         yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
-    rate_hz = (len(seen_ns) - 1) / ((seen_ns[-1] - seen_ns[0]) / 1e9) if len(seen_ns) > 2 else None
+    # Stamps may all be the same, of a driver that gives whole seconds, or jump back.
+    took_ns = seen_ns[-1] - seen_ns[0]
+    rate_hz = (len(seen_ns) - 1) / (took_ns / 1e9) if len(seen_ns) > 2 and took_ns > 0 else None
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
     text = f"{name}: {size_wh[0]}x{size_wh[1]}{rate}"
     if not reasons:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
+import shlex
 import socket
 import tempfile
+import termios
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -12,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import serial
 import zenoh
 
 from edge import clock
@@ -19,7 +24,7 @@ from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.findings import Finding, device_fault, good, poor, wrong
-from edge.links.mavlink_endpoints import NetworkEndpoint, parse_endpoint
+from edge.links.mavlink_endpoints import SerialEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.links.signing import ahead_of_clock
 from edge.links.transports.medium import resolve
@@ -34,6 +39,7 @@ NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = (
     "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
 )
+ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
 HEARING_S = 4.0
 LOOK_S = 0.1
 
@@ -55,6 +61,8 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
         yield from _zenoh(config.zenoh)
     if config.mavlink.enabled:
         yield from _mavlink(config.mavlink)
+    if config.health.prometheus_port is not None:
+        yield metrics_finding(config.health.prometheus_port)
 
 
 def told_reasons(running: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -79,9 +87,11 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
         yield good(
             "zenoh", f"can listen on {', '.join(settings.listen)}" if settings.listen else "no address to listen on"
         )
-    except zenoh.ZError:
-        advice = "stop the program that uses one of them (`ss -ltnup` shows which), or change [zenoh] listen"
-        yield wrong("zenoh", f"cannot listen on {', '.join(settings.listen)}", advice)
+    except zenoh.ZError as error:
+        reason = str(error).partition(" at /")[0]  # the rest is a location in zenoh's source
+        code = re.search(r"\(os error (\d+)\)", reason)
+        advice = _advice_to_listen(int(code[1]) if code else None, "[zenoh] listen")
+        yield wrong("zenoh", f"cannot listen on {', '.join(settings.listen)}: {reason}", advice)
     for endpoint in settings.connect:
         try:
             zenoh.open(client_config([endpoint], tls=tls)).close()
@@ -91,34 +101,42 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
             yield poor("ground", f"{endpoint} does not answer", advice)
 
 
+def metrics_finding(port: int) -> Finding:
+    """Whether the daemon can serve its metrics: without the port it does not start."""
+    try:
+        socket.create_server(("127.0.0.1", port)).close()
+    except OSError as error:
+        advice = _advice_to_listen(error.errno, "[health] prometheus_port")
+        return wrong("prometheus", f"port {port} of 127.0.0.1 cannot be served: {error.strerror}", advice)
+    return good("prometheus", f"port {port} of 127.0.0.1 is free")
+
+
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
     """Listen as the daemon does until a heartbeat is received."""
     if settings.signing_key is not None:
         yield signing_finding(signing_state_of(settings, settings.signing_key))
     for endpoint in settings.endpoints:
-        kind, _, rest = endpoint.partition(":")
-        if kind == "serial" and (fault := device_fault(Path(rest.rpartition(":")[0]), "dialout")) is not None:
-            yield wrong("mavlink", *fault)
-            return
-        if isinstance(named := parse_endpoint(endpoint), NetworkEndpoint):
-            try:
-                resolve(named, socket.SOCK_DGRAM)
-            except InputError as error:
-                if kind in ("udpin", "tcpin"):
-                    yield wrong("mavlink", str(error), "use an address of this computer, or 0.0.0.0 for all of them")
-                    return
-                yield poor("host", str(error), f"test it with `getent hosts {named.host}`, or use a numeric address")
+        named = parse_endpoint(endpoint)
+        if isinstance(named, SerialEndpoint):
+            if (fault := device_fault(Path(named.device), "dialout") or _port_fault(named)) is not None:
+                yield wrong("mavlink", *fault)
+                return
+            continue
+        try:
+            resolve(named, socket.SOCK_DGRAM)
+        except InputError as error:
+            if named.kind in ("udpin", "tcpin"):
+                yield wrong("mavlink", str(error), ADVICE_ADDRESS)
+                return
+            yield poor("host", str(error), f"test it with `getent hosts {named.host}`, or use a numeric address")
     own_ship = OwnShipBuffer()
     camera = CameraInfo("doctor", (640, 480), np.eye(3), None)
     try:
         link = MavlinkLink(settings, own_ship, camera, RequestQueue(), signing_of(settings))
         link.start()
     except InputError as error:
-        yield wrong(
-            "mavlink",
-            str(error),
-            "stop the program that uses it (`ss -lunp` shows which), or change [mavlink] endpoints",
-        )
+        code = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
+        yield wrong("mavlink", str(error), _advice_to_listen(code, "[mavlink] endpoints"))
         return
     try:
         counters = _wait(link.counters, lambda counted: counted.get("received_HEARTBEAT", 0) > 0)
@@ -131,6 +149,30 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
     refused = ", ".join(f"{name} {count}" for name, count in counters.items() if name.startswith("refused_") and count)
     counted = f" ({refused})" if refused else ""
     yield wrong("mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{counted}", ADVICE_AUTOPILOT)
+
+
+def _port_fault(endpoint: SerialEndpoint) -> tuple[str, str] | None:
+    """Why a serial port does not open, and what to do; None if it does."""
+    try:
+        serial.Serial(endpoint.device, endpoint.baud, exclusive=True).close()
+    except (OSError, ValueError, termios.error) as error:
+        if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
+            advice = f"stop the program that uses it (`sudo fuser -v {shlex.quote(endpoint.device)}` shows which)"
+            return f"{endpoint.device} is used by another program", advice
+        return f"{endpoint.text} does not open: {error}", "choose a serial port, and a speed that it supports"
+    return None
+
+
+def _advice_to_listen(code: int | None, key: str) -> str:
+    """What to do where an endpoint of our own does not open; `code`: the system's error, if it is known."""
+    match code:
+        case errno.EADDRINUSE:
+            return f"stop the program that uses it (`sudo ss -ltunp` shows which), or change {key}"
+        case errno.EADDRNOTAVAIL:
+            return ADVICE_ADDRESS
+        case errno.EACCES:
+            return f"choose a port above 1023 in {key}"
+    return f"change {key}"
 
 
 def signing_finding(state: Path) -> Finding:

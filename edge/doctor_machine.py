@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from edge.config import Config
-from edge.findings import Finding, good, poor, wrong
+from edge.findings import Finding, good, poor, this_user, wrong
 
 CPUINFO = Path("/proc/cpuinfo")
 GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
@@ -88,7 +89,8 @@ def disk_finding(folder: Path, free_min_bytes: int, *, from_start: bool) -> Find
         )
         return bad("disk", f"{of_what}{folder} is on a disk that is mounted read-only", advice)
     if not os.path.isdir(there) or not os.access(there, needed):
-        advice = f"sudo install -d -o $USER {folder}, or choose another in [recorder] folder"
+        command = f"sudo install -d -o {this_user()} {shlex.quote(str(folder))}"
+        advice = f"`{command}`, or choose another in [recorder] folder"
         return bad("disk", f"{of_what}{folder} cannot be written by this user", advice)
     free = shutil.disk_usage(there).free
     if free < free_min_bytes:

@@ -10,10 +10,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -113,6 +115,13 @@ def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Relo
     return Reloaded(file, estimator, outcome)
 
 
+def return_memory() -> None:
+    """Return freed memory to the system. glibc keeps it, in a pool for each of up to 8 threads a core: reload by reload
+    the process would grow to several times its size."""
+    with suppress(OSError, AttributeError):  # a C library without this function
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 class Reloader:
     """Triggered by a signal or a command, works in its own thread, delivers to the loop; one reload at a time."""
 
@@ -120,6 +129,7 @@ class Reloader:
         self._asked = False
         self._ready: Reloaded | None = None
         self._taken = threading.Event()
+        self._flown: tuple[ConfigFile, Estimator] | None = None  # what is in use, for the thread that begins
         self._thread: threading.Thread | None = None  # of the reload in progress
         self._lock = threading.Lock()
         self._answer: Callable[[ReloadOutcome], None] | None = None  # for the reload that is requested or in progress
@@ -148,14 +158,16 @@ class Reloader:
         if self._asked and self._thread is None:
             self._asked = False
             self._taken.clear()
-            arguments = (flying, estimator, camera, event)
-            self._thread = threading.Thread(target=self._work, args=arguments, name="reload", daemon=True)
+            # Not as arguments: a thread holds its arguments until it ends.
+            self._flown = (flying, estimator)
+            self._thread = threading.Thread(target=self._work, args=(camera, event), name="reload", daemon=True)
             self._thread.start()
         return None
 
-    def _work(
-        self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
-    ) -> None:
+    def _work(self, camera: CameraInfo, event: Callable[[int, str], None]) -> None:
+        assert self._flown is not None
+        flying, estimator = self._flown
+        self._flown = None
         log.info("reload: reading %s", flying.path)
         try:
             ready = reload(flying, estimator, camera)
@@ -170,6 +182,8 @@ class Reloader:
             del ready
             # The old estimator is released in this thread, after the loop has the new one: freeing memory takes time.
             self._taken.wait()
+        del estimator
+        return_memory()
         with self._lock:
             answer, self._answer = self._answer, None
             self._thread = None  # before the answer, whose receiver may request the next reload at once

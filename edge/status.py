@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from msgs.session import TlsFiles, check_endpoint, client_config
 ANSWER_S = 5.0
 STALE_S = 3.0
 EXIT_NOT_WELL = 1
+ANY = "*"
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 
 
@@ -31,7 +33,7 @@ def status(config: Path | None, connect: str | None, vehicle: str | None, as_jso
     endpoint, uav, tls = _address(config, connect, vehicle)
     answer = ask(endpoint, uav, tls)
     if answer is None:
-        sentence = f"no daemon answers at {endpoint}: it is not running, or its [zenoh] listen is elsewhere"
+        sentence = _unanswered(endpoint, uav, tls)
         print(json.dumps({"error": sentence}) if as_json else sentence)
         return EXIT_NOT_WELL
     print(json.dumps(answer) if as_json else for_a_person(answer))
@@ -45,7 +47,7 @@ def ask(endpoint: str, uav: str, tls: TlsFiles | None = None) -> dict[str, Any] 
     """
     try:
         with zenoh.open(client_config([endpoint], tls=tls)) as session:
-            vehicles = {str(info.get("vehicle")): info for info in _answers(session, uav, "info")}
+            vehicles = _vehicles(session, uav)
             if len(vehicles) > 1:
                 raise InputError(f"{' and '.join(sorted(vehicles))} answer at {endpoint}: select one with --vehicle")
             # Of this vehicle only: the first answer to `*` may be another's.
@@ -97,6 +99,23 @@ def _headline(info: dict[str, Any]) -> str:
     return f"{state}, {info['activity']}" if state == HealthState.DEGRADED.value else state
 
 
+def _unanswered(endpoint: str, uav: str, tls: TlsFiles | None) -> str:
+    """Why nothing was answered, as a sentence."""
+    if uav != ANY:
+        with suppress(zenoh.ZError), zenoh.open(client_config([endpoint], tls=tls)) as session:
+            if others := sorted(_vehicles(session, ANY)):
+                return (
+                    f"{' and '.join(others)} and not {uav} answers at {endpoint}: "
+                    "a daemon takes a new [vehicle] name when it is restarted"
+                )
+    return f"no daemon answers at {endpoint}: it is not running, or its [zenoh] listen is elsewhere"
+
+
+def _vehicles(session: zenoh.Session, uav: str) -> dict[str, dict[str, Any]]:
+    """`info` of each vehicle that answers, by name."""
+    return {str(info.get("vehicle")): info for info in _answers(session, uav, "info")}
+
+
 def _answers(session: zenoh.Session, uav: str, what: str) -> Iterator[dict[str, Any]]:
     for reply in session.get(key_of(uav, what), timeout=ANSWER_S):
         if reply.ok is None:
@@ -111,7 +130,7 @@ def _answers(session: zenoh.Session, uav: str, what: str) -> Iterator[dict[str, 
 
 def _address(config: Path | None, connect: str | None, vehicle: str | None) -> tuple[str, str, TlsFiles | None]:
     """Endpoint, vehicle (`*`: any) and certificates for the query."""
-    settings, uav, tls = ZenohSettings(), vehicle or "*", None
+    settings, uav, tls = ZenohSettings(), vehicle or ANY, None
     if config is not None:
         loaded = load_config(config).config
         settings, uav = loaded.zenoh, vehicle or loaded.vehicle.name

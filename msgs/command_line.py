@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import select
@@ -19,6 +20,9 @@ EXIT_INTERRUPTED, EXIT_UNREAD = 130, 141
 def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequence[str] = ()) -> int:
     """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or needs a missing
     package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as by `| head`."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # As on standard error, characters that the locale's encoding lacks, in paths or our own, are escaped.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = act()
         sys.stdout.flush()

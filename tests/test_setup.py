@@ -1,5 +1,8 @@
 """Set-up as a stranger meets it where the machine is not as it should be."""
 
+import hashlib
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +23,44 @@ status=$?
 ls -A "$1/.venv"
 exit $status
 """
+
+
+def set_up(folder: Path) -> subprocess.CompletedProcess[str]:
+    """What bootstrap says; pip finds no package, so nothing is downloaded."""
+    environment = {**os.environ, "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
+    for variable in ("PIP_FIND_LINKS", "PIP_EXTRA_INDEX_URL", "PIP_INDEX_URL"):
+        environment.pop(variable, None)
+    command = ["sh", folder / "deploy" / "bootstrap.sh", "demo"]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+def checkout(folder: Path) -> Path:
+    """What bootstrap reads of a checkout."""
+    shutil.copytree(ROOT / "deploy", folder / "deploy")
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+def test_a_copied_checkout_does_not_run_the_code_of_the_original(tmp_path: Path) -> None:
+    original, copied = checkout(tmp_path / "original"), tmp_path / "a copy"
+    assert "making .venv" in set_up(original).stderr
+    assert "making .venv" not in set_up(original).stderr
+    shutil.copytree(original, copied, symlinks=True)
+    assert "making .venv" in set_up(copied).stderr
+    assert str(original) not in (copied / ".venv" / "bin" / "pip").read_text()
+    assert "making .venv" not in set_up(copied).stderr
+
+
+def test_packages_are_installed_again_where_an_upgrade_of_the_system_brought_another_python(tmp_path: Path) -> None:
+    folder = checkout(tmp_path / "checkout")
+    python = folder / ".venv" / "bin" / "python"  # one whose packages are in a folder of the Python before
+    python.parent.mkdir(parents=True)
+    python.symlink_to("/bin/false")
+    content = (folder / "pyproject.toml").read_bytes() + (folder / "deploy" / "constraints.txt").read_bytes()
+    (folder / ".venv" / f".demo-{hashlib.sha256(content).hexdigest()[:16]}").touch()
+    done = set_up(folder)
+    assert "installing Python packages for demo" in done.stderr
+    assert done.returncode != 0
 
 
 def test_a_disk_too_small_for_the_packages_is_told_before_any_is_fetched(tmp_path: Path) -> None:

@@ -35,6 +35,10 @@ def write_new_key(path: Path) -> None:
         raise InputError(f"{path} exists; a key is never overwritten") from error
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from error
-    with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(file.fileno(), 0o600)
-        file.write(secrets.token_bytes(KEY_BYTES))
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(file.fileno(), 0o600)
+            file.write(secrets.token_bytes(KEY_BYTES))
+    except OSError as error:  # as on a full disk; an empty file left behind would keep the next attempt from writing
+        path.unlink(missing_ok=True)
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error

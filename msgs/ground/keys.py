@@ -88,7 +88,9 @@ def listing(folder: Path) -> list[str]:
     """A line for each certificate in `folder`: identity, last day, hosts. Raises InputError if there are none."""
     lines = []
     try:
-        paths = sorted(folder.glob("*.pem"))
+        paths = sorted(path for path in folder.iterdir() if path.suffix == ".pem")
+    except FileNotFoundError:
+        paths = []
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
     for path in paths:

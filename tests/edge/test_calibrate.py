@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -112,6 +115,35 @@ def test_a_file_that_cannot_be_written_is_told_before_the_pictures_are_looked_at
     for out in (tmp_path, tmp_path / "none" / "nose.yaml"):
         done = cli("calibrate", "no-such-video.mp4", "--out", out)
         assert (done.returncode, done.stderr) == (2, f"{out} cannot be written\n")
+
+
+NO_ROOT_CALIBRATES = """
+import os, sys
+from edge import calibrate, cli
+if os.geteuid() == 0:  # who may everything
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+sys.exit(cli.main(["calibrate", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["board.mp4", "--out", "home/nose.yaml"], "home/nose.yaml cannot be written\n"),
+        (["home/board.mp4"], "home/board.mp4 does not exist\n"),
+    ],
+)
+def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_without_a_traceback(
+    arguments: list[str], said: str
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:  # whoever is not root may enter this one, and write there
+        Path(folder).chmod(0o777)
+        (Path(folder) / "home").mkdir(mode=0o000)
+        command = [sys.executable, "-c", NO_ROOT_CALIBRATES, *arguments]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, said)
 
 
 def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -71,6 +72,22 @@ def test_a_certificate_of_another_day_is_told_by_check_and_keeps_nobody_from_fly
     assert flown.returncode == 0, flown.stderr
     assert sentence in flown.stderr
     assert "captured=" in flown.stderr.splitlines()[-1]
+
+
+def test_a_certificate_of_another_day_for_the_camera_is_told_by_check(
+    cli: Cli, tmp_path: Path, toy_model: Path
+) -> None:
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    _, ends = redate(tmp_path, "uav1", begins_days=-9, ends_days=-2)
+    text = (
+        '[camera]\ntype = "zenoh"\ntopic = "nose/image"\nconnect = "tls/127.0.0.1:1"\n'
+        'tls = { root_ca = "ca.pem", certificate = "uav1.pem", private_key = "uav1.key" }\n'
+        "intrinsics = { fx = 900, fy = 900, cx = 320, cy = 240, width = 640, height = 480 }\n"
+        f'[model]\npath = "{toy_model}"\n'
+    )
+    sentence = f"{tmp_path / 'uav1.pem'} expired on {ends:%Y-%m-%d}; today is "
+    assert f"config.toml:5: [camera] tls: {sentence}" in refusal(cli, tmp_path, text + OFF, "check")
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
@@ -217,6 +234,35 @@ def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: P
     done = subprocess.run(arguments, cwd=tmp_path, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write_end)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("encoding", ["iso8859-1", "ascii"])
+def test_a_terminal_without_our_characters_gets_the_others(
+    cli: Cli, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", encoding)
+    folder = tmp_path / "полёт"
+    folder.mkdir()
+    (folder / "config.toml").write_text(text + OFF)
+    checked = cli("check", "--config", folder / "config.toml")
+    assert (checked.returncode, checked.stderr) == (0, "")
+    assert f"{tmp_path}/\\u043f" in checked.stdout
+    (folder / "config.toml").write_text(text.replace("toy.onnx", "none.onnx") + OFF)
+    looked = cli("doctor", "--config", folder / "config.toml")
+    assert (looked.returncode, looked.stderr) == (1, "")
+    assert "\\u2192 set [model] path to a file" in looked.stdout
+    assert looked.stdout.endswith("1 failed\n")
+
+
+def test_a_signing_key_that_the_disk_has_no_room_for_leaves_no_empty_file(tmp_path: Path) -> None:
+    keygen = f"{shlex.quote(sys.executable)} -m edge.cli keygen --out mavlink.key"
+    for limit, code, words in (
+        ("ulimit -f 0", 2, "mavlink.key cannot be written: File too large\n"),
+        ("true", 0, ""),
+    ):
+        done = subprocess.run(["sh", "-c", f"{limit}; exec {keygen}"], cwd=tmp_path, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (code, words)
+    assert (tmp_path / "mavlink.key").stat().st_size == 32
 
 
 def test_nobody_is_told_of_a_flight_by_the_library_that_runs_the_network(

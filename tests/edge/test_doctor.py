@@ -1,27 +1,37 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import pwd
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
+import serial
 
-from edge.doctor import camera_as_told
+from edge.config import load_config
+from edge.doctor import _camera, camera_as_told
 from edge.doctor_links import signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.links.signing import timestamp_of
 from edge.status import ask
+from msgs.publish import TopicPublisher
 from sim_replay.faults.rig import can_mount
 from tests.waiting import until
 
 from . import pictures
 from .conftest import Cli
 from .flying import flying, free_port, toml, write_swaying_scene
+from .test_cameras_live import message, router
 from .test_cameras_stream import UdpCamera
 
 
@@ -78,21 +88,70 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
         taken.listen()
         text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
         text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0", "tcpout:autopilot.invalid:5760"]\n'
+        text += f"[health]\nprometheus_port = {taken.getsockname()[1]}\n"
         code, found = findings(cli, tmp_path, text)
     assert code == 1
     assert "cannot listen on" in found["zenoh"]["says"]
+    assert "stop the program" in found["zenoh"]["advice"]
     assert "no heartbeat" in found["mavlink"]["says"]
     assert "host 'autopilot.invalid' cannot be resolved" in found["host"]["says"]
+    assert "127.0.0.1 cannot be served: Address already in use" in found["prometheus"]["says"]
+    assert "stop the program" in found["prometheus"]["advice"]
 
 
-def test_a_name_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
+@pytest.mark.parametrize(
+    ("host", "said"),
+    [("ground..local", "host 'ground..local' cannot be resolved"), ("192.0.2.1", "Cannot assign requested address")],
+)
+def test_an_address_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
+    cli: Cli, tmp_path: Path, toy_model: Path, host: str, said: str
+) -> None:
+    text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
+    text = text.replace("127.0.0.1", "192.0.2.1") + f'[mavlink]\nendpoints = ["udpin:{host}:14550"]\n'
+    code, found = findings(cli, tmp_path, text)
+    assert code == 1
+    assert said in found["mavlink"]["says"]
+    assert "Cannot assign requested address" in found["zenoh"]["says"]
+    for what in ("mavlink", "zenoh"):
+        assert found[what]["advice"] == "use an address of this computer, or 0.0.0.0 for all of them"
+
+
+def test_a_serial_port_that_another_program_holds_is_not_taken_for_a_silent_autopilot(
     cli: Cli, tmp_path: Path, toy_model: Path
 ) -> None:
     text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
-    code, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["udpin:ground..local:14550"]\n')
-    assert code == 1
-    assert "host 'ground..local' cannot be resolved" in found["mavlink"]["says"]
-    assert found["mavlink"]["advice"] == "use an address of this computer, or 0.0.0.0 for all of them"
+    held, port = pty.openpty()
+    with serial.Serial(os.ttyname(port), exclusive=True):
+        code, found = findings(cli, tmp_path, text + f'[mavlink]\nendpoints = ["serial:{os.ttyname(port)}:57600"]\n')
+    assert (code, found["mavlink"]["says"]) == (1, f"{os.ttyname(port)} is used by another program")
+    assert f"fuser -v {os.ttyname(port)}" in found["mavlink"]["advice"]
+    for descriptor in (held, port):
+        os.close(descriptor)
+    _, found = findings(cli, tmp_path, text + '[mavlink]\nendpoints = ["serial:/dev/null:57600"]\n')
+    assert "serial:/dev/null:57600 does not open" in found["mavlink"]["says"]
+
+
+def test_a_camera_whose_stamps_do_not_advance_has_no_rate(tmp_path: Path) -> None:
+    """As of a driver that stamps in whole seconds."""
+    port, over = pictures.free_port(), threading.Event()
+    intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
+    (tmp_path / "config.toml").write_text(
+        '[camera]\ntype = "zenoh"\ntopic = "nose/image/compressed"\n'
+        f'connect = "tcp/127.0.0.1:{port}"\nintrinsics = {intrinsics}\n'
+    )
+
+    def publish(publisher: TopicPublisher, stamp_ns: int) -> None:
+        index = count()
+        while not over.wait(0.02):
+            publisher.put(message(next(index), stamp_ns=stamp_ns))
+
+    with router(port) as publisher, ThreadPoolExecutor() as pool:
+        pool.submit(publish, publisher, time.time_ns())
+        try:
+            ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
+        finally:
+            over.set()
+    assert (found.says.partition(";")[0], rate_hz) == ("nose/image/compressed: 320x180", None)
 
 
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
@@ -230,6 +289,11 @@ print(disk_finding(Path("{path}"), 0, from_start=True).line())
 """
 
 
+def nobody() -> str:
+    """Who looks in `looked_at_by_nobody`."""
+    return pwd.getpwuid(os.geteuid() or 65534).pw_name
+
+
 def looked_at_by_nobody(folder: Path, path: str) -> str:
     """What is said of `path`, from `folder`, as a device and as a folder for recordings."""
     folder.chmod(0o755)
@@ -238,13 +302,15 @@ def looked_at_by_nobody(folder: Path, path: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("mode", "words"), [(0o000, "usermod -aG video"), (0o444, "is not readable and writable"), (0o666, "may be used")]
+    ("mode", "words"),
+    [(0o000, "usermod -aG video {user},"), (0o444, "is not readable and writable"), (0o666, "may be used")],
 )
-def test_a_device_without_permission_names_the_group(tmp_path: Path, mode: int, words: str) -> None:
+def test_a_device_without_permission_names_the_group_and_who_lacks_it(tmp_path: Path, mode: int, words: str) -> None:
+    """With `sudo -u uavpose`, $USER of the person who follows the advice is another."""
     device = tmp_path / "video0"
     device.touch()
     device.chmod(mode)
-    assert words in looked_at_by_nobody(tmp_path, "video0")
+    assert words.format(user=nobody()) in looked_at_by_nobody(tmp_path, "video0")
 
 
 @pytest.mark.parametrize("path", ["home/rec", "home/rec/deep", "home/none", "link"])
@@ -259,14 +325,17 @@ def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_as_forbidden(tmp_
     assert f"WRONG  disk         {path} cannot be written by this user" in said
 
 
-@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, "cannot be"), (0o333, "cannot be")])
+ADVICE_FOLDER = "`sudo install -d -o {user} 'my rec'`"
+
+
+@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, ADVICE_FOLDER), (0o333, ADVICE_FOLDER)])
 def test_a_recorder_s_folder_must_be_one_to_write_and_to_look_into(tmp_path: Path, mode: int, words: str) -> None:
-    folder = tmp_path / "rec"
+    folder = tmp_path / "my rec"
     folder.mkdir()
     folder.chmod(mode)
-    said = looked_at_by_nobody(tmp_path, "rec")
+    said = looked_at_by_nobody(tmp_path, "my rec")
     folder.chmod(0o755)
-    assert words in said
+    assert words.format(user=nobody()) in said
 
 
 ON_A_READ_ONLY_DISK = 'mount -t tmpfs -o ro tmpfs "$1" && exec "$2" -c "$3" "$1"'

@@ -214,6 +214,24 @@ def test_a_daemon_that_is_stopped_while_it_loads_a_model_ends_well(tmp_path: Pat
             assert flight.process.wait(timeout=60) == 0
 
 
+def test_reload_after_reload_the_daemon_does_not_grow(tmp_path: Path, swaying: Path, port: int) -> None:
+    """glibc keeps what the old models held, and the service is ended at 1 GB."""
+    text = toml(swaying, SHIPPED_MODEL, port, fps=3)
+
+    def memory_mb(pid: int) -> float:
+        kib = re.search(r"^VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
+        assert kib is not None
+        return int(kib[1]) / 1000
+
+    with flying(tmp_path, text) as flight:
+        before_mb = memory_mb(flight.process.pid)
+        for count in (2, 1) * 3:
+            (tmp_path / "config.toml").write_text(text.replace("threads = 1", f"threads = {count}"))
+            flight.process.send_signal(signal.SIGHUP)
+            assert "replaced by" in flight.until("reloaded: ")
+        until(lambda: memory_mb(flight.process.pid) < before_mb + 170, what="memory to be returned", within_s=10)
+
+
 def test_one_reload_at_a_time() -> None:
     reloader, told = Reloader(), list[ReloadOutcome]()
     assert reloader.ask_for(told.append)

@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import json
 import re
+import socket
+import struct
+import threading
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -15,6 +18,7 @@ import zenoh
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.health import Activity, HealthState
+from edge.prometheus import MetricsServer
 from edge.stages import STAGES
 from edge.status import ask
 from edge.status_board import StatusBoard, key_of
@@ -112,8 +116,10 @@ def test_status_refuses_what_is_no_address(cli: Cli) -> None:
 
 @pytest.mark.usefixtures("daemon")
 def test_another_vehicle_s_name_is_not_answered(cli: Cli, ports: tuple[int, int]) -> None:
+    """As of a daemon that was given another name and not restarted: it is there all the same."""
     asked = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}", "--vehicle", "merlin")
     assert asked.returncode == 1
+    assert asked.stdout.startswith(f"kestrel and not merlin answers at tcp/127.0.0.1:{ports[0]}: ")
 
 
 @pytest.mark.usefixtures("daemon")
@@ -136,6 +142,25 @@ def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
         urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/etc/passwd", timeout=10)
     with pytest.raises(urllib.error.URLError, match="refused"):  # who listens everywhere listens there too
         urllib.request.urlopen(f"http://127.0.0.2:{ports[1]}/metrics", timeout=10)
+
+
+def test_a_reader_of_the_metrics_that_breaks_off_leaves_no_traceback_in_the_log(
+    tmp_path: Path, toy_model: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}})
+    camera = CameraInfo("camera", (320, 180), np.eye(3), None)
+    board = StatusBoard(ConfigFile(tmp_path / "config.toml", "", config), load_model(toy_model, 1), camera)
+    port = free_port()
+    server = MetricsServer(board, port)
+    try:
+        with socket.create_connection(("127.0.0.1", port)) as reader:
+            reader.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
+            assert b"uavpose_uptime_seconds" in answer.read()
+        until(lambda: not any("process_request" in thread.name for thread in threading.enumerate()))
+    finally:
+        server.stop()
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("daemon")
