@@ -92,7 +92,6 @@ class Innovation:
     attitude: Array  # [3, 3], covariance due to that error
     across: Array  # [3, 3], the measurement's covariance without that of its range
     log_range_variance: float  # the network's own
-    d2: float  # squared Mahalanobis distance, 3 degrees of freedom, with the network's own variances
 
 
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
@@ -219,9 +218,7 @@ def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Inno
     across *= at_predicted_range**2
     predicted_covariance = symmetric(R_cam_frame @ motion.P[POSITION, POSITION] @ R_cam_frame.T)
     attitude = _by_attitude(predicted_m, view)
-    S = predicted_covariance + attitude + across + log_range_variance * np.outer(predicted_m, predicted_m)
-    d2 = float(residual_m @ np.linalg.solve(S, residual_m))
-    return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance, d2)
+    return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance)
 
 
 def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
