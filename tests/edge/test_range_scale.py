@@ -123,6 +123,21 @@ def test_a_young_track_that_was_missed_is_taken_up_where_it_is_seen(closing_mps:
         assert track.v_ned_target_mps[0] == pytest.approx(20.0 - closing_mps, abs=12.0)
 
 
+@pytest.mark.parametrize("turned_deg", [10.0, 15.0, 20.0])
+def test_in_cam_a_target_missed_while_the_camera_turned_is_told_where_it_is_seen(turned_deg: float) -> None:
+    tracker = Tracker(1, LOOKING_NORTH)
+    for i, error in enumerate(np.random.default_rng(1).normal(scale=0.02, size=40)):
+        angle = np.deg2rad(turned_deg) * np.clip((i - 20) / 15.0, 0.0, 1.0)
+        t_cam = 200.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        found = [] if 20 < i < 35 else [sight(t_cam, float(error))]
+        (track,) = tracker.update(1 + round(i * 1e9 / 20), found, None, K, SIZE_WH)
+        if i >= 35:
+            assert track.measured_ns == track.time_ns
+            told_px, true_px = ((K @ t)[:2] / t[2] for t in (track.t_cam_target_m, t_cam))
+            assert np.abs(told_px - true_px).max() < 5.0
+            assert np.linalg.norm(track.t_cam_target_m) == pytest.approx(200.0, rel=0.1)
+
+
 @pytest.mark.parametrize("kind", ["ned", "ned_relative"])
 @pytest.mark.parametrize("beside_m", [10.0, 20.0])
 def test_what_comes_into_sight_far_ahead_is_not_the_target_that_has_just_passed(beside_m: float, kind: str) -> None:
