@@ -11,6 +11,7 @@ from edge.health import Activity, Condition, HealthState
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
 from edge.links.outgoing import UNSURE_ROTATION_RAD, rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
+from edge.tracking.view import POSITION_STD_M
 from edge.types import Array, CameraInfo, Report, Track, TrackState
 from msgs import mavlink
 from msgs.geometry import q_wxyz_from_R
@@ -106,9 +107,11 @@ def geo_status(report: Report, track: Track) -> Any | None:
     if own_ship is None or own_ship.lat_lon_alt is None or t_m is None or R is None or P is None:
         return None
     lat, lon, alt = lat_lon_alt_from_ned(own_ship.lat_lon_alt, t_m)
-    velocity, vel_acc = [NAN] * 3, NAN
-    # Without own position the velocity is relative to the own ship, which this message cannot express.
-    if own_ship.t_ned_body_m is not None and track.v_ned_target_mps is not None:
+    P_place, velocity, vel_acc = P[:3, :3], [NAN] * 3, NAN
+    if own_ship.t_ned_body_m is None:
+        # Relative to the own ship: the own position's error is missing, and such a velocity cannot be expressed.
+        P_place = P_place + POSITION_STD_M**2 * np.eye(3)
+    elif track.v_ned_target_mps is not None:
         velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
     heading_rad, heading_std_rad = _heading_rad(R, P[6:, 6:]) if rotation_known(track) else (NAN, NAN)
     return dialect.MAVLink_camera_tracking_geo_status_message(
@@ -116,8 +119,8 @@ def geo_status(report: Report, track: Track) -> Any | None:
         round(lat * 1e7),
         round(lon * 1e7),
         alt,
-        _largest_std(P[:2, :2]),
-        math.sqrt(P[2, 2]),
+        _largest_std(P_place[:2, :2]),
+        math.sqrt(P_place[2, 2]),
         *velocity,
         vel_acc,
         float(np.linalg.norm(track.t_cam_target_m)),

@@ -35,14 +35,13 @@ def associate(
     If a target or an estimate has several candidates, rotation counts too: crossing aircraft differ in it.
     """
     seen: dict[tuple[int, int], Innovation] = {}
+    cost = np.full((len(targets), len(estimates)), np.inf)
     for i, (motion, _) in enumerate(targets):
         for j, estimate in enumerate(estimates):
             one = ekf.innovation(motion, estimate, K, view)
-            if one.d2 < POSITION_GATE_D2:
-                seen[i, j] = one
-    cost = np.full((len(targets), len(estimates)), np.inf)
-    for (i, j), one in seen.items():
-        cost[i, j] = one.d2
+            d2 = distance_d2(one, estimate)
+            if d2 < POSITION_GATE_D2:
+                seen[i, j], cost[i, j] = one, d2
     contested = np.isfinite(cost)
     for i, j in seen:
         if contested[i].sum() > 1 or contested[:, j].sum() > 1:
@@ -51,6 +50,21 @@ def associate(
     best = best_pairs(cost)
     idle = set(range(len(targets))) - {i for i, _ in best}
     return [Pair(i, j, seen[i, j], sorted(k for k in idle if (k, j) in seen)) for i, j in best]
+
+
+def distance_d2(seen: Innovation, estimate: Estimate) -> float:
+    """Squared Mahalanobis distance, 3 degrees of freedom, of an estimate to a target, with the network's own variances.
+
+    The larger of two: by log range, which is how measurements err, and in metres, which is how predictions do. By log
+    range alone, a target predicted to be near, give or take a good part of that range, would fit any other beyond it.
+    """
+    ray = seen.predicted_m
+    predicted = seen.predicted_covariance + seen.attitude
+    measured = seen.across + seen.log_range_variance * np.outer(ray, ray)
+    apart_m = estimate.t_cam_target_m - ray
+    farther = max(float(np.linalg.norm(estimate.t_cam_target_m) / np.linalg.norm(ray)), 1.0)
+    in_metres = apart_m @ np.linalg.solve(predicted + farther**2 * measured, apart_m)
+    return max(float(seen.residual_m @ np.linalg.solve(predicted + measured, seen.residual_m)), float(in_metres))
 
 
 def best_pairs(cost: Array) -> list[tuple[int, int]]:

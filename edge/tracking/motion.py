@@ -10,8 +10,8 @@ Innovations are always computed in `cam`, where the measurement covariance is gi
 The network misjudges the range of one target by nearly the same factor in all frames (`range_scale.py`), and averaging
 frames does not reduce that error. The state holds ranges as measured, so P covers only the other errors; the variance
 of the common factor is added on output (`covariance`). Range is compared and corrected by its logarithm: otherwise
-frames that read short would weigh more than frames that read far. The constants below are tuning choices for
-fixed-wing aircraft at 100-500 m, not measurements.
+frames that read short would weigh more than frames that read far. Directions are compared and corrected by angle. The
+constants below are tuning choices for fixed-wing aircraft at 100-500 m, not measurements.
 """
 
 from __future__ import annotations
@@ -86,13 +86,12 @@ class Sight:
 class Innovation:
     """Measured minus predicted position, in `cam`."""
 
-    residual_m: Array  # [3]; along the ray it is range times the difference of log ranges
+    residual_m: Array  # [3], range times: along the ray the difference of log ranges, across it the angle
     predicted_m: Array  # [3]
     predicted_covariance: Array  # [3, 3], without the frame's attitude error
     attitude: Array  # [3, 3], covariance due to that error
     across: Array  # [3, 3], the measurement's covariance without that of its range
     log_range_variance: float  # the network's own
-    d2: float  # squared Mahalanobis distance, 3 degrees of freedom, with the network's own variances
 
 
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
@@ -212,16 +211,14 @@ def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Inno
     R_cam_frame = view.R_frame_cam.T
     predicted_m = R_cam_frame @ (motion.t_m - view.t_frame_cam_m)
     range_m, measured_m = float(np.linalg.norm(predicted_m)), float(np.linalg.norm(estimate.t_cam_target_m))
-    at_predicted_range = range_m / measured_m
-    residual_m = at_predicted_range * estimate.t_cam_target_m - predicted_m
-    residual_m -= float(np.log(at_predicted_range)) * predicted_m
+    turned = so3.turn(predicted_m, estimate.t_cam_target_m)
+    residual_m = so3.skew(turned) @ predicted_m + float(np.log(measured_m / range_m)) * predicted_m
     across, log_range_variance = _measurement_noise(estimate, K)
-    across *= at_predicted_range**2
+    to_predicted = (range_m / measured_m) * so3.exp(-turned)
+    across = symmetric(to_predicted @ across @ to_predicted.T)
     predicted_covariance = symmetric(R_cam_frame @ motion.P[POSITION, POSITION] @ R_cam_frame.T)
     attitude = _by_attitude(predicted_m, view)
-    S = predicted_covariance + attitude + across + log_range_variance * np.outer(predicted_m, predicted_m)
-    d2 = float(residual_m @ np.linalg.solve(S, residual_m))
-    return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance, d2)
+    return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance)
 
 
 def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
@@ -251,15 +248,16 @@ def correct(motion: Motion, seen: Innovation, view: View) -> Motion:
     # Joseph's form keeps P positive semi-definite whatever the gain.
     keep = np.eye(DIMENSION) - gain @ H
     P = symmetric(keep @ motion.P @ keep.T + gain @ (noise + seen.attitude) @ gain.T)
+    relative_m, turned, log_factor = corrected(motion.t_m - view.t_frame_cam_m, change[POSITION])
+    v_mps = motion.v_mps + gain[VELOCITY] @ in_metres(seen.residual_m, ray, log_factor, motion.kind != "cam")
     if motion.kind == "cam":
-        P = _follow_sight_line(P, motion.t_m, change)
-    relative_m, log_factor = corrected(motion.t_m - view.t_frame_cam_m, change[POSITION])
+        P, v_mps = _follow_sight_line(P, motion.t_m, change, turned), turned @ v_mps
     turn_rate = float(np.clip(motion.turn_rate_radps + change[TURN_RATE], -TURN_RATE_MAX, TURN_RATE_MAX))
     return replace(
         motion,
         seen_ns=motion.time_ns,
         t_m=view.t_frame_cam_m + relative_m,
-        v_mps=motion.v_mps + gain[VELOCITY] @ in_metres(seen.residual_m, ray, log_factor),
+        v_mps=v_mps,
         turn_rate_radps=turn_rate,
         P=_farther(P, log_factor),
         scale=scale,
@@ -335,8 +333,8 @@ def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
     """Prediction (covariance `in_cam`, the frame's attitude error included) and measurement combined in `cam`."""
     gain = np.linalg.solve(in_cam + noise, in_cam).T
     keep = so3.IDENTITY - gain
-    t_cam_m, log_factor = corrected(seen.predicted_m, gain @ seen.residual_m)
-    covariance = np.exp(2.0 * log_factor) * (keep @ in_cam @ keep.T + gain @ noise @ gain.T)
+    t_cam_m, turned, log_factor = corrected(seen.predicted_m, gain @ seen.residual_m)
+    covariance = np.exp(2.0 * log_factor) * turned @ (keep @ in_cam @ keep.T + gain @ noise @ gain.T) @ turned.T
     return Sight(t_cam_m, symmetric(covariance))
 
 
@@ -375,18 +373,18 @@ def _acceleration_density(motion: Motion) -> Array:
     return (ACCELERATION["ned_relative"] ** 2 + passing) * along + across
 
 
-def _follow_sight_line(P: Array, t_m: Array, change: Array) -> Array:
-    """P after a correction in `cam`: range errors turn with the line of sight and scale its rate.
+def _follow_sight_line(P: Array, t_m: Array, change: Array, turned: Array) -> Array:
+    """P after a correction in `cam` that turns the line of sight: errors turn with it, those of range scale its rate.
 
     The line of sight turns there mostly because the camera does, so a change across it must not be taken for parallax,
     from which a filter in Cartesian coordinates would infer range.
     """
     range_m = float(np.linalg.norm(t_m))
     along = t_m / range_m
+    across = change[VELOCITY] - (change[VELOCITY] @ along) * along
     T = np.eye(DIMENSION)
-    for part in (POSITION, VELOCITY):
-        across = change[part] - (change[part] @ along) * along
-        T[part, POSITION] += np.outer(across, along) / range_m
+    T[VELOCITY, POSITION] = turned @ np.outer(across, along) / range_m
+    T[POSITION, POSITION] = T[VELOCITY, VELOCITY] = turned
     return symmetric(T @ P @ T.T)
 
 

@@ -17,6 +17,7 @@ from statistics import fmean, median
 
 import numpy as np
 
+from edge.tracking import so3
 from edge.types import Array
 
 FRAME_SHARE = 0.2  # share of the network's log-range variance that differs from frame to frame
@@ -111,20 +112,30 @@ def _gone_since(ago_s: float, along_per_s: float, across_per_s: float) -> float:
     return -math.log(max(shares_then, math.exp(-OPENING_MAX_PER_S * ago_s)))
 
 
-def corrected(relative_m: Array, change_m: Array) -> tuple[Array, float]:
-    """Apply a correction [3] to a position relative_m [3] from the camera; returns it and the change of log range.
+def corrected(relative_m: Array, change_m: Array) -> tuple[Array, Array, float]:
+    """Apply a correction [3] to a position relative_m [3] from the camera; returns it, the turn [3, 3] of the line of
+    sight and the change of log range.
 
-    Along the ray it is a change of log range: taken as metres, that of an uncertain prediction leads too near, or
-    behind the camera.
+    Along the ray a correction is a change of log range, across it an angle: taken as metres, that of an uncertain
+    prediction leads too near, behind the camera, or beside what was seen.
     """
-    log_factor = float(change_m @ relative_m) / float(relative_m @ relative_m)
-    return np.exp(log_factor) * (relative_m + change_m - log_factor * relative_m), log_factor
+    range_m2 = float(relative_m @ relative_m)
+    log_factor = float(change_m @ relative_m) / range_m2
+    turned = so3.exp(so3.skew(relative_m) @ change_m / range_m2)
+    return np.exp(log_factor) * turned @ relative_m, turned, log_factor
 
 
-def in_metres(residual_m: Array, ray_m: Array, log_factor: float) -> Array:
-    """Convert a residual [3], along ray_m [3] a difference of log ranges, to metres flown: what corrects the velocity.
+def in_metres(residual_m: Array, ray_m: Array, log_factor: float, straight: bool) -> Array:
+    """Convert a residual [3], along ray_m [3] a difference of log ranges and across it an angle, to metres flown: what
+    corrects the velocity.
 
-    log_factor: the change of log range by the correction.
+    log_factor: the change of log range by the correction; `straight`: by the chord of that angle, as a target flies;
+    else by its arc, as a camera turns.
     """
+    range_m2 = float(ray_m @ ray_m)
     metres = math.expm1(log_factor) / log_factor if log_factor else 1.0
-    return residual_m + (metres - 1.0) * float(residual_m @ ray_m) / float(ray_m @ ray_m) * ray_m
+    along_m = float(residual_m @ ray_m) / range_m2 * ray_m
+    across_m = residual_m - along_m
+    if straight:
+        across_m = so3.exp(so3.skew(ray_m) @ residual_m / range_m2) @ ray_m - ray_m
+    return across_m + metres * along_m

@@ -58,3 +58,10 @@ def log(R: Array) -> Array:
     length = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 / w if length < SMALL_RAD * w else 2.0 * math.atan2(length, w) / length
     return np.array([scale * x, scale * y, scale * z])
+
+
+def turn(start: Array, end: Array) -> Array:
+    """The rotation vector [3] of the shortest turn from one direction [3] to another; 0 between opposite ones."""
+    across = skew(start) @ end
+    sine = float(np.linalg.norm(across))
+    return across * (math.atan2(sine, float(start @ end)) / sine if sine > 0.0 else 0.0)

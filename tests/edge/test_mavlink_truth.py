@@ -20,11 +20,22 @@ from edge.links.mavlink_traffic import adsb_vehicle, follow_target
 from edge.links.outgoing import sendable
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
-from edge.types import TrackState
+from edge.tracking.tracker import Tracker
+from edge.types import Estimate, Mount, OwnShip, TrackState
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import CAMERA, on_the_wire
-from .reports import make_report, make_track
+from .reports import (
+    BOX_XYXY_PX,
+    ORIGIN,
+    R_CAM_TARGET,
+    R_NED_CAM,
+    SIZE_WH,
+    T_CAM_TARGET_M,
+    K,
+    make_report,
+    make_track,
+)
 
 NOW_NS = 5_000_000_000
 VARIANCES_NED = np.array([4.0, 9.0, 16.0, 1.0, 4.0, 2.0, 0.01, 0.02, 0.09])
@@ -78,6 +89,24 @@ def test_a_velocity_against_the_own_ship_is_not_told_as_one_over_ground() -> Non
     geo = words.geo_status(replace(report, own_ship=nowhere), track)
     assert geo is not None
     assert all(map(math.isnan, (geo.vel_n, geo.vel_e, geo.vel_d, geo.vel_acc)))
+
+
+def test_a_place_on_the_globe_is_no_surer_than_the_own_one_whichever_message_tells_that() -> None:
+    """Without a local position the own ship is where GLOBAL_POSITION_INT says, which is off by as much."""
+    told = {}
+    for own_m in (np.zeros(3), None):
+        own_v = None if own_m is None else np.zeros(3)
+        tracker = Tracker(1, Mount(R_NED_CAM, np.zeros(3)))
+        for k in range(3):
+            own = OwnShip(NOW_NS + k, np.eye(3), own_m, own_v, ORIGIN)
+            near = Estimate(0.9, BOX_XYXY_PX, R_CAM_TARGET, 0.1 * T_CAM_TARGET_M, 1e-4 * np.eye(6), "track")
+            (track,) = tracker.update(own.time_ns, [near], own, K, SIZE_WH)
+        told[own_m is None] = words.geo_status(replace(make_report(track, now_ns=NOW_NS), own_ship=own), track)
+    by_local, by_global = told[False], told[True]
+    assert by_local is not None
+    assert by_global is not None
+    assert by_local.v_acc > 1.5
+    assert (by_global.h_acc, by_global.v_acc) == pytest.approx((by_local.h_acc, by_local.v_acc), rel=0.01)
 
 
 def test_the_attitude_s_uncertainty_is_that_of_all_its_axes() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge.tracking.tracker import Tracker
-from edge.types import Estimate, Mount, OwnShip, Track
+from edge.types import Estimate, Mount, OwnShip, Track, TrackState
 
 K = np.array([[2000.0, 0.0, 960.0], [0.0, 2000.0, 540.0], [0.0, 0.0, 1.0]])
 SIZE_WH = (1920, 1080)
@@ -121,6 +121,45 @@ def test_a_young_track_that_was_missed_is_taken_up_where_it_is_seen(closing_mps:
     if own_ship_known:
         assert track.v_ned_target_mps is not None
         assert track.v_ned_target_mps[0] == pytest.approx(20.0 - closing_mps, abs=12.0)
+
+
+@pytest.mark.parametrize("turned_deg", [10.0, 15.0, 20.0])
+def test_in_cam_a_target_missed_while_the_camera_turned_is_told_where_it_is_seen(turned_deg: float) -> None:
+    tracker = Tracker(1, LOOKING_NORTH)
+    for i, error in enumerate(np.random.default_rng(1).normal(scale=0.02, size=40)):
+        angle = np.deg2rad(turned_deg) * np.clip((i - 20) / 15.0, 0.0, 1.0)
+        t_cam = 200.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        found = [] if 20 < i < 35 else [sight(t_cam, float(error))]
+        (track,) = tracker.update(1 + round(i * 1e9 / 20), found, None, K, SIZE_WH)
+        if i >= 35:
+            assert track.measured_ns == track.time_ns
+            told_px, true_px = ((K @ t)[:2] / t[2] for t in (track.t_cam_target_m, t_cam))
+            assert np.abs(told_px - true_px).max() < 5.0
+            assert np.linalg.norm(track.t_cam_target_m) == pytest.approx(200.0, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["ned", "ned_relative"])
+@pytest.mark.parametrize("beside_m", [10.0, 20.0])
+def test_what_comes_into_sight_far_ahead_is_not_the_target_that_has_just_passed(beside_m: float, kind: str) -> None:
+    """Beside the camera a few metres are a good part of the range, and their logarithm is as uncertain as that of any
+    range ahead; the metres are not."""
+    for seed in range(4):
+        tracker = Tracker(4, LOOKING_NORTH)
+        for i, error in enumerate(np.random.default_rng(seed).normal(scale=0.04, size=34)):
+            t_s = i / 20.0
+            passing = np.array([beside_m, 0.0, 80.0 - 60.0 * t_s])
+            follows = passing + np.array([-10.0, 2.0, 100.0])
+            found = [] if 0.0 < passing[2] < 40.0 else [sight(passing if passing[2] > 0.0 else follows, float(error))]
+            v_mps = np.array([20.0, 0.0, 0.0])
+            own = OwnShip(1 + round(t_s * 1e9), np.eye(3), t_s * v_mps, v_mps, None)
+            if kind == "ned_relative":
+                own = replace(own, t_ned_body_m=None, v_ned_body_mps=None)
+            tracks = tracker.update(own.time_ns, found, own, K, SIZE_WH)
+            if passing[2] <= 0.0:
+                (seen,) = (track for track in tracks if track.measured_ns == track.time_ns)
+                assert seen.track_id == 1
+                assert seen.t_cam_target_m == pytest.approx(follows, rel=0.2)
+        assert seen.state is TrackState.CONFIRMED
 
 
 @pytest.mark.parametrize("seed", range(3))
