@@ -6,15 +6,18 @@ import itertools
 import json
 import math
 import os
+import shutil
 import socket
 import subprocess
 import sys
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pymavlink
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -57,6 +60,38 @@ def test_crc_extra_of_the_xml_is_upstreams() -> None:
     assert (crc & 0xFF) ^ (crc >> 8) == 28
     ours = mavlink.MAVLink_target_relative_message
     assert (ours.id, ours.crc_extra, ours.unpacker.format, ours.unpacker.size) == (511, 28, "<Qfff3ff4f4fBBB", 71)
+
+
+INCLUDES = "<mavlink><include>common.xml</include><include>uavpose.xml</include><messages/></mavlink>"
+READ = """import json, sys, generated
+mav = generated.MAVLink(None)
+message = mav.decode(bytearray.fromhex(sys.argv[1]))
+print(json.dumps([message.get_type(), *(getattr(message, name) for name in sys.argv[2:])]))
+"""
+
+
+@pytest.mark.parametrize("root", ["uavpose.xml", "own.xml"], ids=["by itself", "beside common.xml"])
+def test_upstream_s_generator_takes_the_dialect(tmp_path: Path, root: str) -> None:
+    shutil.copy(mavlink.DIALECT_XML, tmp_path)
+    for name in ("common.xml", "standard.xml", "minimal.xml"):
+        shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / name, tmp_path)
+    (tmp_path / "own.xml").write_text(INCLUDES)
+    generator = [sys.executable, "-m", "pymavlink.tools.mavgen", "--lang=Python3", "--wire-protocol=2.0"]
+    made = subprocess.run(
+        [*generator, f"--output={tmp_path / 'generated.py'}", tmp_path / root],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert made.returncode == 0, made.stdout + made.stderr
+    packed = mavlink.pack_target_relative(mavlink.MAVLink(None, srcSystem=1, srcComponent=191), **POSE)
+    fields = ["timestamp", "id", "frame", "x", "z", "pos_std", "yaw_std", "q_target", "q_sensor", "type"]
+    read = subprocess.run(
+        [sys.executable, "-c", READ, packed.hex(), *fields], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    name, timestamp, target_id, frame, x, z, *rest = json.loads(read.stdout)
+    assert (name, timestamp, target_id, frame, x, z) == ("TARGET_RELATIVE", POSE["utc_us"], 2, 3, 1.5, 300.125)
+    assert rest == [[0.5, 0.75, 12.0], 0.125, [0.5, 0.5, -0.5, 0.5], [0.0, 1.0, 0.0, 0.0], 3]
 
 
 def _free_port() -> int:
