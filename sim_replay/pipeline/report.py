@@ -16,6 +16,7 @@ from sim_replay.pipeline.flight import Flight
 
 SETTLE_S = 1.0  # after the sequence restarts: the target has jumped and must be re-acquired
 FLAT_FROM_MINUTES = 60.0
+MINUTE_NS = 60_000_000_000
 FAST_ABOVE_HZ = 31.0
 SENT_MAX_HZ = MavlinkSettings().target_relative_rate_hz
 PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
@@ -151,15 +152,25 @@ def last_counters(flight: Flight) -> dict[str, int]:
     return {name: int(text) for name, text in flight.diagnostics[-1]["values"].items() if text.isdecimal()}
 
 
-def memory_mb(flight: Flight) -> dict[str, float]:
-    """Resident memory; its growth is the slope of the second half. Empty: too few samples."""
+def memory_mb(flight: Flight) -> dict[str, Any]:
+    """Resident memory; its growth is the slope of the second half. Empty: too few samples.
+
+    Memory varies by whole images: `floor_by_minute`, 10th percentiles, shows whether it grew by steps or steadily.
+    """
     rss = np.array([usage.rss_mb for usage in flight.usage])
     if len(rss) < 4:
         return {}
     half = len(rss) // 2
     hours = np.array([usage.time_ns for usage in flight.usage[half:]]) / 3.6e12
     slope = float(np.polyfit(hours - hours[0], rss[half:], 1)[0])
-    return {"first": float(rss[0]), "last": float(rss[-1]), "max": float(rss.max()), "growth_per_hour": slope}
+    minutes = (np.array([usage.time_ns for usage in flight.usage]) - flight.usage[0].time_ns) // MINUTE_NS
+    return {
+        "first": float(rss[0]),
+        "last": float(rss[-1]),
+        "max": float(rss.max()),
+        "growth_per_hour": slope,
+        "floor_by_minute": [float(np.percentile(rss[minutes == minute], 10)) for minute in np.unique(minutes)],
+    }
 
 
 def cpu(flight: Flight, captured: int | None) -> dict[str, float | None]:

@@ -96,6 +96,13 @@ def test_growth_is_of_the_second_half() -> None:
     assert memory["growth_per_hour"] == pytest.approx(36.0)
 
 
+def test_memory_by_minute_tells_a_step_from_steady_growth() -> None:
+    flight = heard([], [])
+    rss_mb = [100.0 + (6.2 if 60 <= second < 75 else 0.0) + (6.2 if second >= 110 else 0.0) for second in range(180)]
+    flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb, 20, 9) for second, mb in enumerate(rss_mb)]
+    assert memory_mb(flight)["floor_by_minute"] == pytest.approx([100.0, 100.0, 106.2])
+
+
 def test_processor_time_and_waiting_are_told_apart() -> None:
     flight = heard([], [])
     flight.usage = [Usage(0, 3.0, 1.0, 100.0, 20, 9), Usage(20_000_000_000, 13.0, 5.0, 100.0, 20, 9)]
