@@ -25,7 +25,7 @@ def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequen
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = act()
-        sys.stdout.flush()
+        print(end="", flush=True)  # also where there is no standard output: sys.stdout is then None
     except bad_input as error:
         print(error, file=sys.stderr)
         return EXIT_BAD_INPUT
