@@ -25,7 +25,7 @@ def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequen
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = act()
-        sys.stdout.flush()
+        print(end="", flush=True)  # also where there is no standard output: sys.stdout is then None
     except bad_input as error:
         print(error, file=sys.stderr)
         return EXIT_BAD_INPUT
@@ -41,10 +41,14 @@ def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequen
     except BrokenPipeError:
         if _stdout_is_read():
             raise  # another pipe or socket broke
-        # Otherwise Python would report an error at exit when flushing the buffer.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
         return EXIT_UNREAD
     return code
+
+
+def discard_output() -> None:
+    """After an error on standard output: otherwise Python would report it again at exit, when flushing the buffer."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _stdout_is_read() -> bool:

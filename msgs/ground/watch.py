@@ -16,6 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from msgs.cdr import DiagnosticArray, Log
+from msgs.command_line import discard_output
+from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, linked, listening, session
 from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
 from msgs.session import TlsFiles
@@ -39,7 +41,8 @@ class WatchOptions:
 
 
 def watch(options: WatchOptions, stop: threading.Event, console: Console, say: Callable[[str], None]) -> int:
-    """Show the vehicles until `stop` is set; returns 0. Raises InputError for a bad endpoint."""
+    """Show the vehicles until `stop` is set; returns 0. Raises InputError for a bad endpoint, or if JSON lines cannot
+    be written."""
     fleet = Fleet(domain=options.domain, max_age_s=options.max_age_s)
     show = _watch_json if options.as_json else _watch_table
     with session(options.endpoint, options.tls, stop, say) as opened:
@@ -70,16 +73,22 @@ def _watch_table(
 def _watch_json(
     options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
 ) -> None:
-    """One JSON object per line: `pose`, `health`, `event`, `vehicle` (present or gone) and `link` (up or down)."""
-    lock = threading.Lock()
+    """One JSON object per line: `pose`, `health`, `event`, `vehicle` (present or gone) and `link` (up or down).
+
+    Raises InputError if the lines cannot be written, as into a file on a full disk.
+    """
+    lock, broken = threading.Lock(), list[OSError]()
 
     def tell(**values: object) -> None:
         line = json.dumps(values)
         with lock:
+            if broken:
+                return
             try:
                 console.file.write(line + "\n")
                 console.file.flush()
-            except BrokenPipeError:
+            except OSError as error:
+                broken.append(error)
                 stop.set()
 
     def take(incoming: Incoming) -> None:
@@ -112,7 +121,10 @@ def _watch_json(
                 tell(type="link", up=up)
                 told = up
             if stop.wait(REFRESH_S):
-                return
+                break
+    if broken and not isinstance(broken[0], BrokenPipeError):
+        discard_output()
+        raise InputError(f"standard output: cannot be written: {broken[0].strerror}")
 
 
 def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) -> Group:

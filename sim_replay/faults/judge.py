@@ -39,24 +39,29 @@ def violations(witness: Witness) -> list[str]:
 
 def faults_since(witness: Witness, poses: int = 0, messages: int = 0) -> list[str]:
     """Violations among what the peers received after this many poses and messages, as sentences."""
-    sent_on_time = [one for one in witness.poses[poses:] if not _held_back(one, witness.held_back)]
-    told_on_time = [one for one in witness.messages[messages:] if not _held_back(one, witness.held_back)]
-    return pose_faults(sent_on_time, witness.frames) + message_faults(told_on_time, witness.frames)
+    held_back = witness.held_back
+    return pose_faults(witness.poses[poses:], witness.frames, held_back) + message_faults(
+        witness.messages[messages:], witness.frames, held_back
+    )
 
 
-def pose_faults(poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame]) -> list[str]:
+def pose_faults(
+    poses: Sequence[ReceivedPose], frames: Sequence[ExposedFrame], held_back: Sequence[tuple[int, int]] = ()
+) -> list[str]:
     """Violations among the poses, as sentences. Wrong stamps of the camera do not matter: ages count from the true
-    exposure.
+    exposure. In the intervals `held_back` (UTC ns) the link to the ground held data back, which may come late.
     """
-    exposures = _Exposures(frames)
+    exposures = _Exposures(frames, held_back)
     return [text for pose in poses if (text := _fault_of(pose, exposures))]
 
 
-def message_faults(messages: Sequence[ReceivedMessage], frames: Sequence[ExposedFrame]) -> list[str]:
+def message_faults(
+    messages: Sequence[ReceivedMessage], frames: Sequence[ExposedFrame], held_back: Sequence[tuple[int, int]] = ()
+) -> list[str]:
     """The same for other messages. One without a stamp describes the present: a frame that is not frozen must have been
     exposed just before it arrived.
     """
-    exposures = _Exposures(frames)
+    exposures = _Exposures(frames, held_back)
     return [text for message in messages if (text := _fault_of_message(message, exposures))]
 
 
@@ -66,9 +71,10 @@ def ages_ms(witness: Witness, peer: str) -> list[float]:
 
 
 class _Exposures:
-    """Frames by the stamp that a pose carries."""
+    """Frames by the stamp that a pose carries, and when the link to the ground held data back."""
 
-    def __init__(self, frames: Sequence[ExposedFrame]) -> None:
+    def __init__(self, frames: Sequence[ExposedFrame], held_back: Sequence[tuple[int, int]]) -> None:
+        self._held_back = held_back
         self._by_stamp = sorted(frames, key=lambda frame: frame.stamp_ns)
         self._stamps = [frame.stamp_ns for frame in self._by_stamp]
         self._wrong = sorted(
@@ -80,6 +86,13 @@ class _Exposures:
     def any_living(self, from_ns: int, to_ns: int) -> bool:
         """Whether an image that is not frozen was exposed in this interval."""
         return bisect.bisect_left(self._living, from_ns) < bisect.bisect_right(self._living, to_ns)
+
+    def held_back(self, peer: str, capture_ns: int) -> bool:
+        """Whether a message of this frame was sent to the ground while the link held data back."""
+        limit_ns = AGE_MAX_NS[SUBSCRIBER] + TRANSIT_MAX_NS
+        return peer == SUBSCRIBER and any(
+            from_ns - limit_ns <= capture_ns <= to_ns for from_ns, to_ns in self._held_back
+        )
 
     def of(self, capture_ns: int) -> list[ExposedFrame]:
         """Frames with this stamp, or else wrongly stamped ones whose arrival time may have replaced their stamp."""
@@ -117,18 +130,9 @@ def _stamp_fault(told: str, peer: str, capture_ns: int, arrival_ns: int, exposur
     if all(frame.frozen for frame in frames):
         return f"{told} of a frozen picture, stamped {capture_ns}"
     age_ns = arrival_ns - max(frame.exposed_ns for frame in frames)
-    if age_ns > AGE_MAX_NS[peer] + TRANSIT_MAX_NS:
+    if age_ns > AGE_MAX_NS[peer] + TRANSIT_MAX_NS and not exposures.held_back(peer, capture_ns):
         return f"{told} {age_ns / 1e6:.0f} ms after its frame was exposed"
     return None
-
-
-def _held_back(received: ReceivedPose | ReceivedMessage, windows: Sequence[tuple[int, int]]) -> bool:
-    """Whether it was sent to the ground while the link held data back."""
-    capture_ns = received.capture_ns
-    if received.peer != SUBSCRIBER or capture_ns is None:
-        return False
-    limit_ns = AGE_MAX_NS[SUBSCRIBER] + TRANSIT_MAX_NS
-    return any(from_ns - limit_ns <= capture_ns <= to_ns for from_ns, to_ns in windows)
 
 
 def _attitude_holds(pose: ReceivedPose) -> bool:

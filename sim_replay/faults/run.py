@@ -17,11 +17,12 @@ from sim_replay.faults.actions import act
 from sim_replay.faults.expectations import Seen, Since, Unmet, expect
 from sim_replay.faults.judge import ages_ms, violations
 from sim_replay.faults.rig import Rig, RigSettings, can_mount
-from sim_replay.faults.timeline import ExpectPoses, Step, Timeline, load_timeline
+from sim_replay.faults.timeline import ExpectExit, ExpectPoses, Signal, Start, Step, Timeline, load_timeline
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 TIMELINES = Path(__file__).parent / "timelines"
 EXIT_UNMET = 1
+ENDING = ("TERM", "KILL")  # and HUP, but for the daemon, which reloads
 REPORT = "faults.json"
 
 Say = Callable[[str], None]
@@ -42,18 +43,31 @@ class Outcome:
 
 
 def play_timeline(rig: Rig, timeline: Timeline, say: Say) -> Outcome:
-    """Run every step on a running rig, once both peers receive poses; stops at the first unmet expectation."""
+    """Run every step on a running rig, once both peers receive poses; stops at the first unmet expectation.
+
+    A process that has ended, though no step signalled or expected that, is a violation too.
+    """
     outcome = Outcome(timeline.title)
     say(timeline.title)
     now_ns = time.time_ns()
     since = Since(now_ns, now_ns)
+    asked_to_end: set[str] = set()
     try:
         expect(ExpectPoses(do="expect_poses"), rig, since)
         for step in timeline.step:
+            if isinstance(step, Start):
+                asked_to_end.discard(step.who)
+            elif isinstance(step, Signal) and (step.name in ENDING or (step.name == "HUP" and step.who != "daemon")):
+                asked_to_end.add(step.who)
+            elif isinstance(step, ExpectExit):
+                asked_to_end.add("daemon")
             since = _take(step, rig, since, outcome, say)
     except Unmet as error:
         outcome.wrong.append(str(error))
         say(f"  NOT MET: {error}")
+    for who, process in rig.processes.items():
+        if process.exit_code is not None and who not in asked_to_end:
+            outcome.wrong.append(f"the {who} ended with exit code {process.exit_code}, which no step asked for")
     return outcome
 
 

@@ -66,8 +66,9 @@ def _add_arguments(parser: argparse.ArgumentParser, minutes: float, out: str) ->
 
 def run(args: argparse.Namespace) -> int:
     """0 if it was measured, whatever the result. Raises InputError, PlayError."""
-    result, _ = _measure(args)
-    _write(args.out / "pipeline.json", result)
+    path = args.out / "pipeline.json"
+    result, _ = _measure(args, path)
+    _write(path, result)
     print(json.dumps(result) if args.json else table(result))
     return 0
 
@@ -77,17 +78,18 @@ def run_soak(args: argparse.Namespace) -> int:
     minutes_min = SAMPLES_MIN * SAMPLE_S / 60.0
     if args.minutes < minutes_min:
         raise InputError(f"--minutes {args.minutes:g}: must be at least {minutes_min:g} to show a trend")
-    result, flight = _measure(args)
+    path = args.out / "soak.json"
+    result, flight = _measure(args, path)
     found = trends(flight, result["fps"])
     silent = silences(flight)
     result = {**result, "trends": [asdict(trend) for trend in found], "silences": silent}
-    _write(args.out / "soak.json", result)
+    _write(path, result)
     print(json.dumps(result) if args.json else "\n".join([trend_table(found, args.minutes), *silent]))
     return EXIT_DRIFTS if silent or any(trend.grows for trend in found) else 0
 
 
-def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
-    """Fly; returns the report and the flight."""
+def _measure(args: argparse.Namespace, path: Path) -> tuple[dict[str, Any], Flight]:
+    """Fly; returns the report, which is for `path`, and the flight."""
     if not 0.0 < args.minutes <= 24 * 60:
         raise InputError(f"--minutes {args.minutes:g}: must be above 0 and at most 1440, a day")
     model = load_model(args.model, threads=1)
@@ -100,6 +102,7 @@ def _measure(args: argparse.Namespace) -> tuple[dict[str, Any], Flight]:
             f"--fps {fps:g}: {args.sequence} was filmed from a gimbal, whose motion has the sequence's own rate"
         )
     settings = FlightSettings(sequence, args.out, args.minutes, args.model, fps)
+    path.unlink(missing_ok=True)  # of an earlier run: this one may end without
     load_before = os.getloadavg()[0]
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:

@@ -115,7 +115,10 @@ def poses_withheld(flight: Flight, fps: float, period_s: float) -> int | None:
         return None
     told_utc_ns = [record["capture_utc_us"] * 1000 for record in flight.targets]
     had, told = (Counter(_frames(flight, stamps, fps)) for stamps in (flight.poses_utc_ns, told_utc_ns))
-    flown = range(min(told), max(told) + 1) if told else range(max(had, default=0) + 1)  # while both were receiving
+    first, last = min(told, default=0), max(had, default=0)
+    if told:  # the daemon's end may have cut off MAVLink a little sooner than zenoh
+        last = max(*told, last - round(SETTLE_S * fps))
+    flown = range(first, last + 1)
     missed = had - told
     return sum(count for frame, count in missed.items() if frame in flown and _is_steady(frame, fps, period_s))
 

@@ -61,7 +61,7 @@ class Outcome:
     age_p95_s: float
     age_p99_s: float
     age_max_s: float
-    gap_max_s: float  # the longest time without a pose
+    gap_max_s: float  # the longest time without a pose, from the first one to the end of sending
     back_s: float | None  # from the end of the outage to the next pose; None: no outage, or none came
     up_kbps: float  # payload that the vehicle's session sent by radio
 
@@ -114,9 +114,10 @@ def play(plan: Plan) -> Outcome:
         bytes_before, began_s = relay.bytes_up, time.monotonic()
         restored_s = _wait_out(plan, relay)
         kbps = 8e-3 * (relay.bytes_up - bytes_before) / (time.monotonic() - began_s)
+        ended_s = time.time()
         sent = vehicle.end()["sent_pose"]
         threading.Event().wait(DRAIN_S)  # what is in flight counts as late or lost, not as never sent
-        return outcome_of(plan, ledger, sent, refused(), restored_s, kbps)
+        return outcome_of(plan, ledger, sent, refused(), restored_s, ended_s, kbps)
 
 
 def _wait_out(plan: Plan, relay: RadioRelay) -> float | None:
@@ -174,8 +175,10 @@ def _as_watch(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[Ca
         yield lambda: sum(row.refused for row in fleet.rows(time.time_ns()))
 
 
-def outcome_of(plan: Plan, ledger: Ledger, sent: int, refused: int, restored_s: float | None, kbps: float) -> Outcome:
-    """`sent`: number of poses put by the vehicle; `restored_s`: UTC of the end of the outage."""
+def outcome_of(
+    plan: Plan, ledger: Ledger, sent: int, refused: int, restored_s: float | None, ended_s: float, kbps: float
+) -> Outcome:
+    """`sent`: number of poses put by the vehicle; `restored_s`, `ended_s`: UTC of the end of the outage, of sending."""
     rows = list(ledger.rows)
     shown_s = np.array([row[0] for row in rows])
     ages_s = np.array([row[2] for row in rows])
@@ -193,7 +196,7 @@ def outcome_of(plan: Plan, ledger: Ledger, sent: int, refused: int, restored_s: 
         age_p95_s=p95_s,
         age_p99_s=p99_s,
         age_max_s=float(ages_s.max()),
-        gap_max_s=float(np.diff(shown_s).max(initial=0.0)),
+        gap_max_s=float(np.diff(shown_s, append=max(ended_s, shown_s[-1])).max()),
         back_s=float(after_s[0] - restored_s) if restored_s is not None and after_s.size else None,
         up_kbps=kbps,
     )

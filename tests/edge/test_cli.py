@@ -236,6 +236,13 @@ def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: P
     assert (done.returncode, done.stderr) == (141, "")
 
 
+def test_a_command_without_a_standard_output_does_its_work_all_the_same(tmp_path: Path, text: str) -> None:
+    (tmp_path / "config.toml").write_text(text + OFF)
+    command = f"{shlex.quote(sys.executable)} -m edge.cli check --config config.toml >&-"  # as some supervisors do
+    done = subprocess.run(["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("encoding", ["iso8859-1", "ascii"])
 def test_a_terminal_without_our_characters_gets_the_others(
     cli: Cli, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch, encoding: str

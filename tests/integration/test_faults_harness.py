@@ -23,7 +23,7 @@ from sim_replay.faults import hostile, run
 from sim_replay.faults.judge import pose_faults
 from sim_replay.faults.relay import LOOPBACK, LinkState, TcpRelay, UdpRelay, message_id
 from sim_replay.faults.rig import SERVING, Rig, RigSettings
-from sim_replay.faults.timeline import Start, load_timeline
+from sim_replay.faults.timeline import Start, Who, load_timeline
 from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose
 
 MS = 1_000_000
@@ -121,6 +121,26 @@ def test_what_was_not_seen_is_told_as_it_was(rig: Rig, tmp_path: Path) -> None:
     rig.processes["camera"].send_signal(signal.SIGCONT)
     assert "captured_ (which the daemon has not told of) stood still" in outcome.seen[0]["seen"]
     assert outcome.wrong[0].startswith("no silence of 90 s within 3 s, but of ")
+
+
+@pytest.mark.parametrize("who", ["daemon", "subscriber"])
+def test_a_process_that_ends_by_itself_is_told_also_if_nothing_more_is_expected_of_it(
+    rig: Rig, tmp_path: Path, who: Who
+) -> None:
+    path = tmp_path / "held.toml"
+    path.write_text('title = "x"\n[[step]]\ndo = "hold"\nfor_s = 0.1\n')
+
+    def say(text: str) -> None:
+        if text.startswith("  hold"):
+            rig.processes[who].send_signal(signal.SIGABRT)
+            assert rig.processes[who].wait(WAIT_S) == -6
+
+    outcome = run.play_timeline(rig, load_timeline(path), say)
+    assert outcome.wrong == [f"the {who} ended with exit code -6, which no step asked for"]
+    rig.start(Start(do="start", who=who))
+    steps = f'[[step]]\ndo = "signal"\nwho = "{who}"\nname = "KILL"\n'
+    assert play_steps(rig, tmp_path, steps).wrong == []
+    rig.start(Start(do="start", who=who))
 
 
 def test_a_scene_of_another_picture_format_is_shown_as_a_camera_would(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -94,3 +95,14 @@ def test_only_what_a_cut_link_to_the_ground_held_back_may_come_late() -> None:
     witness.messages.append(stale)
     witness.messages.append(tf(25, 4_000))
     assert len(faults_since(witness)) == 2
+
+
+def test_what_a_cut_link_held_back_may_be_late_and_no_more() -> None:
+    never_exposed = replace(tf(3, 4_000), capture_ns=FRAMES[3].stamp_ns + 50 * MS)
+    witness = Witness(frames=FRAMES, messages=[tf(24, 4_000), tf(3, 4_000, (0.5, 0.5, 0.5, 0.5)), never_exposed])
+    witness.zenoh_cut(True, FRAMES[2].exposed_ns)
+    witness.zenoh_cut(False, FRAMES[30].exposed_ns)
+    faults = faults_since(witness)
+    assert len(faults) == 3
+    for fault, words in zip(faults, ("frozen", "nobody flew", "never exposed"), strict=True):
+        assert words in fault

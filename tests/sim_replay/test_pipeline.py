@@ -160,6 +160,14 @@ def test_what_was_too_old_for_the_autopilot_is_counted_since_no_latency_tells_of
     assert report(flight, 60.0, PERIOD_S, 2.0)["poses_withheld"] is None  # more than it is sent
 
 
+def test_an_autopilot_that_receives_nothing_any_more_while_poses_go_on_has_them_withheld() -> None:
+    flight = heard([1.5 + frame / 30.0 for frame in range(30)], [12.0] * 30)
+    flight.poses_utc_ns = poses_at(range(45, 150))
+    result = report(flight, 30.0, PERIOD_S, 2.0)
+    assert result["poses_withheld"] == 150 - 75 - 30  # not of the last second
+    assert {one["name"]: one["met"] for one in result["budgets"]}["poses withheld by MAVLink, tracking"] is False
+
+
 def test_sixty_frames_a_second_have_a_budget_of_their_own() -> None:
     for p99_ms, met in ((32.0, True), (34.0, False)):
         judged = report(heard([2.0, 3.0], [p99_ms, p99_ms]), 60.0, PERIOD_S, 2.0)["budgets"]

@@ -96,9 +96,19 @@ def test_a_pose_is_late_by_what_it_tells_and_not_by_its_stamp() -> None:
     ledger = Ledger()
     for sequence, age_s in enumerate((0.1, 0.9, 1.2), start=7):
         ledger.show(range_m(now_ns / 1e9 - age_s), sequence, now_ns)
-    outcome = outcome_of(Plan(NARROW, max_age_s=1.0), ledger, 10, 0, None, 0.0)
+    outcome = outcome_of(Plan(NARROW, max_age_s=1.0), ledger, 10, 0, None, now_ns / 1e9, 0.0)
     assert (outcome.late_shown, outcome.sent, outcome.delivered) == (1, 4, 0.75)
     assert outcome.age_max_s == pytest.approx(1.2, abs=1e-5)
+
+
+def test_a_link_that_never_comes_back_has_a_gap_to_the_end() -> None:
+    ledger, began_s = Ledger(), 1_700_000_000.0
+    for sequence in range(1, 21):
+        now_s = began_s + 0.1 * sequence
+        ledger.show(range_m(now_s), sequence, round(now_s * 1e9))
+    outcome = outcome_of(Plan(OUTAGE, fps=10.0), ledger, 90, 0, began_s + 6.0, began_s + 9.0, 0.0)
+    assert outcome.back_s is None
+    assert outcome.gap_max_s == pytest.approx(7.0, abs=1e-3)
 
 
 def test_each_of_several_vehicles_on_one_router_gets_through() -> None:

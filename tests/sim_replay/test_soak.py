@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +19,7 @@ from sim_replay.pipeline.soak import silences, trends
 from sim_replay.pipeline.usage import Usage
 from tests.edge.toy_model import write_toy_model
 from tests.sim_replay.toy_flight import write_toy_flight
+from tests.waiting import until
 
 MINUTES, FPS = 4.0, 30.0
 START_NS, UTC_NS = 7_000_000_000, 1_700_000_000_000_000_000
@@ -98,13 +102,15 @@ def test_age_and_drops_of_a_busy_machine_are_not_judged_and_leaks_still_are() ->
     assert told["memory"] is True
 
 
-def test_poses_that_never_came_or_stopped_are_told_of_each_peer() -> None:
+@pytest.mark.parametrize("share", [0.1, 0.7])  # in the warm-up, and after it
+def test_poses_that_never_came_or_stopped_are_told_of_each_peer(share: float) -> None:
     flight = steady()
     assert silences(flight) == []
-    until_ns = START_NS + round(0.7 * MINUTES * 60e9)
+    until_ns = START_NS + round(share * MINUTES * 60e9)
     flight.targets = [record for record in flight.targets if record["received_ns"] < until_ns]
     (told,) = silences(flight)
-    assert re.fullmatch(r"the autopilot received \d+ poses in the first third and none in the last", told)
+    last_s = round(share * MINUTES * 60)
+    assert re.fullmatch(rf"the autopilot received \d+ poses, the last after {last_s} s", told)
     flight.poses_ns.clear()
     assert silences(flight) == [told, "the subscriber received no pose"]
 
@@ -127,6 +133,18 @@ def test_a_soak_without_a_pose_fails(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(flown) == 1
     assert "the autopilot received no pose" in capsys.readouterr().out
     assert "the subscriber received no pose" in json.loads((tmp_path / "soak.json").read_text())["silences"]
+
+
+def test_an_interrupted_run_does_not_leave_the_report_of_an_earlier_one(tmp_path: Path) -> None:
+    for command, report in (("soak", "soak.json"), ("bench-pipeline", "pipeline.json")):
+        (tmp_path / report).write_text("{}")
+        (tmp_path / "config.toml").unlink(missing_ok=True)
+        words = [sys.executable, "-m", "sim_replay.cli", command, "--out", str(tmp_path)]
+        with subprocess.Popen(words) as flying:
+            until((tmp_path / "config.toml").exists, what="the daemon's configuration")
+            flying.send_signal(signal.SIGINT)
+        assert flying.returncode == 130
+        assert not (tmp_path / report).exists()
 
 
 @pytest.mark.timeout(420)

@@ -105,9 +105,9 @@ def _play(options: ViewOptions, scene: Scene, stop: threading.Event, say: Callab
         for incoming, log_ns in samples(path):
             if stop.is_set():
                 return
+            scene.tick(log_ns)  # first: after a gap, the sample may be of the very target that was lost in it
             if not options.uavs or incoming.uav in options.uavs:
                 scene.take(incoming, log_ns)
-            scene.tick(log_ns)
         say(f"{path}: read")
 
 

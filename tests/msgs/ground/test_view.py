@@ -118,6 +118,22 @@ def test_a_target_that_is_not_told_again_is_taken_away_after_a_second(tmp_path: 
         assert cleared == [stamps_ns(10)[-1] + 1_000_000_000], where
 
 
+def test_what_an_outage_takes_away_is_gone_also_if_the_first_to_come_again_is_its_own_pose(tmp_path: Path) -> None:
+    """Nothing at all is recorded for 5.5 s; the pose of t0 is the first sample after that."""
+    file = McapFile(tmp_path / "outage.mcap")
+    for topic, target, payload, log_ns in samples(75):
+        if not 10 <= (log_ns - START_NS) // PERIOD_NS < 65:
+            file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.close()
+    path = tmp_path / "outage.rrd"
+    assert main(["view", str(tmp_path / "outage.mcap"), "--save", str(path)]) == 0
+    for where in ("ned", "ned/camera", "map", "zoom"):
+        cleared = [stamp_ns for stamp_ns, row in rows(path, f"{where}/target/t0") if clears(row)]
+        assert cleared == [stamps_ns(10)[-1] + 1_000_000_000], where
+    (silent,) = (stamp_ns for stamp_ns, row in rows(path, "health") if "No word since" in str(row))
+    assert silent == START_NS + 3_000_000_000
+
+
 def test_health_that_is_not_told_again_says_since_when(tmp_path: Path) -> None:
     file, told = McapFile(tmp_path / "silent.mcap"), []
     for topic, target, payload, log_ns in samples(150):

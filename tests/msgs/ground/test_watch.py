@@ -149,6 +149,19 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
         assert process.wait(60.0) == 0
 
 
+def test_lines_that_cannot_be_written_any_more_end_it_with_a_sentence(network: Network, tmp_path: Path) -> None:
+    """A file that may not grow beyond 4 kB stands for a full disk."""
+    words = [sys.executable, "-m", "msgs.ground.cli", "watch", "--json", "-e", network.endpoint]
+    shell = ["bash", "-c", 'ulimit -f 4 && exec "$@" >poses.jsonl', "bash", *words]
+    with ExitStack() as stack:
+        process = stack.enter_context(subprocess.Popen(shell, cwd=tmp_path, stderr=subprocess.PIPE, text=True))
+        uav1 = Vehicle(network.daemon, "uav1", stack)
+        until(lambda: process.poll() is not None, uav1.tell, what="the end of watch")
+        assert process.stderr is not None
+        assert process.stderr.read() == "standard output: cannot be written: File too large\n"
+        assert process.returncode == 2
+
+
 def test_the_table_shows_vehicles_and_targets_and_junk_is_refused(network: Network) -> None:
     with ExitStack() as stack, ground("watch", "--seconds", 3, "-e", network.endpoint) as (process, lines):
         uav1 = Vehicle(network.daemon, "uav1", stack)
