@@ -117,7 +117,7 @@ class Estimator:
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         aspect = pixel_aspect(frame.K)
         image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens, aspect)
-        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh, frame.up_cam)
         turns = quarter_turns(frame.up_cam)
         peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), contract.acquire_size_wh, turns)
         found = decode(peaks, 0, shown, contract, "acquire", score_min, refused)
@@ -172,7 +172,7 @@ class Estimator:
         scale, aspect = contract.track_window_scale, pixel_aspect(frame.K)
         windows = [window_around(box, scale, size_wh, frame_wh, lens, aspect) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
-        shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
+        shown = [Shown(one, one.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam) for one in maps]
         pixels = {window: cut(frame.image_bgr, window, size_wh, lens) for window in dict.fromkeys(windows)}
         turns = quarter_turns(frame.up_cam)
         images, K = turned(np.stack([pixels[window] for window in windows]), np.stack([one.K for one in shown]), turns)
