@@ -70,7 +70,7 @@ class VehicleSettings(Section):
 class MountSettings(Section):
     """Camera pose on the vehicle: three angles, or a matrix. All zero: along the nose, upright."""
 
-    roll_deg: Finite = Field(default=0.0, description="about the nose axis; positive: right side down")
+    roll_deg: Finite = Field(default=0.0, description="about the optical axis; positive: the right of the image down")
     pitch_deg: Finite = Field(default=0.0, ge=-90, le=90, description="positive: optical axis above the nose")
     yaw_deg: Finite = Field(default=0.0, description="positive: optical axis to the right of the nose")
     R_body_cam: list[list[Finite]] | None = Field(

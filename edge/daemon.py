@@ -11,6 +11,7 @@ import logging
 import threading
 from collections import Counter
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 
 from edge.cameras import FrameSupply, open_capture
 from edge.cameras.source import EndOfStream
@@ -19,6 +20,7 @@ from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
+from edge.estimator.upright import up_in_cam
 from edge.health import HealthSnapshot
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
@@ -148,6 +150,7 @@ class Pipeline:
         clock = StageClock(frame.meta, monotonic_ns())
         capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         own_ship = self._own_ship.at(capture_ns)
+        frame = replace(frame, up_cam=up_in_cam(own_ship, self._tracker.mount))
         self._take_requests(capture_ns)
         expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh, frame.distortion)
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)

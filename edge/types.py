@@ -30,6 +30,7 @@ class Frame:
     image_bgr: NDArray[np.uint8]  # [H, W, 3]
     K: Array  # [3, 3], pixel centres at integers
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] (plumb bob); empty: a pinhole camera
+    up_cam: Array | None = None  # [3], unit vector upwards in `cam`; None: unknown, taken for the top of the picture
 
 
 @dataclass(frozen=True)

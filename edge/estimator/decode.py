@@ -34,6 +34,9 @@ DOUBT_SIGMA_LOG_Z, DOUBT_SIGMA_ORIGIN, DOUBT_SIGMA_ROTATION_RAD = 0.5, 0.05, 0.5
 # A depth at the graph's upper limit is only a lower bound, one at its lower limit only an upper bound: 1-sigma of log Z
 # then, and the relative tolerance for being at a limit.
 LIMIT_SIGMA_LOG_Z, LIMIT_TOLERANCE = 1.0, 1e-3
+# No sight line in training is steeper: the network does not know the outlines of aircraft seen from farther above or
+# below. The excess, as 1-sigma about each axis, covers the shipped model's errors up to the vertical.
+TRAINED_STEEPNESS_RAD = float(np.deg2rad(40.0))
 
 
 class Shown(NamedTuple):
@@ -43,6 +46,7 @@ class Shown(NamedTuple):
     K: Array  # [3, 3] of the network's pixels
     size_wh: tuple[int, int]  # of the network's input
     frame_wh: tuple[int, int]
+    up_cam: Array | None = None  # as in Frame
 
     def cut_sides(self, box_xyxy_px: Array) -> NDArray[np.bool_]:
         """[4], for each side of a box on the frame: whether an edge of the window, beyond which the frame continues,
@@ -71,8 +75,9 @@ def decode(
 
     Rejected peaks are counted in `refused` by reason if their score reaches the contract's minimum.
 
-    The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training
-    or at a limit of depth. A cut target with its origin off the frame, or one too small to show a shape, is rejected.
+    The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training,
+    at a limit of depth, or seen from farther above or below than in training. A cut target with its origin off the
+    frame, or one too small to show a shape, is rejected.
     """
     acquiring = stage == "acquire"
     calibration = contract.acquire_score if acquiring else contract.track_score
@@ -100,6 +105,7 @@ def decode(
         nearest_m, farthest_m = contract.depth_limits_m
         if not nearest_m * (1.0 + LIMIT_TOLERANCE) < t_m[2] < farthest_m * (1.0 - LIMIT_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], LIMIT_SIGMA_LOG_Z)
+        sigma[3:] = np.hypot(sigma[3:], max(_steepness_rad(t_m, shown.up_cam) - TRAINED_STEEPNESS_RAD, 0.0))
         covariance = pose_covariance(t_m, sigma, shown.K, contract.trained_range_m)
         found.append(Estimate(score, on_frame, _nearest_rotation(R), t_m, covariance, stage))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
@@ -229,6 +235,11 @@ def _excess(value: float, trained: tuple[float, float]) -> float:
     """Factor by which a depth or a size lies outside the trained interval; 1 inside."""
     low, high = trained
     return float(max(low / value, value / high, 1.0))
+
+
+def _steepness_rad(t_m: Array, up_cam: Array | None) -> float:
+    """Angle of the sight line to the horizon, 0 .. pi / 2; 0 if it is unknown where up is."""
+    return 0.0 if up_cam is None else float(np.arcsin(min(abs(float(t_m @ up_cam)) / float(np.linalg.norm(t_m)), 1.0)))
 
 
 def _nearest_rotation(R: Array) -> Array:

@@ -12,6 +12,7 @@ from edge.estimator.decode import Shown, decode, distinct, grown, nearest_expect
 from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
+from edge.estimator.upright import quarter_turns, turned, turned_back
 from edge.estimator.window import cut, fit_frame, pixel_aspect, window_around
 from edge.types import Array, Estimate, Frame
 
@@ -116,8 +117,10 @@ class Estimator:
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         aspect = pixel_aspect(frame.K)
         image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens, aspect)
-        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh)
-        found = decode(run(image[None], shown.K[None]), 0, shown, contract, "acquire", score_min, refused)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh, frame.up_cam)
+        turns = quarter_turns(frame.up_cam)
+        peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), contract.acquire_size_wh, turns)
+        found = decode(peaks, 0, shown, contract, "acquire", score_min, refused)
         return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 0)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
@@ -169,12 +172,13 @@ class Estimator:
         scale, aspect = contract.track_window_scale, pixel_aspect(frame.K)
         windows = [window_around(box, scale, size_wh, frame_wh, lens, aspect) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
-        shown = [Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh) for pixel_map in maps]
+        shown = [Shown(one, one.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam) for one in maps]
         pixels = {window: cut(frame.image_bgr, window, size_wh, lens) for window in dict.fromkeys(windows)}
-        images = np.stack([pixels[window] for window in windows])
-        K = np.stack([one.K for one in shown])
-        turned = np.array(mirrors, dtype=bool) if mirrors else np.zeros(len(images), dtype=bool)
-        peaks = unmirrored(self.model.run(*mirrored(images, K, turned)), size_wh[0], turned)
+        turns = quarter_turns(frame.up_cam)
+        images, K = turned(np.stack([pixels[window] for window in windows]), np.stack([one.K for one in shown]), turns)
+        flipped = np.array(mirrors, dtype=bool) if mirrors else np.zeros(len(images), dtype=bool)
+        peaks = unmirrored(self.model.run(*mirrored(images, K, flipped)), images.shape[2], flipped)
+        peaks = turned_back(peaks, size_wh, turns)
         found = [
             nearest_expected(decode(peaks, i, one, contract, "track", score_min, self.refused), boxes_xyxy_px[i])
             for i, one in enumerate(shown)
@@ -185,7 +189,7 @@ class Estimator:
             if estimate is not None and (box := grown(estimate.box_xyxy_px, one)) is not None
         }
         if beyond and looks_left > 1:
-            again = self._look(frame, list(beyond.values()), score_min, turned[list(beyond)].tolist(), looks_left - 1)
+            again = self._look(frame, list(beyond.values()), score_min, flipped[list(beyond)].tolist(), looks_left - 1)
             for i, estimate in zip(beyond, again, strict=True):
                 found[i] = estimate
         return found

@@ -110,10 +110,10 @@ def begin(estimate: Estimate, K: Array, view: View) -> Motion:
 
 def unknown_motion(motion: Motion, view: View) -> Motion:
     """The same position with unknown velocity and turn rate; `view` is in the motion's frame."""
-    range_m = float(np.linalg.norm(motion.t_m - view.t_frame_cam_m))
     P = np.zeros((DIMENSION, DIMENSION))
     P[POSITION, POSITION] = motion.P[POSITION, POSITION]
-    return replace(motion, v_mps=np.zeros(3), turn_rate_radps=0.0, P=_unknown_velocity(P, motion.kind, range_m))
+    P = _unknown_velocity(P, motion.kind, float(np.linalg.norm(motion.t_m - view.t_frame_cam_m)))
+    return replace(motion, v_mps=np.zeros(3), turn_rate_radps=0.0, P=P, scale=motion.scale.alone())
 
 
 def turning(motion: Motion, time_ns: int) -> Array:

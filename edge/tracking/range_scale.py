@@ -12,7 +12,7 @@ error variances are scaled up.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean, median
 
 import numpy as np
@@ -80,6 +80,10 @@ class RangeScale:
         frame_variance = max((told + len(now) * scatter) / (PRIOR_FRAMES + len(now)), FRAME_STD_MIN**2)
         discord = fmean((one - center) ** 2 for one in now)
         return RangeScale(math.sqrt(sigma2), recent, frame_variance, discord, center, now[-1] - center)
+
+    def alone(self) -> RangeScale:
+        """With the last frame only: without a velocity, ranges of earlier ones cannot be compared with later ones."""
+        return replace(self, recent=self.recent[-1:])
 
     def noise(self, dt_s: float) -> float:
         """Measurement variance of log range for the last frame, dt_s after the one before."""

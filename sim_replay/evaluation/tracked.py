@@ -22,6 +22,7 @@ from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.estimator.pace import Pace, looked_at_twice
+from edge.estimator.upright import up_in_cam
 from edge.links.outgoing import rotation_known, sendable
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
@@ -153,9 +154,10 @@ def _flown(
 ) -> tuple[Report, list[Estimate], float]:
     """The tracker's report on the sequence's next frame, the estimates that it was given, and how long it took, ms."""
     image_bgr = read_undistorted_bgr(sequence.scene.image_path(shown), shown.K, shown.distortion)
-    frame = Frame(sequence.meta(shown.image_id), image_bgr, shown.K)
-    size_wh = (image_bgr.shape[1], image_bgr.shape[0])
-    capture_ns, own_ship = frame.meta.capture_ns, sequence.own_ship(shown.image_id)
+    own_ship = sequence.own_ship(shown.image_id)
+    up_cam = None if own_ship is None else up_in_cam(own_ship, _CAMERA_ITSELF)
+    frame = Frame(sequence.meta(shown.image_id), image_bgr, shown.K, up_cam=up_cam)
+    size_wh, capture_ns = (image_bgr.shape[1], image_bgr.shape[0]), frame.meta.capture_ns
     started_ns = time.monotonic_ns()
     expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
     estimates = _estimate(estimator, sequence, frame, expected)

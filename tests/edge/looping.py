@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -84,10 +84,12 @@ class Supply:
 
 
 @contextmanager
-def looping(gated: Gated, max_targets: int = 4) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
+def looping(
+    gated: Gated, max_targets: int = 4, mount: Mapping[str, float] | None = None
+) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
     config = Config.model_validate({
         "camera": {"type": "sequence", "path": "/scene"}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
-        "estimator": {"acquire_every_n": 5, "max_targets": max_targets},
+        "estimator": {"acquire_every_n": 5, "max_targets": max_targets}, "mount": mount or {},
     })  # fmt: skip
     board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))
     ear, requests = Ear(), RequestQueue()

@@ -197,6 +197,23 @@ def test_a_depth_at_either_end_of_what_a_graph_can_tell_is_a_bound() -> None:
     assert min(sigma[50.01], sigma[599.99]) > 0.9
 
 
+@pytest.mark.parametrize(("steep_deg", "excess_deg"), [(0.0, 0.0), (39.0, 0.0), (60.0, 20.0), (-85.0, 45.0)])
+def test_an_aircraft_seen_from_farther_above_or_below_than_in_training_is_less_sure_in_rotation(
+    steep_deg: float, excess_deg: float
+) -> None:
+    contract, peaks = ModelContract(**CONTRACT), peaks_of(score=1.0)
+    ray = peaks.t_cam_target_m[0, 0].astype(float) / np.linalg.norm(peaks.t_cam_target_m)
+    across = np.cross(ray, [1.0, 0.0, 0.0]) / np.linalg.norm(np.cross(ray, [1.0, 0.0, 0.0]))
+    up_cam = np.sin(np.deg2rad(steep_deg)) * ray + np.cos(np.deg2rad(steep_deg)) * across
+    estimates = [
+        decode(peaks, 0, WHOLE._replace(up_cam=up), contract, "track", contract.track_score_min, Counter())[0]
+        for up in (None, up_cam)
+    ]
+    unknown, steep = (np.sqrt(np.diag(e.covariance)) for e in estimates)
+    np.testing.assert_allclose(steep[3:], np.hypot(unknown[3:], np.deg2rad(excess_deg)), atol=1e-4)
+    np.testing.assert_array_equal(steep[:3], unknown[:3])
+
+
 def test_what_may_not_be_what_it_is_taken_for_is_less_sure_in_all_it_tells() -> None:
     """Half a chance to be something else: half the variance of what such things are off by."""
     contract = ModelContract(**(CONTRACT | {"track_score_min": 0.3}))

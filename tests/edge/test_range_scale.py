@@ -31,8 +31,10 @@ def follow(
     range_m: float = 200.0,
     opening_mps: float = 6.0,
     missed: range = range(0),
+    doubted: int | None = None,
 ) -> list[tuple[Track, np.ndarray]]:
-    """Tracks and truths of a target ahead that draws away, or closes, and to the right; `missed` frames show none."""
+    """Tracks and truths of a target ahead that draws away, or closes, and to the right; `missed` frames show none, and
+    before frame `doubted` the camera's timestamps are found to have jumped."""
     tracker = Tracker(1, LOOKING_NORTH)
     flown = []
     for i, error in enumerate(log_range_errors):
@@ -41,6 +43,8 @@ def follow(
         own_m = np.array([20.0 * t_s, 0.0, -100.0])
         own = OwnShip(1 + round(t_s * 1e9), np.eye(3), own_m, np.array([20.0, 0.0, 0.0]), None)
         found = [] if i in missed else [sight(t_cam, float(error))]
+        if i == doubted:
+            tracker.doubt_motion()
         (track,) = tracker.update(own.time_ns, found, own if own_ship_known else None, K, SIZE_WH)
         flown.append((track, t_cam))
     return flown
@@ -83,6 +87,16 @@ def test_a_target_that_comes_head_on_is_not_told_farther_than_it_is(closing_mps:
         flown = follow(errors, 30.0, own_ship_known, 100.0 + 4.0 * closing_mps, -closing_mps)
         last_m = [np.linalg.norm([track.t_cam_target_m, truth], axis=1) for track, truth in flown[-30:]]
         assert max(abs(np.log(told_m / true_m)) for told_m, true_m in last_m) < 0.07
+
+
+@pytest.mark.parametrize("own_ship_known", [True, False], ids=["ned", "cam"])
+def test_a_target_whose_velocity_was_forgotten_is_not_told_where_it_was_before(own_ship_known: bool) -> None:
+    """Without a velocity, the ranges of a second ago, half as far again, say nothing of where it is now."""
+    for seed in range(3):
+        errors = np.random.default_rng(seed).normal(scale=0.02, size=90)
+        flown = follow(errors, 30.0, own_ship_known, 450.0, -100.0, doubted=60)
+        last_m = [np.linalg.norm([track.t_cam_target_m, truth], axis=1) for track, truth in flown[60:]]
+        assert max(abs(np.log(told_m / true_m)) for told_m, true_m in last_m) < 0.1
 
 
 @pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
