@@ -257,6 +257,17 @@ def test_fourteen_heartbeats_behind_a_truncated_header_are_all_read() -> None:
     assert len(mavlink.FrameReader(datagram=True).feed(datagram)) == 14
 
 
+@pytest.mark.parametrize("before", [b"\xfd\xff\x00", b"\xfe\xff", b"\x00\xfd\xff\x01\x00\xfe\xff"])
+def test_no_false_start_in_a_stream_delays_what_follows(before: bytes) -> None:
+    """Such as in a message of another dialect, of which ArduPilot sends several a second."""
+    mav, reader = mavlink.MAVLink(None, 1, 1), mavlink.FrameReader(datagram=False)
+    reader.feed(before)
+    for _ in range(3):
+        frame = mavlink.pack(mav, HEARTBEAT)
+        assert [len(reader.feed(part)) for part in (frame[:5], frame[5:])] == [0, 1]
+    assert reader.bad_runs == 1
+
+
 @given(position=st.integers(0, 20), bit=st.integers(0, 7))
 def test_a_frame_with_one_bit_wrong_is_no_message(position: int, bit: int) -> None:
     frame = bytearray(mavlink.pack(mavlink.MAVLink(None, 1, 1), HEARTBEAT))
