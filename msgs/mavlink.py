@@ -184,30 +184,35 @@ class FrameReader:
         self._buffer = bytearray()
         self._decoder = dialect.MAVLink(None)
         self._in_bad_run = False
+        self._framed = 0  # end in the buffer of the last frame, of whatever id
 
     def feed(self, data: bytes) -> list[Any]:
         """All messages with a valid checksum that are complete with these bytes, as pymavlink's classes."""
         self._buffer += data
         self._in_bad_run = self._in_bad_run and not self.datagram
         messages = []
-        at, spoilt, framed = 0, 0, 0  # `framed`: end of the last message
+        at, spoilt = 0, 0
         begun: int | None = None  # the first start whose frame may still be completed
         while spoilt <= CANDIDATES_MAX and (at := self._next_magic(at)) < len(self._buffer):
             end = self._frame_end(at)
             if end is not None and end <= len(self._buffer):
-                message = self._decoded(at, end, first_seen=begun is None)
-                if message is not None:
-                    self._skip(at, framed)
+                message = self._decoded(at, end)
+                known = message is not None and message.get_msgId() >= 0
+                if known or (message is not None and begun is None and at >= self._framed):
+                    self._skip(at)
+                    self._in_bad_run, self._framed = False, max(self._framed, end)
+                    self.unknown_ids += not known
+                if known:
                     messages.append(message)
-                    self._in_bad_run = False
-                    at, framed, begun = end, end, None
+                    at, begun = end, None
                     continue
                 spoilt += 1
             elif begun is None and not self.datagram:
                 begun = at  # what follows is read all the same: a false start must not hold it back
             at += 1
         keep_from = len(self._buffer) if begun is None or spoilt > CANDIDATES_MAX else begun
-        self._skip(keep_from, framed)
+        self._skip(keep_from)
+        self._framed = max(self._framed - keep_from, 0)
         del self._buffer[:keep_from]
         return messages
 
@@ -226,19 +231,14 @@ class FrameReader:
             return 0
         return at + 12 + header[1] + (13 if header[2] else 0)
 
-    def _decoded(self, at: int, end: int, *, first_seen: bool) -> Any | None:
-        if end <= at:
-            return None
+    def _decoded(self, at: int, end: int) -> Any | None:
+        """The message of this frame, unchecked and with a negative id if its id is not in our dialects."""
         try:
-            message = self._decoder.decode(self._buffer[at:end])
+            return self._decoder.decode(self._buffer[at:end]) if end > at else None
         except MAVError:
             return None
-        if message.get_msgId() >= 0 and not message.get_type().startswith("UNKNOWN"):
-            return message
-        self.unknown_ids += first_seen
-        return None
 
-    def _skip(self, end: int, start: int) -> None:
-        if end > start and not self._in_bad_run:
+    def _skip(self, end: int) -> None:
+        if end > self._framed and not self._in_bad_run:
             self._in_bad_run = True
             self.bad_runs += 1
