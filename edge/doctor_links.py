@@ -24,6 +24,7 @@ from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.findings import Finding, device_fault, good, poor, wrong
+from edge.health import Activity, Condition, HealthState
 from edge.links.mavlink_endpoints import SerialEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.links.signing import ahead_of_clock
@@ -112,7 +113,8 @@ def metrics_finding(port: int) -> Finding:
 
 
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
-    """Listen as the daemon does until a heartbeat is received."""
+    """Speak and listen as the daemon does before its first frame, until a heartbeat is received: a router, or an
+    autopilot, may send to nobody who has not spoken first."""
     if settings.signing_key is not None:
         yield signing_finding(signing_state_of(settings, settings.signing_key))
     for endpoint in settings.endpoints:
@@ -138,8 +140,13 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         code = error.__cause__.errno if isinstance(error.__cause__, OSError) else None
         yield wrong("mavlink", str(error), _advice_to_listen(code, "[mavlink] endpoints"))
         return
+
+    def spoken_and_heard() -> dict[str, int]:
+        link.set_health(Condition(HealthState.INIT, Activity.WAITING))
+        return link.counters()
+
     try:
-        counters = _wait(link.counters, lambda counted: counted.get("received_HEARTBEAT", 0) > 0)
+        counters = _wait(spoken_and_heard, lambda counted: counted.get("received_HEARTBEAT", 0) > 0)
     finally:
         link.stop()
     where = ", ".join(settings.endpoints)

@@ -173,8 +173,8 @@ class FrameReader:
     """Extracts MAVLink messages from bytes, skipping garbage between them.
 
     After a false frame start it skips one byte, not the length claimed there, so a truncated header hides nothing that
-    follows. Use `datagram=True` for datagram transports, where no frame continues in the next datagram; for byte
-    streams use one reader per connection.
+    follows, nor delays it. Use `datagram=True` for datagram transports, where no frame continues in the next datagram;
+    for byte streams use one reader per connection.
     """
 
     def __init__(self, datagram: bool) -> None:
@@ -184,6 +184,7 @@ class FrameReader:
         self._buffer = bytearray()
         self._decoder = dialect.MAVLink(None)
         self._in_bad_run = False
+        self._framed = 0  # end in the buffer of the last frame, of whatever id
 
     def feed(self, data: bytes) -> list[Any]:
         """All messages with a valid checksum that are complete with these bytes, as pymavlink's classes."""
@@ -191,28 +192,33 @@ class FrameReader:
         self._in_bad_run = self._in_bad_run and not self.datagram
         messages = []
         at, spoilt = 0, 0
+        begun: int | None = None  # the first start whose frame may still be completed
         while spoilt <= CANDIDATES_MAX and (at := self._next_magic(at)) < len(self._buffer):
             end = self._frame_end(at)
-            message = None if end is None or end > len(self._buffer) else self._decoded(at, end)
-            if message is not None and end is not None:
-                messages.append(message)
-                self._in_bad_run = False
-                at = end
-            elif not self.datagram and (end is None or end > len(self._buffer)):
-                break  # the rest may still arrive
-            else:
+            if end is not None and end <= len(self._buffer):
+                message = self._decoded(at, end)
+                known = message is not None and message.get_msgId() >= 0
+                if known or (message is not None and begun is None and at >= self._framed):
+                    self._skip(at)
+                    self._in_bad_run, self._framed = False, max(self._framed, end)
+                    self.unknown_ids += not known
+                if known:
+                    messages.append(message)
+                    at, begun = end, None
+                    continue
                 spoilt += 1
-                self._skip(at + 1, at)
-                at += 1
-        keep_from = len(self._buffer) if self.datagram or spoilt > CANDIDATES_MAX else at
+            elif begun is None and not self.datagram:
+                begun = at  # what follows is read all the same: a false start must not hold it back
+            at += 1
+        keep_from = len(self._buffer) if begun is None or spoilt > CANDIDATES_MAX else begun
+        self._skip(keep_from)
+        self._framed = max(self._framed - keep_from, 0)
         del self._buffer[:keep_from]
         return messages
 
     def _next_magic(self, start: int) -> int:
         found = [i for i in (self._buffer.find(magic, start) for magic in (b"\xfd", b"\xfe")) if i >= 0]
-        nearest = min(found, default=len(self._buffer))
-        self._skip(nearest, start)
-        return nearest
+        return min(found, default=len(self._buffer))
 
     def _frame_end(self, at: int) -> int | None:
         """End of the frame that starts here; None if its header is incomplete, 0 if it is no frame."""
@@ -226,18 +232,13 @@ class FrameReader:
         return at + 12 + header[1] + (13 if header[2] else 0)
 
     def _decoded(self, at: int, end: int) -> Any | None:
-        if end <= at:
-            return None
+        """The message of this frame, unchecked and with a negative id if its id is not in our dialects."""
         try:
-            message = self._decoder.decode(self._buffer[at:end])
+            return self._decoder.decode(self._buffer[at:end]) if end > at else None
         except MAVError:
             return None
-        if message.get_msgId() >= 0 and not message.get_type().startswith("UNKNOWN"):
-            return message
-        self.unknown_ids += 1
-        return None
 
-    def _skip(self, end: int, start: int) -> None:
-        if end > start and not self._in_bad_run:
+    def _skip(self, end: int) -> None:
+        if end > self._framed and not self._in_bad_run:
             self._in_bad_run = True
             self.bad_runs += 1

@@ -38,10 +38,9 @@ class Daytime:
 
     def news(self, now_ns: int) -> list[str]:
         """A sentence each time that the two are found to differ, at most one a minute (`now_ns` is monotonic)."""
-        untold, self._untold = self._untold, False
         just_told = self._told_ns is not None and now_ns - self._told_ns < TOLD_AGAIN_NS
-        if not untold or just_told or self.ahead_ns is None:
+        if not self._untold or just_told or self.ahead_ns is None:
             return []
-        self._told_ns = now_ns
+        self._untold, self._told_ns = False, now_ns
         apart = f"{abs(self.ahead_ns) * 1e-9:.1f} s {'ahead of' if self.ahead_ns > 0 else 'behind'}"
         return [f"UTC here is {apart} the autopilot's: receivers that judge poses by their stamps will refuse them"]

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 from edge.links.mavlink_endpoints import plain_host
 from edge.links.mavlink_packing import Letter, Packer
 from edge.links.mavlink_receive import Receiver
+from edge.links.mavlink_table import RATE_LIMITS_HZ
 from edge.links.mavlink_vehicle import LOST_NS
 from edge.links.transports.medium import Address, Received, Transport
 
@@ -99,8 +100,8 @@ class Endpoint:
     def send(self, letter: Letter) -> bool:
         """Send to the accepted peer, if any; False if that failed. Raises ValueError if a value does not fit its
         field."""
-        peer = self.peer
-        return peer is None or self.transport.send(self._packer.packed(letter), peer)
+        peer, repeats = self.peer, letter.message.get_msgId() in RATE_LIMITS_HZ
+        return peer is None or self.transport.send(self._packer.packed(letter), peer, yields=repeats)
 
     def tick(self, now_ns: int) -> None:
         """Maintain connections, and drop a peer that is silent or disconnected."""

@@ -290,8 +290,10 @@ class Station:
 
     def _tells(self, message_id: int, now_ns: int) -> bool:
         """Whether there is content for a message now."""
-        if message_id in (CAMERA_INFORMATION, IMAGE_STATUS):
+        if message_id == CAMERA_INFORMATION:
             return True
+        if message_id == IMAGE_STATUS:  # before the autopilot is received no target is told, so nor that there is none
+            return self.vehicle.contact is not Contact.WAITING
         if message_id == HEARTBEAT:
             return self._condition(now_ns) is not None
         if self.vehicle.contact is not Contact.HEARD:

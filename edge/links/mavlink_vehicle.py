@@ -22,7 +22,7 @@ LOST_NS = 5_000_000_000
 ACK_TIMEOUT_NS = 1_000_000_000
 RETRY_NS = 3_000_000_000
 RETRY_MAX_NS = 30_000_000_000
-RATE_WINDOW_NS = 2_000_000_000
+RATE_WINDOW_NS = 2_500_000_000  # not a multiple of the longest period, 1 s: jitter would change the count
 RATE_ENOUGH = 0.7  # of the requested rate
 IN_VAIN = 2  # requests without any message received
 
@@ -134,7 +134,7 @@ class Vehicle:
             self._streams[message_id].arrivals_ns.append(now_ns)
 
     def measured_hz(self, message_id: int, now_ns: int) -> float:
-        """Rate of a requested message over the last two seconds."""
+        """Rate of a requested message over RATE_WINDOW_NS."""
         return self._streams[message_id].measured_hz(now_ns)
 
     def acknowledged(self, accepted: bool) -> None:

@@ -10,17 +10,21 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Any
 
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.config import MavlinkSettings
+from edge.doctor_links import _mavlink
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint
 from edge.links.transports import open_transport
 from edge.links.transports.tcp import TcpClient
 from edge.links.transports.udp import SILENT_NS, UdpCaller
+from msgs.mavlink import MAVLink, dialect
 from tests.waiting import until
 
 from .mavlink_peer import DEADLINE_S, Peer, Udp, hear, linked, meet
@@ -185,3 +189,13 @@ def test_each_address_of_a_silent_ground_station_has_its_turn_until_one_is_heard
                 caller.tick(now_ns)
                 assert caller.peer == heard, "who is heard stays"
             assert next_called() != "127.0.0.2"
+
+
+def test_the_doctor_hears_an_autopilot_behind_a_router_that_sends_only_to_who_has_spoken() -> None:
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3).pack(MAVLink(None, 1, 1))
+    with socket.socket(type=socket.SOCK_DGRAM) as router, ThreadPoolExecutor() as pool:
+        router.bind(("127.0.0.1", 0))
+        router.settimeout(DEADLINE_S)
+        pool.submit(lambda: router.sendto(beat, router.recvfrom(300)[1]))
+        (finding,) = _mavlink(MavlinkSettings(endpoints=[f"udpout:127.0.0.1:{router.getsockname()[1]}"]))
+    assert finding.verdict == "good", finding.says

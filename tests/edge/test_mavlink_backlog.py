@@ -8,15 +8,23 @@ import pty
 import socket
 import time
 import tty
+from collections import Counter
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge import clock
+from edge.links import mavlink_messages as words
 from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint
-from edge.links.transports.medium import PENDING_MAX, WAITING_MAX_NS, Outbox, Received
+from edge.links.mavlink_packing import Letter, Packer
+from edge.links.mavlink_peer import Endpoint
+from edge.links.mavlink_recognition import Recognition
+from edge.links.mavlink_vehicle import Vehicle
+from edge.links.transports.medium import BEHIND_NS, PENDING_MAX, WAITING_MAX_NS, Outbox, Received
 from edge.links.transports.serial_port import SerialPort
 from edge.links.transports.tcp import TcpServer
+from msgs.mavlink import dialect
 from tests.waiting import until
 
 TICK_NS = 10_000_000
@@ -169,3 +177,58 @@ def test_what_a_connection_still_holds_at_its_end_is_counted() -> None:
         until(lambda: not server.reaches(peer), lambda: server.receive(), what="the end of the connection")
         assert server.dropped() >= PENDING_MAX // 250
         assert server.dropped() == 0
+
+
+@pytest.mark.parametrize("targets", [2, 4])
+def test_on_a_line_too_slow_for_all_poses_answers_come_out_all_the_same(targets: int) -> None:
+    """57600 baud, thirty frames a second: what is sent with frames yields, each kind alike."""
+    outbox, line, frame_ns = Outbox(), Line(57), 33_000_000
+    put_ns: dict[int, int] = {}
+    numbers: dict[str, list[int]] = {"answer": [], "pose": [], "box": []}
+
+    def put(kind: str, length: int, now_ns: int) -> None:
+        put_ns[number := len(put_ns)] = now_ns
+        numbers[kind].append(number)
+        outbox.put(message(number, length), now_ns, yields=kind != "answer")
+
+    for now_ns in range(0, 20_000_000_000, TICK_NS):
+        if now_ns % frame_ns < TICK_NS:
+            for _ in range(targets):
+                put("pose", 83, now_ns)
+        if now_ns % 100_000_000 < TICK_NS:
+            put("box", 61, now_ns)
+        if now_ns % 200_000_000 < TICK_NS:
+            put("answer", 28, now_ns)
+        line.room = line.per_tick
+        outbox.flush(line.write, 10**9, now_ns)
+    read, out = 0, set()
+    while read + 6 <= len(line.out):
+        out.add(int.from_bytes(line.out[read : read + 4], "big"))
+        read += int.from_bytes(line.out[read + 4 : read + 6], "big")
+    came = {kind: len(out.intersection(of_kind)) / len(of_kind) for kind, of_kind in numbers.items()}
+    assert came["answer"] > 0.98, "the last may still wait"
+    assert min(came["pose"], came["box"]) > 0.3
+    assert len(line.out) > 0.9 * 57 * 2_000, "the line is not idle"
+
+
+def test_what_is_sent_with_frames_yields_to_answers(stepped: int) -> None:
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    device = os.ttyname(theirs)
+    port = SerialPort(SerialEndpoint(device, 57600, f"serial:{device}:57600"))
+    vehicle = Vehicle(None, {})
+    endpoint = Endpoint(port, [], Counter(), Recognition(vehicle, None, None, Counter()), Packer(0, None))
+    text = Letter(dialect.MAVLink_statustext_message(4, b"x" * 50, 0, 0), 1, 191)
+    answer = Letter(dialect.MAVLink_command_ack_message(2004, 0, 0, 0, 255, 190), 1, 100)
+    box = Letter(words.idle_image_status(), 1, 100, words.IMAGE_STATUS_UNKNOWN)
+    with contextlib.closing(port):
+        endpoint.tick(stepped)
+        os.close(theirs)
+        assert endpoint.send(box), "nothing waits yet"
+        while endpoint.send(text):  # nobody reads: the line is full, and so is what waits for it
+            pass
+        clock.step_to(stepped + 2 * WAITING_MAX_NS)
+        assert endpoint.send(text)
+        clock.step_to(stepped + 2 * WAITING_MAX_NS + 2 * BEHIND_NS)
+        assert [endpoint.send(letter) for letter in (box, answer)] == [False, True]
+    os.close(ours)

@@ -266,6 +266,18 @@ def test_that_nothing_is_tracked_can_be_asked_for_without_a_frame() -> None:
         assert status.tracking_status == dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
 
 
+def test_before_the_autopilot_is_received_a_camera_that_tracks_does_not_say_that_it_tracks_nothing() -> None:
+    station = Station(MavlinkSettings(system_id=SYSTEM_ID), OwnShipBuffer(), CAMERA, RequestQueue())
+    now_ns = time.monotonic_ns()
+    assert station.report(report(track(now_ns), now_ns=now_ns), now_ns) == []
+    wanted = dialect.MAVLink_command_long_message(SYSTEM_ID, 100, 512, 0, 275.0, *[0.0] * 6)
+    by_ground = wanted.pack(MAVLink(None, srcSystem=255, srcComponent=190))
+    told = on_the_wire(station.take(FrameReader(datagram=True).feed(by_ground), 0, now_ns))
+    assert [(m.get_type(), getattr(m, "result", None)) for m in told] == [
+        ("COMMAND_ACK", dialect.MAV_RESULT_TEMPORARILY_REJECTED)
+    ]
+
+
 @pytest.mark.parametrize(("later_s", "told"), [(0.5, True), (1.1, False), (180.0, False)])
 def test_what_was_asked_for_once_comes_soon_or_never(later_s: float, told: bool) -> None:
     """Its stream is switched off; the target that was there when it was asked for is gone for a while."""

@@ -78,3 +78,4 @@ def test_it_is_told_once_and_again_when_it_happens_again_much_later() -> None:
     assert once.startswith("UTC here is 5.0 s ahead of the autopilot's")
     assert len(told([-5.0, -5.0, -5.0, 0.0, 0.0, 0.0] * 8)) == 1, "it goes to and fro"
     assert len(told([-5.0] * 30 + [0.0] * 60 + [5.0] * 30)) == 2
+    assert len(told([-5.0] * 10 + [0.0] * 10 + [-3_600.0] * 100)) == 2, "set wrongly within a minute, and left so"

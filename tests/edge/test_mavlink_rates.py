@@ -11,6 +11,7 @@ import pytest
 from edge.config import MavlinkSettings
 from edge.links.mavlink_station import Station
 from edge.links.mavlink_table import READ, SENT
+from edge.links.mavlink_vehicle import Vehicle
 from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from msgs.mavlink import FrameReader, MAVLink, dialect
@@ -62,3 +63,19 @@ def test_what_goes_unasked_by_default_is_what_the_table_says(autopilot: int) -> 
     to_px4 = autopilot == dialect.MAV_AUTOPILOT_PX4
     wanted = {row.name for row in SENT if row.default == "on" or (row.default == "on, off to PX4" and not to_px4)}
     assert set(went) == wanted - {"STATUSTEXT", "COMMAND_ACK"}  # on a change, and to a command: there was none
+
+
+@pytest.mark.parametrize("late_ms", [(0,), (0, 0, 40, 40), (0, 40, 80)])
+def test_what_comes_once_a_second_as_asked_is_not_asked_again_for_its_jitter(late_ms: tuple[int, ...]) -> None:
+    """An autopilot sends at its main loop's next turn."""
+    rate_hz, ms = {dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0}, 1_000_000
+    vehicle = Vehicle(None, rate_hz)
+    arrives_ms = {1_000 * second + 20 + late_ms[second % len(late_ms)] for second in range(60)}
+    for now_ms in range(0, 60_000, 10):
+        if now_ms % 1_000 == 0:
+            vehicle.heartbeat(SYSTEM_ID, dialect.MAV_AUTOPILOT_PX4, now_ms * ms)
+        if now_ms in arrives_ms:
+            vehicle.arrived(dialect.MAVLINK_MSG_ID_SYSTEM_TIME, now_ms * ms)
+        if vehicle.request(now_ms * ms) is not None:
+            vehicle.acknowledged(accepted=True)
+    assert vehicle.asked_again == 0

@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -23,6 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
+from pymavlink.dialects.v20 import ardupilotmega
 
 from msgs import mavlink
 
@@ -255,6 +257,29 @@ def test_fourteen_heartbeats_behind_a_truncated_header_are_all_read() -> None:
     mav = mavlink.MAVLink(None, 1, 1)
     datagram = b"\xfd\xff\x00\x00" + b"".join(mavlink.pack(mav, HEARTBEAT) for _ in range(14))
     assert len(mavlink.FrameReader(datagram=True).feed(datagram)) == 14
+
+
+@pytest.mark.parametrize("before", [b"\xfd\xff\x00", b"\xfe\xff", b"\x00\xfd\xff\x01\x00\xfe\xff"])
+def test_no_false_start_in_a_stream_delays_what_follows(before: bytes) -> None:
+    """Such as in a message of another dialect, of which ArduPilot sends several a second."""
+    mav, reader = mavlink.MAVLink(None, 1, 1), mavlink.FrameReader(datagram=False)
+    reader.feed(before)
+    for _ in range(3):
+        frame = mavlink.pack(mav, HEARTBEAT)
+        assert [len(reader.feed(part)) for part in (frame[:5], frame[5:])] == [0, 1]
+    assert reader.bad_runs == 1
+
+
+@pytest.mark.parametrize("datagram", [True, False])
+def test_messages_of_another_dialect_are_not_counted_as_spoilt_bytes(datagram: bool) -> None:
+    ardupilot, mav = ardupilotmega.MAVLink(None, 1, 1), mavlink.MAVLink(None, 1, 1)
+    reader, heard = mavlink.FrameReader(datagram), 0
+    for number in range(256):
+        # With a false start inside, whose frame would end there or behind.
+        wind = ardupilotmega.MAVLink_wind_message(1.0, struct.unpack("<f", bytes([0xFE, number, 0, 1]))[0], 2.0)
+        for frame in (wind.pack(ardupilot), mavlink.pack(mav, HEARTBEAT)):
+            heard += len(reader.feed(frame))
+    assert (heard, reader.unknown_ids, reader.bad_runs) == (256, 256, 0)
 
 
 @given(position=st.integers(0, 20), bit=st.integers(0, 7))

@@ -21,6 +21,7 @@ DATAGRAM_MAX = 65_536  # bytes
 CHUNK_MAX = 4096  # bytes of a stream at once
 PENDING_MAX = 32_768  # bytes that may be pending on a byte stream before whole messages are dropped
 WAITING_MAX_NS = 200_000_000  # how long a message may wait before it is dropped
+BEHIND_NS = 20_000_000  # the messages of one frame are put within less
 
 
 class Received(NamedTuple):
@@ -55,8 +56,9 @@ class Transport(Protocol):
     def receive(self) -> Received | None:
         """The next bytes; None if there are none."""
 
-    def send(self, data: bytes, peer: Address) -> bool:
-        """Send a whole message; False if it cannot be sent now, and then no part of it is."""
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
+        """Send a whole message; False if it cannot be sent now, and then no part of it is. `yields`: it is one of many
+        and not sent while others wait."""
 
     def dropped(self) -> int:
         """Number of messages since the last call that `send` took, but that the medium then did not."""
@@ -114,8 +116,12 @@ class Outbox:
         self._pending_bytes = 0
         self._begun = b""  # the rest of a partly written message, which must be completed
 
-    def put(self, data: bytes, now_ns: int) -> bool:
+    def put(self, data: bytes, now_ns: int, *, yields: bool = False) -> bool:
+        """Whether the message was accepted. One that `yields` is not while others have waited for BEHIND_NS: on a line
+        that is too slow for all poses, answers and heartbeats behind them would otherwise expire."""
         self._forget(now_ns)
+        if yields and self._waiting and now_ns - self._waiting[0][0] > BEHIND_NS:
+            return False
         if self._pending_bytes + len(data) > PENDING_MAX:
             return False
         self._waiting.append((now_ns, data))

@@ -66,10 +66,10 @@ class SerialPort:
             return None
         return Received(data, (self._device,), self._reader)
 
-    def send(self, data: bytes, peer: Address) -> bool:
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
         if self._port is None:
             return False
-        fits = self._outbox.put(data, clock.monotonic_ns())
+        fits = self._outbox.put(data, clock.monotonic_ns(), yields=yields)
         self._flush()
         return fits
 

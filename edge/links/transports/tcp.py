@@ -64,10 +64,10 @@ class Connection:
             return None
         return Received(data, self.address, self._reader)
 
-    def send(self, data: bytes) -> bool:
+    def send(self, data: bytes, *, yields: bool = False) -> bool:
         if not self.open:
             return False
-        fits = self._outbox.put(data, clock.monotonic_ns())
+        fits = self._outbox.put(data, clock.monotonic_ns(), yields=yields)
         self.flush()
         return fits
 
@@ -151,8 +151,8 @@ class TcpClient:
         self._part_if_closed(time.monotonic_ns())
         return received
 
-    def send(self, data: bytes, peer: Address) -> bool:
-        return self._connection is not None and self._connection.send(data)
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
+        return self._connection is not None and self._connection.send(data, yields=yields)
 
     def dropped(self) -> int:
         count, self._dropped = self._dropped, 0
@@ -263,10 +263,10 @@ class TcpServer:
                 return received
         return None
 
-    def send(self, data: bytes, peer: Address) -> bool:
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
         self._heeded = peer
         caller = self._callers.get(peer)
-        return caller is not None and caller.send(data)
+        return caller is not None and caller.send(data, yields=yields)
 
     def dropped(self) -> int:
         count, self._dropped = self._dropped, 0

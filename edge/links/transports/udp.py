@@ -58,7 +58,7 @@ class Udp:
             return None
         return Received(data, sender, self._reader)
 
-    def send(self, data: bytes, peer: Address) -> bool:
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
         try:
             self._socket.sendto(data, peer)
         except OSError:
@@ -128,7 +128,7 @@ class UdpCaller:
         self._heard = self._heard or sender == self.peer
         return Received(data, sender, self._reader)
 
-    def send(self, data: bytes, peer: Address) -> bool:
+    def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
         try:
             return self._socket is not None and self._socket.sendto(data, peer) > 0
         except OSError:
