@@ -279,17 +279,19 @@ def test_nothing_is_removed_where_that_would_not_make_room(tmp_path: Path, monke
 def test_what_a_file_at_the_limit_holds_is_not_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     limits = RecordingLimits(total_bytes_max=50_000, free_bytes_min=0, when_full="stop")
-    recorder, put = Recorder(tmp_path, "uav1", limits, lambda *_: None), 0
+    recorder, put = Recorder(tmp_path, "uav1", limits, lambda *_: None), list[bytes]()
+
+    def put_one() -> None:
+        put.append(bytes(5000))
+        record_some(recorder, put[-1:])
+
     recorder.start()
-    while recorder.recording:
-        record_some(recorder, [bytes(5000)])
-        put += 1
-        time.sleep(0.001)
+    until(lambda: not recorder.recording, put_one, what="the limit")
     recorder.stop()
     held = sum(len(read(path)) for path in tmp_path.iterdir())
     counters = recorder.counters()
     assert counters["recorded"] == held > 5
-    assert held + counters.get("lost", 0) == put
+    assert held + counters.get("lost", 0) == len(put)
 
 
 def test_a_file_that_another_recorder_removes_before_it_is_locked_is_made_again(
