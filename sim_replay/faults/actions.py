@@ -157,7 +157,8 @@ def _model_file(step: ModelFile, rig: Rig) -> None:
 @act.register
 def _load(step: Load, rig: Rig) -> None:
     count = step.times * (os.cpu_count() or 1)
-    busy = [subprocess.Popen([sys.executable, "-c", _BUSY]) for _ in range(count)]
+    # Linux shares the CPU between sessions first: in the rig's own, the load would slow the relays and not the daemon.
+    busy = [subprocess.Popen([sys.executable, "-c", _BUSY], start_new_session=True) for _ in range(count)]
     try:
         threading.Event().wait(step.for_s)
     finally:
