@@ -22,6 +22,7 @@ from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.estimator.upright import up_in_cam
 from edge.health import HealthSnapshot
+from edge.memory import MemoryKeeper
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
@@ -58,6 +59,9 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         # Objects that exist now live until exit: exclude them from garbage collection between frames.
         gc.collect()
         gc.freeze()
+        memory = MemoryKeeper()
+        cleanup.callback(memory.stop)
+        memory.start()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
         # In lock-step mode start() waits for the player's first message; the player may disconnect before sending it.

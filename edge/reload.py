@@ -10,12 +10,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +23,7 @@ from edge.config import Config, ConfigFile, load_config
 from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model, load_model
+from edge.memory import return_memory
 from edge.requests import ReloadOutcome
 from edge.types import CameraInfo, Frame, FrameMeta
 
@@ -113,13 +112,6 @@ def reload(flying: ConfigFile, estimator: Estimator, camera: CameraInfo) -> Relo
     sentence = f"reloaded: {'; '.join(said) or 'nothing has changed'}"
     outcome = ReloadOutcome(True, sentence, estimator.model.sha256, tuple(live), tuple(changed))
     return Reloaded(file, estimator, outcome)
-
-
-def return_memory() -> None:
-    """Return freed memory to the system. glibc keeps it, in a pool for each of up to 8 threads a core: reload by reload
-    the process would grow to several times its size."""
-    with suppress(OSError, AttributeError):  # a C library without this function
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Reloader:

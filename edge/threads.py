@@ -33,6 +33,7 @@ THREADS = (
     ThreadRow("watchdog", "ends the process when the loop stands still", "anybody"),
     ThreadRow("signals", "hears SIGTERM, SIGINT and SIGHUP for the loop", "anybody"),
     ThreadRow("reload", "while SIGHUP is obeyed: reads the configuration, loads and warms the model", "the loop"),
+    ThreadRow("memory", "returns freed memory to the system every ten minutes", "anybody"),
     ThreadRow("prometheus", "answers scrapes on loopback, if `[health] prometheus_port` is set", "the loop"),
 )
 
