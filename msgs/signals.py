@@ -26,9 +26,22 @@ def on_signals(actions: Mapping[signal.Signals, Callable[[], object]]) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that SIGTERM and SIGINT (Ctrl-C) set. Like `on_signals`, call once, in the main thread."""
+    """An event that SIGTERM, SIGINT (Ctrl-C) and SIGHUP (the terminal is gone) set; SIGHUP not if it was ignored at the
+    start, as by nohup. Like `on_signals`, call once, in the main thread."""
     stop = threading.Event()
-    on_signals(dict.fromkeys((signal.SIGTERM, signal.SIGINT), stop.set))
+    actions: dict[signal.Signals, Callable[[], object]] = {signal.SIGTERM: stop.set, signal.SIGINT: stop.set}
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        terminals = [number for number in (1, 2) if os.isatty(number)]
+
+        def hang_up() -> None:
+            # What is still said would otherwise raise an error, before the command has saved its work.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for number in terminals:
+                os.dup2(nowhere, number)
+            stop.set()
+
+        actions[signal.SIGHUP] = hang_up
+    on_signals(actions)
     return stop
 
 

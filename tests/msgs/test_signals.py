@@ -47,7 +47,7 @@ def line(process: subprocess.Popen[str]) -> str:
     return process.stdout.readline()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_an_event_is_set_while_the_main_thread_sleeps_on_it(number: signal.Signals) -> None:
     with started(WAITS) as process:
         try:
