@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 # Variance that stands for "unknown"; ROS has no other representation for it.
 NOT_ESTIMATED = 1e6
+# Cosine of pitch below which rounding, and no longer the matrix, decides what is roll and what is yaw.
+VERTICAL = 1e-8
 
 
 def skew(vector: ArrayLike) -> Array:
@@ -104,9 +106,11 @@ def R_from_euler(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) 
 def euler_from_R(R_ned_body: ArrayLike) -> tuple[Array, Array, Array]:
     """R_ned_body [..., 3, 3] to aerospace (roll, pitch, yaw), radians; roll is 0 by convention at pitch = ±90°."""
     R = np.asarray(R_ned_body, dtype=np.float64)
-    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    level = np.hypot(R[..., 2, 1], R[..., 2, 2])
+    vertical = level < VERTICAL
+    pitch = np.arctan2(-R[..., 2, 0], level)
+    roll = np.where(vertical, 0.0, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    yaw = np.where(vertical, np.arctan2(-R[..., 0, 1], R[..., 1, 1]), np.arctan2(R[..., 1, 0], R[..., 0, 0]))
     return roll, pitch, yaw
 
 

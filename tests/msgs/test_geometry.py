@@ -94,6 +94,18 @@ def test_euler_angles_are_yaw_then_pitch_then_roll(roll: float, pitch: float, ya
     np.testing.assert_allclose(geometry.R_from_euler(*geometry.euler_from_R(R)), R, atol=1e-7)
 
 
+@SOME
+@given(angles, st.sampled_from([-np.pi / 2, np.pi / 2]), angles)
+def test_euler_angles_of_a_vertical_aircraft_give_its_rotation_with_no_roll(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    R = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    for exact in (R, np.round(R * [[0, 1, 1], [0, 1, 1], [1, 0, 0]], 15)):  # with rounding errors, and without
+        told = geometry.euler_from_R(exact)
+        assert told[0] == 0.0
+        np.testing.assert_allclose(geometry.R_from_euler(*told), R, atol=2e-8)
+
+
 def test_euler_angles_of_known_attitudes() -> None:
     # Nose up 30°: the nose points north and up, that is -z in ned.
     R = geometry.R_from_euler(0.0, np.radians(30.0), 0.0)
