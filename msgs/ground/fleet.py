@@ -33,6 +33,7 @@ RANGE_NOISE_M = 5.0
 FORGET_TARGET_NS = 10_000_000_000
 RATE_WINDOW_NS = 3_000_000_000
 HEALTH_STALE_NS = 3_000_000_000  # health is sent every second
+SCORE_STALE_NS = 2_000_000_000  # scores come with each frame, at most as often as the poses
 SET_BACK_NS = 500_000_000  # reception times further in the future mean that our clock was set back since
 _KEPT_MAX = 256
 TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # topics that a Fleet evaluates
@@ -113,8 +114,15 @@ class _Vehicle:
     event_number: tuple[bytes, int] = (b"", 0)  # publisher and sequence number of the newest event
     own: OwnShipHistory = field(default_factory=OwnShipHistory)
     scores: dict[str, float] = field(default_factory=dict)
+    scored_ns: int = 0  # stamp of the frame that they are of
     targets: dict[str, _Target] = field(default_factory=dict)
     arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
+
+    def score(self, pose: TargetPose) -> float | None:
+        """As last told; None if that was for a frame long before this pose, or after it."""
+        if abs(pose.stamp_ns - self.scored_ns) > SCORE_STALE_NS:
+            return None
+        return self.scores.get(pose.target)
 
 
 class Fleet:
@@ -186,7 +194,7 @@ class Fleet:
             ranges.popleft()
         ship = vehicle.own.near(pose.stamp_ns)
         R_ned_cam = None if ship is None else ship.R_ned_cam
-        row = target_row(pose, closing_mps(ranges), R_ned_cam, vehicle.scores.get(pose.target))
+        row = target_row(pose, closing_mps(ranges), R_ned_cam, vehicle.score(pose))
         if known is None:
             known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
         known.newest, known.seen_ns = row, pose.arrival_ns
@@ -227,6 +235,7 @@ def _note(
     match message:
         case Detection3DArray():
             vehicle.scores = {one.id: one.hypotheses[0].score for one in message.detections if one.hypotheses}
+            vehicle.scored_ns = message.stamp_ns
         case TFMessage():
             vehicle.own.take(message)
             for target in vehicle.targets.values():

@@ -67,6 +67,25 @@ def test_targets_of_before_our_clock_was_set_back_are_not_shown_for_as_long() ->
     assert (row.targets, row.pose_rate_hz) == ((), 0.0)
 
 
+def detections(stamp_ns: int, number: int, score: float) -> Incoming:
+    t, q, covariance = np.array([1.0, 2.0, 300.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)
+    hypothesis = cdr.Hypothesis("fixed_wing", score, t, q, covariance)
+    one = cdr.Detection3D(stamp_ns, "camera_optical_frame", (hypothesis,), t, q, np.zeros(3), "t0")
+    return incoming(topics.DETECTIONS, cdr.Detection3DArray(stamp_ns, "camera_optical_frame", (one,)), number)
+
+
+def test_a_score_is_not_told_for_poses_long_after_it() -> None:
+    """As over a link that no longer carries detections."""
+    fleet = Fleet()
+    fleet.take(detections(NOW_NS, 1, 0.9), NOW_NS)
+    scores = []
+    for number, after_ns in enumerate((0, S, 3 * S), start=1):
+        fleet.take(pose(NOW_NS + after_ns, number), NOW_NS + after_ns)
+        (row,) = fleet.rows(NOW_NS + after_ns)
+        scores.append(row.targets[0].score)
+    assert scores == [0.9, 0.9, None]
+
+
 def test_how_fast_a_target_nears_is_not_taken_across_a_clock_that_was_set_back() -> None:
     fleet = Fleet()
     for k in range(20):
