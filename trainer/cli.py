@@ -76,7 +76,14 @@ def _average(arguments: argparse.Namespace) -> None:
 def _refine(arguments: argparse.Namespace) -> None:
     from trainer.refine import RefinePlan, refine
 
-    plan = RefinePlan(arguments.seed, arguments.windows, arguments.epochs, arguments.strangers)
+    plan = RefinePlan(
+        arguments.seed,
+        arguments.windows,
+        arguments.epochs,
+        arguments.strangers,
+        tuple(arguments.dataset),
+        arguments.dataset_share,
+    )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")
 
@@ -121,8 +128,8 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine = commands.add_parser(
         "refine",
         help="train the uncertainty and range correction of a trained network",
-        description="Run a trained network on rendered windows and train only its refinement head on the outputs: it "
-        "predicts a correction of the range, and sigma. All other weights are unchanged. Writes weights.pt to --out.",
+        description="Run a trained network on windows and train only its refinement head on the outputs: it predicts a "
+        "correction of the range, and sigma. All other weights are unchanged. Writes weights.pt to --out.",
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="output folder for the weights")
@@ -137,7 +144,19 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "--strangers",
         type=share,
         default=0.35,
-        help="share of targets that are randomly generated aircraft not used in training (default %(default)s)",
+        help="share of rendered targets that are randomly generated aircraft not used in training (default "
+        "%(default)s)",
+    )
+    refine.add_argument(
+        "--dataset",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="BOP datasets with images on which no run was trained, to take windows from (default: all are rendered)",
+    )
+    refine.add_argument(
+        "--dataset-share", type=share, default=0.5, help="share of windows from --dataset (default %(default)s)"
     )
     refine.set_defaults(run=_refine)
 

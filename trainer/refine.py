@@ -36,7 +36,9 @@ class RefinePlan(NamedTuple):
     seed: int
     windows: int = 100_000
     epochs: int = 8
-    strangers: float = 0.35  # share of targets that are generated airframes, unseen by the network
+    strangers: float = 0.35  # share of rendered targets that are generated airframes, unseen by the network
+    datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
+    dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
 
 
 class Kept(NamedTuple):
@@ -57,7 +59,9 @@ def refine(
     out: Path,
     plan: RefinePlan,
     *,
-    open_sampler: Callable[[DataConfig, int, int, float], Callable[[], Sampler]] = refinement_sampler,
+    open_sampler: Callable[
+        [DataConfig, int, int, float, tuple[Path, ...], float], Callable[[], Sampler]
+    ] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Write weights.pt with a newly trained refinement head into `out`; returns its path. Raises ConfigError."""
@@ -76,7 +80,12 @@ def refine(
     torch.manual_seed(plan.seed)
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
     model.head_refine = head.eval()
-    opener = open_sampler(config.data, plan.seed, config.schedule.sizes[-1].size_px, plan.strangers)
+    trained_on = {source.path.resolve() for source in config.data.datasets}
+    for path in plan.datasets:
+        if path.resolve() in trained_on:
+            raise ConfigError(f"--dataset {path}: the network was trained on it; give another")
+    size_px = config.schedule.sizes[-1].size_px
+    opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, plan.datasets, plan.dataset_share)
     kept = look(model, config, opener, plan.windows, say)
     fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
     training = content["training"] | {
@@ -85,6 +94,7 @@ def refine(
         "refined_epochs": plan.epochs,
         "refined_seed": plan.seed,
         "refined_strangers": plan.strangers,
+        "refined_dataset_share": plan.dataset_share if plan.datasets else 0.0,
         "refined_commit": commit,
     }
     made_folder(out)

@@ -252,7 +252,7 @@ def told(history: Sequence[Mapping[str, Any]], training: Mapping[str, str | int 
     """Text on the amount of training, from the history and from the `training` entry of a model's contract."""
     runs = len({line["run"] for line in history})
     words = (
-        f"Trained on {history[-1]['total_samples']:,} rendered windows in {runs} runs, each initialised from the "
+        f"Trained on {history[-1]['total_samples']:,} windows in {runs} runs, each initialised from the "
         "weights of earlier runs (those of the run before it, or a mean of several)."
     )
     if "refined_windows" in training:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 from trainer.config import ConfigError, DataConfig
 from trainer.data import Sampler
@@ -65,17 +66,33 @@ def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool =
     return partial(_open_window_sampler, config, seed, size_px, held_out)
 
 
-def _open_refinement_sampler(config: DataConfig, seed: int, size_px: int, strangers: float) -> Sampler:
+def _open_refinement_sampler(
+    config: DataConfig, seed: int, size_px: int, strangers: float, datasets: Sequence[Path], dataset_share: float
+) -> Sampler:
     from sim_replay.airframes.invented import KEPT_BACK_VARIANTS, Invention
     from sim_replay.sampler import WindowSampler
 
     invention = Invention(strangers, KEPT_BACK_VARIANTS)
-    shares = config.acquire_share, 0.0
-    return WindowSampler(seed, size_px, config.airframe_ids, *shares, invention, config.acquire_view)
+    acquire = config.acquire_share
+    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, invention, config.acquire_view)
+    if not datasets:
+        return rendered
+    cut = [DatasetSampler(path, None, seed, size_px, acquire, config.acquire_view) for path in datasets]
+    each = dataset_share / len(cut)
+    return MixedSampler([rendered, *cut], [1.0 - dataset_share, *[each] * len(cut)])
 
 
-def refinement_sampler(config: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], Sampler]:
-    """Like `window_sampler`, for the refinement head: a target in each window, a share of `strangers` being generated
-    aircraft that training never uses. Rendered windows only: a dataset has few images, and the network's errors on
-    those it was trained on are too small."""
-    return partial(_open_refinement_sampler, config, seed, size_px, strangers)
+def refinement_sampler(
+    config: DataConfig,
+    seed: int,
+    size_px: int,
+    strangers: float,
+    datasets: Sequence[Path] = (),
+    dataset_share: float = 0.0,
+) -> Callable[[], Sampler]:
+    """Like `window_sampler`, for the refinement head. In each rendered window there is a target, a share of `strangers`
+    being generated aircraft that training never uses. The `datasets` must be others than those trained on, where the
+    network's errors are too small; an unreadable one raises ConfigError."""
+    for path in datasets:
+        DatasetSampler(path, None, seed, size_px, config.acquire_share, config.acquire_view)
+    return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, dataset_share)

@@ -20,11 +20,13 @@ from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from sim_replay.datasets import box_of_mask, open_dataset
 from sim_replay.sample import AcquireView
-from trainer.config import ConfigError, parse_config
+from trainer.config import ConfigError, DataConfig, parse_config
 from trainer.data import TrainingBatch, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 from trainer.export import stage_sampler
 from trainer.losses import dense_terms, heatmap_loss, heatmap_target, to_tensors
+from trainer.refine import fleet_size
+from trainer.sources import refinement_sampler
 from trainer.train import run_training
 
 K = np.array([[1500.0, 0, 320], [0, 1480, 180], [0, 0, 1]])
@@ -350,6 +352,23 @@ def test_a_run_on_a_dataset_that_is_not_there_says_so_and_leaves_nothing_to_resu
     with pytest.raises(ConfigError, match=rf"^{nowhere} is not a folder$"):
         run_training(parse_config(text, "own.toml"), text, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*.pt"))
+
+
+def test_refining_takes_its_share_of_the_windows_from_datasets(dataset: Path) -> None:
+    """Object coordinates are known for rendered windows only."""
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6])
+    batch = refinement_sampler(data, 12, 96, 1.0, (dataset,), 0.25)().batch(0, 24)
+    assert isinstance(batch, TrainingBatch)
+    of_dataset = np.isnan(batch.noc).all(axis=(1, 2, 3))
+    assert of_dataset.sum() == 6
+    assert not (batch.airframe_id[of_dataset] >= fleet_size()).any()
+    assert (batch.airframe_id[~of_dataset & batch.present] >= fleet_size()).all()
+
+
+def test_a_dataset_to_refine_on_that_is_not_there_is_told_before_anything_is_rendered(tmp_path: Path) -> None:
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6])
+    with pytest.raises(ConfigError, match="nowhere"):
+        refinement_sampler(data, 12, 96, 0.35, (tmp_path / "nowhere",), 0.5)
 
 
 def test_held_out_windows_are_of_the_validation_split(dataset: Path) -> None:

@@ -42,12 +42,12 @@ class NoTargets(PlateSampler):
         return dataclasses.replace(batch, present=batch.present & False)
 
 
-def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], Filling]:
+def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], Filling]:
     assert (seed, size_px, strangers) == (PLAN.seed, tiny.config().schedule.sizes[-1].size_px, PLAN.strangers)
     return partial(Filling, seed, size_px)
 
 
-def open_empty(data: DataConfig, seed: int, size_px: int, strangers: float) -> Callable[[], NoTargets]:
+def open_empty(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], NoTargets]:
     return partial(NoTargets, seed, size_px)
 
 
@@ -72,7 +72,9 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     told = load_model(one)[2]
     assert told["samples"] == 5
     assert told["refined_from"] == load_model(run)[3][:16]
-    assert {name: told[f"refined_{name}"] for name in PLAN._fields} == PLAN._asdict()
+    of_plan = ("seed", "windows", "epochs", "strangers")
+    assert {name: told[f"refined_{name}"] for name in of_plan} == {name: getattr(PLAN, name) for name in of_plan}
+    assert told["refined_dataset_share"] == 0.0
 
 
 def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_path: Path) -> None:
@@ -94,6 +96,15 @@ def test_its_strangers_are_none_that_training_draws() -> None:
     of_training = {draw_invented(np.random.default_rng(k), data.airframe_ids or []) for k in range(400)}
     assert names
     assert not names & of_training
+
+
+def test_images_that_the_network_was_trained_on_are_refused(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    named = f'[data]\ndatasets = [{{ path = "{own}", share = 0.5 }}]\n'
+    run = write_run(tmp_path / "run", tiny.TOML.replace("[data]\n", named))
+    plan = PLAN._replace(datasets=(tmp_path / "run" / ".." / "own",))
+    with pytest.raises(ConfigError, match=r"--dataset .*own: the network was trained on it; give another"):
+        refine(run, tmp_path / "out", plan, open_sampler=open_plates, say=silent)
 
 
 def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:

@@ -57,7 +57,7 @@ def run_folder(folder: Path, samples: list[int]) -> Path:
 def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
     history = gathered([], [run_folder(tmp_path / "a", [100, 250]), run_folder(tmp_path / "b", [40])])
     assert [line["total_samples"] for line in history] == [100, 250, 290]
-    assert told(history, {}).startswith("Trained on 290 rendered windows in 2 runs")
+    assert told(history, {}).startswith("Trained on 290 windows in 2 runs")
     refined = {"refined_windows": 1200, "refined_epochs": 3, "refined_seed": 7, "refined_strangers": 0.35}
     ending = "3 epochs on 1,200 further windows (seed 7; 35 % of the targets are randomly generated aircraft)."
     assert told(history, refined).endswith(ending)
