@@ -23,7 +23,7 @@ import numpy as np
 from edge.tracking import so3
 from edge.tracking.boxes import RANGE_MIN_M
 from edge.tracking.range_scale import RangeScale, corrected, in_metres, rates_of
-from edge.tracking.view import NS_PER_S, FrameKind, View
+from edge.tracking.view import NS_PER_S, FrameKind, View, between
 from edge.types import Array, Estimate
 
 POSITION, VELOCITY = slice(0, 3), slice(3, 6)
@@ -183,13 +183,6 @@ def reframe(motion: Motion, old: View, new: View, attitude_age_s: float) -> Moti
         turn_rate_radps=0.0,
         P=symmetric(P),
     )
-
-
-def between(old: View, new: View) -> Array:
-    """R_new_old [3, 3] between the frames of two views at one time; ned and ned_relative have the same axes."""
-    if old.linked_by_cam(new):
-        return new.R_frame_cam @ old.R_frame_cam.T
-    return so3.IDENTITY
 
 
 def untangled(motion: Motion, view: View) -> Motion:

@@ -20,7 +20,7 @@ from edge.tracking.doubles import Doubles
 from edge.tracking.heading import Flight
 from edge.tracking.motion import Innovation, Motion
 from edge.tracking.rotation import Attitude
-from edge.tracking.view import NS_PER_S, View
+from edge.tracking.view import NS_PER_S, View, between
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
 
 CONFIRM_HITS = 3
@@ -175,7 +175,7 @@ class Tracker:
         stale_s = (view.time_ns - self._view.time_ns) / NS_PER_S if through_cam and old.kind != "cam" else 0.0
         return (
             ekf.untangled(ekf.reframe(motion, old, view, stale_s), view),
-            rotation.reframe(attitude, ekf.between(old, view), stale_s) if through_cam else attitude,
+            rotation.reframe(attitude, between(old, view), stale_s) if through_cam else attitude,
         )
 
     def _double(self, pairs: list[Pair], more: bool, chosen_id: int | None, time_ns: int) -> int | None:

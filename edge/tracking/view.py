@@ -120,3 +120,10 @@ def _moved_mps(before: View, time_ns: int, t_frame_cam_m: Array) -> Array | None
     """Mean velocity [3] of the camera since an earlier view; None after a gap."""
     dt_s = (time_ns - before.time_ns) / NS_PER_S
     return (t_frame_cam_m - before.t_frame_cam_m) / dt_s if 0.0 < dt_s <= RATE_GAP_MAX_S else None
+
+
+def between(old: View, new: View) -> Array:
+    """R_new_old [3, 3] between the frames of two views at one time; ned and ned_relative have the same axes."""
+    if old.linked_by_cam(new):
+        return new.R_frame_cam @ old.R_frame_cam.T
+    return so3.IDENTITY

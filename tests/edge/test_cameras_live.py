@@ -1,16 +1,13 @@
-"""Cameras that others run: a zenoh topic, a stream over UDP, pictures that freeze, stamps that jump."""
+"""Cameras that others run: a zenoh topic, devices, calibrations that are refused."""
 
 from __future__ import annotations
 
-import queue
 import struct
 import threading
 import time
 import zlib
-from collections import Counter
-from collections.abc import Container, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import cv2
@@ -21,16 +18,12 @@ import zenoh
 from edge.cameras import zenoh_topic
 from edge.cameras.capture import Capture
 from edge.cameras.device import complaints
-from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.intrinsics import read_calibration
 from edge.cameras.source import EndOfStream, SourceLost
-from edge.cameras.watch import FrameWatch
 from edge.cameras.zenoh_topic import ZenohSource, decode_picture, picture_size_wh
-from edge.config_camera import DeviceCamera, FolderCamera, ZenohCamera
+from edge.config_camera import DeviceCamera, ZenohCamera
 from edge.errors import InputError
-from edge.estimator.pace import Pace
-from edge.health import Health
-from edge.types import CameraInfo, Frame, FrameMeta
+from edge.types import Frame
 from msgs import topics
 from msgs.cdr import CompressedImage
 from msgs.publish import Node, TopicPublisher
@@ -223,181 +216,6 @@ def test_a_device_that_does_other_than_asked_is_told() -> None:
     assert complaints(asked, "MJPG", 30.0, 4.0) == []
     assert complaints(asked, "MJPG", 29.97, 4.0) == []
     assert complaints(asked, "YUYV", 5.0, 4.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
-
-
-class Playing(FolderSource):
-    """A folder that is a live camera: what repeats there is frozen."""
-
-    live = True
-
-
-def write_pictures(folder: Path, numbers: list[int]) -> Path:
-    folder.mkdir()
-    for index, number in enumerate(numbers):
-        cv2.imwrite(str(folder / f"frame{index}.png"), picture(number))
-    return folder
-
-
-def all_of(source: FolderSource) -> tuple[list[int], dict[str, int]]:
-    """Brightness of every frame handed out to a reader that is always in time, and the counters."""
-    capture = Capture(source, False)
-    capture.start()
-    numbers = []
-    try:
-        while True:
-            if (frame := capture.newest(5.0)) is not None:
-                numbers.append(number_of(frame))
-    except EndOfStream:
-        return numbers, capture.counters()
-    finally:
-        capture.stop()
-
-
-def test_a_live_picture_that_repeats_is_withheld_and_a_recordings_is_not(tmp_path: Path) -> None:
-    shown = [1, 2, 3, 3, 3, 4, 5, 5, 6, 7, 8]  # ten in eleven: names are sorted as numbers
-    folder = write_pictures(tmp_path / "pictures", shown)
-    settings = FolderCamera(type="folder", path=folder, fps=8, intrinsics=INTRINSICS)
-    numbers, counters = all_of(FolderSource(settings))
-    assert numbers == shown
-    assert (counters["frozen"], counters["dropped"]) == (3, 0)
-    numbers, counters = all_of(Playing(settings))
-    assert numbers == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert (counters["frozen"], counters["dropped"]) == (3, 0)
-
-
-class Numbered:
-    """A live camera of thirty frames a second that shows what it is given, under its number."""
-
-    live = True
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._shown: queue.Queue[tuple[int, int]] = queue.Queue()
-
-    def show(self, sequence: int, shade: int) -> None:
-        self._shown.put((sequence, shade))
-
-    def open(self) -> CameraInfo:
-        return CameraInfo("numbered", (16, 16), np.eye(3), 30.0)
-
-    def read(self, stop: threading.Event) -> Frame:
-        while not stop.is_set():
-            with suppress(queue.Empty):
-                sequence, shade = self._shown.get(timeout=0.02)
-                meta = FrameMeta(sequence, sequence * PERIOD_NS, sequence * PERIOD_NS)
-                return Frame(meta, np.full((16, 16, 3), shade, np.uint8), np.eye(3))
-        raise EndOfStream
-
-    def close(self) -> None: ...
-
-
-def handed_on(numbers: Iterable[int], repeated: Container[int]) -> tuple[list[FrameMeta], dict[str, int]]:
-    """What a reader that is always in time gets of a live camera, those `repeated` show what the one before does."""
-    source, taken, shade = Numbered(), list[FrameMeta](), 0
-    capture = Capture(source, True)
-    capture.start()
-    try:
-        for number in numbers:
-            shade += number not in repeated
-            source.show(number, shade)
-            if number not in repeated:
-                frame = capture.newest(60.0)
-                assert frame is not None
-                taken.append(frame.meta)
-        return taken, capture.counters()
-    finally:
-        capture.stop()
-
-
-@pytest.mark.parametrize(
-    ("numbers", "repeated", "said", "frozen", "dropped"),
-    [
-        (range(60), range(4, 60, 6), [], 10, 0),  # a sensor of 25 Hz in a stream of 30
-        (range(60), [k for k in range(60) if k % 19 > 11], [], 21, 0),  # frozen again and again
-        ([k for k in range(60) if k % 6 != 2], [], ["17 % of frames dropped"], 0, 10),
-        ([k for k in range(60) if k % 6 != 2], range(3, 60, 6), ["20 % of frames dropped"], 10, 10),
-    ],
-)
-def test_pictures_that_a_live_camera_repeats_are_no_drops_and_numbers_that_it_skips_are(
-    numbers: Iterable[int], repeated: Container[int], said: list[str], frozen: int, dropped: int
-) -> None:
-    taken, counters = handed_on(numbers, repeated)
-    health = Health(wants_attitude=False)
-    for meta in taken:
-        health.frame_done(meta.sequence, {"total": 1}, (), True, meta.capture_ns)
-    assert [reason.text for reason in health.assess(taken[-1].capture_ns).reasons] == said
-    assert (counters["captured"], counters["frozen"], counters["dropped"]) == (len(taken), frozen, dropped)
-
-
-def test_a_camera_that_shows_each_picture_twice_leaves_the_time_of_both() -> None:
-    pace = Pace()
-    taken, _ = handed_on(range(12), range(1, 12, 2))
-    assert [pace.unhurried(meta) for meta in taken] == [False, *[True] * 5]
-
-
-def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("none here")
-    with pytest.raises(InputError, match=rf"{tmp_path} has no pictures"):
-        list_pictures(tmp_path)
-    with pytest.raises(InputError, match=r"nowhere cannot be read"):
-        list_pictures(tmp_path / "nowhere")
-
-
-def frame_at(capture_ms: float, arrival_ms: float, shade: int = 0) -> Frame:
-    meta = FrameMeta(0, round(capture_ms * 1e6), round(arrival_ms * 1e6))
-    return Frame(meta, np.full((16, 16, 3), shade, np.uint8), np.eye(3))
-
-
-def test_stamps_that_jump_are_noticed_and_those_that_jitter_are_not() -> None:
-    watch = FrameWatch()
-
-    def jumps(capture_ms: float, arrival_ms: float) -> bool:
-        frame = frame_at(capture_ms, arrival_ms)
-        jumped = watch.jumps(frame)
-        watch.repeats(frame)
-        return jumped
-
-    assert [jumps(1000 + 33 * k, 1050 + 33 * k + (k % 3) * 20) for k in range(6)] == [False] * 6
-    assert jumps(1100, 1300)  # back
-    assert jumps(1000 + 600, 1550)  # in the future
-    assert jumps(2000, 2900)  # much older than those before
-    assert not jumps(2033, 2933)
-
-
-class Jumping(FolderSource):
-    """A folder whose fourth picture is stamped a second too early."""
-
-    def read(self, stop: threading.Event) -> Frame:
-        frame = super().read(stop)
-        early_ns = 1_000_000_000 if frame.meta.sequence == 3 else 0
-        return replace(frame, meta=replace(frame.meta, capture_ns=frame.meta.capture_ns - early_ns))
-
-
-def test_every_frame_tells_how_often_the_cameras_time_has_jumped(tmp_path: Path) -> None:
-    folder = write_pictures(tmp_path / "pictures", list(range(1, 7)))
-    settings = FolderCamera(type="folder", path=folder, fps=10.0, intrinsics=INTRINSICS)
-    capture = Capture(Jumping(settings), False)
-    capture.start()
-    told = {}
-    try:
-        while True:
-            if (frame := capture.newest(5.0)) is not None:
-                told[frame.meta.sequence] = frame.meta.time_jumps
-    except EndOfStream:
-        pass
-    finally:
-        capture.stop()
-    # There and back again.
-    assert all(jumps == {0: 0, 1: 0, 2: 0, 3: 1}.get(sequence, 2) for sequence, jumps in told.items())
-    assert max(told.values()) == 2
-
-
-def test_one_pixel_that_changed_is_another_picture() -> None:
-    watch = FrameWatch()
-    still = frame_at(0, 1)
-    moved = frame_at(33, 34)
-    moved.image_bgr[3, 5, 1] = 1
-    assert [watch.repeats(frame) for frame in (still, still, moved, moved, still)] == [False, True, False, True, False]
 
 
 def test_a_calibration_of_another_lens_model_is_refused(tmp_path: Path) -> None:

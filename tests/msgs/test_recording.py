@@ -1,14 +1,12 @@
-"""Recordings as mcap's own reader and rosbags read them, after kills and on full disks."""
+"""Recordings as mcap's own reader and rosbags read them, after kills too."""
 
 from __future__ import annotations
 
 import fcntl
-import os
 import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -27,15 +25,8 @@ from tests.waiting import until
 
 from . import make_definitions
 from .conftest import pose_now
+from .recordings import ROOM, read, record_some
 from .ros_oracle import STORE, deserialize, serialize
-
-ROOM = RecordingLimits(free_bytes_min=0)
-
-
-def read(path: Path) -> list[tuple[str, str, bytes, int]]:
-    """(topic, schema's name, payload, log time) of each message."""
-    with open(path, "rb") as file:
-        return [(c.topic, s.name if s else "", m.data, m.log_time) for s, c, m in make_reader(file).iter_messages()]
 
 
 def is_whole(path: Path) -> bool:
@@ -47,11 +38,6 @@ def test_definitions_are_those_of_the_interfaces() -> None:
     assert make_definitions.PATH.read_text() == make_definitions.interfaces()
     for topic in topics.TOPICS:
         assert definition(topic.ros_type) == make_definitions.whole_definition(topic.ros_type)
-
-
-def record_some(recorder: Recorder, payloads: list[bytes]) -> None:
-    for payload in payloads:
-        recorder.record(topics.POSE, "uav1", "t0", payload, time.time_ns())
 
 
 def test_a_recording_holds_the_bytes_that_were_sent_and_ros_reads_them(tmp_path: Path) -> None:
@@ -343,77 +329,3 @@ def test_each_file_holds_what_is_told_on_change_alone(tmp_path: Path, monkeypatc
     recorder.stop()
     told = [("/uav1/camera_info", b"narrow"), ("/uav1/target/t0/pose", b"pose")]
     assert [[(topic, data) for topic, _, data, _ in read(path)] for path in sorted(tmp_path.iterdir())] == [told, told]
-
-
-def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    monkeypatch.setattr(recording, "RETRY_S", 0.05)
-    told: list[tuple[int, str]] = []
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    recorder = Recorder(folder, "uav1", ROOM, lambda *event: told.append(event))
-    recorder.start()
-    record_some(recorder, [b"before"])
-    until(lambda: recorder.counters()["recorded"] == 1)
-    full = os.open("/dev/full", os.O_WRONLY)
-    real_write = os.write
-    monkeypatch.setattr(os, "write", lambda _, data: real_write(full, data))
-    until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
-    assert not recorder.recording
-    until(lambda: recorder.counters().get("failures", 0) >= 3)
-    assert told == [(40, "recording stopped: No space left on device")]
-    monkeypatch.setattr(os, "write", real_write)
-    os.close(full)
-    until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
-    assert told[1] == (20, "recording again")
-    recorder.stop()
-    kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
-    assert (kept[0], kept[-1]) == (b"before", b"after")
-    assert b"lost" not in kept
-
-
-def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is_told_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    monkeypatch.setattr(recording, "WAITING_MAX", 50)
-    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
-
-    def sync(fd: int) -> None:
-        stands.set()
-        goes_on.wait()
-        real_sync(fd)
-
-    monkeypatch.setattr(os, "fdatasync", sync)
-    told: list[tuple[int, str]] = []
-    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
-    recorder.start()
-    try:
-        record_some(recorder, [b"before"])
-        stands.wait()
-        record_some(recorder, [b"kept"] * 50 + [b"lost"] * 20)
-        assert recorder.counters()["lost"] == 20
-        assert recorder.recording
-    finally:
-        goes_on.set()
-    until(lambda: told != [])
-    until(lambda: recorder.counters()["recorded"] == 51)
-    record_some(recorder, [b"after"])
-    recorder.stop()
-    assert told == [(30, "recording has gaps: the disk is too slow, 20 messages were lost")]
-    kept = Counter(data for path in tmp_path.iterdir() for *_, data, _ in read(path))
-    assert kept == {b"before": 1, b"kept": 50, b"after": 1}
-
-
-def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    told: list[tuple[int, str]] = []
-    limits = RecordingLimits(free_bytes_min=2**62, when_full="stop")
-    recorder = Recorder(tmp_path, "uav1", limits, lambda *event: told.append(event))
-    recorder.start()
-    record_some(recorder, [b"one"])
-    until(lambda: told == [(40, "recording stopped: no room left for recordings")])
-    recorder.stop()
-    assert recorder.counters()["lost"] == 1

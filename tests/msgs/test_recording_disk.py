@@ -1,0 +1,90 @@
+"""Recording on a disk that is full, stands still or has no room left."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from msgs import recording
+from msgs.recording import Recorder, RecordingLimits
+from tests.waiting import until
+
+from .recordings import ROOM, read, record_some
+
+
+def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.05)
+    told: list[tuple[int, str]] = []
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    recorder = Recorder(folder, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    record_some(recorder, [b"before"])
+    until(lambda: recorder.counters()["recorded"] == 1)
+    full = os.open("/dev/full", os.O_WRONLY)
+    real_write = os.write
+    monkeypatch.setattr(os, "write", lambda _, data: real_write(full, data))
+    until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
+    assert not recorder.recording
+    until(lambda: recorder.counters().get("failures", 0) >= 3)
+    assert told == [(40, "recording stopped: No space left on device")]
+    monkeypatch.setattr(os, "write", real_write)
+    os.close(full)
+    until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
+    assert told[1] == (20, "recording again")
+    recorder.stop()
+    kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
+    assert (kept[0], kept[-1]) == (b"before", b"after")
+    assert b"lost" not in kept
+
+
+def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "WAITING_MAX", 50)
+    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
+
+    def sync(fd: int) -> None:
+        stands.set()
+        goes_on.wait()
+        real_sync(fd)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    try:
+        record_some(recorder, [b"before"])
+        stands.wait()
+        record_some(recorder, [b"kept"] * 50 + [b"lost"] * 20)
+        assert recorder.counters()["lost"] == 20
+        assert recorder.recording
+    finally:
+        goes_on.set()
+    until(lambda: told != [])
+    until(lambda: recorder.counters()["recorded"] == 51)
+    record_some(recorder, [b"after"])
+    recorder.stop()
+    assert told == [(30, "recording has gaps: the disk is too slow, 20 messages were lost")]
+    kept = Counter(data for path in tmp_path.iterdir() for *_, data, _ in read(path))
+    assert kept == {b"before": 1, b"kept": 50, b"after": 1}
+
+
+def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    told: list[tuple[int, str]] = []
+    limits = RecordingLimits(free_bytes_min=2**62, when_full="stop")
+    recorder = Recorder(tmp_path, "uav1", limits, lambda *event: told.append(event))
+    recorder.start()
+    record_some(recorder, [b"one"])
+    until(lambda: told == [(40, "recording stopped: no room left for recordings")])
+    recorder.stop()
+    assert recorder.counters()["lost"] == 1
