@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sim_replay.airframes import AIRFRAMES, airframe_of
 from sim_replay.airframes.invented import FLEET_ALONE, Invention
 from sim_replay.render.distractors import add_decoy, add_distractors
+from sim_replay.render.flown import NONE_FLOWN, FlownShare
 from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
 from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
 from sim_replay.render.projection import extents_px
@@ -99,11 +100,12 @@ class WindowSampler:
         empty_share: float = 0.12,
         invention: Invention = FLEET_ALONE,
         acquire_view: AcquireView = "crop",
+        flown: FlownShare = NONE_FLOWN,
     ) -> None:
         self.seed, self.size_px = seed, size_px
         self.airframe_ids = tuple(range(len(AIRFRAMES)) if airframe_ids is None else airframe_ids)
         self.acquire_share, self.empty_share = acquire_share, empty_share
-        self.invention, self.acquire_view = invention, acquire_view
+        self.invention, self.acquire_view, self.flown = invention, acquire_view, flown
         self._renderer: Renderer | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -127,7 +129,16 @@ class WindowSampler:
 
     def _window(self, index: int) -> Window:
         shares = self.acquire_share, self.empty_share
-        drawn = self.seed, index, self.size_px, self.airframe_ids, *shares, self.invention, self.acquire_view
+        drawn = (
+            self.seed,
+            index,
+            self.size_px,
+            self.airframe_ids,
+            *shares,
+            self.invention,
+            self.acquire_view,
+            self.flown,
+        )
         return draw_window(*drawn)
 
     def _finish(self, out: dict[str, NDArray], k: int, window: Window, rendered: Rendered, tile: int) -> None:

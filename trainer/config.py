@@ -117,7 +117,11 @@ class DataConfig(Section):
         "crop", description="a window of the reduced frame, or the whole frame squashed, as contract.acquire_fit has it"
     )
     empty_share: float = Field(0.12, ge=0, lt=1, description="share of windows without a target")
-    invented_share: float = Field(0.0, ge=0, le=1, description="of targets that are no member of the fleet")
+    invented_share: float = Field(0.0, ge=0, le=1, description="of targets not flown: no member of the fleet")
+    flown: list[WrittenPath] = Field(
+        [], description="generated datasets (with or without pictures) whose poses and cameras rendered windows take"
+    )
+    flown_share: float = Field(0.0, ge=0, le=1, description="of the rendered windows: show a frame of `flown` anew")
     batch_size: int = Field(ge=2)
     workers: int = Field(1, ge=1, description="rendering processes")
     prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")
@@ -143,6 +147,12 @@ class DataConfig(Section):
     def _shares_fit(self) -> DataConfig:
         if sum(source.share for source in self.datasets) > 1.0 + 1e-9:
             raise ValueError("the shares of datasets add up to more than 1")
+        return self
+
+    @model_validator(mode="after")
+    def _flown_have_a_share(self) -> DataConfig:
+        if bool(self.flown) != (self.flown_share > 0.0):
+            raise ValueError("flown and flown_share need each other")
         return self
 
     @model_validator(mode="after")

@@ -71,10 +71,11 @@ def stage_sampler(
     """An opener of windows of the kind one stage processes; `acquire_share` is 0 for track, 1 for acquire.
 
     Some contain no target, even if training had none: scores cannot be evaluated without them. The share in `held_out`
-    windows is independent of training, so that metrics are comparable.
+    windows is independent of training, so that metrics are comparable. None is flown: weights are exported and
+    evaluated without the flights that they were trained on.
     """
     empty_share = EMPTY_SHARE if held_out else max(data.empty_share, EMPTY_SHARE)
-    shares = {"acquire_share": acquire_share, "empty_share": empty_share}
+    shares = {"acquire_share": acquire_share, "empty_share": empty_share, "flown": [], "flown_share": 0.0}
     return window_sampler(data.model_copy(update=shares), seed, size_px, held_out)
 
 
@@ -193,6 +194,7 @@ def data_told(data: DataConfig) -> str:
     if rendered > 0.0:
         told = f"rendered windows: {rendered:.0%}, of them {data.empty_share:.0%} without a target"
         told += f", {data.acquire_share:.0%} of the whole frame"
+        told += f", {data.flown_share:.0%} of flown frames" if data.flown_share else ""
         parts.append(told + (f", {data.invented_share:.0%} of invented aircraft" if data.invented_share else ""))
     return "; ".join(parts)
 

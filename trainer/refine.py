@@ -36,7 +36,7 @@ class RefinePlan(NamedTuple):
     seed: int
     windows: int = 100_000
     epochs: int = 8
-    strangers: float = 0.35  # share of rendered targets that are generated airframes, unseen by the network
+    strangers: float = 0.35  # share of rendered targets not flown that are generated airframes, unseen by the network
     datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
 

@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from sim_replay.bop import BopError
 from trainer.config import ConfigError, DataConfig
 from trainer.data import Sampler
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 
+if TYPE_CHECKING:
+    from sim_replay.render.flown import FlownShare
+
 
 def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
     from sim_replay.airframes.invented import Invention  # needs the renderer's packages
+    from sim_replay.render.flown import NONE_FLOWN
     from sim_replay.sampler import WindowSampler
 
     validating = seed == config.validation_seed
@@ -25,19 +31,34 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
             shares.append(source.share)
     if not samplers or config.rendered_share > 0.0:
-        # Evaluation windows show the fleet only, whatever the share of generated aircraft in training.
-        invention = Invention(0.0 if validating or held_out else config.invented_share)
-        samplers.append(
-            WindowSampler(seed, size_px, config.airframe_ids, config.acquire_share, config.empty_share, invention, view)
-        )
+        # Evaluation windows show the fleet only, none of it flown, whatever the shares in training.
+        judging = validating or held_out
+        invention = Invention(0.0 if judging else config.invented_share)
+        flown = NONE_FLOWN if judging else _flown(config)
+        shares_drawn = config.acquire_share, config.empty_share
+        samplers.append(WindowSampler(seed, size_px, config.airframe_ids, *shares_drawn, invention, view, flown))
         shares.append(1.0 - sum(shares))
     # Datasets without a validation split leave their shares to the others in proportion.
     shares = [share / sum(shares) for share in shares]
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
 
 
+def _flown(config: DataConfig) -> FlownShare:
+    from sim_replay.airframes import AIRFRAMES
+    from sim_replay.render.flown import NONE_FLOWN, FlownShare, read_flown
+
+    if not config.flown:
+        return NONE_FLOWN
+    known = range(len(AIRFRAMES)) if config.airframe_ids is None else config.airframe_ids
+    try:
+        return FlownShare(config.flown_share, read_flown(config.flown, known))
+    except BopError as error:
+        raise ConfigError(str(error)) from error
+
+
 def refuse_unreadable(config: DataConfig) -> None:
     """Raises ConfigError if a dataset for training or validation is unusable; a check before hours of training."""
+    _flown(config)
     size_px = 32  # any: the labels do not depend on it
     show_targets: dict[str, list[bool]] = {"train": [], "validate": []}
     for source in config.datasets:
@@ -74,7 +95,8 @@ def _open_refinement_sampler(
 
     invention = Invention(strangers, KEPT_BACK_VARIANTS)
     acquire = config.acquire_share
-    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, invention, config.acquire_view)
+    drawn = invention, config.acquire_view, _flown(config)
+    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, *drawn)
     if not datasets:
         return rendered
     cut = [DatasetSampler(path, None, seed, size_px, acquire, config.acquire_view) for path in datasets]
@@ -93,6 +115,7 @@ def refinement_sampler(
     """Like `window_sampler`, for the refinement head. In each rendered window there is a target, a share of `strangers`
     being generated aircraft that training never uses. The `datasets` must be others than those trained on, where the
     network's errors are too small; an unreadable one raises ConfigError."""
+    _flown(config)
     for path in datasets:
         DatasetSampler(path, None, seed, size_px, config.acquire_share, config.acquire_view)
     return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, dataset_share)

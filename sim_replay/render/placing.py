@@ -14,6 +14,7 @@ from msgs.geometry import R_from_euler, so3_exp
 from sim_replay.airframes.invented import FLEET_ALONE, Invention, draw_invented
 from sim_replay.render.distractors import Decoy
 from sim_replay.render.environment import direction_ned
+from sim_replay.render.flown import FRAME_HEIGHT_PX, FRAME_WIDTH_PX, NONE_FLOWN, FlownShare
 from sim_replay.render.frame import outline_px
 from sim_replay.render.projection import extents_px, solid_vertices_m
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
@@ -22,7 +23,6 @@ from sim_replay.sample import AcquireView
 
 Array = NDArray[np.float64]
 Kind = Literal["track", "acquire"]
-FRAME_WIDTH_PX, FRAME_HEIGHT_PX = 1920, 1080
 RANGE_M = (90.0, 550.0)
 FOCAL_PX = (1200.0, 8000.0)
 BOX_PX = (40.0, 400.0)  # longer side of the visible box on the frame, uniformly distributed
@@ -192,13 +192,17 @@ def draw_window(
     empty_share: float,
     invention: Invention = FLEET_ALONE,
     acquire_view: AcquireView = "crop",
+    flown: FlownShare = NONE_FLOWN,
 ) -> Window:
     """Window number `index`: a pure function of its arguments."""
     rng = np.random.default_rng([seed, index, size_px])
     kind: Kind = "acquire" if rng.random() < acquire_share else "track"
     empty = bool(rng.random() < empty_share)
     distractors = bool(rng.random() < (DISTRACTORS_EMPTY_SHARE if empty else DISTRACTORS_SHARE))
-    frame = frame_scene(rng, airframe_ids, invention, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
+    if flown.frames is not None and rng.random() < flown.share:
+        frame = flown.frames.scene(rng)
+    else:
+        frame = frame_scene(rng, airframe_ids, invention, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
     if kind == "acquire" and acquire_view == "frame":
         rendered_px = size_px
         x0, y0, scale_x, scale_y = 0.0, 0.0, size_px / FRAME_WIDTH_PX, size_px / FRAME_HEIGHT_PX

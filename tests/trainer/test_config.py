@@ -27,7 +27,7 @@ def test_the_flights_continue_the_training_of_the_network_that_ships() -> None:
     edge, flights = (load_config(CONFIGS / name) for name in ("edge.toml", "flights.toml"))
     assert (flights.model, flights.contract) == (edge.model, edge.contract)
     assert flights.data.airframe_ids == edge.data.airframe_ids
-    assert {source.split for source in flights.data.datasets} == {"train"}
+    assert 0.0 < flights.data.flown_share < 1.0
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,8 @@ def test_the_flights_continue_the_training_of_the_network_that_ships() -> None:
         ("batch_size = 4", "batch_size = 4\nairframe_ids = [-1]", "the fleet's numbers, 0 to 20, each once"),
         ("batch_size = 4", "batch_size = 4\nairframe_ids = []", "data.airframe_ids: "),
         ("batch_size = 4", "batch_size = 4\nairframe_ids = [3, 3]", "data.airframe_ids: "),
+        ("batch_size = 4", "batch_size = 4\nflown_share = 0.5", "flown and flown_share need each other"),
+        ("batch_size = 4", 'batch_size = 4\nflown = ["data/flown"]', "flown and flown_share need each other"),
         ("acquire_size_wh = [128, 96]", "acquire_size_wh = [1280, 720]", "contract.acquire_size_wh.1: "),
         ("acquire_size_wh = [128, 96]", "acquire_size_wh = [0, 96]", "contract.acquire_size_wh.0: "),
         ("track_size_wh = [64, 64]", "track_size_wh = [200, 200]", "contract.track_size_wh.0: "),

@@ -28,6 +28,7 @@ from trainer.evaluate import (
 from trainer.export import Measured, Strayed, Tolerance, Views, export_models, stage_sampler, write_int8
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
+from trainer.sources import window_sampler
 
 ANY = Tolerance(180.0, 100.0, 100.0, 100.0)
 
@@ -189,6 +190,15 @@ def test_windows_are_measured_on_alike_whatever_was_trained_on() -> None:
     drawn = [stage_sampler(data.model_copy(update=s), 5, 64, 0.0)().batch(0, 40) for s in shares]
     np.testing.assert_array_equal(drawn[0].image_bgr, drawn[1].image_bgr)
     assert 20 < drawn[0].present.sum() < 40
+
+
+def test_weights_are_exported_without_the_flights_that_they_were_trained_on() -> None:
+    data = tiny.config().data
+    flown = data.model_copy(update={"flown": [Path("/no/longer/there")], "flown_share": 0.5})
+    with pytest.raises(ConfigError, match="/no/longer/there"):
+        window_sampler(flown, 5, 64)()
+    calibration = [stage_sampler(one, 5, 64, 0.0, held_out=False)().batch(0, 8) for one in (data, flown)]
+    np.testing.assert_array_equal(calibration[0].image_bgr, calibration[1].image_bgr)
 
 
 def test_where_every_window_holds_a_target_the_threshold_is_the_usual_one(exported: Exported) -> None:

@@ -85,6 +85,12 @@ def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_
     load_model(refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent))
 
 
+def test_flights_to_render_anew_that_are_not_there_are_told_before_anything_is_rendered() -> None:
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, flown=[Path("/no/longer/there")], flown_share=0.5)
+    with pytest.raises(ConfigError, match="/no/longer/there"):
+        refinement_sampler(data, 12, 96, 0.35)
+
+
 def test_its_strangers_are_none_that_training_draws() -> None:
     """Two of three are asked to be strangers, whatever share the run was trained with; each window shows a target."""
     data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.5)
