@@ -138,12 +138,9 @@ def finish_unfinished(path: Path) -> bool:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        size = os.fstat(file.fileno()).st_size
-        if size > 2 * len(MCAP0_MAGIC):
-            file.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-            if file.read() == MCAP0_MAGIC:
-                return False
-        whole = _whole_bytes(file, size)
+        whole = unfinished_bytes(file)
+        if whole is None:
+            return False
         if whole > 0:
             ending = RecordBuilder()
             DataEnd(0).write(ending)
@@ -154,6 +151,17 @@ def finish_unfinished(path: Path) -> bool:
             return True
     path.unlink()
     return True
+
+
+def unfinished_bytes(file: BinaryIO) -> int | None:
+    """Bytes up to the end of the last complete chunk of a file that a crash ended or that is being written; 0 if there
+    is not even a header. None: the file is finished. Raises OSError."""
+    size = os.fstat(file.fileno()).st_size
+    if size > 2 * len(MCAP0_MAGIC):
+        file.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+        if file.read() == MCAP0_MAGIC:
+            return None
+    return _whole_bytes(file, size)
 
 
 def _is_whole(opcode: int, record: bytes) -> bool:

@@ -17,7 +17,7 @@ from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, listening, session
 from msgs.ground.fleet import TAKEN, Fleet
 from msgs.ground.view.layout import blueprint
-from msgs.ground.view.recorded import check_opens, samples
+from msgs.ground.view.recorded import check_opens, is_unfinished, samples
 from msgs.ground.view.saving import saved
 from msgs.ground.view.scene import Scene
 from msgs.ground.view.viewer import page, window
@@ -108,7 +108,8 @@ def _play(options: ViewOptions, scene: Scene, stop: threading.Event, say: Callab
             scene.tick(log_ns)  # first: after a gap, the sample may be of the very target that was lost in it
             if not options.uavs or incoming.uav in options.uavs:
                 scene.take(incoming, log_ns)
-        say(f"{path}: read")
+        how_far = ", as far as it is complete: a crash ended it, or it is being recorded" if is_unfinished(path) else ""
+        say(f"{path}: read{how_far}")
 
 
 def _listen(options: ViewOptions, scene: Scene, stop: threading.Event, say: Callable[[str], None]) -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
+from typing import BinaryIO
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Message, Schema
 
 from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming
+from msgs.mcap_file import unfinished_bytes
 
 # Recordings contain no attachments: everything gets one publisher, with sequence numbers continuing across files.
 _GID, _numbers = bytes(16), count(1)
@@ -25,13 +29,20 @@ def check_opens(path: Path) -> None:
         make_reader(stream).get_header()
 
 
+def is_unfinished(path: Path) -> bool:
+    """Whether a crash ended the recording, or it is still being written. Raises InputError if it cannot be read."""
+    with _blame(path), path.open("rb") as stream:
+        return bool(unfinished_bytes(stream))
+
+
 def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
     """Each sample of our topics with its recording time (UTC ns); other topics are skipped.
 
-    Raises InputError if the file cannot be read, is damaged or truncated, after yielding the samples before that.
+    An unfinished recording is read up to the last second that is complete. Raises InputError if the file cannot be read
+    or is damaged, after yielding the samples before that.
     """
     with _blame(path), path.open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages():
+        for _, channel, message in _messages(stream):
             key = f"0{channel.topic}"
             row = topics.parse_any_key(key)
             if row is None:
@@ -40,6 +51,20 @@ def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
                 raise ValueError("recorded after the year 2262")
             attachment = topics.attachment(next(_numbers), message.publish_time, _GID)
             yield Incoming(*row, key, message.data, attachment), message.log_time
+
+
+def _messages(stream: BinaryIO) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    whole = unfinished_bytes(stream)
+    if not whole:
+        stream.seek(0)
+        yield from make_reader(stream).iter_messages()
+        return
+    with mmap.mmap(stream.fileno(), whole, access=mmap.ACCESS_READ) as part:
+        try:
+            # Ordering by time would keep all messages in memory; they were written in that order.
+            yield from NonSeekingReader(part).iter_messages(log_time_order=False)  # type: ignore[arg-type]
+        except EndOfFile:
+            return  # there is no footer
 
 
 @contextmanager

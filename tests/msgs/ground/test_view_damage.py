@@ -69,6 +69,24 @@ def test_a_recording_with_a_wrong_byte_is_read_or_a_sentence(tmp_path: Path, fli
     assert all(sentence.startswith(f"{path}: ") for sentence in said)
 
 
+@pytest.mark.parametrize("torn", [b"", bytes(4096), b"\x06" + (9999).to_bytes(8, "little") + bytes(500)])
+def test_a_recording_that_is_not_finished_is_drawn_up_to_its_last_complete_chunk(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], torn: bytes
+) -> None:
+    """Ten frames are on the disk: during a flight, and after a crash that left zeros or part of the next chunk."""
+    path, into = tmp_path / "flight.mcap", tmp_path / "flight.rrd"
+    file = McapFile(path)
+    for topic, target, payload, log_ns in samples(10):
+        file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.flush()
+    with path.open("ab") as after:
+        after.write(torn)
+    assert main(["view", str(path), "--save", str(into)]) == 0
+    assert [stamp_ns for stamp_ns, _ in rows(into, "ned/target/t0/body")] == stamps_ns(10)
+    assert f"{path}: read, as far as it is complete" in capsys.readouterr().err
+    file.abandon()
+
+
 def test_a_recording_of_a_time_that_no_clock_tells_is_a_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
