@@ -112,6 +112,7 @@ class DataConfig(Section):
     seed: int = Field(ge=0)
     validation_seed: int = Field(ge=0)
     airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
+    hard_airframe_ids: list[int] = Field([], description="of those, drawn twice as often in training as the others")
     acquire_share: float = Field(0.3, ge=0, le=1, description="share of views as the acquire stage sees them")
     acquire_view: AcquireView = Field(
         "crop", description="a window of the reduced frame, or the whole frame squashed, as contract.acquire_fit has it"
@@ -147,6 +148,12 @@ class DataConfig(Section):
     def _shares_fit(self) -> DataConfig:
         if sum(source.share for source in self.datasets) > 1.0 + 1e-9:
             raise ValueError("the shares of datasets add up to more than 1")
+        return self
+
+    @model_validator(mode="after")
+    def _hard_ones_are_among_them(self) -> DataConfig:
+        if self.hard_airframe_ids and not set(self.hard_airframe_ids) <= set(self.airframe_ids or []):
+            raise ValueError("hard_airframe_ids must be some of airframe_ids")
         return self
 
     @model_validator(mode="after")

@@ -36,11 +36,17 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: 
         invention = Invention(0.0 if judging else config.invented_share)
         flown = NONE_FLOWN if judging else _flown(config)
         shares_drawn = config.acquire_share, config.empty_share
-        samplers.append(WindowSampler(seed, size_px, config.airframe_ids, *shares_drawn, invention, view, flown))
+        ids = config.airframe_ids if judging else _drawn_ids(config)
+        samplers.append(WindowSampler(seed, size_px, ids, *shares_drawn, invention, view, flown))
         shares.append(1.0 - sum(shares))
     # Datasets without a validation split leave their shares to the others in proportion.
     shares = [share / sum(shares) for share in shares]
     return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
+
+
+def _drawn_ids(config: DataConfig) -> list[int] | None:
+    """The airframes as often as they are to be drawn."""
+    return None if config.airframe_ids is None else [*config.airframe_ids, *config.hard_airframe_ids]
 
 
 def _flown(config: DataConfig) -> FlownShare:
@@ -49,7 +55,7 @@ def _flown(config: DataConfig) -> FlownShare:
 
     if not config.flown:
         return NONE_FLOWN
-    known = range(len(AIRFRAMES)) if config.airframe_ids is None else config.airframe_ids
+    known = _drawn_ids(config) or range(len(AIRFRAMES))
     try:
         return FlownShare(config.flown_share, read_flown(config.flown, known))
     except BopError as error:

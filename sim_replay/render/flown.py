@@ -54,7 +54,8 @@ NONE_FLOWN = FlownShare()
 
 
 def read_flown(folders: Sequence[Path], airframe_ids: Sequence[int]) -> FlownFrames:
-    """The frames of generated datasets, or splits of them, that show one of those airframes.
+    """The frames of generated datasets, or splits of them, that show one of those airframes; of an airframe that is
+    given several times, each frame is drawn so many times as often.
 
     Raises BopError if a folder is no dataset of the fleet, was filmed through a distorting lens, or shows none of them.
     """
@@ -70,7 +71,7 @@ def read_flown(folders: Sequence[Path], airframe_ids: Sequence[int]) -> FlownFra
                 )
             if frame.distortion is not None:
                 raise BopError(f"{folder}: its lenses distort; generate it with --undistorted")
-            found.append(frame)
+            found += [frame] * list(airframe_ids).count(frame.targets[0].object_id - 1)
     return _stacked(found)
 
 

@@ -91,6 +91,13 @@ def test_a_share_of_the_windows_is_flown(flown: Path) -> None:
     assert 0.23 < np.mean(np.abs(K[:, 0, 0] / K[:, 1, 1] - 1.0) < 1e-6) < 0.37
 
 
+def test_an_airframe_given_twice_is_drawn_twice_as_often(flown: Path) -> None:
+    light, male = airframe_id("light_aircraft"), airframe_id("male_v_tail")
+    once, twice = (read_flown([flown], ids).airframe_id for ids in ([light, male], [light, male, male]))
+    assert np.sum(twice == light) == np.sum(once == light) > 0
+    assert np.sum(twice == male) == 2 * np.sum(once == male) > 0
+
+
 def test_what_cannot_be_drawn_anew_is_refused(flown: Path, tmp_path: Path) -> None:
     with pytest.raises(BopError, match="shows one of the airframes"):
         read_flown([flown], [airframe_id("glider")])

@@ -43,6 +43,11 @@ def test_the_flights_continue_the_training_of_the_network_that_ships() -> None:
         ("batch_size = 4", "batch_size = 4\nairframe_ids = [-1]", "the fleet's numbers, 0 to 20, each once"),
         ("batch_size = 4", "batch_size = 4\nairframe_ids = []", "data.airframe_ids: "),
         ("batch_size = 4", "batch_size = 4\nairframe_ids = [3, 3]", "data.airframe_ids: "),
+        (
+            "batch_size = 4",
+            "batch_size = 4\nairframe_ids = [3]\nhard_airframe_ids = [4]",
+            "must be some of airframe_ids",
+        ),
         ("batch_size = 4", "batch_size = 4\nflown_share = 0.5", "flown and flown_share need each other"),
         ("batch_size = 4", 'batch_size = 4\nflown = ["data/flown"]', "flown and flown_share need each other"),
         ("acquire_size_wh = [128, 96]", "acquire_size_wh = [1280, 720]", "contract.acquire_size_wh.1: "),

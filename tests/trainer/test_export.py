@@ -192,6 +192,13 @@ def test_windows_are_measured_on_alike_whatever_was_trained_on() -> None:
     assert 20 < drawn[0].present.sum() < 40
 
 
+def test_hard_airframes_are_drawn_twice_as_often_in_training_but_not_in_what_is_judged_by() -> None:
+    data = tiny.config().data.model_copy(update={"airframe_ids": [3, 6], "hard_airframe_ids": [6], "empty_share": 0.0})
+    trained, judged = (window_sampler(data, 5, 64, held_out)().batch(0, 300) for held_out in (False, True))
+    shares = [np.mean(batch.airframe_id[batch.present] == 6) for batch in (trained, judged)]
+    assert shares == pytest.approx([2 / 3, 1 / 2], abs=0.08)
+
+
 def test_weights_are_exported_without_the_flights_that_they_were_trained_on() -> None:
     data = tiny.config().data
     flown = data.model_copy(update={"flown": [Path("/no/longer/there")], "flown_share": 0.5})
