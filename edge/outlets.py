@@ -6,6 +6,7 @@ import logging
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from edge import clock
 from edge.health import Condition, HealthSnapshot, HealthState
 from edge.requests import AskReload, RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
@@ -85,6 +86,15 @@ class Outlets:
     def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
         if self._zenoh is not None:
             self._zenoh.publish_diagnostics(snapshot)
+
+    def threads(self) -> frozenset[str]:
+        """Names of the links' threads, running or not."""
+        links = {
+            "zenoh": self._zenoh,
+            "recorder": self._recorder,
+            "mavlink": None if clock.stepped() else self._mavlink,
+        }
+        return frozenset(name for name, link in links.items() if link is not None)
 
     def settle(self) -> None:
         """In lock-step mode: return when all output is sent and all input is processed."""

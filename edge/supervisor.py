@@ -60,8 +60,8 @@ class Supervisor:
         self._latency_max_ms = settings.latency_max_ms
 
     def ready(self) -> None:
-        """The daemon is warmed up: the watched threads running now are expected to keep running."""
-        self._threads_wanted = threads.running()
+        """The daemon is warmed up: the watched threads running now, and the links', are expected to keep running."""
+        self._threads_wanted = threads.running() | self._outlets.threads()
         self._notifier.ready()
 
     def stopping(self) -> None:

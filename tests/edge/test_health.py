@@ -10,6 +10,8 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,16 +20,20 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge import threads
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.estimator.providers import NAMES, choose_provider
 from edge.health import FIRST_FRAME_NS, Activity, Condition, Health, HealthState, Reason, judge
+from edge.links.mavlink_link import MavlinkLink
 from edge.logs import CountingHandler
-from edge.outlets import Outlets
+from edge.outlets import Outlets, start_outlets
+from edge.requests import RequestQueue
 from edge.stages import STAGES, StageClock
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
 from edge.systemd import Notifier
+from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo, FrameMeta
 from msgs import topics
 from msgs.cdr import Log
@@ -176,6 +182,26 @@ def test_a_link_whose_thread_has_ended_is_told(toy_model: Path) -> None:
     while "the mavlink thread has ended" not in supervisor.snapshot().condition.texts and time.monotonic() < deadline_s:
         supervisor.turn()
     assert "the mavlink thread has ended" in supervisor.snapshot().condition.texts
+
+
+def test_a_link_whose_thread_ended_before_the_daemon_was_ready_is_told(
+    toy_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its thread ends as soon as it has started, while the model is still being warmed up."""
+    monkeypatch.setattr(MavlinkLink, "_run", lambda _: None)
+    text = '[camera]\ntype = "sequence"\npath = "/x"\n[mavlink]\nendpoints = ["udpout:127.0.0.1:14999"]\n'
+    config = Config.model_validate(tomllib.loads(text + "[zenoh]\nenabled = false\n"))
+    board = StatusBoard(
+        ConfigFile(Path("x.toml"), text, config), load_model(toy_model, 1), CameraInfo("x", (640, 480), K, None)
+    )
+    with ExitStack() as cleanup:
+        outlets = start_outlets(board, OwnShipBuffer(), RequestQueue(), lambda: None, cleanup)
+        supervisor = Supervisor(config.health, False, outlets, board, dict, lambda _: ())
+        until(lambda: "mavlink" not in threads.running())
+        supervisor.ready()
+        supervisor.turn()
+        supervisor.turn()
+        assert "the mavlink thread has ended" in supervisor.snapshot().condition.texts
 
 
 def test_a_camera_that_is_gone_has_no_frame_rate() -> None:
