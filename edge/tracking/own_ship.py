@@ -17,14 +17,16 @@ from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
 ATTITUDE_GAP_MAX_NS = 500_000_000  # no interpolation between samples further apart
-# How long an attitude is extrapolated with its rates: 1.5 times the usual interval, within these limits. If the usual
-# interval exceeds the upper one, attitudes are not used at all: rather none than for some frames only.
-ATTITUDE_AHEAD_NS = (50_000_000, 150_000_000)
+# How long an attitude is extrapolated with its rates: enough for a link that delays messages. If they usually come more
+# rarely, they are not used at all: rather none than for some frames only.
+ATTITUDE_AHEAD_MAX_NS = 150_000_000
 USUAL_OF = 5  # samples that give the usual interval: a single lost or late one does not change it
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
+GIMBAL_ACCELERATION_STD_RADPS2 = 5.0  # of a gimbal that begins or ends a slew
 # Least horizontal part of the unit nose vector for a defined heading: within 15 degrees of the vertical, small attitude
 # errors turn the heading, and everything given relative to it, many times as far.
 LEVEL_MIN = float(np.sin(np.deg2rad(15.0)))
+GIMBAL_HELD_MAX_NS = 50_000_000  # how long a gimbal's attitude of unknown rate is taken to stay as it is
 GIMBAL_STEP_MIN_NS = 5_000_000  # the difference of closer samples is mostly rounding and gives no rate
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
@@ -158,7 +160,9 @@ class OwnShipBuffer:
             t_ned_m, v_ned_mps = position if position is not None else (None, None)
             origin = self._origin(time_ns, t_ned_m is not None)
             clock_std_s = self._of_body_and_gimbal(*(s[-1].clock_std_s if s else 0.0 for s in self._sources))
-            attitude_std_rad = self._of_body_and_gimbal(*(_turned_rad(s, time_ns) for s in self._sources))
+            attitude_std_rad = self._of_body_and_gimbal(
+                _body_turned_rad(self._attitudes, time_ns), _gimbal_turned_rad(self._gimbals, time_ns)
+            )
             return OwnShip(
                 time_ns,
                 R_ned_body,
@@ -220,13 +224,12 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     if after == 0:
         return None
     a = samples[after - 1]
-    elapsed_s, reach_ns = (time_ns - a.time_ns) / NS_PER_S, _reach_ns(samples)
-    if reach_ns is None:
+    if _too_rare(samples):
         return None
     if after == len(samples):
-        if time_ns - a.time_ns > reach_ns:
+        if time_ns - a.time_ns > ATTITUDE_AHEAD_MAX_NS:
             return None
-        return a.R_ned_body @ so3_exp(a.rates_body_radps * elapsed_s)
+        return a.R_ned_body @ so3_exp(a.rates_body_radps * ((time_ns - a.time_ns) / NS_PER_S))
     b = samples[after]
     if b.time_ns - a.time_ns > ATTITUDE_GAP_MAX_NS:
         return None
@@ -234,14 +237,28 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
 
 
-def _turned_rad(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> float:
+def _body_turned_rad(samples: deque[_Attitude], time_ns: int) -> float:
     """Standard deviation of an interpolated or extrapolated attitude, from unknown angular acceleration."""
+    since_s, until_s = _apart_s(samples, time_ns)
+    return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * since_s * (since_s if until_s is None else until_s)
+
+
+def _gimbal_turned_rad(samples: deque[_Gimbal], time_ns: int) -> float:
+    """The same of a gimbal, whose rate is that of the last two samples: half an interval old."""
+    since_s, until_s = _apart_s(samples, time_ns)
+    if until_s is None:
+        between_s = (samples[-1].time_ns - samples[-2].time_ns) / NS_PER_S if len(samples) > 1 else 0.0
+        until_s = since_s + between_s
+    return 0.5 * GIMBAL_ACCELERATION_STD_RADPS2 * since_s * until_s
+
+
+def _apart_s(samples: deque[_Attitude] | deque[_Gimbal], time_ns: int) -> tuple[float, float | None]:
+    """Seconds since the last sample before a time, and until the next one (None: there is none yet)."""
     after = _first_after(samples, time_ns)
     if after == 0:
-        return 0.0
+        return 0.0, 0.0
     since_s = (time_ns - samples[after - 1].time_ns) / NS_PER_S
-    until_s = since_s if after == len(samples) else (samples[after].time_ns - time_ns) / NS_PER_S
-    return 0.5 * ANGULAR_ACCELERATION_STD_RADPS2 * since_s * until_s
+    return since_s, None if after == len(samples) else (samples[after].time_ns - time_ns) / NS_PER_S
 
 
 def _usual_gaps_ns(samples: deque) -> list[int]:
@@ -250,14 +267,10 @@ def _usual_gaps_ns(samples: deque) -> list[int]:
     return sorted(b - a for a, b in pairwise(times))
 
 
-def _reach_ns(samples: deque[_Attitude] | deque[_Gimbal]) -> int | None:
-    """How long the last sample may be extrapolated; None: samples are too rare to be used."""
+def _too_rare(samples: deque[_Attitude] | deque[_Gimbal]) -> bool:
+    """Whether samples usually lie further apart than the last one may be extrapolated."""
     gaps_ns = _usual_gaps_ns(samples)
-    least_ns, most_ns = ATTITUDE_AHEAD_NS
-    if not gaps_ns:
-        return least_ns
-    gap_ns = gaps_ns[len(gaps_ns) // 2]
-    return min(max(gap_ns * 3 // 2, least_ns), most_ns) if gap_ns <= most_ns else None
+    return bool(gaps_ns) and gaps_ns[len(gaps_ns) // 2] > ATTITUDE_AHEAD_MAX_NS
 
 
 def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
@@ -272,13 +285,15 @@ def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
     """R_body_gimbal: slerp between samples, extrapolation at the rate of the last two for at most 150 ms; None if given
     relative to a heading while the nose points nearly straight up or down."""
-    after, reach_ns = _first_after(samples, time_ns), _reach_ns(samples)
-    if after == 0 or reach_ns is None or (after == len(samples) and time_ns - samples[-1].time_ns > reach_ns):
+    after = _first_after(samples, time_ns)
+    if after == 0 or _too_rare(samples):
+        return None
+    if after == len(samples) and time_ns - samples[-1].time_ns > ATTITUDE_AHEAD_MAX_NS:
         return None
     a, b = samples[max(min(after, len(samples) - 1) - 1, 0)], samples[min(after, len(samples) - 1)]
     least_ns = GIMBAL_STEP_MIN_NS if after == len(samples) else 1
     if a.frame is not b.frame or not least_ns <= b.time_ns - a.time_ns <= ATTITUDE_GAP_MAX_NS:
-        if after < len(samples) or time_ns - b.time_ns > ATTITUDE_AHEAD_NS[0]:
+        if after < len(samples) or time_ns - b.time_ns > GIMBAL_HELD_MAX_NS:
             return None
         a, share = b, 0.0  # the last sample alone, without a rate
     else:

@@ -43,6 +43,54 @@ def test_a_still_target_stands_still_while_gimbal_and_body_turn() -> None:
     assert np.linalg.norm(track.v_ned_target_mps) < 4.0
 
 
+def slewed_rad(t_s: float) -> float:
+    """Heading of a gimbal that turns by 20 degrees from 3 s on, at up to 60 deg/s, begun and ended with 600 deg/s^2."""
+    ramp_s, whole_s = 0.1, 20.0 / 60.0
+    times_s = np.arange(0.0, t_s, 1e-3) - 3.0
+    speeds = np.interp(times_s, [0.0, ramp_s, whole_s, whole_s + ramp_s], np.deg2rad([0.0, 60.0, 60.0, 0.0]))
+    return float(speeds.sum() * 1e-3)
+
+
+@pytest.mark.parametrize("attitudes_hz", [10, 20, 50])
+def test_a_gimbal_that_begins_and_ends_a_slew_leaves_one_target_where_it_is(attitudes_hz: int) -> None:
+    """Its messages are exact, but 20 ms late: between and after them, nothing tells how it is being accelerated."""
+    buffer, tracker, rng = OwnShipBuffer(gimballed=True), Tracker(4, MOUNT), np.random.default_rng(0)
+    v_target_mps, start_m, due_s, numbers = np.array([25.0, 0.0, 0.0]), np.array([300.0, 60.0, 0.0]), 0.0, set[int]()
+    for frame in range(180):
+        t_s = frame * FRAME_S
+        while due_s + 0.02 <= t_s + 0.005:
+            stamp_ns = round((1.0 + due_s) * 1e9)
+            gimbal = Rotation.from_euler("z", slewed_rad(due_s))
+            buffer.add_attitude(stamp_ns, [1.0, 0.0, 0.0, 0.0], np.zeros(3))
+            buffer.add_position(stamp_ns, V_NED_OWN_MPS * due_s, V_NED_OWN_MPS)
+            buffer.add_gimbal(stamp_ns, np.roll(gimbal.as_quat(), 1), GimbalFrame.EARTH)
+            due_s += 1.0 / attitudes_hz
+        own = buffer.at(round((1.0 + t_s) * 1e9))
+        R_cam_ned = (Rotation.from_euler("z", slewed_rad(t_s)).as_matrix() @ MOUNT.R_body_cam).T
+        t_cam_m = R_cam_ned @ (start_m + (v_target_mps - V_NED_OWN_MPS) * t_s)
+        center_px = (K @ t_cam_m / t_cam_m[2])[:2]
+        along, across = np.outer(t_cam_m, t_cam_m), np.eye(3) * float(t_cam_m @ t_cam_m) - np.outer(t_cam_m, t_cam_m)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3], covariance[3:, 3:] = 0.03**2 * along + 1500.0**-2 * across, 0.1**2 * np.eye(3)
+        seen_m = t_cam_m * (1.0 + rng.normal(0.0, 0.01))
+        box = np.concatenate([center_px - 25.0, center_px + 25.0])
+        tracks = tracker.update(
+            round((1.0 + t_s) * 1e9), [Estimate(0.9, box, R_cam_ned, seen_m, covariance, "track")], own, K, (8192, 1080)
+        )
+        assert len(tracks) == 1
+        numbers.add(tracks[0].track_id)
+        if own is not None and t_s > 2.0:
+            assert own.R_body_gimbal is not None
+            off_rad = (
+                Rotation.from_matrix(own.R_body_gimbal).inv() * Rotation.from_euler("z", slewed_rad(t_s))
+            ).magnitude()
+            assert off_rad < 3.0 * np.hypot(own.attitude_std_rad, 1e-3)
+            assert tracks[0].v_ned_target_mps is not None
+            off_mps = tracks[0].v_ned_target_mps - v_target_mps
+            assert off_mps @ np.linalg.solve(tracks[0].covariance_ned[3:6, 3:6], off_mps) < 16.3  # chi-squared, 99.9 %
+    assert numbers == {0}
+
+
 @pytest.mark.parametrize("pitch_deg", [-90.0, -89.0, -80.0, -70.0, 0.0, 70.0, 80.0, 89.0, 90.0])
 @pytest.mark.parametrize("frame", list(GimbalFrame))
 def test_a_nose_that_points_up_or_down_leaves_no_heading_to_tell_a_gimbal_against(
