@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.links.outgoing import range_known
 from edge.types import Track, TrackState
 
 NS_PER_S = 1e9
@@ -17,7 +18,7 @@ NS_PER_S = 1e9
 class _Held:
     since_ns: int  # confirmed, monotonic
     measured_ns: int
-    range_m: float  # then
+    range_m: float | None  # then; None: too uncertain to be sent
 
 
 class TargetNews:
@@ -39,11 +40,17 @@ class TargetNews:
                 now[number] = before
                 continue
             since_ns = track.time_ns if before is None else before.since_ns
-            now[number] = _Held(since_ns, track.measured_ns, float(np.linalg.norm(track.t_cam_target_m)))
+            range_m = float(np.linalg.norm(track.t_cam_target_m)) if range_known(track) else None
+            now[number] = _Held(since_ns, track.measured_ns, range_m)
         self._held = now
-        return told + [(logging.INFO, f"target {one} acquired at {now[one].range_m:.0f} m") for one in acquired]
+        return told + [(logging.INFO, _acquired(number, now[number])) for number in acquired]
+
+
+def _acquired(number: int, held: _Held) -> str:
+    return f"target {number} acquired" + (", range unknown" if held.range_m is None else f" at {held.range_m:.0f} m")
 
 
 def _lost(number: int, held: _Held) -> str:
     held_s = (held.measured_ns - held.since_ns) / NS_PER_S
-    return f"target {number} lost: held for {held_s:.1f} s, last seen at {held.range_m:.0f} m"
+    last = "range unknown" if held.range_m is None else f"last seen at {held.range_m:.0f} m"
+    return f"target {number} lost: held for {held_s:.1f} s, {last}"

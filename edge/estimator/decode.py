@@ -19,6 +19,9 @@ RANGE_EXCESS_MAX = 2.0
 # Two boxes are of one aircraft if this share of the smaller lies inside the larger.
 SAME_TARGET_OVERLAP = 0.5
 ROTATION_TOLERANCE = 0.05
+# 1-sigma of (u, v) px, log Z and rotation rad above which a network has told nothing, and the tracker's matrices would
+# become singular.
+SIGMA_MAX = np.array([1e4, 1e4, 100.0, 100.0, 100.0, 100.0])
 # A box whose longer side is below this many pixels of the frame shows too little shape for a pose.
 BOX_MIN_PX = 8.0
 # A box this near to the frame's edge, as a share of its longer side plus pixels, may be cut by it.
@@ -176,6 +179,8 @@ def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> E
 def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tuple[float, float]) -> str | None:
     if not all(np.all(np.isfinite(value)) for value in (R, t_m, sigma, box)):
         return "not_finite"
+    if np.any(sigma > SIGMA_MAX):
+        return "unsure"
     if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         return "no_rotation"
     if np.any(sigma <= 0) or np.any(box[2:] <= box[:2]):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +31,14 @@ def rotation_known(track: Track) -> bool:
     return float(np.trace(track.covariance[3:, 3:])) <= 3.0 * UNSURE_ROTATION_RAD**2
 
 
+def range_known(track: Track) -> bool:
+    """Whether the range is certain enough for the track to be sent."""
+    range_m = float(np.linalg.norm(track.t_cam_target_m))
+    along = track.t_cam_target_m / range_m
+    variance_m2 = float(along @ track.covariance[:3, :3] @ along)
+    return variance_m2 <= (UNSURE_RANGE_SHARE * range_m) ** 2
+
+
 def _of_what_is_known(track: Track) -> Track:
     if track.covariance_ned is None or is_covariance(track.covariance_ned):
         return track
@@ -44,10 +51,7 @@ def _whole(track: Track) -> bool:
     values = in_cam + [value for value in in_ned if value is not None]
     if not np.isfinite(np.concatenate([np.ravel(value) for value in values])).all():
         return False
-    range_m = float(np.linalg.norm(track.t_cam_target_m))
     if track.t_cam_target_m[2] <= 0.0 or not is_covariance(track.covariance):
         return False
-    along = track.t_cam_target_m / range_m
-    range_std_m = math.sqrt(max(float(along @ track.covariance[:3, :3] @ along), 0.0))
     skewness = np.abs(track.R_cam_target @ track.R_cam_target.T - np.eye(3)).max()
-    return bool(skewness <= ROTATION_TOLERANCE and range_std_m <= UNSURE_RANGE_SHARE * range_m)
+    return bool(skewness <= ROTATION_TOLERANCE and range_known(track))

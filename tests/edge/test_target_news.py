@@ -47,6 +47,17 @@ def test_a_number_that_is_used_again_is_another_target() -> None:
     assert [text for _, text in news.words([track(2 * FRAME_NS, track_id=2)])] == ["target 2 acquired at 240 m"]
 
 
+def test_no_range_is_told_that_is_too_uncertain_to_be_sent() -> None:
+    """1-sigma of 0.8 and then of 0.3 times the range: poses are withheld above 0.5."""
+    news, told = TargetNews(), []
+    for frame, share in enumerate((0.8, 0.8, 0.3)):
+        covariance = np.diag([0.09, 0.09, (share * 240.0) ** 2, 0.01, 0.01, 0.01])
+        seen = track(frame * FRAME_NS, t_cam_target_m=np.array([0.0, 0.0, 240.0]), covariance=covariance)
+        told.append([text for _, text in news.words([seen])])
+    assert told == [["target 0 acquired, range unknown"], [], []]
+    assert news.words([])[0][1].endswith("last seen at 240 m")
+
+
 def test_the_ground_hears_that_a_target_is_lost(tmp_path: Path, toy_model: Path) -> None:
     scene = tmp_path / "000001"
     (scene / "rgb").mkdir(parents=True)
