@@ -104,7 +104,10 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--config", type=Path, required=True, help="TOML, such as trainer/configs/edge.toml")
     train.add_argument("--out", type=Path, required=True, help="run folder")
     train.add_argument(
-        "--budget-minutes", type=positive, help="wall-clock limit of this start; the schedule is fitted into it"
+        "--budget-minutes",
+        type=positive,
+        help="wall-clock time for the run, or with --resume so much more time; the schedule is fitted into it "
+        "(default: none, or what is left of the resumed run's)",
     )
     train.add_argument(
         "--samples",

@@ -200,6 +200,27 @@ class Plan(NamedTuple):
 
     samples: int  # planned, in total
     used_s: float = 0.0  # wall-clock seconds before this start
+    budget_s: float | None = None  # in total; None: no limit
+
+    def progress(self, samples: int) -> float:
+        """Progress 0..1 of the schedule after `samples` at this start."""
+        by_time = self.used_s / self.budget_s if self.budget_s else 0.0
+        return min(max(samples / self.samples, by_time), 1.0)
+
+    def resumed(self, out: Path, budget_s: float | None, samples: int | None) -> Plan:
+        """The plan of the next start, with this much more time and so many samples in total; None: as before.
+
+        Raises ConfigError if the time is used up.
+        """
+        if budget_s is not None:
+            return Plan(samples or self.samples, self.used_s, self.used_s + budget_s)
+        if samples is not None:
+            return Plan(samples, self.used_s)
+        if self.budget_s is not None and self.used_s >= self.budget_s:
+            raise ConfigError(
+                f"{out}: the run's time budget is used up; give --budget-minutes for more time, or --samples"
+            )
+        return self
 
 
 def resume_run(out: Path, trainer: Trainer) -> Plan:
@@ -221,7 +242,8 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
         raise ConfigError(f"{path}: [run] bf16 differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
     # Older files lack the plan: theirs was the configuration's.
-    return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]))
+    budget_s = state.get("budget_s")
+    return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]), budget_s)
 
 
 def run_training(
@@ -239,7 +261,7 @@ def run_training(
     """Train until the planned samples, the time budget, `max_steps` of this start, or a signal; save a checkpoint.
 
     Progress, which drives the schedule, is the larger of samples done / planned and time used / budget.
-    A resumed run keeps its planned `samples` unless others are given. Raises ConfigError.
+    A resumed run keeps its planned `samples` and its time budget unless others are given. Raises ConfigError.
     """
     torch.set_num_threads(config.run.threads)
     refuse_unreadable(config.data)
@@ -253,9 +275,15 @@ def run_training(
         if start_from is not None:
             trainer.start_from(start_from)
         with run_folder(out, resume, hold=group.first):
-            plan = resume_run(out, trainer) if resume else Plan(config.schedule.samples)
-            budget = Budget(plan.used_s, None if budget_s is None else plan.used_s + budget_s)
-            loop = _Loop(trainer, config_text, out, budget, samples or plan.samples, opener)
+            if resume:
+                earlier = resume_run(out, trainer)
+                plan = earlier.resumed(out, budget_s, samples)
+            else:
+                earlier = plan = Plan(samples or config.schedule.samples, 0.0, budget_s)
+            loop = _Loop(trainer, config_text, out, Budget(plan.used_s, plan.budget_s), plan.samples, opener)
+            before, now = earlier.progress(trainer.samples), plan.progress(trainer.samples)
+            if now < before:
+                loop.note(f"with the new plan the schedule goes back from {before:.0%} to {now:.0%}")
             with stop_on_signals() as stopped:
                 loop.run(stopped, max_steps)
     return trainer
@@ -374,7 +402,7 @@ class _Loop:
         if self.log is None:
             return
         state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
-        state["planned_samples"] = self.planned
+        state |= {"planned_samples": self.planned, "budget_s": self.budget.total_s}
         training = {
             **self.provenance,
             "started_from": self.trainer.started_from,

@@ -180,6 +180,31 @@ def test_a_budget_ends_a_run_and_stretches_its_schedule_over_itself(tmp_path: Pa
     assert max(filter(None, progress)) > trainer.samples / 1_000_000
 
 
+def test_a_resumed_run_goes_on_within_its_budget(tmp_path: Path) -> None:
+    """A budget of some steps out of a million samples: by the samples alone, progress would start at nothing again."""
+
+    def logged() -> list[float]:
+        records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+        return [record["progress"] for record in records if record["kind"] == "train"]
+
+    train(tmp_path, LONG, budget_s=60.0, max_steps=2)
+    first = logged()
+    train(tmp_path, LONG, resume=True, max_steps=1)
+    assert logged()[-1] >= first[-1] > 100 * 8 / 1_000_000
+    state = load_file(tmp_path / "resume.pt")
+    state["used_s"] = state["budget_s"]
+    torch.save(state, tmp_path / "resume.pt")
+    with pytest.raises(ConfigError, match=f"{tmp_path}: the run's time budget is used up; give --budget-minutes"):
+        train(tmp_path, LONG, resume=True)
+
+
+def test_a_plan_that_takes_the_schedule_back_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train(tmp_path, LONG, budget_s=60.0, max_steps=2)
+    capsys.readouterr()
+    train(tmp_path, LONG, resume=True, budget_s=6000.0, max_steps=1)
+    assert re.search(r"the schedule goes back from \d+% to \d+%", capsys.readouterr().out)
+
+
 def test_weights_that_another_command_left_are_not_overwritten(tmp_path: Path) -> None:
     save_weights(tmp_path / "weights.pt", tiny.network(), tiny.TOML, {"samples": 0})
     before = (tmp_path / "weights.pt").read_bytes()
