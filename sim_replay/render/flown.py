@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES
-from sim_replay.bop import BopError, BopFrame, find_scenes
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
+from sim_replay.bop.fields import load_object
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
 
 Array = NDArray[np.float64]
@@ -57,31 +58,39 @@ def read_flown(folders: Sequence[Path], airframe_ids: Sequence[int]) -> FlownFra
     """The frames of generated datasets, or splits of them, that show one of those airframes; of an airframe that is
     given several times, each frame is drawn so many times as often.
 
-    Raises BopError if a folder is no dataset of the fleet, was filmed through a distorting lens, or shows none of them.
+    Raises BopError if a folder is no dataset of the fleet in frames of 1920 x 1080 pixels, was filmed through a lens
+    that distorts, or shows none of them.
     """
     found = []
     for folder in folders:
-        of_folder = [frame for scene in find_scenes(folder) for frame in scene.frames if _shows(frame, airframe_ids)]
+        of_folder = [frame for scene in find_scenes(folder) for frame in _shown(folder, scene, airframe_ids)]
         if not of_folder:
             raise BopError(f"{folder}: none of its frames shows one of the airframes to train on")
         for frame in of_folder:
-            if frame.R_cam_world is None or frame.t_cam_world_m is None:
-                raise BopError(
-                    f"{folder}: picture {frame.image_id} has no cam_R_w2c: `uavpose-replay generate` made it?"
-                )
-            if frame.distortion is not None:
-                raise BopError(f"{folder}: its lenses distort; generate it with --undistorted")
             found += [frame] * list(airframe_ids).count(frame.targets[0].object_id - 1)
     return _stacked(found)
 
 
-def _shows(frame: BopFrame, airframe_ids: Sequence[int]) -> bool:
-    if not frame.targets:
-        return False
-    target = frame.targets[0]
-    if not 0 < target.object_id <= len(AIRFRAMES):
-        raise BopError(f"picture {frame.image_id} shows obj_id {target.object_id}, which is no member of the fleet")
-    return target.box_visible_xyxy_px is not None and target.object_id - 1 in airframe_ids
+def _shown(folder: Path, scene: BopScene, airframe_ids: Sequence[int]) -> Iterator[BopFrame]:
+    """The scene's frames whose first target is visible and one of those."""
+    camera = load_object(scene.folder / "camera.json", optional=True)
+    size_wh = (camera.get("width"), camera.get("height"))
+    if size_wh != (FRAME_WIDTH_PX, FRAME_HEIGHT_PX):
+        told = f"{scene.folder / 'camera.json'}: its frames have {size_wh[0]} x {size_wh[1]} pixels"
+        raise BopError(f"{told}; windows are drawn of frames of {FRAME_WIDTH_PX} x {FRAME_HEIGHT_PX}")
+    for frame in scene.frames:
+        if not frame.targets or frame.targets[0].box_visible_xyxy_px is None:
+            continue
+        number = frame.targets[0].object_id
+        if not 0 < number <= len(AIRFRAMES):
+            raise BopError(f"{folder}: picture {frame.image_id} shows obj_id {number}, which is no member of the fleet")
+        if number - 1 not in airframe_ids:
+            continue
+        if frame.R_cam_world is None or frame.t_cam_world_m is None:
+            raise BopError(f"{folder}: picture {frame.image_id} has no cam_R_w2c: `uavpose-replay generate` made it?")
+        if frame.distortion is not None:
+            raise BopError(f"{folder}: its lenses distort; generate it with --undistorted")
+        yield frame
 
 
 def _stacked(frames: Sequence[BopFrame]) -> FlownFrames:
