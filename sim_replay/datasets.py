@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,8 @@ from edge.estimator.lens import Lens, lens_of
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.fields import integer, load_json
 from sim_replay.bop.layout import TARGETS_FILE, dataset_of
-from sim_replay.bop.scene import Image, Mask, picture_size_wh, read_picture_bgr
+from sim_replay.bop.models import models_folder
+from sim_replay.bop.scene import Image, Mask, header_size_wh, picture_size_wh, read_picture_bgr
 
 Array = NDArray[np.float64]
 Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
@@ -81,6 +82,7 @@ class Dataset:
     root: Path
     split: str | None  # None: it has no splits, or several of them were opened together
     scenes: tuple[BopScene, ...]
+    one_scene: bool = False  # opened by a scene's folder: others that the dataset may have are not missing
 
     @cached_property
     def models(self) -> dict[int, Model]:
@@ -91,13 +93,14 @@ class Dataset:
         """
         frames = self.scenes[0].models
         models = read_models(self.root, frames)
-        if models:
+        if models and models_folder(self.root) is not None:
             return models
-        return {
+        seen = {
             object_id: Model(frames.common.diameter_m or looks_m)
             for object_id, looks_m in _diameters_from_boxes(self.scenes).items()
             if frames.common.diameter_m or looks_m
         }
+        return seen | models
 
     def frames(self) -> Iterator[DatasetFrame]:
         """Every frame that has an image, by scene and image id; of a test split those in test_targets_bop19.json.
@@ -105,7 +108,7 @@ class Dataset:
         Raises BopError, naming file and key; also at the end if that file lists no existing image.
         """
         wanted = self._wanted
-        passed_over, listed = 0, False
+        passed_over, met = 0, set[tuple[int, int]]()
         for scene in self.scenes:
             frames = scene.pictured
             if len(frames) < len(scene.frames):
@@ -116,14 +119,25 @@ class Dataset:
             for frame in frames:
                 indices: Sequence[int] = range(len(frame.targets))
                 if wanted is not None and _is_test(scene):
-                    if (scene.scene_id, frame.image_id) not in wanted:
+                    key = scene.scene_id, frame.image_id
+                    if key not in wanted:
                         passed_over += 1
                         continue
-                    listed = True
-                    indices = _chosen(frame.targets, wanted[scene.scene_id, frame.image_id])
+                    met.add(key)
+                    indices = _chosen(frame.targets, wanted[key])
                 yield self._frame(scene, frame, indices)
-        if passed_over and not listed:
+        if passed_over and not met:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
+        if met and wanted is not None:
+            self._warn_of_missing(wanted.keys() - met)
+
+    def _warn_of_missing(self, pictures: Set[tuple[int, int]]) -> None:
+        if self.one_scene:
+            pictures = {key for key in pictures if key[0] == self.scenes[0].scene_id}
+        if pictures:
+            told = "%s: %d of the pictures that it lists are missing, and count nowhere, such as %d of scene %d"
+            scene_id, image_id = min(pictures)
+            _log.warning(told, self.root / TARGETS_FILE, len(pictures), image_id, scene_id)
 
     def pictured_frames(self) -> Iterator[DatasetFrame]:
         """Every frame that has an image, whatever test_targets_bop19.json lists. Raises BopError."""
@@ -165,12 +179,15 @@ class Dataset:
 
     def _frame(self, scene: BopScene, frame: BopFrame, indices: Sequence[int]) -> DatasetFrame:
         path = scene.image_path(frame)
+        size_wh = header_size_wh(path)
         unlisted = [index for index in range(len(frame.targets)) if index not in indices]
-        targets = [_with_box(scene, frame, index) for index in (*indices, *unlisted)]
+        targets = [_with_box(scene, frame, index, size_wh) for index in (*indices, *unlisted)]
         placed = tuple(
             _with_projected_box(t, self.models.get(t.object_id), frame, picture_size_wh(path)) if _unseen(t) else t
             for t in targets
         )
+        if size_wh is not None:
+            _refuse_boxes_outside(scene, frame, placed, size_wh)
         return DatasetFrame(
             scene.scene_id,
             frame.image_id,
@@ -210,7 +227,8 @@ def open_dataset(path: Path, split: str | None = None) -> Dataset:
         splits = chosen
         scenes = tuple(scene for scene in scenes if scene.split == chosen[0])
     root = scenes[0].root or path
-    return Dataset(root.absolute().name, root, splits[0] if len(splits) == 1 else None, scenes)
+    one_scene = len(scenes) == 1 and scenes[0].folder == path
+    return Dataset(root.absolute().name, root, splits[0] if len(splits) == 1 else None, scenes, one_scene)
 
 
 def _is_test(scene: BopScene) -> bool:
@@ -250,8 +268,11 @@ def _unseen(target: BopTarget) -> bool:
     return target.box_visible_xyxy_px is None and target.visible_px is None
 
 
-def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
-    """The target with a visible box from its mask, if the scene has a mask but no other information on visibility."""
+def _with_box(scene: BopScene, frame: BopFrame, index: int, size_wh: tuple[int, int] | None = None) -> BopTarget:
+    """The target with a visible box from its mask, if the scene has a mask but no other information on visibility.
+
+    Raises BopError if the mask is not of the size of the picture, where that is given.
+    """
     target = frame.targets[index]
     if not _unseen(target):
         return target
@@ -260,6 +281,11 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int) -> BopTarget:
         mask = scene.whole_mask(frame, index)
     if mask is None:
         return target
+    if size_wh is not None and mask.shape != size_wh[::-1]:
+        raise BopError(
+            f"{scene.folder}: picture {frame.image_id} has {size_wh[0]} x {size_wh[1]} pixels, but its mask has "
+            f"{mask.shape[1]} x {mask.shape[0]}"
+        )
     if mask.any() and target.t_cam_target_m[2] <= 0:
         raise BopError(
             f"{scene.folder}: a mask shows obj_id {target.object_id} in picture {frame.image_id}, "
@@ -279,6 +305,18 @@ def box_of_mask(mask: Mask) -> Array | None:
     if not len(rows):
         return None
     return np.array([columns[0] - 0.5, rows[0] - 0.5, columns[-1] + 0.5, rows[-1] + 0.5])
+
+
+def _refuse_boxes_outside(
+    scene: BopScene, frame: BopFrame, targets: Sequence[BopTarget], size_wh: tuple[int, int]
+) -> None:
+    for target in targets:
+        box = target.box_visible_xyxy_px
+        if box is not None and (np.any(box[:2] >= np.array(size_wh) - 0.5) or np.any(box[2:] <= -0.5)):
+            raise BopError(
+                f"{scene.folder}: picture {frame.image_id} has {size_wh[0]} x {size_wh[1]} pixels, but the visible box "
+                f"of its obj_id {target.object_id} lies outside: are its labels those of another size?"
+            )
 
 
 def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:

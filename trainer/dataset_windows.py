@@ -60,6 +60,17 @@ class DatasetSampler:
         """Whether any image shows a target."""
         return any(target.box_visible_xyxy_px is not None for frame in self._frames for target in frame.targets)
 
+    @property
+    def scene_folders(self) -> set[Path]:
+        """Folders of the scenes, without links."""
+        return {frame.scene.folder.resolve() for frame in self._frames}
+
+    @property
+    def depths_m(self) -> Array:
+        """Z of all targets that an image shows."""
+        seen = [target for frame in self._frames for target in frame.targets if target.box_visible_xyxy_px is not None]
+        return np.array([target.t_cam_target_m[2] for target in seen])
+
     def batch(self, first_index: int, count: int) -> TrainingBatch:
         """Windows first_index .. first_index + count - 1."""
         return joined([self._window(i) for i in range(first_index, first_index + count)])

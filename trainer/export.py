@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from msgs.contract import CONTRACT_VERSION, ModelContract
 from trainer.checkpoint import load_model, weights_sha256
 from trainer.config import Z_RANGE_M, ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
 from trainer.data import Sampler, TrainingBatch, render_once
+from trainer.dataset_windows import DatasetSampler
 from trainer.evaluate import (
     Predictions,
     Predictor,
@@ -126,22 +127,22 @@ def make_contract(
     views: Views,
     thresholds: tuple[float, float],
 ) -> ModelContract:
-    """The contract of the FP32 file, without metrics; the trained ranges (focal length, box, depths of datasets) are
-    measured on `views`, windows like those in training. Raises ConfigError if they show no target."""
+    """The contract of the FP32 file, without metrics; the trained ranges of focal length and box are measured on
+    `views`, windows like those in training. Raises ConfigError if they show no target."""
     batches = [*views.track, *views.acquire]
     on = np.concatenate([batch.present for batch in batches])
     focal_px = np.concatenate([batch.K[:, 0, 0] for batch in batches])
     box_px = np.concatenate([batch.size_px.max(axis=1) for batch in batches])[on]
     if not len(box_px):
         raise ConfigError("the training data show no target")
-    range_m = config.contract.trained_range_m or _trained_range_m(config.data, batches)
+    range_m = config.contract.trained_range_m or _trained_range_m(config.data)
     return _contract(config, training, sha256, thresholds, range_m, _span(focal_px), _span(box_px))
 
 
-def _trained_range_m(data: DataConfig, batches: Sequence[TrainingBatch]) -> tuple[float, float]:
-    """Range of target depths in training, in whole metres."""
-    of_datasets = [batch.t_cam_target_m[batch.present & (batch.airframe_id < 0), 2] for batch in batches]
-    Z_m = np.clip(np.concatenate(of_datasets), *Z_RANGE_M)
+def _trained_range_m(data: DataConfig) -> tuple[float, float]:
+    """Range of target depths in training, in whole metres; of datasets by their labels."""
+    of_datasets = [DatasetSampler(one.path, one.split, data.seed, 32, 0.0).depths_m for one in data.datasets]
+    Z_m = np.clip(np.concatenate([np.zeros(0), *of_datasets]), *Z_RANGE_M)
     spans = [] if data.rendered_share == 0.0 else [RENDERED_RANGE_M]
     if len(Z_m):
         low_m = min(math.floor(Z_m.min()), Z_RANGE_M[1] - 1.0)  # all depths may be equal

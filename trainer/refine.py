@@ -80,9 +80,8 @@ def refine(
     torch.manual_seed(plan.seed)
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
     model.head_refine = head.eval()
-    trained_on = {source.path.resolve() for source in config.data.datasets}
     for path in plan.datasets:
-        if path.resolve() in trained_on:
+        if any(_holds(path.resolve(), source.path.resolve(), source.split) for source in config.data.datasets):
             raise ConfigError(f"--dataset {path}: the network was trained on it; give another")
     size_px = config.schedule.sizes[-1].size_px
     opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, plan.datasets, plan.dataset_share)
@@ -100,6 +99,14 @@ def refine(
     made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
     return out / WEIGHTS_NAME
+
+
+def _holds(folder: Path, dataset: Path, split: str) -> bool:
+    """Whether a folder holds images of a dataset's split, which may be `test_primesense` for `test`."""
+    if folder == dataset or folder in dataset.parents:
+        return True
+    within = folder.relative_to(dataset).parts[0] if dataset in folder.parents else ""
+    return within == split or within.startswith(f"{split}_")
 
 
 def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:

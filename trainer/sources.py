@@ -67,17 +67,17 @@ def refuse_unreadable(config: DataConfig) -> None:
     _flown(config)
     size_px = 32  # any: the labels do not depend on it
     show_targets: dict[str, list[bool]] = {"train": [], "validate": []}
+    scenes: dict[str, set[Path]] = {"train": set(), "validate": set()}
     for source in config.datasets:
-        if source.split == source.validation_split:
-            raise ConfigError(
-                f"{source.path}: validation_split {source.split!r} is also used for training: give another"
-            )
         for purpose, split in zip(show_targets, (source.split, source.validation_split), strict=True):
             if split is not None:
                 opened = DatasetSampler(
                     source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view
                 )
                 show_targets[purpose].append(opened.shows_targets)
+                scenes[purpose] |= opened.scene_folders
+    if both := scenes["train"] & scenes["validate"]:
+        raise ConfigError(f"{min(both)}: is both trained on and validated on: give another split or validation_split")
     for purpose, shown in show_targets.items():
         if config.rendered_share == 0.0 and shown and not any(shown):
             raise ConfigError(
@@ -103,7 +103,7 @@ def _open_refinement_sampler(
     acquire = config.acquire_share
     drawn = invention, config.acquire_view, _flown(config)
     rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, *drawn)
-    if not datasets:
+    if not datasets or dataset_share == 0.0:
         return rendered
     cut = [DatasetSampler(path, None, seed, size_px, acquire, config.acquire_view) for path in datasets]
     each = dataset_share / len(cut)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from sim_replay.bop.models import models_folder
 from sim_replay.bop.records import BopError
 from sim_replay.bop.scene import BopScene, ImagewiseScene, imagewise_keys
 
+_log = logging.getLogger(__name__)
 _SCENE_FILES = ("scene_camera.json", "scene_gt.json")
 _DEEPEST = 4  # levels between the given folder and a scene, and from a scene up to its dataset
 TARGETS_FILE = "test_targets_bop19.json"
@@ -67,8 +69,12 @@ def _walk(folder: Path, deepest: int) -> Iterator[Path]:
     if deepest == 0 or _is_scene(folder):
         return
     for child in sorted(folder.iterdir()):
-        if child.is_dir() and not child.name.startswith((".", "models")):
+        if not child.is_dir() or child.name.startswith((".", "models")):
+            continue
+        if os.access(child, os.R_OK | os.X_OK):
             yield from _walk(child, deepest - 1)
+        else:
+            _log.warning("%s: cannot be searched for scenes", child)
 
 
 def _is_scene(folder: Path) -> bool:

@@ -229,13 +229,17 @@ def _is_torn_jpeg(coded: bytes) -> bool:
 
 def picture_size_wh(path: Path) -> tuple[int, int]:
     """Width and height of an image as stored, from its header if possible. Raises BopError."""
+    size_wh = header_size_wh(path)
+    if size_wh is None:
+        height, width = read_picture_bgr(path).shape[:2]
+        return width, height
+    return size_wh
+
+
+def header_size_wh(path: Path) -> tuple[int, int] | None:
+    """The same if the header tells it; None: the whole image must be read, by OpenCV."""
     try:
         with PIL.Image.open(path) as picture:
             return picture.size
-    except (
-        OSError,
-        ValueError,
-        PIL.Image.DecompressionBombError,
-    ):  # other formats that OpenCV reads
-        height, width = read_picture_bgr(path).shape[:2]
-        return width, height
+    except (OSError, ValueError, PIL.Image.DecompressionBombError):
+        return None

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from edge.errors import InputError
 from sim_replay.bop import BopTarget, Model
 from sim_replay.datasets import Dataset, DatasetFrame
@@ -46,13 +48,13 @@ def is_seen(target: BopTarget) -> bool:
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
     """The image's visible targets, with size, name and model points; then those that are not to be estimated.
 
-    Raises InputError for an object without a model that is to be estimated; others without one are skipped.
+    Raises InputError for an object without a model that is to be estimated; others are as large as their box tells.
     """
     truths = []
     for target, wanted in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
         if not is_seen(target):
             continue
-        model = models.get(target.object_id)
+        model = models.get(target.object_id) or (None if wanted else _as_it_looks(target, picture))
         if model is None and not wanted:
             continue
         if model is None:
@@ -73,6 +75,15 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
             )
         )
     return truths
+
+
+def _as_it_looks(target: BopTarget, picture: DatasetFrame) -> Model | None:
+    """An aircraft as large as its box at its depth; None if it has no box."""
+    box = target.box_visible_xyxy_px if target.box_whole_xyxy_px is None else target.box_whole_xyxy_px
+    if box is None:
+        return None
+    sides_m = (box[2:] - box[:2]) / np.array([picture.K[0, 0], picture.K[1, 1]]) * target.t_cam_target_m[2]
+    return Model(float(sides_m.max()))
 
 
 def judge_frames(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -161,6 +162,9 @@ def test_without_any_model_the_diameter_comes_from_how_large_targets_look(tmp_pa
     for text in ("diameter_m = 6.5\n", "[objects.1]\ndiameter_m = 6.5\n"):
         (tmp_path / "model_frame.toml").write_text(text)
         assert open_dataset(tmp_path, "train").models[1].diameter_m == 6.5
+    (tmp_path / "model_frame.toml").write_text("diameter_m = 6.5\n[objects.2]\ndiameter_m = 9.0\n")
+    models = open_dataset(tmp_path, "train").models
+    assert {number: model.diameter_m for number, model in models.items()} == {1: 6.5, 2: 9.0}
 
 
 def test_a_scene_without_its_own_cameras_takes_the_datasets(root: Path) -> None:
@@ -227,6 +231,38 @@ def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> 
     write_json(root / "test_targets_bop19.json", [{"scene_id": 2, "obj_id": 1}])
     with pytest.raises(BopError, match=r"test_targets_bop19\.json: 'entry 0' has no integer 'im_id'"):
         list(open_dataset(root).frames())
+
+
+def test_listed_test_pictures_that_there_are_not_are_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    listed = [{"scene_id": scene, "im_id": 1, "obj_id": 1, "inst_count": 1} for scene in (2, 3, 4)]
+    write_json(root / "test_targets_bop19.json", [*listed, {"scene_id": 2, "im_id": 99, "obj_id": 1, "inst_count": 1}])
+    assert ids(open_dataset(root, "test")) == [(2, 1)]
+    assert "3 of the pictures that it lists are missing, and count nowhere, such as 99 of scene 2" in caplog.text
+    caplog.clear()
+    assert ids(open_dataset(root / "test" / "000002")) == [(2, 1)]
+    assert "1 of the pictures that it lists are missing" in caplog.text  # those of other scenes were not asked for
+
+
+def test_labels_of_another_picture_size_are_refused(root: Path, tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "masks" / "train" / "000000")
+    cv2.imwrite(str(scene / "mask_visib" / "000000_000000.png"), np.kron(silhouette(), np.ones((2, 2), np.uint8)))
+    with pytest.raises(BopError, match="picture 0 has 160 x 120 pixels, but its mask has 320 x 240"):
+        list(open_dataset(tmp_path / "masks").frames())
+    scene = write_scene(tmp_path / "boxes" / "train" / "000000", masks=False)
+    write_json(scene / "scene_gt_info.json", {"0": [{"bbox_visib": [640, 480, 80, 80]}]})
+    with pytest.raises(BopError, match="160 x 120 pixels, but the visible box of its obj_id 1 lies outside"):
+        list(open_dataset(tmp_path / "boxes").frames())
+
+
+def test_a_folder_that_may_not_be_searched_is_passed_over(
+    root: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As lost+found is on a disk of its own."""
+    (root / "lost+found").mkdir()
+    allowed = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "lost+found" and allowed(path, mode))
+    assert len(ids(open_dataset(root, "test"))) > 2
+    assert "lost+found: cannot be searched" in caplog.text
 
 
 def test_indices_may_write_the_same_number_in_different_ways(root: Path) -> None:

@@ -167,13 +167,15 @@ def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:
     assert json.loads((root / "test_targets_bop19.json").read_text())
 
 
-def test_a_distractor_without_a_model_is_passed_over_where_it_is_not_asked_for(root: Path) -> None:
+def test_a_distractor_without_a_model_is_neither_right_nor_wrong_where_it_is_not_asked_for(root: Path) -> None:
     truth = json.loads((root / "test" / "000000" / "scene_gt.json").read_text())
     truth["0"][1]["obj_id"] = 77
     write_json(root / "test" / "000000" / "scene_gt.json", truth)
     listed(root, {"scene_id": 0, "im_id": 0, "obj_id": 1, "inst_count": 1})
-    frames = judged(root, [(1, 0.9, LEFT, True)])
-    assert (turns_deg(frames), frames[0].false_poses) == ([0], ())
+    for rows in ([(1, 0.9, LEFT, True)], [(1, 0.9, LEFT, True), (0, 0.8, RIGHT, True)]):
+        frames = judged(root, rows)
+        assert (turns_deg(frames), frames[0].false_poses) == ([0], ())
+        assert [truth.object_id for truth in frames[0].not_asked] == [77]
 
 
 def test_covariances_that_cannot_be_inverted_are_told_in_the_table() -> None:

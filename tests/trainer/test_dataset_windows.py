@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from sim_replay.datasets import box_of_mask, open_dataset
-from sim_replay.sample import AcquireView
+from sim_replay.sample import AcquireView, SampleBatch
 from trainer.config import ConfigError, DataConfig, parse_config
 from trainer.data import TrainingBatch, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 from trainer.export import stage_sampler
 from trainer.losses import dense_terms, heatmap_loss, heatmap_target, to_tensors
 from trainer.refine import fleet_size
-from trainer.sources import refinement_sampler
+from trainer.sources import refinement_sampler, refuse_unreadable
 from trainer.train import run_training
 
 K = np.array([[1500.0, 0, 320], [0, 1480, 180], [0, 0, 1]])
@@ -269,7 +269,7 @@ def test_a_network_trains_on_a_dataset_named_in_its_configuration(dataset: Path,
     assert trainer.samples == 4
 
 
-@pytest.mark.parametrize(("split", "named"), [("vall", "'vall'"), ("train", "is also used for training")])
+@pytest.mark.parametrize(("split", "named"), [("vall", "'vall'"), ("train", "is both trained on and validated on")])
 def test_a_wrong_validation_split_is_told_before_the_first_step(
     dataset: Path, tmp_path: Path, split: str, named: str
 ) -> None:
@@ -352,6 +352,25 @@ def test_a_run_on_a_dataset_that_is_not_there_says_so_and_leaves_nothing_to_resu
     with pytest.raises(ConfigError, match=rf"^{nowhere} is not a folder$"):
         run_training(parse_config(text, "own.toml"), text, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*.pt"))
+
+
+def test_what_is_validated_on_is_not_trained_on_under_another_name(dataset: Path, tmp_path: Path) -> None:
+    for split in ("train_pbr", "val"):
+        shutil.copytree(dataset / "train", tmp_path / "own" / split)
+    for sources in (
+        [{"split": "train", "validation_split": "train_pbr"}],
+        [{"split": "train", "validation_split": "val"}, {"split": "val"}],
+    ):
+        datasets = [{"path": str(tmp_path / "own"), "share": 0.5} | source for source in sources]
+        told = {"seed": 1, "validation_seed": 2, "batch_size": 8, "datasets": datasets}
+        with pytest.raises(ConfigError, match="is both trained on and validated on"):
+            refuse_unreadable(DataConfig.model_validate(told))
+
+
+def test_refining_with_no_share_of_the_datasets_takes_none(dataset: Path) -> None:
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6])
+    batch = refinement_sampler(data, 12, 96, 1.0, (dataset, dataset), 0.0)().batch(0, 8)
+    assert isinstance(batch, SampleBatch)
 
 
 def test_refining_takes_its_share_of_the_windows_from_datasets(dataset: Path) -> None:

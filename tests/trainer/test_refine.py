@@ -108,9 +108,11 @@ def test_images_that_the_network_was_trained_on_are_refused(tmp_path: Path) -> N
     own = tmp_path / "own"
     named = f'[data]\ndatasets = [{{ path = "{own}", share = 0.5 }}]\n'
     run = write_run(tmp_path / "run", tiny.TOML.replace("[data]\n", named))
-    plan = PLAN._replace(datasets=(tmp_path / "run" / ".." / "own",))
-    with pytest.raises(ConfigError, match=r"--dataset .*own: the network was trained on it; give another"):
-        refine(run, tmp_path / "out", plan, open_sampler=open_plates, say=silent)
+    for folder in ("run/../own", "own/train", "own/train_pbr", "own/train/000003", "."):
+        plan = PLAN._replace(datasets=(tmp_path / folder,))
+        with pytest.raises(ConfigError, match=r"--dataset .*: the network was trained on it; give another"):
+            refine(run, tmp_path / "out", plan, open_sampler=open_plates, say=silent)
+    refine(run, tmp_path / "out", PLAN._replace(datasets=(own / "val",)), open_sampler=open_plates, say=silent)
 
 
 def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:

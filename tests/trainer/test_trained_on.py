@@ -72,6 +72,14 @@ def test_the_contract_tells_what_was_trained_on_and_not_what_was_measured_on(
     assert contract.trained_focal_px[1] < 15_000.0
 
 
+def test_a_dataset_of_a_small_share_adds_all_the_depths_of_its_labels(tmp_path: Path) -> None:
+    discs(tmp_path / "own" / "train" / "000001", 1500.0, (60.5, *np.linspace(200.0, 210.0, 30), 590.5))
+    config = parse_config(on_dataset(tmp_path / "own").replace("share = 1.0", "share = 0.02"), "own.toml")
+    rendered = training_batch(PlateSampler(5, 64).batch(0, 8))
+    contract = make_contract(config, {}, "0" * 64, Views([rendered], [rendered]), (0.3, 0.3))
+    assert contract.trained_range_m == (60.0, 591.0)
+
+
 def test_rendered_windows_are_of_100_to_500_m_and_a_dataset_beside_them_adds_its_own(tmp_path: Path) -> None:
     discs(tmp_path / "own" / "train" / "000001", 1500.0, (69.5, 80.0))
     config = parse_config(on_dataset(tmp_path / "own").replace("share = 1.0", "share = 0.7"), "own.toml")
