@@ -28,13 +28,13 @@ def test_own_attitude_is_stamped_with_the_time_it_was_measured() -> None:
     with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
         meet(link, peer)
         turning = Rotation.from_euler("ZYX", [0.3, 0.1, -0.2])
-        measured_ns = time.monotonic_ns() - 80_000_000
+        measured_ns = time.monotonic_ns() - 200_000_000
         stamp_ms = (measured_ns - peer.boot_at_ns) // 1_000_000
-        # It arrives 80 ms after it was measured, as over a slow link.
+        # It arrives 200 ms after it was measured, as over a slow link.
         peer.attitude(turning, stamp_ms)
         peer.settle(lambda: own_ship.at(measured_ns + 2_000_000) is not None, "attitude")
         assert own_ship.at(measured_ns - 10_000_000) is None, "not before it was measured"
-        assert own_ship.at(measured_ns + 60_000_000) is None, "not by the time it arrived"
+        assert own_ship.at(measured_ns + 160_000_000) is None, "not by the time it arrived"
         now = own_ship.at(measured_ns + 2_000_000)
         assert now is not None
         np.testing.assert_allclose(now.R_ned_body, turning.as_matrix(), atol=1e-6)
@@ -370,17 +370,17 @@ def test_a_gimbals_attitude_between_samples_is_their_slerp(share: float, seed: i
     assert rotation_angle(own_ship.R_body_gimbal, expected) < 1e-6
 
 
-def test_a_turning_gimbal_goes_on_turning_for_fifty_milliseconds_and_is_then_unknown() -> None:
+def test_a_turning_gimbal_goes_on_turning_for_150_milliseconds_and_is_then_unknown() -> None:
     buffer = OwnShipBuffer(gimballed=True)
     rate_radps = 0.8
     for k in range(6):
         yaw = Rotation.from_euler("z", rate_radps * 0.02 * k)
         buffer.add_attitude(k * 20_000_000, [1, 0, 0, 0], np.zeros(3))
         buffer.add_gimbal(k * 20_000_000, np.roll(yaw.as_quat(), 1), GimbalFrame.HEADING)
-    ahead = buffer.at(150_000_000)
+    ahead = buffer.at(250_000_000)
     assert ahead is not None
     assert ahead.R_body_gimbal is not None
-    np.testing.assert_allclose(ahead.R_body_gimbal, Rotation.from_euler("z", 0.12).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(ahead.R_body_gimbal, Rotation.from_euler("z", 0.2).as_matrix(), atol=1e-9)
     for k in range(6, 20):
         buffer.add_attitude(k * 20_000_000, [1, 0, 0, 0], np.zeros(3))
-    assert buffer.at(151_000_000) is None
+    assert buffer.at(251_000_000) is None

@@ -57,7 +57,7 @@ def _messages(stream: BinaryIO) -> Iterator[tuple[Schema | None, Channel, Messag
     whole = unfinished_bytes(stream)
     if not whole:
         stream.seek(0)
-        yield from make_reader(stream).iter_messages()
+        yield from make_reader(stream, validate_crcs=True).iter_messages()
         return
     with mmap.mmap(stream.fileno(), whole, access=mmap.ACCESS_READ) as part:
         try:

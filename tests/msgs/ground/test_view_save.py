@@ -71,15 +71,15 @@ def test_a_recording_that_does_not_open_is_told_before_anything_is_drawn(
     assert out.read_bytes() == OLD
 
 
-def test_a_recording_that_ends_in_the_middle_leaves_an_old_file_and_is_a_file_where_there_is_none(
-    flight: Path,
-) -> None:
-    flight.write_bytes(flight.read_bytes()[:-2000])
+def test_a_damaged_recording_leaves_an_old_file_and_is_a_file_where_there_is_none(flight: Path) -> None:
+    whole = flight.read_bytes()
+    place = len(whole) // 2
+    flight.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
     assert main(["view", str(flight), "--save", str(flight.with_name("out.rrd"))]) == 2
     assert flight.with_name("out.rrd").read_bytes() == OLD
     assert names(flight.parent) == ["flight.mcap", "out.rrd"]
     assert main(["view", str(flight), "--save", str(flight.with_name("new.rrd"))]) == 2
-    assert len(RrdReader(flight.with_name("new.rrd")).recordings()) == 1, "what came before the cut"
+    assert len(RrdReader(flight.with_name("new.rrd")).recordings()) == 1, "what came before the damage"
 
 
 @pytest.mark.parametrize("old", [True, False])
