@@ -25,18 +25,12 @@ from trainer.guidance import guided_peaks
 from trainer.losses import Labels, joint_loss, to_tensors
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
+from trainer.plan import Plan
 from trainer.rounding import rounded
 from trainer.runlog import RunLog, provenance, run_folder
 from trainer.sources import refuse_unreadable, window_sampler
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
-
-
-class Budget(NamedTuple):
-    """Wall-clock seconds of this run so far, before this start, and in total; total None: no limit."""
-
-    used_before_s: float
-    total_s: float | None
 
 
 def learning_rate(schedule: ScheduleConfig, samples_done: int, progress: float) -> float:
@@ -195,34 +189,6 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-class Plan(NamedTuple):
-    """Planned length of a run, and the time already used."""
-
-    samples: int  # planned, in total
-    used_s: float = 0.0  # wall-clock seconds before this start
-    budget_s: float | None = None  # in total; None: no limit
-
-    def progress(self, samples: int) -> float:
-        """Progress 0..1 of the schedule after `samples` at this start."""
-        by_time = self.used_s / self.budget_s if self.budget_s else 0.0
-        return min(max(samples / self.samples, by_time), 1.0)
-
-    def resumed(self, out: Path, budget_s: float | None, samples: int | None) -> Plan:
-        """The plan of the next start, with this much more time and so many samples in total; None: as before.
-
-        Raises ConfigError if the time is used up.
-        """
-        if budget_s is not None:
-            return Plan(samples or self.samples, self.used_s, self.used_s + budget_s)
-        if samples is not None:
-            return Plan(samples, self.used_s)
-        if self.budget_s is not None and self.used_s >= self.budget_s:
-            raise ConfigError(
-                f"{out}: the run's time budget is used up; give --budget-minutes for more time, or --samples"
-            )
-        return self
-
-
 def resume_run(out: Path, trainer: Trainer) -> Plan:
     """Restore `trainer` from the run folder and return its plan. Raises ConfigError.
 
@@ -280,8 +246,8 @@ def run_training(
                 plan = earlier.resumed(out, budget_s, samples)
             else:
                 earlier = plan = Plan(samples or config.schedule.samples, 0.0, budget_s)
-            loop = _Loop(trainer, config_text, out, Budget(plan.used_s, plan.budget_s), plan.samples, opener)
-            before, now = earlier.progress(trainer.samples), plan.progress(trainer.samples)
+            loop = _Loop(trainer, config_text, out, plan, opener)
+            before, now = (one.progress(trainer.samples, plan.used_before_s) for one in (earlier, plan))
             if now < before:
                 loop.note(f"with the new plan the schedule goes back from {before:.0%} to {now:.0%}")
             with stop_on_signals() as stopped:
@@ -292,16 +258,14 @@ def run_training(
 class _Loop:
     """Data feeds, time budget, log and checkpoints around a Trainer."""
 
-    def __init__(
-        self, trainer: Trainer, config_text: str, out: Path, budget: Budget, planned: int, opener: OpenSampler
-    ) -> None:
+    def __init__(self, trainer: Trainer, config_text: str, out: Path, plan: Plan, opener: OpenSampler) -> None:
         self.trainer, self.config, self.config_text = trainer, trainer.config, config_text
-        self.out, self.budget, self.planned, self.opener = out, budget, planned, opener
+        self.out, self.plan, self.opener = out, plan, opener
         self.started_s = time.monotonic()
         self.saved_s = self.started_s
         self.group = trainer.group
         self.provenance = {**provenance(trainer.config), "processes": self.group.size}
-        asked = {"from_samples": trainer.samples, "planned_samples": planned, "budget_s": budget.total_s}
+        asked = {"from_samples": trainer.samples, "planned_samples": plan.samples, "budget_s": plan.budget_s}
         start = {**self.provenance, **asked, "started_from": trainer.started_from}
         self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
@@ -309,12 +273,12 @@ class _Loop:
         self.validated: tuple[int, int] | None = None  # samples and size at the last validation
 
     def used_s(self) -> float:
-        return self.budget.used_before_s + time.monotonic() - self.started_s
+        return self.plan.used_before_s + time.monotonic() - self.started_s
 
     def progress(self) -> float:
-        by_samples = self.trainer.samples / self.planned
-        by_time = self.used_s() / self.budget.total_s if self.budget.total_s else 0.0
-        return self.group.agreed(max(by_samples, by_time))[0]  # collective: all processes must call it
+        return self.group.agreed(self.plan.progress(self.trainer.samples, self.used_s()))[
+            0
+        ]  # collective: all processes must call it
 
     def note(self, text: str) -> None:
         if self.log is not None:
@@ -331,7 +295,7 @@ class _Loop:
                 if self._train_at(size_px, stopped, last_step):
                     reason = "stopped before the planned number of samples"
                     break
-            if self.budget.total_s and self.used_s() >= self.budget.total_s:
+            if self.plan.budget_s and self.used_s() >= self.plan.budget_s:
                 reason = "time budget used up"
         except Diverged:
             worth_saving = False
@@ -402,7 +366,7 @@ class _Loop:
         if self.log is None:
             return
         state = {"trainer": self.trainer.state(), "used_s": self.used_s(), "config": self.config_text}
-        state |= {"planned_samples": self.planned, "budget_s": self.budget.total_s}
+        state |= {"planned_samples": self.plan.samples, "budget_s": self.plan.budget_s}
         training = {
             **self.provenance,
             "started_from": self.trainer.started_from,
