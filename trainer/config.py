@@ -118,11 +118,17 @@ class DataConfig(Section):
         "crop", description="a window of the reduced frame, or the whole frame squashed, as contract.acquire_fit has it"
     )
     empty_share: float = Field(0.12, ge=0, lt=1, description="share of windows without a target")
-    invented_share: float = Field(0.0, ge=0, le=1, description="of targets not flown: no member of the fleet")
+    invented_share: float = Field(0.0, ge=0, le=1, description="of rendered targets: no member of the fleet")
     flown: list[WrittenPath] = Field(
         [], description="generated datasets (with or without pictures) whose poses and cameras rendered windows take"
     )
     flown_share: float = Field(0.0, ge=0, le=1, description="of the rendered windows: show a frame of `flown` anew")
+    replays: int = Field(
+        0, ge=0, description="steps over earlier windows, mirrored and relit, after each over new ones"
+    )
+    replay_windows: int = Field(
+        100_000, ge=2, description="the last windows, which those are of: 0.18 MB each at 224 px"
+    )
     batch_size: int = Field(ge=2)
     workers: int = Field(1, ge=1, description="rendering processes")
     prefetch: int = Field(4, ge=1, description="batches kept ready by each worker")

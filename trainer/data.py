@@ -15,6 +15,7 @@ import threading
 import traceback
 import weakref
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -144,6 +145,9 @@ class Feed:
         """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ..., those of one training process."""
         context = mp.get_context("spawn")
         self._turn = 0
+        # Receives the next batch while the trainer computes.
+        self._receiver = ThreadPoolExecutor(1, "receiver")
+        self._awaited: Future[TrainingBatch] | None = None
         self._readers: list[Connection] = []
         self._processes: list[BaseProcess] = []
         # In case nobody closes it: at exit, multiprocessing waits for processes that ignore its SIGTERM.
@@ -166,6 +170,12 @@ class Feed:
 
     def next(self) -> TrainingBatch:
         """The next batch in index order. Raises RenderingError if its renderer failed, ConfigError for bad input."""
+        awaited = self._awaited or self._receiver.submit(self._receive)
+        batch = awaited.result()
+        self._awaited = self._receiver.submit(self._receive)
+        return batch
+
+    def _receive(self) -> TrainingBatch:
         process = self._processes[self._turn]
         try:
             batch = self._readers[self._turn].recv()
@@ -183,6 +193,7 @@ class Feed:
     def close(self) -> None:
         """Stop the renderers; idempotent."""
         _kill(self._processes)
+        self._receiver.shutdown()  # its pipe has ended
         for process, reader in zip(self._processes, self._readers, strict=True):
             process.join(timeout=5.0)
             reader.close()

@@ -36,7 +36,7 @@ class RefinePlan(NamedTuple):
     seed: int
     windows: int = 100_000
     epochs: int = 8
-    strangers: float = 0.35  # share of rendered targets not flown that are generated airframes, unseen by the network
+    strangers: float = 0.35  # share of rendered targets that are generated airframes, unseen by the network
     datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
 
@@ -76,10 +76,12 @@ def refine(
         raise ConfigError(f"{out}: contains a run that can be resumed; give another --out")
     torch.set_num_threads(config.run.threads)
     commit = provenance(config)["commit"]
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     model = network_without_head(config, content["weights"], checkpoint)
     torch.manual_seed(plan.seed)
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
     model.head_refine = head.eval()
+    model.to(device)
     for path in plan.datasets:
         if any(_holds(path.resolve(), source.path.resolve(), source.split) for source in config.data.datasets):
             raise ConfigError(f"--dataset {path}: the network was trained on it; give another")
@@ -141,7 +143,7 @@ def look(
                 columns = [*part.evidence, part.residual, part.strange]
                 if not found:
                     room = windows + RENDERED_AT_ONCE
-                    found = [torch.empty((room, *one.shape[1:]), dtype=one.dtype) for one in columns]
+                    found = [one.new_empty((room, *one.shape[1:])) for one in columns]
                 for whole, one in zip(found, columns, strict=True):
                     whole[count : count + len(one)] = one
                 count += len(part.residual)
@@ -156,8 +158,9 @@ def look(
 
 
 def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: list[Evidence]) -> Kept:
-    image, labels = to_tensors(batch, torch.device("cpu"))
-    with torch.autocast("cpu", torch.bfloat16, enabled=config.run.bf16):
+    device = next(model.parameters()).device
+    image, labels = to_tensors(batch, device)
+    with torch.autocast(device.type, torch.bfloat16, enabled=config.run.bf16):
         perceived = model.perceive(image)
     perceived = Perception(perceived.F_global.float(), perceived.heat_logits.float())
     _, peaks_xy = eq.heatmap_peaks(torch.sigmoid(perceived.heat_logits), 1)

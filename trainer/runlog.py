@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.tensorboard import SummaryWriter
 
-from sim_replay.benchmark.manifest import PACKAGES, package_version
 from sim_replay.lock import take_lock
+from sim_replay.packages import packages
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME
 from trainer.config import ConfigError, TrainerConfig, made_folder
 from trainer.evaluate import null_where_unknown
@@ -75,7 +75,7 @@ def provenance(config: TrainerConfig) -> dict[str, str | int | float]:
         "seed": config.data.seed,
         "commit": commit_of(Path(__file__).parent.parent),
         "torch": str(torch.__version__),
-        **{name: package_version(name) for name in PACKAGES},
+        **packages(),
         "python": platform.python_version(),
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else platform.machine(),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,28 +13,24 @@ from trainer.data import Sampler
 from trainer.dataset_windows import DatasetSampler, MixedSampler
 
 if TYPE_CHECKING:
-    from sim_replay.render.flown import FlownShare
+    from sim_replay.render.flown import FlownFrames, FlownShare
 
 
-def _open_window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Sampler:
+def _open_window_sampler(config: DataConfig, seed: int, size_px: int, judging: bool, flown: FlownShare) -> Sampler:
     from sim_replay.airframes.invented import Invention  # needs the renderer's packages
-    from sim_replay.render.flown import NONE_FLOWN
     from sim_replay.sampler import WindowSampler
 
-    validating = seed == config.validation_seed
     view = config.acquire_view
     samplers: list[Sampler] = []
     shares: list[float] = []
     for source in config.datasets:
-        split = source.validation_split if validating or held_out else source.split
+        split = source.validation_split if judging else source.split
         if split is not None:
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
             shares.append(source.share)
     if not samplers or config.rendered_share > 0.0:
         # Evaluation windows show the fleet only, none of it flown, whatever the shares in training.
-        judging = validating or held_out
         invention = Invention(0.0 if judging else config.invented_share)
-        flown = NONE_FLOWN if judging else _flown(config)
         shares_drawn = config.acquire_share, config.empty_share
         ids = config.airframe_ids if judging else _drawn_ids(config)
         samplers.append(WindowSampler(seed, size_px, ids, *shares_drawn, invention, view, flown))
@@ -51,13 +47,20 @@ def _drawn_ids(config: DataConfig) -> list[int] | None:
 
 def _flown(config: DataConfig) -> FlownShare:
     from sim_replay.airframes import AIRFRAMES
-    from sim_replay.render.flown import NONE_FLOWN, FlownShare, read_flown
+    from sim_replay.render.flown import NONE_FLOWN, FlownShare
 
     if not config.flown:
         return NONE_FLOWN
     known = _drawn_ids(config) or range(len(AIRFRAMES))
+    return FlownShare(config.flown_share, _read_once(tuple(config.flown), tuple(known)))
+
+
+@lru_cache(1)
+def _read_once(folders: tuple[Path, ...], airframe_ids: tuple[int, ...]) -> FlownFrames:
+    from sim_replay.render.flown import read_flown
+
     try:
-        return FlownShare(config.flown_share, read_flown(config.flown, known))
+        return read_flown(folders, airframe_ids)
     except BopError as error:
         raise ConfigError(str(error)) from error
 
@@ -88,20 +91,30 @@ def refuse_unreadable(config: DataConfig) -> None:
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:
     """A picklable opener of rendered and dataset windows; the renderer starts in the process that calls it.
 
-    `held_out` windows come from images that are not trained on, as those of the validation seed always do.
+    `held_out` windows come from images that are not trained on, as those of the validation seed always do. Raises
+    ConfigError if a flown dataset is unusable.
     """
-    return partial(_open_window_sampler, config, seed, size_px, held_out)
+    from sim_replay.render.flown import NONE_FLOWN
+
+    judging = held_out or seed == config.validation_seed
+    return partial(_open_window_sampler, config, seed, size_px, judging, NONE_FLOWN if judging else _flown(config))
 
 
 def _open_refinement_sampler(
-    config: DataConfig, seed: int, size_px: int, strangers: float, datasets: Sequence[Path], dataset_share: float
+    config: DataConfig,
+    seed: int,
+    size_px: int,
+    strangers: float,
+    datasets: Sequence[Path],
+    dataset_share: float,
+    flown: FlownShare,
 ) -> Sampler:
     from sim_replay.airframes.invented import KEPT_BACK_VARIANTS, Invention
     from sim_replay.sampler import WindowSampler
 
     invention = Invention(strangers, KEPT_BACK_VARIANTS)
     acquire = config.acquire_share
-    drawn = invention, config.acquire_view, _flown(config)
+    drawn = invention, config.acquire_view, flown
     rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, *drawn)
     if not datasets or dataset_share == 0.0:
         return rendered
@@ -121,7 +134,7 @@ def refinement_sampler(
     """Like `window_sampler`, for the refinement head. In each rendered window there is a target, a share of `strangers`
     being generated aircraft that training never uses. The `datasets` must be others than those trained on, where the
     network's errors are too small; an unreadable one raises ConfigError."""
-    _flown(config)
     for path in datasets:
         DatasetSampler(path, None, seed, size_px, config.acquire_share, config.acquire_view)
-    return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, dataset_share)
+    with_flown = dataset_share, _flown(config)
+    return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, *with_flown)

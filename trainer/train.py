@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_to_start_from, write_atomic
@@ -26,6 +26,7 @@ from trainer.losses import Labels, joint_loss, to_tensors
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
 from trainer.plan import Plan
+from trainer.replay import Replay
 from trainer.rounding import rounded
 from trainer.runlog import RunLog, provenance, run_folder
 from trainer.sources import refuse_unreadable, window_sampler
@@ -71,6 +72,7 @@ class Trainer:
             layer.requires_grad_(False)
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr, fused=True)
+        self.replay = Replay(config.data.replay_windows) if config.data.replays else None
         self.steps = 0
         self.samples = 0
         self.samples_before: int | None = 0  # of the runs behind the initial weights; None: unknown
@@ -89,15 +91,28 @@ class Trainer:
         return [{"params": p, "lr_scale": scale, "weight_decay": decay} for (scale, decay), p in groups.items()]
 
     def step(self, batch: TrainingBatch, progress: float) -> StepResult:
-        """One optimiser step over the batches of all processes; gradients and norm statistics are averaged over them.
+        """One optimiser step over the batches of all processes, then the configured number over earlier windows.
 
-        All randomness derives from (seed, step, rank), so a resumed run repeats the step exactly. Raises Diverged, in
-        all processes.
+        All randomness derives from (seed, step, rank), so a resumed run without replays repeats the step exactly.
+        Raises Diverged, in all processes.
         """
-        schedule = self.config.schedule
         image, labels = to_tensors(batch, self.device)
+        result = self._learn(image, labels, progress)
+        self.samples += len(batch.present) * self.group.size
+        if self.replay is not None:
+            self.replay.add(image, labels)
+            for _ in range(self.config.data.replays):
+                self._learn(*self.replay.drawn(len(image), self._generator()), progress)
+        return result
+
+    def _generator(self) -> torch.Generator:
         draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
-        generator = torch.Generator().manual_seed(draw_of)
+        return torch.Generator().manual_seed(draw_of)
+
+    def _learn(self, image: Tensor, labels: Labels, progress: float) -> StepResult:
+        """One step; gradients and norm statistics are averaged over all processes."""
+        schedule = self.config.schedule
+        generator = self._generator()
         self.model.train()
         for layer in self.frozen:
             layer.eval()  # keeps its norm statistics too
@@ -126,7 +141,6 @@ class Trainer:
         self.optimizer.step()
         self.group.average(b for b in self.model.buffers() if b.dtype.is_floating_point)
         self.steps += 1
-        self.samples += len(batch.present) * self.group.size
         self._update_average()
         rotation_deg, depth_rel = _batch_errors(out, labels)
         return StepResult(loss.item(), {k: v.item() for k, v in terms.items()}, rotation_deg, depth_rel)
@@ -230,6 +244,7 @@ def run_training(
     A resumed run keeps its planned `samples` and its time budget unless others are given. Raises ConfigError.
     """
     torch.set_num_threads(config.run.threads)
+    torch.backends.cudnn.benchmark = True  # windows of one size: choosing the fastest convolution once pays
     refuse_unreadable(config.data)
     opener = open_sampler or (lambda seed, size: window_sampler(config.data, seed, size))
     with joined_group() as group:

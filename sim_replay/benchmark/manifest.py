@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from edge.errors import InputError
@@ -14,16 +13,16 @@ from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import SPLITS
 from sim_replay.benchmark.scene_store import is_finished, replace_text
 from sim_replay.benchmark.sequence_files import Job
+from sim_replay.packages import packages
 
 FILE = "dataset.toml"
 PRESET_FILE = "preset.toml"
 LOCK_FILE = ".lock"
-PACKAGES = ("mf-uavpose6d-edge", "numpy", "opencv-python-headless", "moderngl", "jsbsim", "av")
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What determines every byte of a dataset, on one machine, besides PACKAGES."""
+    """What determines every byte of a dataset, on one machine, besides the installed packages."""
 
     preset: str  # the name that it gives itself
     seed: int
@@ -95,11 +94,6 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
     replace_text(job.out / FILE, "\n".join(lines))
 
 
-def packages() -> dict[str, str]:
-    """Versions of PACKAGES."""
-    return {name: package_version(name) for name in PACKAGES}
-
-
 def digests(paths: Sequence[Path]) -> dict[str, str]:
     """SHA-256 of files of one folder, by name. Raises InputError."""
     found = {}
@@ -110,11 +104,3 @@ def digests(paths: Sequence[Path]) -> dict[str, str]:
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     return found
-
-
-def package_version(package: str) -> str:
-    """The installed version, or a note that it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed as a package"

@@ -33,12 +33,13 @@ class FlownFrames:
     t_ned_body_m: Array  # [N, 3]
     airframe_id: NDArray[np.int64]  # [N], of the fleet
 
-    def scene(self, rng: np.random.Generator) -> Scene:
-        """One of the frames, with one target."""
+    def scene(self, rng: np.random.Generator, stranger: int | None = None) -> Scene:
+        """One of the frames, with one target: the aircraft that flew, or this one in its place."""
         k = int(rng.integers(len(self.airframe_id)))
         camera = Camera(self.K[k], FRAME_WIDTH_PX, FRAME_HEIGHT_PX, self.R_ned_cam[k], self.t_ned_cam_m[k])
         livery_seed, environment_seed = (int(seed) for seed in rng.integers(2**31, size=2))
-        target = Target(int(self.airframe_id[k]), livery_seed, self.R_ned_body[k], self.t_ned_body_m[k])
+        airframe_id = int(self.airframe_id[k]) if stranger is None else stranger
+        target = Target(airframe_id, livery_seed, self.R_ned_body[k], self.t_ned_body_m[k])
         sight = self.t_ned_body_m[k] - self.t_ned_cam_m[k]
         environment = environment_from_seed(environment_seed, sight_ned=sight / np.linalg.norm(sight))
         return Scene(camera, (target,), environment)

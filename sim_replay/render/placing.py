@@ -200,7 +200,8 @@ def draw_window(
     empty = bool(rng.random() < empty_share)
     distractors = bool(rng.random() < (DISTRACTORS_EMPTY_SHARE if empty else DISTRACTORS_SHARE))
     if flown.frames is not None and rng.random() < flown.share:
-        frame = flown.frames.scene(rng)
+        invented = rng.random() < invention.share
+        frame = flown.frames.scene(rng, draw_invented(rng, airframe_ids, invention.variants) if invented else None)
     else:
         frame = frame_scene(rng, airframe_ids, invention, SMALL_EMPTY_SHARE if empty else SMALL_SHARE)
     if kind == "acquire" and acquire_view == "frame":

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sim_replay.airframes import AIRFRAMES, airframe_id
+from sim_replay.airframes.invented import Invention
 from sim_replay.bop import BopError, BopFrame, find_scenes
 from sim_replay.cli import main
 from sim_replay.render.flown import FlownShare, read_flown
@@ -89,6 +90,16 @@ def test_a_share_of_the_windows_is_flown(flown: Path) -> None:
     share = FlownShare(0.3, read_flown([flown], FLEET))
     K = WindowSampler(2, 32, FLEET, acquire_share=0.0, flown=share).batch(0, 400).K
     assert 0.23 < np.mean(np.abs(K[:, 0, 0] / K[:, 1, 1] - 1.0) < 1e-6) < 0.37
+
+
+def test_a_share_of_the_flown_aircraft_is_exchanged_for_invented_ones(flown: Path) -> None:
+    share = FlownShare(1.0, read_flown([flown], FLEET))
+    drawn = [0.0, 0.0, Invention(0.4), "crop", share]
+    batch = WindowSampler(3, 32, FLEET, *drawn).batch(0, 300)
+    assert 0.3 < np.mean(batch.airframe_id[batch.present] >= len(AIRFRAMES)) < 0.5
+    flew = np.stack([frame.targets[0].t_cam_target_m for frame in _frames(flown)])
+    gap_m = np.linalg.norm(flew - batch.t_cam_target_m[batch.present][:, None], axis=-1).min(1)
+    assert gap_m.max() < 1e-3, "each is where one flew"
 
 
 def test_an_airframe_given_twice_is_drawn_twice_as_often(flown: Path) -> None:
