@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from trainer.config import ConfigError
 from trainer.losses import Labels
 
 # Standard deviations of the logarithms of brightness and of tint, and the most noise, in grey levels.
@@ -25,19 +26,32 @@ class Replay:
         self._added = 0
 
     def add(self, image: Tensor, labels: Labels) -> None:
-        """Keep images [N, H, W, 3] uint8 and their labels in place of the oldest; forget all of another size."""
+        """Keep images [N, H, W, 3] uint8 and their labels in place of the oldest; forget all of another size.
+
+        Raises ConfigError if there is not enough memory for `capacity` of them.
+        """
         if self._image is None or self._image.shape[1:] != image.shape[1:]:
-            room = lambda value, dtype: value.new_empty((self.capacity, *value.shape[1:]), dtype=dtype)  # noqa: E731
-            self._image = room(image, image.dtype)
-            halves = {name: torch.float16 for name in _AS_HALF}
-            self._labels = Labels(*(room(v, halves.get(n, v.dtype)) for n, v in labels._asdict().items()))
-            self._added = 0
+            self._make_room(image, labels)
+        assert self._image is not None
         assert self._labels is not None
         rows = (self._added + torch.arange(len(image), device=image.device)) % self.capacity
         self._image[rows] = image
         for kept, value in zip(self._labels, labels, strict=True):
             kept[rows] = value.to(kept.dtype)
         self._added += len(image)
+
+    def _make_room(self, image: Tensor, labels: Labels) -> None:
+        room = lambda value, dtype: value.new_empty((self.capacity, *value.shape[1:]), dtype=dtype)  # noqa: E731
+        halves = {name: torch.float16 for name in _AS_HALF}
+        self._image = self._labels = None  # frees the memory of another size
+        self._added = 0
+        try:
+            self._image = room(image, image.dtype)
+            self._labels = Labels(*(room(v, halves.get(n, v.dtype)) for n, v in labels._asdict().items()))
+        except RuntimeError:  # PyTorch's out of memory, on any device
+            raise ConfigError(
+                f"[data] replay_windows: {self.capacity} windows do not fit in the memory of {image.device}; give fewer"
+            ) from None
 
     def drawn(self, count: int, generator: torch.Generator) -> tuple[Tensor, Labels]:
         """So many of the windows with their labels, half of them mirrored, all in other light."""

@@ -11,7 +11,7 @@ from synthetic_sampler import PlateSampler
 from torch import Tensor
 
 from sim_replay.sampler import WindowSampler
-from trainer.config import parse_config
+from trainer.config import ConfigError, parse_config
 from trainer.data import DENSE_STRIDE, TrainingBatch, training_batch
 from trainer.losses import Labels, to_tensors
 from trainer.replay import Replay, mirrored, relit
@@ -89,6 +89,11 @@ def test_the_last_windows_replace_the_first_and_a_new_size_all() -> None:
     small = to_tensors(training_batch(PlateSampler(5, 32).batch(0, 4)), CPU)
     replay.add(*small)
     assert replay.drawn(8, drawing)[0].shape == (8, 32, 32, 3)
+
+
+def test_more_windows_than_the_memory_holds_are_a_sentence() -> None:
+    with pytest.raises(ConfigError, match="replay_windows: 100000000000 windows do not fit in the memory of cpu"):
+        Replay(10**11).add(*to_tensors(training_batch(PlateSampler(5, 64).batch(0, 4)), CPU))
 
 
 def test_replays_are_steps_over_windows_that_were_rendered_once() -> None:
