@@ -97,22 +97,22 @@ class Trainer:
         Raises Diverged, in all processes.
         """
         image, labels = to_tensors(batch, self.device)
-        result = self._learn(image, labels, progress)
+        result = self._learn(image, labels, progress, self._generator())
         self.samples += len(batch.present) * self.group.size
         if self.replay is not None:
             self.replay.add(image, labels)
             for _ in range(self.config.data.replays):
-                self._learn(*self.replay.drawn(len(image), self._generator()), progress)
+                generator = self._generator()
+                self._learn(*self.replay.drawn(len(image), generator), progress, generator)
         return result
 
     def _generator(self) -> torch.Generator:
         draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
         return torch.Generator().manual_seed(draw_of)
 
-    def _learn(self, image: Tensor, labels: Labels, progress: float) -> StepResult:
+    def _learn(self, image: Tensor, labels: Labels, progress: float, generator: torch.Generator) -> StepResult:
         """One step; gradients and norm statistics are averaged over all processes."""
         schedule = self.config.schedule
-        generator = self._generator()
         self.model.train()
         for layer in self.frozen:
             layer.eval()  # keeps its norm statistics too
