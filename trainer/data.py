@@ -93,7 +93,9 @@ def _serve(
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+    # As many processes as cores: threads of one would only compete with the others.
     os.environ.setdefault("LP_NUM_THREADS", "1")
+    cv2.setNumThreads(1)
     made: queue.Queue[TrainingBatch | ConfigError | str | None] = queue.Queue(prefetch)
     sender = threading.Thread(target=_send, args=(made, out), daemon=True)
     sender.start()

@@ -5,12 +5,30 @@ Pixel centres lie at integers, so cell x of a stride-s map is centred at s (x + 
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 STRIDE = 8
 SHARPENING = 2.2
+
+Numbers = tuple[float, ...] | tuple[tuple[float, ...], ...]
+
+
+def constant(values: Numbers, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """These values as a tensor on the device of `like`, of its type unless another is given; copied there only once.
+
+    Each copy from the processor makes a GPU wait, and a CUDA graph cannot contain one.
+    """
+    return _constant(values, dtype or like.dtype, like.device)
+
+
+@functools.cache
+def _constant(values: Numbers, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # the first caller may be evaluating, a later one training
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def soft_argmax(log_P: Tensor, peaks_xy: Tensor, sigma_g: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -35,7 +53,7 @@ def image_plane_point(point_px: Tensor, K: Tensor) -> Tensor:
 
 def _focal_lengths(K: Tensor) -> Tensor:
     """(f_x, f_y) [..., 2] of K [..., 3, 3]; ignores skew."""
-    return (K[..., :2, :2] * torch.eye(2).to(K)).sum(-1)
+    return (K[..., :2, :2] * constant(((1.0, 0.0), (0.0, 1.0)), K)).sum(-1)
 
 
 def _unit(vector: Tensor) -> Tensor:
@@ -54,9 +72,10 @@ def ray_rotation(d: Tensor) -> Tensor:
     I + [v]x + [v]x^2 / (1 + c) with v = z x d and c = z . d, which is I + 2 d z^T - (d + z) (d + z)^T / (1 + c); needs
     d_z > -1.
     """
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=d.dtype, device=d.device)
+    I = constant(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), d)
+    z = constant((0.0, 0.0, 1.0), d)
     both = d + z
-    return torch.eye(3).to(d) + d[..., None] * (2.0 * z) - both[..., None] * (both / both[..., 2:])[..., None, :]
+    return I + d[..., None] * (2.0 * z) - both[..., None] * (both / both[..., 2:])[..., None, :]
 
 
 def gram_schmidt(r_6d: Tensor) -> Tensor:
@@ -66,7 +85,7 @@ def gram_schmidt(r_6d: Tensor) -> Tensor:
     """
     z = _unit(r_6d[..., :3])
     x = _unit(r_6d[..., 3:] - (z * r_6d[..., 3:]).sum(-1, keepdim=True) * z)
-    next_axis, last_axis = torch.tensor([1, 2, 0], device=z.device), torch.tensor([2, 0, 1], device=z.device)
+    next_axis, last_axis = constant((1, 2, 0), z, torch.int64), constant((2, 0, 1), z, torch.int64)
     y = z.index_select(-1, next_axis) * x.index_select(-1, last_axis)
     y = y - z.index_select(-1, last_axis) * x.index_select(-1, next_axis)
     return torch.stack([x, y, z], dim=-1)
@@ -79,10 +98,15 @@ def heading_anchors(count: int) -> Tensor:
     return torch.stack([zero, zero + 1, zero, torch.sin(heading), zero, torch.cos(heading)], dim=-1)
 
 
+def _area(sides: Tensor) -> Tensor:
+    """The product [...] of two numbers [..., 2]; the gradient of torch.prod waits for a GPU to count zeros."""
+    return sides[..., 0] * sides[..., 1]
+
+
 def focal_length(K: Tensor, kind: str) -> Tensor:
     """f [...] in pixels: the paper's "mean", or "geometric", which keeps APDD exact under an anisotropic resize."""
     f = _focal_lengths(K)
-    return f.mean(-1) if kind == "mean" else torch.sqrt(f.prod(-1))
+    return f.mean(-1) if kind == "mean" else torch.sqrt(_area(f))
 
 
 def seen_scale(extents_m: Tensor, R_allo: Tensor) -> Tensor:
@@ -91,12 +115,12 @@ def seen_scale(extents_m: Tensor, R_allo: Tensor) -> Tensor:
     sqrt of its projected width times height: half-width_x = sqrt(sum_j (R_1j e_j)^2), half-height_y likewise.
     """
     along = R_allo[..., :2, :] * extents_m[..., None, :]
-    return 2.0 * ((along * along).sum(-1) + 1e-9).prod(-1) ** 0.25
+    return 2.0 * _area((along * along).sum(-1) + 1e-9) ** 0.25
 
 
 def apdd_depth(f_px: Tensor, S_m: Tensor, size_px: Tensor) -> Tensor:
     """Z = f S / S_img [...] in metres, S_img = sqrt(w h + eps) (paper: APDD); size_px [..., 2]."""
-    return f_px * S_m / torch.sqrt(size_px.prod(-1) + 1e-6)
+    return f_px * S_m / torch.sqrt(_area(size_px) + 1e-6)
 
 
 def back_project(plane_xy: Tensor, Z_m: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ Terms are means over the windows that contain a target; heatmap and mask are tra
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -108,9 +109,14 @@ def rotation_residual(R_est: Tensor, R_true: Tensor) -> Tensor:
     return F.normalize(axis, dim=-1) * eq.rotation_angle(R_est, R_true)[..., None]
 
 
+@functools.cache
+def _hypotheses(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return eq.gram_schmidt(eq.heading_anchors(count)).to(device, dtype)
+
+
 def hypothesis_share(R_allo_true: Tensor, count: int) -> Tensor:
     """Soft assignment [N, count] of a true rotation [N, 3, 3] to hypotheses: near 1 for the one of its heading."""
-    anchors = eq.gram_schmidt(eq.heading_anchors(count)).to(R_allo_true)
+    anchors = _hypotheses(count, R_allo_true.dtype, R_allo_true.device)
     angle = eq.rotation_angle(R_allo_true[:, None], anchors)
     return torch.softmax(-0.5 * (angle / HYPOTHESIS_SPREAD_RAD) ** 2, dim=-1)
 

@@ -263,7 +263,7 @@ class PoseNet(nn.Module):
     def _anchor(self, log_P: Tensor) -> Tensor:
         """Sides in pixels, [1] or [2], of the reference box; sizes are predicted as multiples of it."""
         if self.config.box_anchor_px is not None:
-            return torch.tensor([self.config.box_anchor_px], device=log_P.device)
+            return eq.constant((self.config.box_anchor_px,), log_P)
         return 0.1 * _extent_px(log_P)
 
     def forward(self, image: Tensor, K: Tensor) -> tuple[Tensor, ...]:
@@ -287,6 +287,6 @@ def _extent_px(log_P: Tensor) -> Tensor:
     return eq.STRIDE * torch.stack([_float(log_P.shape[2], log_P), _float(log_P.shape[1], log_P)])
 
 
-def _float(length: int, like: Tensor) -> Tensor:
+def _float(length: int | Tensor, like: Tensor) -> Tensor:
     """A dimension as a scalar tensor, so that it stays dynamic on export."""
-    return torch.as_tensor(length, device=like.device).to(like.dtype)
+    return length.to(like) if isinstance(length, Tensor) else like.new_full((), length)

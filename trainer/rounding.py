@@ -21,29 +21,31 @@ _SMALLEST_SCALE = 1e-8
 
 def rounded_weights(weight: Tensor) -> Tensor:
     """Weights [O, ...] on the symmetric S8 grid of each output channel; the gradient is that of `weight`."""
-    scale = weight.detach().flatten(1).abs().amax(1).clamp(min=127 * _SMALLEST_SCALE) / 127
-    zero = torch.zeros(len(scale), dtype=torch.int32, device=weight.device)
-    return torch.fake_quantize_per_channel_affine(weight, scale, zero, 0, -127, 127)
+    largest = weight.detach().abs().amax(tuple(range(1, weight.ndim)), keepdim=True)
+    return _Rounded.apply(weight, (largest / 127).clamp(min=_SMALLEST_SCALE))
 
 
 class _Rounded(torch.autograd.Function):
-    """Rounds to the grid, whose range is the tensor's own: nothing is clipped, so all gradients pass unchanged."""
+    """Rounds to multiples of a scale that lie within the tensor's range: none is clipped, so gradients pass unchanged.
+
+    PyTorch's own fake quantisation reads its zero points on the processor, for which a GPU waits.
+    """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        low, high = torch.aminmax(x)
-        scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE)
-        # 0 .. 255 steps are exact in bfloat16 too, and zero is a grid point.
+    def forward(ctx: Any, x: Tensor, scale: Tensor) -> Tensor:
         return (x * (1.0 / scale)).round_().mul_(scale)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        return gradients[0]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return gradients[0], None
 
 
 def rounded_activations(x: Tensor) -> Tensor:
     """A tensor on the U8 grid that spans its values and zero; the gradient is that of `x`."""
-    return _Rounded.apply(x)
+    low, high = torch.aminmax(x.detach())
+    scale = ((high.float().clamp(min=0.0) - low.float().clamp(max=0.0)) / 255).clamp(min=_SMALLEST_SCALE)
+    # 0 .. 255 steps are exact in bfloat16 too, and zero is a grid point.
+    return _Rounded.apply(x, scale)
 
 
 @contextlib.contextmanager

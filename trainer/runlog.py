@@ -134,12 +134,12 @@ class RunLog:
         self._lines = log.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=samples + 1)
         self._started_s = time.monotonic()
-        self._reset()
+        self._reset(samples)
 
-    def _reset(self) -> None:
+    def _reset(self, samples: int) -> None:
         self._sums: dict[str, float] = {}
         self._count = 0
-        self._since_s = time.monotonic()
+        self._since_s, self._since_samples = time.monotonic(), samples
 
     def add(self, loss: float, terms: dict[str, float], rotation_deg: float, depth_rel: float) -> None:
         """Add one step's values; `report` averages them."""
@@ -150,8 +150,7 @@ class RunLog:
     def report(self, step: int, samples: int, progress: float, rate: float) -> None:
         """Print a line and write a JSON record with the means since the last report."""
         means = {name: value / self._count for name, value in self._sums.items()}
-        done = self._count * samples / step
-        per_s = done / max(time.monotonic() - self._since_s, 1e-6)
+        per_s = (samples - self._since_samples) / max(time.monotonic() - self._since_s, 1e-6)
         told_apart = ("loss", "rotation_deg", "depth_rel", "geodesic")
         terms = " ".join(f"{name} {value:.3f}" for name, value in means.items() if name not in told_apart)
         print(
@@ -162,7 +161,7 @@ class RunLog:
         )
         record = {"step": step, "samples": samples, "progress": progress, "images_per_s": per_s, "lr": rate, **means}
         self._record("train", samples, record)
-        self._reset()
+        self._reset(samples)
 
     def validation(self, step: int, samples: int, size_px: int, metrics: dict[str, float]) -> None:
         """Metrics on held-out windows."""
@@ -176,8 +175,7 @@ class RunLog:
             flush=True,
         )
         self._record("validation", samples, {"step": step, "samples": samples, "size_px": size_px, **metrics})
-        self._since_s = time.monotonic()
-        self._sums, self._count = {}, 0
+        self._reset(samples)
 
     def picture(self, name: str, samples: int, image_bgr: NDArray[np.uint8]) -> None:
         """An image [H, W, 3] on TensorBoard."""

@@ -7,12 +7,13 @@ import copy
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weights, weights_to_start_from, write_atomic
@@ -21,7 +22,8 @@ from trainer.data import Feed, Sampler, TrainingBatch, render_once
 from trainer.distributed import Group, joined_group
 from trainer.evaluate import measure, predict_all, torch_predictor
 from trainer.fixed_norms import folded_norms
-from trainer.guidance import guided_peaks
+from trainer.graphed import Graphed
+from trainer.guidance import drawn_guide, guided_peaks
 from trainer.losses import Labels, joint_loss, to_tensors
 from trainer.model import Decoded, Perception, PoseNet
 from trainer.pictures import example_sheet
@@ -52,9 +54,9 @@ class Diverged(ArithmeticError):
 
 class StepResult(NamedTuple):
     loss: float
-    terms: dict[str, float]
     rotation_deg: float  # mean over the batch's targets
     depth_rel: float  # mean over the batch's targets
+    terms: dict[str, float]
 
 
 class Trainer:
@@ -72,6 +74,7 @@ class Trainer:
             layer.requires_grad_(False)
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(self._parameter_groups(), lr=config.schedule.lr, fused=True)
+        self.passes = Graphed(self._passes, self.model) if device.type == "cuda" else self._passes
         self.replay = Replay(config.data.replay_windows) if config.data.replays else None
         self.steps = 0
         self.samples = 0
@@ -97,44 +100,35 @@ class Trainer:
         Raises Diverged, in all processes.
         """
         image, labels = to_tensors(batch, self.device)
-        result = self._learn(image, labels, progress, self._generator())
+        means = self._learn(image, labels, progress, self._generator())
+        values = dict(zip(means, torch.stack(list(means.values())).tolist(), strict=True))
         self.samples += len(batch.present) * self.group.size
         if self.replay is not None:
             self.replay.add(image, labels)
             for _ in range(self.config.data.replays):
                 generator = self._generator()
                 self._learn(*self.replay.drawn(len(image), generator), progress, generator)
-        return result
+        return StepResult(values.pop("loss"), values.pop("rotation_deg"), values.pop("depth_rel"), values)
 
     def _generator(self) -> torch.Generator:
         draw_of = (self.config.data.seed * 1_000_003 + self.steps) + 7_919 * self.group.rank
         return torch.Generator().manual_seed(draw_of)
 
-    def _learn(self, image: Tensor, labels: Labels, progress: float, generator: torch.Generator) -> StepResult:
-        """One step; gradients and norm statistics are averaged over all processes."""
+    def _learn(
+        self, image: Tensor, labels: Labels, progress: float, generator: torch.Generator
+    ) -> Mapping[str, Tensor]:
+        """One step; gradients and norm statistics are averaged over all processes. Returns the means of `_passes`."""
         schedule = self.config.schedule
         self.model.train()
         for layer in self.frozen:
             layer.eval()  # keeps its norm statistics too
-        with contextlib.ExitStack() as views:
-            if schedule.fixed_norms:
-                views.enter_context(folded_norms(self.model))
-            if progress >= schedule.rounded_from:
-                views.enter_context(rounded(self.model))
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
-                seen = self.model.perceive(image)
-                dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
-            seen = Perception(seen.F_global.float(), seen.heat_logits.float())
-            teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
-            peaks, guide_size = guided_peaks(seen.heat_logits, labels, teacher, generator)
-            out = self.model.decode(seen, labels.K, peaks, guide_size)
-        loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss, self.config.model.ray)
+        teacher = max(0.0, 1.0 - progress / schedule.teacher_until) if schedule.teacher_until > 0 else 0.0
+        guide = drawn_guide(len(image), teacher, generator).to(self.device)
+        means = self.passes(progress >= schedule.rounded_from, image, *labels, guide)
 
         rate = learning_rate(schedule, self.samples, progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group["lr_scale"]
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
         self.group.average(p.grad for p in self.model.parameters() if p.grad is not None)
         if not nn.utils.clip_grad_norm_(self.model.parameters(), schedule.gradient_clip).isfinite():
             raise Diverged
@@ -142,18 +136,36 @@ class Trainer:
         self.group.average(b for b in self.model.buffers() if b.dtype.is_floating_point)
         self.steps += 1
         self._update_average()
-        rotation_deg, depth_rel = _batch_errors(out, labels)
-        return StepResult(loss.item(), {k: v.item() for k, v in terms.items()}, rotation_deg, depth_rel)
+        return means
+
+    def _passes(self, with_rounding: bool, image: Tensor, *labels_guide: Tensor) -> dict[str, Tensor]:
+        """Forward and backward pass: leaves the gradients, and returns loss, terms and errors of the batch, scalars."""
+        labels, guide = Labels(*labels_guide[:-1]), labels_guide[-1]
+        self.optimizer.zero_grad(set_to_none=True)
+        with contextlib.ExitStack() as views:
+            if self.config.schedule.fixed_norms:
+                views.enter_context(folded_norms(self.model))
+            if with_rounding:
+                views.enter_context(rounded(self.model))
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.run.bf16):
+                seen = self.model.perceive(image)
+                dense = self.model.dense(seen.F_global).float() if self.config.model.dense else None
+            seen = Perception(seen.F_global.float(), seen.heat_logits.float())
+            out = self.model.decode(seen, labels.K, *guided_peaks(seen.heat_logits, labels, guide))
+        loss, terms = joint_loss(seen.heat_logits, out, dense, labels, self.config.loss, self.config.model.ray)
+        loss.backward()
+        means = {"loss": loss, **terms, **_batch_errors(out, labels)}
+        return {name: mean.detach() for name, mean in means.items()}
 
     @torch.no_grad()
     def _update_average(self) -> None:
         """Exponential moving average of weights and norm statistics; the first steps use a smaller decay."""
         decay = min(self.config.schedule.ema_decay, (1 + self.steps) / (10 + self.steps))
-        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
-            if mean.dtype.is_floating_point:
-                mean.lerp_(value, 1 - decay)
-            else:
-                mean.copy_(value)
+        means, values = (list(network.state_dict().values()) for network in (self.average, self.model))
+        real = [k for k, mean in enumerate(means) if mean.dtype.is_floating_point]
+        get_ema_multi_avg_fn(decay)([means[k] for k in real], [values[k] for k in real], None)
+        for k in set(range(len(means))) - set(real):
+            means[k].copy_(values[k])
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on."""
@@ -184,11 +196,12 @@ class Trainer:
 
 
 @torch.no_grad()
-def _batch_errors(out: Decoded, labels: Labels) -> tuple[float, float]:
+def _batch_errors(out: Decoded, labels: Labels) -> dict[str, Tensor]:
     weight = labels.present / labels.present.sum().clamp(min=1.0)
     angle = torch.rad2deg(eq.rotation_angle(out.R_ego[:, 0], labels.R_cam_target))
     Z = labels.t_cam_target_m[:, 2].clamp(min=1.0)
-    return float((angle * weight).sum()), float(((torch.exp(out.log_Z[:, 0]) / Z - 1).abs() * weight).sum())
+    off = (torch.exp(out.log_Z[:, 0]) / Z - 1).abs()
+    return {"rotation_deg": (angle * weight).sum(), "depth_rel": (off * weight).sum()}
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from trainer import equations as eq
 from trainer.evaluate import box_iou
-from trainer.guidance import guided_peaks
+from trainer.guidance import drawn_guide, guided_peaks
 from trainer.losses import (
     Labels,
     gaussian_radius,
@@ -135,7 +135,8 @@ def run_once(**replaced: float) -> tuple[torch.nn.Module, torch.Tensor, dict[str
     model = tiny.network().train()
     image, labels = tiny.batch()
     seen = model.perceive(image)
-    peaks, size = guided_peaks(seen.heat_logits, labels, 1.0, torch.Generator().manual_seed(0))
+    guide = drawn_guide(len(labels.present), 1.0, torch.Generator().manual_seed(0))
+    peaks, size = guided_peaks(seen.heat_logits, labels, guide)
     out = model.decode(seen, labels.K, peaks, size)
     weights = tiny.config().loss.model_copy(update=replaced)
     total, terms = joint_loss(seen.heat_logits, out, model.dense(seen.F_global), labels, weights)
