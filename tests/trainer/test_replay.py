@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+import synthetic_sampler
 import tiny
 import torch
 from synthetic_sampler import PlateSampler
@@ -15,7 +19,7 @@ from trainer.config import ConfigError, parse_config
 from trainer.data import DENSE_STRIDE, TrainingBatch, training_batch
 from trainer.losses import Labels, to_tensors
 from trainer.replay import Replay, mirrored, relit
-from trainer.train import Trainer
+from trainer.train import Trainer, run_training
 
 CPU = torch.device("cpu")
 SIZE_PX = 128
@@ -102,3 +106,15 @@ def test_replays_are_steps_over_windows_that_were_rendered_once() -> None:
     for first in range(0, 12, 4):
         trainer.step(training_batch(PlateSampler(3, 64).batch(first, 4)), 0.5)
     assert (trainer.steps, trainer.samples) == (9, 12)
+
+
+def test_the_log_counts_rendered_images_by_the_clock(tmp_path: Path) -> None:
+    text = tiny.TOML.replace("[data]", "[data]\nreplays = 1\nreplay_windows = 8")
+    text = text.replace("samples = 16\nw", "samples = 40\nw").replace("log_every_steps = 1", "log_every_steps = 2")
+    run_training(parse_config(text, "tiny.toml"), text, tmp_path / "run", open_sampler=synthetic_sampler.opener)
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    steps = [line for line in lines if line["kind"] == "train"]
+    assert [line["samples"] for line in steps] == list(range(4, 44, 4))
+    # Time between the lines; the first includes starting the renderer, and a validation is in none.
+    told_s = sum(4 / line["images_per_s"] for line in steps)
+    assert 0.5 * lines[-1]["wall_s"] < told_s < 1.05 * lines[-1]["wall_s"]
