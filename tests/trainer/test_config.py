@@ -23,8 +23,9 @@ def test_shipped_configurations_are_valid_and_say_which_they_are() -> None:
     assert (paper.loss.depth, paper.loss.planar, paper.loss.rotation_6d, paper.model.origin_range) == (20, 50, 5, 1.25)
 
 
-def test_the_flights_continue_the_training_of_the_network_that_ships() -> None:
-    edge, flights = (load_config(CONFIGS / name) for name in ("edge.toml", "flights.toml"))
+@pytest.mark.parametrize("name", ["flights.toml", "flights_cuda.toml"])
+def test_the_flights_continue_the_training_of_the_network_that_ships(name: str) -> None:
+    edge, flights = (load_config(CONFIGS / file) for file in ("edge.toml", name))
     assert (flights.model, flights.contract) == (edge.model, edge.contract)
     assert flights.data.airframe_ids == edge.data.airframe_ids
     assert 0.0 < flights.data.flown_share < 1.0
