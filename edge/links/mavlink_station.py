@@ -267,6 +267,8 @@ class Station:
             self.counters["gimbal_jumps"] = self._telemetry.gimbal_jumps
             if (ahead_ns := self._telemetry.daytime.ahead_ns) is not None:
                 self.counters["utc_ahead_ms"] = ahead_ns // 1_000_000
+            else:
+                del self.counters["utc_ahead_ms"]  # of the autopilot before its reboot
             if reason is not None:
                 self.refused[reason] += 1
         return []

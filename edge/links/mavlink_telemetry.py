@@ -30,6 +30,9 @@ SAME_CLOCK_MS = 2000
 HELD_BACK_MAX_MS = 30_000  # longer than any backlog of a link lasts
 # After a jump, data of that kind are ignored for this long, so that frames without them carry the tracks over.
 JUMP_REST_NS = 300_000_000
+# How far quaternions may lie apart before Euler angles, the same attitude less well rounded, fill the gaps: somebody
+# else on the link may have asked for them at a low rate.
+QUATERNION_GAP_MAX_NS = 60_000_000
 FALLBACK_NS = 1_000_000_000  # silence of the better source after which the other one is used
 # Failures that make a gimbal's attitude doubtful; being at an end stop does not.
 GIMBAL_FAILURES = (
@@ -119,11 +122,11 @@ class Telemetry:
         time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
         rising = True
         if message_id == ATTITUDE_QUATERNION:
-            self._quaternion_ns = now_ns
+            self._quaternion_ns = time_ns
             q_wxyz = (message.q1, message.q2, message.q3, message.q4)
             rising = self._add_attitude(time_ns, q_wxyz, message, now_ns)
         elif message_id == ATTITUDE:
-            if self._quaternion_ns is None or now_ns - self._quaternion_ns > FALLBACK_NS:
+            if self._quaternion_ns is None or abs(time_ns - self._quaternion_ns) > QUATERNION_GAP_MAX_NS:
                 R_ned_body = R_from_euler(message.roll, message.pitch, message.yaw)
                 rising = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
         elif message_id == LOCAL_POSITION_NED:

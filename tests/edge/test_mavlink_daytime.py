@@ -79,3 +79,14 @@ def test_it_is_told_once_and_again_when_it_happens_again_much_later() -> None:
     assert len(told([-5.0, -5.0, -5.0, 0.0, 0.0, 0.0] * 8)) == 1, "it goes to and fro"
     assert len(told([-5.0] * 30 + [0.0] * 60 + [5.0] * 30)) == 2
     assert len(told([-5.0] * 10 + [0.0] * 10 + [-3_600.0] * 100)) == 2, "set wrongly within a minute, and left so"
+
+
+def test_the_difference_is_no_longer_counted_once_the_autopilot_has_rebooted() -> None:
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.send(dialect.MAVLink_system_time_message(time.time_ns() // 1000, peer.boot_ms()))
+        peer.settle(lambda: "utc_ahead_ms" in link.counters(), "count")
+        peer.boot_at_ns = time.monotonic_ns()
+        peer.send(dialect.MAVLink_system_time_message(0, peer.boot_ms()))  # it has no fix yet
+        peer.settle(lambda: link.counters()["reboots"] == 1, "reboot")
+        peer.settle(lambda: "utc_ahead_ms" not in link.counters(), "the count's end")

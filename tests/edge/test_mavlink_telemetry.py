@@ -81,6 +81,30 @@ def test_nothing_of_one_vehicle_is_left_when_another_takes_its_place() -> None:
     assert own_ship.at(1_000_000_000_000) is None
 
 
+def test_rare_quaternions_do_not_hide_frequent_euler_angles() -> None:
+    own_ship = OwnShipBuffer()
+    station = Station(MavlinkSettings(), own_ship, CAMERA, RequestQueue())
+    mav, start_ns, ms, roll_radps = MAVLink(None, srcSystem=1, srcComponent=1), 1_000_000_000_000, 1_000_000, 0.5
+
+    def tell(message: Any, now_ns: int) -> None:
+        station.take(FrameReader(datagram=True).feed(message.pack(mav)), 0, now_ns)
+
+    for at_ms in range(3_000):
+        now_ns, boot_ms, roll = start_ns + at_ms * ms, 50_000 + at_ms, roll_radps * at_ms * 1e-3
+        if at_ms % 1_000 == 0:
+            tell(dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3), now_ns)
+        if at_ms % 20 == 5:
+            tell(dialect.MAVLink_attitude_message(boot_ms, roll, 0.0, 0.0, roll_radps, 0.0, 0.0), now_ns)
+        if at_ms % 250 == 0:
+            q = np.roll(Rotation.from_euler("x", roll).as_quat(), 1).tolist()
+            tell(dialect.MAVLink_attitude_quaternion_message(boot_ms, *q, roll_radps, 0.0, 0.0), now_ns)
+        if at_ms > 500:
+            now = own_ship.at(now_ns)
+            assert now is not None, f"unknown {at_ms} ms after the start"
+            assert rotation_angle(now.R_ned_body, Rotation.from_euler("x", roll).as_matrix()) < 2e-3
+    assert station.refused["late"] == 0
+
+
 @pytest.mark.parametrize("synced", [True, False])
 def test_own_attitude_goes_on_when_the_autopilots_milliseconds_wrap_after_49_days(synced: bool) -> None:
     own_ship = OwnShipBuffer()

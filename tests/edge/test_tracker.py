@@ -273,6 +273,17 @@ def test_a_frame_from_the_past_changes_nothing() -> None:
     assert tracker.out_of_order == 1
 
 
+@pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
+@settings(max_examples=20, deadline=None)
+@given(steps_ns=st.lists(st.sampled_from([1, 40, 20_000, 900_000, 1_000_000, 33_333_333]), min_size=30, max_size=60))
+def test_stamps_however_close_keep_every_track_finite(kind: str, steps_ns: list[int]) -> None:
+    tracker = Tracker(4, FORWARD)
+    for now, time_ns in zip(flight(12, frames=len(steps_ns)), np.cumsum(steps_ns).tolist(), strict=True):
+        for track in update(tracker, replace(now, time_ns=time_ns), kind):
+            assert np.all(np.isfinite(track.t_cam_target_m))
+            assert np.all(np.linalg.eigvalsh(track.covariance) > 0.0)
+
+
 def test_a_rotation_turned_over_once_is_ignored_and_one_that_stays_is_believed() -> None:
     tracker = Tracker(4, FORWARD)
     about_nose = Rotation.from_euler("x", 180, degrees=True).as_matrix()

@@ -27,7 +27,8 @@ def in_a_terminal(*arguments: object, ignoring_hang_up: bool = False) -> Iterato
     """`uavpose-ground` as the leader of a terminal's session, and the terminal's other end, which the caller closes."""
     master, terminal = os.openpty()
     command = [sys.executable, "-m", "msgs.ground.cli", *map(str, arguments)]
-    prefix = ["setsid", "--ctty", *(["env", "--ignore-signal=HUP"] if ignoring_hang_up else [])]
+    # Set either way: the tests may themselves run under nohup.
+    prefix = ["setsid", "--ctty", "env", "--ignore-signal=HUP" if ignoring_hang_up else "--default-signal=HUP"]
     with subprocess.Popen([*prefix, *command], stdin=terminal, stdout=terminal, stderr=terminal) as process:
         os.close(terminal)
         try:
