@@ -18,6 +18,7 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from msgs.contract import INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
 from trainer.backbones import fuse_branches
+from trainer.bias_correction import correct_biases
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch
 from trainer.evaluate import Predictions, Predictor
@@ -54,17 +55,16 @@ def write_graph(model: PoseNet, path: Path) -> None:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
+def _one_by_one(batches: list[TrainingBatch]) -> Iterator[dict[str, np.ndarray]]:
+    """The graph's inputs, one image at a time."""
+    for batch in batches:
+        for image, K in zip(batch.image_bgr, batch.K, strict=True):
+            yield {"image": image[None], "K": K[None]}
+
+
 class _Batches(CalibrationDataReader):
-    """Calibration inputs, one image at a time."""
-
     def __init__(self, batches: list[TrainingBatch]) -> None:
-        self._inputs = self._each(batches)
-
-    @staticmethod
-    def _each(batches: list[TrainingBatch]) -> Iterator[dict[str, np.ndarray]]:
-        for batch in batches:
-            for image, K in zip(batch.image_bgr, batch.K, strict=True):
-                yield {"image": image[None], "K": K[None]}
+        self._inputs = _one_by_one(batches)
 
     def get_next(self) -> dict[str, np.ndarray] | None:
         return next(self._inputs, None)
@@ -89,7 +89,7 @@ def fold_pads(graph: onnx.GraphProto) -> None:
 
 
 def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
-    """Static INT8: QDQ, U8 activations, S8 weights per channel, calibrated on `calibration`.
+    """Static INT8: QDQ, U8 activations, S8 weights per channel, calibrated on `calibration`, biases corrected on it.
 
     Layers that remain in float have their weights stored in half precision.
     """
@@ -119,6 +119,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
             },
         )
     quantised = onnx.load(str(destination))
+    correct_biases(quantised, prepared_model.graph, _one_by_one(calibration))
     feed_pixels(quantised.graph, INPUT_NAMES[0])
     take_quads(quantised.graph, INPUT_NAMES[0])
     store_halved(quantised.graph)
