@@ -101,7 +101,7 @@ class Track:
     time_ns: int  # monotonic time the state is valid for
     measured_ns: int  # monotonic time of the last measurement in it; receivers judge a track by its age
     born_ns: int  # monotonic time of the first measurement; tells tracks apart, as track_id is reused
-    score: float
+    score: float  # probability that it is a target: mean of its recent frames' scores
     box_xyxy_px: Array  # [4], the target's box on the frame, measured or predicted
     R_cam_target: Array  # [3, 3]
     t_cam_target_m: Array  # [3]

@@ -9,6 +9,7 @@ import numpy as np
 from edge.types import Report, Track, TrackState
 from msgs.wire import is_covariance
 
+UNSURE_SCORE = 0.8  # below: what looks like an aircraft in one frame and not in the next is mostly a bird
 UNSURE_RANGE_SHARE = 0.5  # 1-sigma over range above which a pose is not sent
 UNSURE_ROTATION_RAD = 1.0  # root mean square over the axes; 1.33 for a completely unknown rotation
 ROTATION_TOLERANCE = 1e-3
@@ -16,13 +17,14 @@ NS_PER_MS = 1e6
 
 
 def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
-    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, recently measured, finite and consistent. A
-    track whose ned covariance is not valid is returned without its ned fields, for the camera frame only."""
+    """Tracks fit to be sent at `now_ns` (monotonic): confirmed or coasting, most probably a target or selected by the
+    operator, recently measured, finite and consistent. A track whose ned covariance is not valid is returned without
+    its ned fields, for the camera frame only."""
     oldest_ns = now_ns - round(max_age_ms * NS_PER_MS)
     return [
         _of_what_is_known(track)
         for track in report.tracks
-        if track.state is not TrackState.TENTATIVE and track.measured_ns >= oldest_ns and _whole(track)
+        if _exists(track, report.chosen_id) and track.measured_ns >= oldest_ns and _whole(track)
     ]
 
 
@@ -37,6 +39,11 @@ def range_known(track: Track) -> bool:
     along = track.t_cam_target_m / range_m
     variance_m2 = float(along @ track.covariance[:3, :3] @ along)
     return variance_m2 <= (UNSURE_RANGE_SHARE * range_m) ** 2
+
+
+def _exists(track: Track, chosen_id: int | None) -> bool:
+    likely = track.score >= UNSURE_SCORE or track.track_id == chosen_id
+    return likely and track.state is not TrackState.TENTATIVE
 
 
 def _of_what_is_known(track: Track) -> Track:

@@ -27,6 +27,7 @@ CONFIRM_HITS = 3
 TENTATIVE_MISSES = 2  # in a row: deleted
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
+SCORE_MEMORY_S = 1.0  # time constant of a track's score, the mean of its frames'
 
 Size = tuple[int, int]
 
@@ -246,7 +247,8 @@ def _taken_over(target: Target, spare: list[Estimate], lens: Lens, view: View) -
 
 def _seen(target: Target, estimate: Estimate, lens: Lens, view: View) -> None:
     target.box = BoxModel.measured(estimate.box_xyxy_px, ekf.t_in_cam(target.motion, view), lens)
-    target.score = estimate.score
+    remembered = float(np.exp(-(view.time_ns - target.measured_ns) / NS_PER_S / SCORE_MEMORY_S))
+    target.score += max(1.0 - remembered, 1.0 / (target.hits + 1)) * (estimate.score - target.score)
     target.measured_ns = view.time_ns
     target.hits += 1
     target.misses = 0

@@ -144,6 +144,13 @@ def test_a_track_that_cannot_be_is_not_sent(spoilt: dict[str, Any]) -> None:
     assert sendable(make_report(whole, broken, now_ns=NOW_NS), NOW_NS, 500.0) == [whole]
 
 
+def test_what_is_hardly_a_target_is_not_sent_unless_the_operator_selected_it() -> None:
+    likely, doubtful = make_track(NOW_NS), make_track(NOW_NS, track_id=1, score=0.7)
+    report = make_report(likely, doubtful, now_ns=NOW_NS)
+    assert sendable(report, NOW_NS, 500.0) == [likely]
+    assert sendable(replace(report, chosen_id=1), NOW_NS, 500.0) == [likely, doubtful]
+
+
 @pytest.mark.parametrize("variance", [-1e-9, -4.0])
 def test_a_covariance_in_ned_that_is_none_costs_what_is_told_in_ned_alone(variance: float) -> None:
     station = Station(MavlinkSettings(follow_target=True), OwnShipBuffer(), CAMERA, RequestQueue())

@@ -256,6 +256,17 @@ def test_uncertainty_grows_while_coasting() -> None:
     assert np.all(np.diff(sizes[30:]) > 0)
 
 
+@pytest.mark.parametrize(
+    ("scores", "least", "most"),
+    [([0.99] * 90, 0.98, 1.0), ([0.95, 0.35] * 45, 0.6, 0.7), ([0.95] * 3 + [0.4] * 87, 0.4, 0.5)],
+)
+def test_a_tracks_score_is_that_of_its_recent_frames(scores: list[float], least: float, most: float) -> None:
+    tracker = Tracker(4, FORWARD)
+    for now, score in zip(flight(10, frames=len(scores)), scores, strict=True):
+        (track,) = update(tracker, now, "ned", [replace(now.estimate, score=score)])
+    assert least <= track.score <= most
+
+
 def test_one_false_detection_never_becomes_a_track() -> None:
     tracker = Tracker(4, FORWARD)
     for i, now in enumerate(flight(11, frames=30)):
