@@ -250,9 +250,11 @@ class Pipeline:
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
     ) -> None:
-        sha256 = self._estimator.model.sha256
-        chosen_id = self._by_hand.chosen_id
-        report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, sha256, chosen_id, frame.distortion)
+        model, chosen_id = self._estimator.model, self._by_hand.chosen_id
+        calibrated = model.contract.scores_calibrated
+        report = Report(
+            frame.meta, frame.K, size_wh, tracks, own_ship, model.sha256, chosen_id, frame.distortion, calibrated
+        )
         self._outlets.publish(report)
         self._outlets.show(frame)
 

@@ -124,3 +124,4 @@ class Report:
     model_sha256: str
     chosen_id: int | None = None  # track_id of the target that the operator selected
     distortion: tuple[float, ...] = ()  # of the frame's lens, as in Frame
+    scores_calibrated: bool = True  # the tracks' scores are probabilities

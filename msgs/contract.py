@@ -120,3 +120,9 @@ class ModelContract(BaseModel):
     )
     metrics: dict[str, float] = Field(description="measured when the file was made; empty if not measured")
     weights_sha256: str = Field(description="hash of the float weights the graph was made from")
+
+    @property
+    def scores_calibrated(self) -> bool:
+        """Whether the scores of tracks are probabilities; otherwise they are the heights of peaks in the heatmap."""
+        stage = self.acquire_score if self.track_size_wh is None else self.track_score
+        return stage != ScoreCalibration()

@@ -24,7 +24,7 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
     return [
         _of_what_is_known(track)
         for track in report.tracks
-        if _exists(track, report.chosen_id) and track.measured_ns >= oldest_ns and _whole(track)
+        if _exists(track, report) and track.measured_ns >= oldest_ns and _whole(track)
     ]
 
 
@@ -41,9 +41,10 @@ def range_known(track: Track) -> bool:
     return variance_m2 <= (UNSURE_RANGE_SHARE * range_m) ** 2
 
 
-def _exists(track: Track, chosen_id: int | None) -> bool:
-    likely = track.score >= UNSURE_SCORE or track.track_id == chosen_id
-    return likely and track.state is not TrackState.TENTATIVE
+def _exists(track: Track, report: Report) -> bool:
+    # The height of a peak that was not calibrated says nothing: aircraft are often below 0.8.
+    doubtful = report.scores_calibrated and track.score < UNSURE_SCORE and track.track_id != report.chosen_id
+    return track.state is not TrackState.TENTATIVE and not doubtful
 
 
 def _of_what_is_known(track: Track) -> Track:

@@ -141,7 +141,7 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
         if not current or current[-1].scene is not picture.scene:
             current[:] = [_Sequence.of(picture.scene, own_ship)]
         for shown in current[-1].until(picture.image_id):
-            report, estimates, time_ms = _flown(estimator, current[-1], shown, model.sha256)
+            report, estimates, time_ms = _flown(estimator, current[-1], shown)
         told = sendable(report, report.meta.capture_ns, _MAX_AGE_MS)
         known = [rotation_known(track) for track in told]
         return Answer(_poses(index, told, known), time_ms, _poses(index, estimates, [True] * len(estimates)))
@@ -149,9 +149,7 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
     return answer
 
 
-def _flown(
-    estimator: Estimator, sequence: _Sequence, shown: BopFrame, model_sha256: str
-) -> tuple[Report, list[Estimate], float]:
+def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[Report, list[Estimate], float]:
     """The tracker's report on the sequence's next frame, the estimates that it was given, and how long it took, ms."""
     image_bgr = read_undistorted_bgr(sequence.scene.image_path(shown), shown.K, shown.distortion)
     own_ship = sequence.own_ship(shown.image_id)
@@ -163,7 +161,10 @@ def _flown(
     estimates = _estimate(estimator, sequence, frame, expected)
     tracks = sequence.tracker.update(capture_ns, estimates, own_ship, shown.K, size_wh)
     time_ms = (time.monotonic_ns() - started_ns) * 1e-6
-    return Report(frame.meta, shown.K, size_wh, tracks, own_ship, model_sha256), estimates, time_ms
+    model = estimator.model
+    calibrated = model.contract.scores_calibrated
+    report = Report(frame.meta, shown.K, size_wh, tracks, own_ship, model.sha256, scores_calibrated=calibrated)
+    return report, estimates, time_ms
 
 
 def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) -> tuple[TargetPose, ...]:

@@ -24,6 +24,14 @@ def test_a_whole_contract_is_read() -> None:
     assert ModelContract.model_validate(WHOLE | {"track_size_wh": None}).track_size_wh is None
 
 
+def test_scores_are_calibrated_once_the_stage_that_tells_tracks_is() -> None:
+    fitted = {"offset": -1.0, "slope": 2.0}
+    assert not ModelContract.model_validate(WHOLE).scores_calibrated
+    assert not ModelContract.model_validate(WHOLE | {"acquire_score": fitted}).scores_calibrated
+    assert ModelContract.model_validate(WHOLE | {"track_score": fitted}).scores_calibrated
+    assert ModelContract.model_validate(WHOLE | {"track_size_wh": None, "acquire_score": fitted}).scores_calibrated
+
+
 def test_a_model_of_one_fixed_camera_has_one_focal_length() -> None:
     one = ModelContract.model_validate(WHOLE | {"trained_focal_px": (700.0, 700.0)})
     assert one.trained_focal_px == (700.0, 700.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -13,12 +14,15 @@ from scipy.spatial.transform import Rotation
 from edge.errors import InputError
 from edge.estimator.pace import Pace
 from edge.links import outgoing
+from msgs.contract import ScoreCalibration
 from sim_replay import metrics
 from sim_replay.datasets import open_dataset
+from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation import tracked
 from sim_replay.evaluation.judge import JudgedFrame, judge_frames
 from sim_replay.evaluation.tracked import tracker_answers
-from sim_replay.offline import load_model
+from sim_replay.offline import SHIPPED_MODEL, load_model
+from trainer.graph import read_contract, write_contract
 
 FRAMES = 14
 FOCAL_PX, CX_PX, CY_PX = 2400.0, 959.5, 539.5
@@ -72,6 +76,18 @@ def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, d
     results = flown(tmp_path / "data", dark_spot_model)
     assert told(results) == [False, False, True, True, True] * 2
     assert all(frame.measured[0].estimate is not None for frame in results)
+
+
+def test_a_model_whose_scores_were_not_calibrated_tells_its_targets_all_the_same(tmp_path: Path) -> None:
+    raw = Path(shutil.copy(SHIPPED_MODEL, tmp_path))
+    uncalibrated = {"acquire_score": ScoreCalibration(), "track_score": ScoreCalibration()}
+    lenient = {"acquire_score_min": 0.3, "track_score_min": 0.3}
+    write_contract(raw, read_contract(raw).model_copy(update=uncalibrated | lenient))
+    answer = tracker_answers(load_model(raw, threads=2))
+    answers = [
+        answer(i, picture) for i, picture in zip(range(6), open_dataset(BUNDLED_SEQUENCE, None).frames(), strict=False)
+    ]
+    assert len(answers[-1].poses) == 1
 
 
 def test_a_rotation_that_no_link_would_tell_is_not_known(
