@@ -19,8 +19,20 @@ apt_install() {
         sudo="sudo -n"
     fi
     say "installing system packages: $*"
-    $sudo apt-get update -qq
-    DEBIAN_FRONTEND=noninteractive $sudo apt-get install -y -qq --no-install-recommends "$@" >/dev/null
+    # A machine that has just started often updates itself. `install` can wait for that, `update` cannot.
+    tries_left=60
+    until problem=$($sudo env LC_ALL=C apt-get update -qq 2>&1); do
+        case $problem in
+        *"Could not get lock"*) ;;
+        *) say "apt-get update failed: $problem"; exit 2 ;;
+        esac
+        [ "$tries_left" -lt 60 ] || say "waiting for another apt, for at most five minutes"
+        tries_left=$((tries_left - 1))
+        [ "$tries_left" -gt 0 ] || { say "$problem"; exit 2; }
+        sleep 5
+    done
+    $sudo env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -y -qq \
+        --no-install-recommends "$@" >/dev/null
 }
 
 find_python() {
