@@ -42,7 +42,7 @@ find_python() {
             echo "$candidate"; return
         fi
     done
-    say "Python 3.11, 3.12 or 3.13 is needed and none was found"; exit 2
+    return 1
 }
 
 # Its commands name the folder that they were installed in: in a copied or moved checkout they would run the code of the
@@ -52,7 +52,10 @@ made_elsewhere() {
 }
 
 if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2>&1 || made_elsewhere; then
-    python=$(find_python)
+    if ! python=$(find_python); then
+        apt_install python3 python3-venv
+        python=$(find_python) || { say "Python 3.11, 3.12 or 3.13 is needed and none was found"; exit 2; }
+    fi
     "$python" -c 'import ensurepip, venv' 2>/dev/null || apt_install "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
     say "making .venv with $("$python" --version)"
     # What is left of one that another Python made, before an upgrade of the system, does not count as installed.
