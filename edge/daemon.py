@@ -168,9 +168,9 @@ class Pipeline:
         for text in self._by_hand.news():
             self._outlets.event(logging.INFO, text)
         clock.lap("track")
-        self._publish(frame, size_wh, tracks, own_ship)
+        report = self._publish(frame, size_wh, tracks, own_ship)
         clock.lap("publish")
-        self.supervisor.frame_done(frame.meta, clock.stages_ns(), tracks, own_ship is not None)
+        self.supervisor.frame_done(report, clock.stages_ns())
 
     def _slept(self) -> bool:
         """Whether the computer was suspended since the last check: frame, tracks and own-ship state are then stale."""
@@ -249,7 +249,7 @@ class Pipeline:
 
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
-    ) -> None:
+    ) -> Report:
         model, chosen_id = self._estimator.model, self._by_hand.chosen_id
         calibrated = model.contract.scores_calibrated
         report = Report(
@@ -257,6 +257,7 @@ class Pipeline:
         )
         self._outlets.publish(report)
         self._outlets.show(frame)
+        return report
 
     def _take_reload(self) -> None:
         """Between two frames: switch to a newly loaded model and configuration; tracks are kept."""

@@ -10,11 +10,12 @@ from edge import clock, threads
 from edge.config import HealthSettings, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.health import Announcer, Health, HealthSnapshot, Reason
+from edge.links.outgoing import probable
 from edge.outlets import LEVELS, Outlets
 from edge.status_board import StatusBoard
 from edge.systemd import Notifier
 from edge.target_news import TargetNews
-from edge.types import FrameMeta, Track
+from edge.types import Report
 from edge.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -68,14 +69,15 @@ class Supervisor:
         self._notifier.stopping()
         self._notifier.close()
 
-    def frame_done(
-        self, meta: FrameMeta, stages_ns: Mapping[str, int], tracks: tuple[Track, ...], has_attitude: bool
-    ) -> None:
+    def frame_done(self, report: Report, stages_ns: Mapping[str, int]) -> None:
         if not self._flew:
             self._flew = True
             log.info("first frame done, %.0f ms after its exposure", stages_ns["total"] / 1e6)
-        self._health.frame_done(meta.sequence, stages_ns, tracks, has_attitude, clock.monotonic_ns())
-        for level, text in self._targets.words(tracks):
+        tracks = tuple(track for track in report.tracks if probable(track, report))
+        self._health.frame_done(
+            report.meta.sequence, stages_ns, tracks, report.own_ship is not None, clock.monotonic_ns()
+        )
+        for level, text in self._targets.words(report):
             log.info("%s", text)
             self._outlets.event(level, text)
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from edge.links.outgoing import range_known
-from edge.types import Track, TrackState
+from edge.links.outgoing import probable, range_known
+from edge.types import Report, TrackState
 
 NS_PER_S = 1e9
 
@@ -22,15 +21,19 @@ class _Held:
 
 
 class TargetNews:
-    """A target is acquired when its track is confirmed, and lost when that track no longer exists."""
+    """A target is acquired when its track is confirmed and probably an aircraft, and lost when that track is gone."""
 
     def __init__(self) -> None:
         self._held: dict[int, _Held] = {}
 
-    def words(self, tracks: Iterable[Track]) -> list[tuple[int, str]]:
+    def words(self, report: Report) -> list[tuple[int, str]]:
         """(logging level, text) of changes since the previous frame. Call it for every frame, as track numbers are
         reused."""
-        sure = {track.track_id: track for track in tracks if track.state is not TrackState.TENTATIVE}
+        sure = {
+            track.track_id: track
+            for track in report.tracks
+            if track.state is not TrackState.TENTATIVE and (track.track_id in self._held or probable(track, report))
+        }
         told = [(logging.WARNING, _lost(number, self._held[number])) for number in sorted(self._held.keys() - sure)]
         acquired = sorted(sure.keys() - self._held.keys())
         now = {}

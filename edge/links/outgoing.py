@@ -24,8 +24,17 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
     return [
         _of_what_is_known(track)
         for track in report.tracks
-        if _exists(track, report) and track.measured_ns >= oldest_ns and _whole(track)
+        if track.state is not TrackState.TENTATIVE
+        and probable(track, report)
+        and track.measured_ns >= oldest_ns
+        and _whole(track)
     ]
+
+
+def probable(track: Track, report: Report) -> bool:
+    """Whether the track is most probably an aircraft, or what the operator selected."""
+    # The height of a peak that was not calibrated says nothing: aircraft are often below 0.8.
+    return not report.scores_calibrated or track.score >= UNSURE_SCORE or track.track_id == report.chosen_id
 
 
 def rotation_known(track: Track) -> bool:
@@ -39,12 +48,6 @@ def range_known(track: Track) -> bool:
     along = track.t_cam_target_m / range_m
     variance_m2 = float(along @ track.covariance[:3, :3] @ along)
     return variance_m2 <= (UNSURE_RANGE_SHARE * range_m) ** 2
-
-
-def _exists(track: Track, report: Report) -> bool:
-    # The height of a peak that was not calibrated says nothing: aircraft are often below 0.8.
-    doubtful = report.scores_calibrated and track.score < UNSURE_SCORE and track.track_id != report.chosen_id
-    return track.state is not TrackState.TENTATIVE and not doubtful
 
 
 def _of_what_is_known(track: Track) -> Track:

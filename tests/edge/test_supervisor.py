@@ -12,12 +12,13 @@ import pytest
 from edge import clock
 from edge.config import Config, ConfigFile, HealthSettings
 from edge.estimator.model import load_model
-from edge.health import Condition, HealthSnapshot, HealthState
+from edge.health import Activity, Condition, HealthSnapshot, HealthState
 from edge.outlets import Outlets
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
-from edge.types import CameraInfo, FrameMeta
+from edge.types import CameraInfo
 
+from .reports import make_report, make_track
 from .toy_scene import SIZE_WH, K
 
 AGES = {"mavlink": 200.0, "zenoh": 500.0}  # the defaults
@@ -36,8 +37,8 @@ def after_frames(supervisor: Supervisor, latency_ms: int) -> Condition:
     """What is said after three frames that took so long from their exposure."""
     for index in range(3):
         now_ns = time.monotonic_ns()
-        meta = FrameMeta(index, now_ns - latency_ms * 1_000_000, now_ns)
-        supervisor.frame_done(meta, {"total": latency_ms * 1_000_000}, (), has_attitude=True)
+        report = make_report(sequence=index, now_ns=now_ns - latency_ms * 1_000_000)
+        supervisor.frame_done(report, {"total": latency_ms * 1_000_000})
         supervisor.turn()
     return supervisor.snapshot().condition
 
@@ -72,6 +73,15 @@ def test_slower_than_the_settings_allow_is_no_good_state(toy_model: Path, latenc
     assert (condition.state is HealthState.DEGRADED) == bool(kinds)
 
 
+@pytest.mark.parametrize(("score", "activity"), [(0.6, Activity.SEARCHING), (0.9, Activity.TRACKING)])
+def test_a_bird_is_not_tracked(toy_model: Path, score: float, activity: Activity) -> None:
+    supervisor = supervised(toy_model, Outlets(None, None), {})
+    now_ns = time.monotonic_ns()
+    supervisor.frame_done(make_report(make_track(now_ns, score=score), now_ns=now_ns), {"total": 10_000_000})
+    assert supervisor.snapshot().condition.activity is activity
+    assert supervisor.snapshot().tracks == (activity is Activity.TRACKING)
+
+
 class Kept(Outlets):
     """Keeps the times of what goes out as diagnostics."""
 
@@ -92,7 +102,7 @@ def test_counters_and_latency_go_out_each_second_and_to_the_log_each_ten(
     for frame in range(25 * FPS):  # 25 s
         now_ns = stepped + frame * PERIOD_NS
         clock.step_to(now_ns)
-        supervisor.frame_done(FrameMeta(frame, now_ns, now_ns), {"total": 10_000_000}, (), has_attitude=True)
+        supervisor.frame_done(make_report(sequence=frame, now_ns=now_ns), {"total": 10_000_000})
         supervisor.turn()
     gaps_ns = np.diff(outlets.times_ns)
     assert len(outlets.times_ns) == 25

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from edge.target_news import TargetNews
 from edge.types import TrackState
@@ -17,6 +19,7 @@ from msgs.cdr import Log
 from msgs.client import connect
 
 from .flying import flying, free_port, toml
+from .reports import make_report as report
 from .reports import make_track as track
 from .toy_scene import K, draw
 
@@ -32,7 +35,7 @@ def test_coming_and_going_are_told_once_and_held_counts_to_the_last_measurement(
         measured_ns = min(frame, 33) * FRAME_NS
         t_m = np.array([0.0, 0.0, 100.0 + frame])
         one = [] if state is None else [track(now_ns, state=state, measured_ns=measured_ns, t_cam_target_m=t_m)]
-        told += [(frame, *words) for words in news.words(one)]
+        told += [(frame, *words) for words in news.words(report(*one))]
     assert told == [
         (3, logging.INFO, "target 0 acquired at 103 m"),
         (94, logging.WARNING, "target 0 lost: held for 1.0 s, last seen at 133 m"),
@@ -41,10 +44,29 @@ def test_coming_and_going_are_told_once_and_held_counts_to_the_last_measurement(
 
 def test_a_number_that_is_used_again_is_another_target() -> None:
     news = TargetNews()
-    assert [text for _, text in news.words([track(0, track_id=2)])] == ["target 2 acquired at 240 m"]
-    (lost,) = news.words([track(FRAME_NS, track_id=2, state=TrackState.TENTATIVE)])
+    assert [text for _, text in news.words(report(track(0, track_id=2)))] == ["target 2 acquired at 240 m"]
+    (lost,) = news.words(report(track(FRAME_NS, track_id=2, state=TrackState.TENTATIVE)))
     assert lost[1].startswith("target 2 lost")
-    assert [text for _, text in news.words([track(2 * FRAME_NS, track_id=2)])] == ["target 2 acquired at 240 m"]
+    assert [text for _, text in news.words(report(track(2 * FRAME_NS, track_id=2)))] == ["target 2 acquired at 240 m"]
+
+
+@pytest.mark.parametrize(
+    ("scores", "calibrated", "chosen", "told"),
+    [
+        ((0.6, 0.6, 0.7), True, False, []),
+        ((0.6, 0.9, 0.6), True, False, ["target 0 acquired at 240 m", "target 0 lost: held for 0.0 s"]),
+        ((0.6, 0.6, 0.7), True, True, ["target 0 acquired at 240 m", "target 0 lost: held for 0.1 s"]),
+        ((0.6, 0.6, 0.7), False, False, ["target 0 acquired at 240 m", "target 0 lost: held for 0.1 s"]),
+    ],
+)
+def test_what_is_no_aircraft_is_neither_acquired_nor_lost(
+    scores: tuple[float, ...], calibrated: bool, chosen: bool, told: list[str]
+) -> None:
+    news = TargetNews()
+    seen = [report(track(frame * FRAME_NS, score=score)) for frame, score in enumerate(scores)]
+    chosen_id = 0 if chosen else None
+    reports = [replace(one, scores_calibrated=calibrated, chosen_id=chosen_id) for one in [*seen, report()]]
+    assert [text.split(",")[0] for one in reports for _, text in news.words(one)] == told
 
 
 def test_no_range_is_told_that_is_too_uncertain_to_be_sent() -> None:
@@ -53,9 +75,9 @@ def test_no_range_is_told_that_is_too_uncertain_to_be_sent() -> None:
     for frame, share in enumerate((0.8, 0.8, 0.3)):
         covariance = np.diag([0.09, 0.09, (share * 240.0) ** 2, 0.01, 0.01, 0.01])
         seen = track(frame * FRAME_NS, t_cam_target_m=np.array([0.0, 0.0, 240.0]), covariance=covariance)
-        told.append([text for _, text in news.words([seen])])
+        told.append([text for _, text in news.words(report(seen))])
     assert told == [["target 0 acquired, range unknown"], [], []]
-    assert news.words([])[0][1].endswith("last seen at 240 m")
+    assert news.words(report())[0][1].endswith("last seen at 240 m")
 
 
 def test_the_ground_hears_that_a_target_is_lost(tmp_path: Path, toy_model: Path) -> None:
