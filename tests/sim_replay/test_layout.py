@@ -9,7 +9,7 @@ import pytest
 
 from sim_replay.bop import BopError, find_scenes
 from sim_replay.datasets import Dataset, open_dataset
-from tests.sim_replay.test_datasets import K, write_json, write_models_info, write_scene
+from tests.sim_replay.foreign import K, write_json, write_models_info, write_scene
 
 
 def numbers(dataset: Dataset) -> dict[str, int]:

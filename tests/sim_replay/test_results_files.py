@@ -21,7 +21,7 @@ from sim_replay.evaluation.bop_results import file_answers, write_results
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
-from tests.sim_replay.test_datasets import UNIT, write_json, write_models_info, write_scene
+from tests.sim_replay.foreign import UNIT, write_json, write_models_info, write_scene
 
 TURNED = Rotation.from_euler("z", 180, degrees=True).as_matrix()
 Row = tuple[int, float, float, bool]  # obj_id, score, x in metres, whether it is turned the right way

@@ -16,7 +16,7 @@ from sim_replay.cli import main
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import truths_of
 from sim_replay.ground_truth import read_scene_truth
-from tests.sim_replay.test_datasets import (
+from tests.sim_replay.foreign import (
     BOX_EDGES,
     SIZE_WH,
     UNIT,
