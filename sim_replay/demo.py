@@ -88,7 +88,8 @@ class LiveView:
     def __init__(self, console: Console, figures: LiveFigures) -> None:
         self._console = console
         self._figures = figures
-        self._live = Live(self._table(), console=console, refresh_per_second=10) if console.is_terminal else None
+        in_place = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(self._table(), console=console, refresh_per_second=10) if in_place else None
         self._printed_s = -np.inf
 
     def __enter__(self) -> LiveView:

@@ -23,6 +23,7 @@ from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, Fleet, Target
 from msgs.session import TlsFiles
 
 REFRESH_S = 0.25
+PLAIN_PERIOD_S = 2.0
 STALE_S = 1.0
 _LEVEL_STYLE = {0: "green", 1: "yellow", 2: "bold red"}
 _NS = 1_000_000_000
@@ -61,13 +62,17 @@ def _watch_table(
         now_ns = time.time_ns()
         return table(fleet.rows(now_ns), linked(opened), options.endpoint, now_ns)
 
-    with (
-        listening(opened, options.uavs, options.domain, take, fleet.alive, TAKEN),
-        Live(picture(), console=console, auto_refresh=False) as live,
-    ):
-        while not stop.wait(REFRESH_S):
+    with listening(opened, options.uavs, options.domain, take, fleet.alive, TAKEN):
+        if not console.is_terminal or console.is_dumb_terminal:  # a picture cannot be replaced there
+            ended = False
+            while not ended:
+                ended = stop.wait(PLAIN_PERIOD_S)
+                console.print(picture())
+            return
+        with Live(picture(), console=console, auto_refresh=False) as live:
+            while not stop.wait(REFRESH_S):
+                live.update(picture(), refresh=True)
             live.update(picture(), refresh=True)
-        live.update(picture(), refresh=True)
 
 
 def _watch_json(

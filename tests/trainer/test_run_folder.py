@@ -145,8 +145,13 @@ def test_nothing_half_written_is_left_and_all_may_read_who_may_read_the_rest(run
 def test_a_write_that_fails_leaves_the_last_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "weights.pt"
     write_atomic(path, {"whole": 1})
-    with pytest.raises(Exception, match="pickle"):
-        write_atomic(path, {"cannot": lambda: None})
+
+    class Unwritable:
+        def __reduce__(self) -> str:
+            raise ArithmeticError("half-way")
+
+    with pytest.raises(ArithmeticError, match="half-way"):
+        write_atomic(path, {"first": bytes(100_000), "cannot": Unwritable()})
     assert load_file(path) == {"whole": 1}
     assert list(tmp_path.iterdir()) == [path]
 
