@@ -251,7 +251,7 @@ def told_health(level: int, text: str) -> cdr.DiagnosticArray:
 
 def line(fleet: Fleet, now_ns: int, start: str) -> str:
     """The line of the table that begins so, as a terminal gets it."""
-    console = Console(file=io.StringIO(), width=160, force_terminal=True, color_system="standard")
+    console = Console(file=io.StringIO(), width=160, height=50, force_terminal=True, color_system="standard")
     console.print(table(fleet.rows(now_ns), True, "tcp/127.0.0.1:7447", now_ns))
     assert isinstance(console.file, io.StringIO)
     (found,) = (one for one in console.file.getvalue().splitlines() if start in one)
@@ -306,7 +306,7 @@ def test_a_narrow_terminal_cuts_neither_names_nor_numbers(columns: int) -> None:
         assert fleet.take(incoming, NOW_NS) is not None
 
     def shown(width: int) -> Counter[str]:
-        console = Console(file=io.StringIO(), width=width)
+        console = Console(file=io.StringIO(), width=width, height=50)
         console.print(table(fleet.rows(NOW_NS), True, "tcp/127.0.0.1:7447", NOW_NS))
         assert isinstance(console.file, io.StringIO)
         return Counter(one for one in console.file.getvalue() if not one.isspace() and one != "─")
