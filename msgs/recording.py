@@ -1,7 +1,7 @@
 """Recording samples as MCAP with the ROS 2 profile: the same CDR bytes as on the wire, under the same topic names.
 
-A separate thread writes; `record` never blocks. New samples are written to disk as a chunk every second, so a crash
-loses at most one second; files left unfinished are repaired at the next start. A full disk stops the recording, never
+A separate thread writes; `record` never blocks. New samples are written to disk as a chunk every second, or sooner if
+they are many, so a crash loses at most one second; files left unfinished are repaired at the next start. A full disk stops the recording, never
 the program.
 """
 
@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 WAITING_MAX = 4096  # samples buffered while the disk stalls
 WAITING_BYTES_MAX = 64 * 1024**2  # images are large
+FULL_ENOUGH = 0.25  # share of either limit at which the writer does not wait for the second to end
 STANDING_MAX = 256  # bounds memory against fake names
 FLUSH_S = 1.0
 RETRY_S = 3.0
@@ -80,6 +81,7 @@ class Recorder:
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
         self._waiting_bytes = 0
+        self._in_hand = 0  # samples that the writer has taken and not written yet
         self._overflowed = 0  # lost to a full buffer since the last warning
         self._gaps_due_s = 0.0
         self._standing: dict[str, Sample] = {}
@@ -120,9 +122,10 @@ class Recorder:
                 self._counters["lost"] += 1
                 self._overflowed += self._failure is None
             else:
-                # No notify: the writer polls every second.
                 self._waiting.append(sample)
                 self._waiting_bytes += len(payload)
+                if self._due():
+                    self._changed.notify()
 
     def switch(self, on: bool) -> None:
         """Start a new file, or end the current one; returns immediately."""
@@ -132,24 +135,37 @@ class Recorder:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Write queued samples and close the file. May be called more than once, and without start."""
+        """Write queued samples and close the file. May be called more than once, and without start. What a stalled
+        disk has not taken after STOP_TIMEOUT_S is counted as lost."""
         with self._changed:
             self._stopping = self._woken = True
             self._changed.notify()
-        if self._thread is not None:
-            self._thread.join(STOP_TIMEOUT_S)
-            self._thread = None
+        if self._thread is None:
+            return
+        self._thread.join(STOP_TIMEOUT_S)
+        self._thread = None
+        with self._changed:
+            lost = self._in_hand + len(self._waiting)
+            if lost:
+                self._counters["lost"] += lost
+        if lost:
+            text = f"recording ended before the disk had taken all: {lost} messages were lost"
+            log.warning("%s", text)
+            self._tell(logging.WARNING, text)
 
     def counters(self) -> dict[str, int]:
         with self._changed:
             return {"recorded": 0, **self._counters}
 
     def _work(self) -> None:
+        began_s = time.monotonic()
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._woken, FLUSH_S)
+                self._changed.wait_for(self._due, max(0.0, began_s + FLUSH_S - time.monotonic()))
+                began_s = time.monotonic()
                 self._woken = False
                 samples, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
+                self._in_hand = len(samples)
                 go_on, stopping = self._wanted and not self._stopping, self._stopping
             self._tell_gaps()
             runs = _between_clock_steps(samples) or [[]]
@@ -163,6 +179,11 @@ class Recorder:
                 runs.pop(0)
             if stopping:
                 return
+
+    def _due(self) -> bool:
+        """Whether the writer should start before the second has ended."""
+        full = len(self._waiting) / WAITING_MAX >= FULL_ENOUGH or self._waiting_bytes / WAITING_BYTES_MAX >= FULL_ENOUGH
+        return self._woken or full
 
     def _tell_gaps(self) -> None:
         now_s = time.monotonic()
@@ -192,6 +213,7 @@ class Recorder:
             self._holds_samples = True
             with self._changed:
                 self._counters["recorded"] += written
+                self._in_hand -= written
             samples.clear()
             self._tell_going()
         aged = time.monotonic() - self._opened_s >= self._limits.file_seconds_max
@@ -254,6 +276,7 @@ class Recorder:
             if failure is not None:
                 self._counters["failures"] += 1
                 self._counters["lost"] += lost + len(self._waiting)
+                self._in_hand = 0
                 self._waiting.clear()
                 self._waiting_bytes = 0
 

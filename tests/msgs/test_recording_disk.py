@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from msgs import recording
+from msgs import recording, topics
 from msgs.recording import Recorder, RecordingLimits
 from tests.waiting import until
 
@@ -88,3 +88,43 @@ def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, m
     until(lambda: told == [(40, "recording stopped: no room left for recordings")])
     recorder.stop()
     assert recorder.counters()["lost"] == 1
+
+
+def test_what_a_disk_that_stands_still_has_not_taken_at_the_end_is_told_as_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "STOP_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    stands, goes_on = threading.Event(), threading.Event()
+
+    def sync(_: int) -> None:
+        stands.set()
+        goes_on.wait()
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    try:
+        record_some(recorder, [b"in hand"])
+        stands.wait()
+        record_some(recorder, [b"waiting"] * 3)
+        recorder.stop()
+        assert recorder.counters() == {"recorded": 0, "lost": 4}
+        assert told == [(30, "recording ended before the disk had taken all: 4 messages were lost")]
+    finally:
+        goes_on.set()
+
+
+def test_the_writer_does_not_wait_for_the_second_to_end_while_much_is_to_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 3600.0)
+    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder.start()
+    recorder.record(topics.IMAGE, "uav1", None, bytes(20 * 1024**2), 1)
+    until(lambda: recorder.counters()["recorded"] == 1)
+    record_some(recorder, [b"pose"] * 1500)
+    until(lambda: recorder.counters()["recorded"] > 1000)
+    recorder.stop()
+    assert recorder.counters() == {"recorded": 1501}
