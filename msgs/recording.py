@@ -1,8 +1,8 @@
 """Recording samples as MCAP with the ROS 2 profile: the same CDR bytes as on the wire, under the same topic names.
 
 A separate thread writes; `record` never blocks. New samples are written to disk as a chunk every second, or sooner if
-they are many, so a crash loses at most one second; files left unfinished are repaired at the next start. A full disk stops the recording, never
-the program.
+they are many, so a crash loses at most one second; files left unfinished are repaired at the next start. A full disk
+stops the recording, never the program.
 """
 
 from __future__ import annotations
