@@ -12,12 +12,14 @@ from importlib.metadata import PackageNotFoundError, requires
 
 EXIT_BAD_INPUT = 2
 PROJECT = "mf-uavpose6d-edge"
-_DISTRIBUTIONS = {"rerun": "rerun-sdk"}  # where the distribution is not named like the package
+_DISTRIBUTIONS = {"rerun": "rerun-sdk", "PIL": "pillow"}  # where the distribution is not named like the package
 # What a shell reports for a command that Ctrl-C or a closed pipe ended.
 EXIT_INTERRUPTED, EXIT_UNREAD = 130, 141
 
 
-def exit_code(act: Callable[[], int], bad_input: type[Exception], extras: Sequence[str] = ()) -> int:
+def exit_code(
+    act: Callable[[], int], bad_input: type[Exception] | tuple[type[Exception], ...], extras: Sequence[str] = ()
+) -> int:
     """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or needs a missing
     package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as by `| head`."""
     if isinstance(sys.stdout, io.TextIOWrapper):
