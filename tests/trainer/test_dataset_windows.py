@@ -20,6 +20,7 @@ from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from sim_replay.datasets import box_of_mask, open_dataset
 from sim_replay.sample import AcquireView, SampleBatch
+from trainer.cli import EDGE_CONFIG
 from trainer.config import ConfigError, DataConfig, parse_config
 from trainer.data import TrainingBatch, training_batch
 from trainer.dataset_windows import DatasetSampler, MixedSampler
@@ -291,6 +292,9 @@ def test_the_examples_of_the_page_on_datasets_are_configurations() -> None:
         for text in examples
     ]
     assert shares == [[0.3], [0.8, 0.2]]
+    (flown,) = re.findall(r"```toml\n(flown = .*?)```", page, re.DOTALL)
+    copied = EDGE_CONFIG.read_text().replace("[data]\n", "[data]\n" + flown)
+    assert parse_config(copied + examples[0], "own").data.flown_share == 0.55
 
 
 def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
