@@ -22,7 +22,7 @@ from zenoh import ext, handlers
 
 from msgs import topics
 from msgs.receive import PoseReceiver, TargetPose
-from msgs.session import TlsFiles, client_config
+from msgs.session import TlsFiles, check_endpoint, client_config
 from msgs.wire import Refusal
 
 FAILURES_MAX = 64  # distinct exception messages that are counted separately
@@ -37,6 +37,10 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
     Raises ConnectionError if the endpoint is malformed or nothing answers there: immediately if the host is reachable,
     after about four seconds if it is not, after ten over `quic/`.
     """
+    try:
+        check_endpoint(endpoint, tls=tls is not None)
+    except ValueError as error:
+        raise ConnectionError(str(error)) from error
     try:
         session = zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:

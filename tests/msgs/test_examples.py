@@ -116,6 +116,19 @@ def test_where_nobody_answers_an_example_says_so_in_a_sentence(tmp_path: Path, e
     assert ".rs" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("127.0.0.1:7447", "'127.0.0.1:7447' is not tcp/HOST:PORT, tls/HOST:PORT or quic/HOST:PORT\n"),
+        ("quic/127.0.0.1:7447", "'quic/127.0.0.1:7447' needs tls: root_ca, certificate and private_key\n"),
+    ],
+)
+def test_what_is_no_endpoint_is_told_in_our_own_words(endpoint: str, said: str) -> None:
+    command = [sys.executable, "-c", RUN, "print_poses", "-e", endpoint, "-n", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+
+
 def test_behind_a_reader_that_has_enough_an_example_ends_quietly(network: Network, tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUN, "print_poses", "-e", network.endpoint]
     with Node(network.daemon, "uav1") as node:
