@@ -36,6 +36,13 @@ SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-e
 # The mount with all three angles zero: optical axis along the nose, image right along the right wing.
 R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
+# For keys that are easily given another kind of value.
+_WRONG_KINDS = ("string_type", "model_type", "model_attributes_type")
+_EXAMPLES: dict[tuple[str, ...], str] = {
+    ("camera", "device"): '"/dev/video0"',
+    ("camera", "intrinsics"): '{ file = "camera.yaml" }',
+}
+
 
 def _signing_key(path: Path) -> Path:
     try:
@@ -320,7 +327,8 @@ def _reason(fault: Fault) -> str:
         return "needs type = one of 'sequence', 'folder', 'file', 'device', 'stream', 'zenoh'"
     if fault.type == "union_tag_invalid":
         return f"type must be one of {fault.context['expected_tags']}"
-    return fault.reason
+    example = _EXAMPLES.get(_key(fault)) if fault.type in _WRONG_KINDS else None
+    return f"{fault.reason}, such as {example}" if example else fault.reason
 
 
 def _sentence(path: Path, text: str, key: tuple[str, ...], reason: str) -> str:

@@ -14,11 +14,27 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Strict, ValidationError
 
-_KNOWN = {
+# Reasons by pydantic's error type, with its parameters; all others are in pydantic's words.
+_REASONS = {
     "extra_forbidden": "unknown key",
     "missing": "is missing",
     **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "must hold keys with values"),
     **dict.fromkeys(("tuple_type", "list_type"), "must be a list"),
+    **dict.fromkeys(("string_type", "path_type"), "must be text"),
+    "bool_type": "must be true or false",
+    "int_type": "must be a whole number",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "greater_than": "must be more than {gt:.12g}",
+    "greater_than_equal": "must be at least {ge:.12g}",
+    "less_than": "must be less than {lt:.12g}",
+    "less_than_equal": "must be at most {le:.12g}",
+    "multiple_of": "must be a multiple of {multiple_of:.12g}",
+    "literal_error": "must be {expected}",
+    "too_short": "must have {min_length} or more items, not {actual_length}",
+    "too_long": "must have {max_length} or fewer items, not {actual_length}",
+    "string_too_short": "must have {min_length} or more characters",
+    "string_too_long": "must have {max_length} or fewer characters",
 }
 
 
@@ -48,14 +64,14 @@ class Fault(NamedTuple):
 def faults_of(error: ValidationError) -> list[Fault]:
     """All errors that pydantic found, with readable reasons."""
     return [
-        Fault(
-            item["loc"],
-            _KNOWN.get(item["type"], item["msg"].removeprefix("Value error, ")),
-            item["type"],
-            item.get("ctx", {}),
-        )
+        Fault(item["loc"], _reason(item["type"], item["msg"], item.get("ctx", {})), item["type"], item.get("ctx", {}))
         for item in error.errors()
     ]
+
+
+def _reason(kind: str, message: str, context: dict[str, Any]) -> str:
+    known = _REASONS.get(kind)
+    return message.removeprefix("Value error, ") if known is None else known.format_map(context)
 
 
 def dotted(location: tuple[str | int, ...]) -> str:

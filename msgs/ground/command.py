@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -18,6 +20,7 @@ RELOAD_ANSWER_S = 60.0  # the model is loaded and warmed up before the answer
 LINK_S = 10.0
 LOOK_EVERY_S = 0.02
 EXIT_REFUSED = 1
+RATE_MIN_HZ, RATE_MAX_HZ = 0.1, 240.0  # the vehicle refuses others
 
 
 def body(name: str, words: Sequence[str]) -> dict[str, Any]:
@@ -26,22 +29,42 @@ def body(name: str, words: Sequence[str]) -> dict[str, Any]:
 
     Raises InputError.
     """
-    try:
-        match name, *words:
-            case ["track", _, _, _, _]:
-                return {"box": [float(word) for word in words]}
-            case ["select", target]:
-                return {"target": target}
-            case ["stop" | "reload"]:
-                return {}
-            case ["record", ("on" | "off") as state]:
-                return {"on": state == "on"}
-            case ["rate", rate]:
-                return {"max_hz": None if rate == "all" else float(rate)}
-    except ValueError as error:
-        raise InputError(f"{name}: {error}") from error
+    match name, *words:
+        case ["track", _, _, _, _]:
+            return {"box": _box(words)}
+        case ["select", target]:
+            if not re.fullmatch(r"t[0-9]{1,3}", target):
+                raise InputError(f"select: {target}: a target is named t0, t1, …")
+            return {"target": target}
+        case ["stop" | "reload"]:
+            return {}
+        case ["record", ("on" | "off") as state]:
+            return {"on": state == "on"}
+        case ["rate", "all"]:
+            return {"max_hz": None}
+        case ["rate", rate]:
+            return {"max_hz": _rate_hz(rate)}
     raise InputError("a command is one of: track LEFT TOP RIGHT BOTTOM (shares of the picture, 0 to 1); "
                      "select TARGET; stop; reload; record on|off; rate HZ|all")  # fmt: skip
+
+
+def _box(words: Sequence[str]) -> list[float]:
+    """left, top, right, bottom"""
+    with suppress(ValueError):
+        left, top, right, bottom = (float(word) for word in words)
+        if 0.0 <= left < right <= 1.0 and 0.0 <= top < bottom <= 1.0:
+            return [left, top, right, bottom]
+    raise InputError(
+        f"track: {' '.join(words)}: LEFT TOP RIGHT BOTTOM must be shares of the picture from 0 to 1, with left < right "
+        "and top < bottom"
+    )
+
+
+def _rate_hz(word: str) -> float:
+    with suppress(ValueError):
+        if RATE_MIN_HZ <= (rate_hz := float(word)) <= RATE_MAX_HZ:
+            return rate_hz
+    raise InputError(f"rate: {word}: HZ must be a number from {RATE_MIN_HZ:g} to {RATE_MAX_HZ:g}, or all")
 
 
 def ask(

@@ -20,7 +20,7 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
             '[mavlink]\nendpoints = ["udpin:127.0.0.1:14550", "serial:ttyS0:57600"]\n',
             r":5: \[mavlink\] endpoints\[1\]: 'serial:ttyS0:57600' is not udpin:HOST:PORT, .* or serial:DEVICE:BAUD",
         ),
-        ("[mavlink]\nadsb_icao_address = 0x1000000\n", r":5: \[mavlink\] adsb_icao_address: .* less than or equal"),
+        ("[mavlink]\nadsb_icao_address = 0x1000000\n", r":5: \[mavlink\] adsb_icao_address: must be at most 16777212"),
         ("[mavlink]\nsystem_id = 7\nvirtual_system_id = 7\n", r"\[mavlink\]: virtual_system_id must not be"),
         ('[mavlink]\nsigning_state = "s"\n', r"\[mavlink\]: signing_state needs signing_key"),
         ('[mavlink]\nsigning_state = "."\n', r":5: \[mavlink\] signing_state: .* is a folder"),

@@ -103,7 +103,7 @@ def test_a_folder_that_cannot_be_written_is_an_event_and_poses_still_leave(
     ("text", "sentence"),
     [
         ("file_max_mb = 100\ntotal_max_mb = 150", "[recorder]: total_max_mb must hold two files of file_max_mb"),
-        ("when_full = 'wait'", "config.toml:5: [recorder] when_full: Input should be 'oldest' or 'stop'"),
+        ("when_full = 'wait'", "config.toml:5: [recorder] when_full: must be 'oldest' or 'stop'"),
         ("dir = 'x'", "config.toml:5: [recorder] dir: unknown key"),
     ],
 )

@@ -57,7 +57,7 @@ def no_certificate(folder: Path) -> None:
         ('listen = ["tcp/0.0.0.0:77447"]', "'tcp/0.0.0.0:77447' is not"),
         (
             "pose_rate_max_hz = 0",
-            "config.toml:5: [zenoh] pose_rate_max_hz: Input should be greater than or equal to 0.1",
+            "config.toml:5: [zenoh] pose_rate_max_hz: must be at least 0.1",
         ),
         ('tls = { root_ca = "x" }', "[zenoh.tls] certificate: is missing"),
     ],

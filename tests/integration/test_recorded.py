@@ -292,7 +292,7 @@ def test_px4_behind_a_bad_link_is_flown_with_and_every_message_it_gets_is_kept(
     [
         (("film.mp4", "gone.mp4"), "gone.mp4 does not exist"),
         (("own.csv", "gone.csv"), "gone.csv: cannot be read"),
-        (("fx = 2000.0", "fx = -1.0"), "intrinsics.fx: Input should be greater than 0"),
+        (("fx = 2000.0", "fx = -1.0"), "intrinsics.fx: must be more than 0"),
         (("height = 384", "height = 400"), "intrinsics: these intrinsics are for 640x400 pixels"),
         (("telemetry", "telemetri"), "telemetri: "),
     ],
