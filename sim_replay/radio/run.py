@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.util import find_spec
 from typing import Any, get_args
@@ -16,6 +17,7 @@ from sim_replay.radio.rig import Transport
 from sim_replay.radio.trial import Outcome, Plan, Tool, play
 
 EXIT_LATE = 1
+VEHICLES_MAX = 64
 
 
 def register(commands: Any) -> None:
@@ -60,11 +62,10 @@ def register(commands: Any) -> None:
     )
     fleet.add_argument(
         "--vehicles",
-        type=int,
-        choices=range(1, 65),
+        type=_vehicles,
         default=10,
         metavar="N",
-        help="number of vehicles, up to 64 (default 10)",
+        help=f"number of vehicles, up to {VEHICLES_MAX} (default 10)",
     )
     fleet.add_argument("--transport", choices=get_args(Transport), default="quic", help="transport (default quic)")
     fleet.add_argument("--seconds", type=_seconds, default=30.0, help="duration (default 30)")
@@ -73,11 +74,17 @@ def register(commands: Any) -> None:
     fleet.set_defaults(run=run_fleet)
 
 
+def _vehicles(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= VEHICLES_MAX:
+        raise argparse.ArgumentTypeError(f"'{text}' is not an integer from 1 to {VEHICLES_MAX}")
+    return int(text)
+
+
 def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value <= 3600.0:
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number up to 3600")
-    return value
+    with suppress(ValueError):
+        if 0.0 < (value := float(text)) <= 3600.0:
+            return value
+    raise argparse.ArgumentTypeError(f"'{text}' is not a positive number up to 3600")
 
 
 def run_radio(args: argparse.Namespace) -> int:

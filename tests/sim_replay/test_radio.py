@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from sim_replay.radio.channel import NARROW, OUTAGE, UDP_HEADER_BYTES, Channel, Lane
 from sim_replay.radio.fleet import fly_fleet
 from sim_replay.radio.rig import Transport
+from sim_replay.radio.run import register
 from sim_replay.radio.trial import Ledger, Plan, outcome_of, play
 from sim_replay.radio.vehicle import content_age_s, range_m
 
@@ -115,3 +117,21 @@ def test_each_of_several_vehicles_on_one_router_gets_through() -> None:
     outcome = fly_fleet(3, seconds=3.0, fps=10.0)
     assert outcome.delivered_min > 0.8
     assert outcome.late_shown == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--vehicles", "100"], "--vehicles: '100' is not an integer from 1 to 64\n"),
+        (["--vehicles", "many"], "--vehicles: 'many' is not an integer from 1 to 64\n"),
+        (["--seconds", "long"], "--seconds: 'long' is not a positive number up to 3600\n"),
+    ],
+)
+def test_a_number_of_the_fleet_that_cannot_be_is_told_with_its_limits(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parser = argparse.ArgumentParser()
+    register(parser.add_subparsers())
+    with pytest.raises(SystemExit):
+        parser.parse_args(["fleet", *words])
+    assert capsys.readouterr().err.endswith(said)
