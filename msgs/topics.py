@@ -48,7 +48,7 @@ class Topic:
     priority: Priority
     rate: str
     cache: int  # samples kept for late joiners; 0: none
-    recorded: bool
+    recorded: bool  # by the recorder on board; False: only with `[recorder] image_max_hz`
 
     @property
     def per_target(self) -> bool:
@@ -209,7 +209,7 @@ def table_markdown() -> str:
         name = f"`<uav>/{one.name}`".replace("{target}", "<tN>")
         reliability = "best effort" if one.reliability == Reliability.BEST_EFFORT else "reliable"
         priority = str(one.priority).rpartition(".")[2].lower().replace("_", " ")
-        kept, recorded = str(one.cache or "–"), "yes" if one.recorded else "no"
+        kept, recorded = str(one.cache or "–"), "yes" if one.recorded else "on board with `image_max_hz`"
         lines.append(f"| {name} | {one.ros_type} | {reliability} | {priority} | {one.rate} | {kept} | {recorded} |")
     return "\n".join(lines) + "\n"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import builtins
 import re
 import shlex
 import tomllib
@@ -49,6 +51,15 @@ def test_the_vehicle_s_files_load(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_parses(command: str) -> None:
     assert callable(cli._parser().parse_args(shlex.split(command)).act)
+
+
+@pytest.mark.parametrize("program", re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL))
+def test_each_program_imports_what_it_uses(program: str) -> None:
+    nodes = list(ast.walk(ast.parse(program)))
+    used = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
+    there = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    there |= {alias.name for node in nodes if isinstance(node, ast.Import | ast.ImportFrom) for alias in node.names}
+    assert used <= there | set(dir(builtins))
 
 
 def test_commands_are_found() -> None:
