@@ -23,11 +23,13 @@ class Source(NamedTuple):
 
 
 def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, models: ModelFrames) -> BopFrame:
-    """One image's record; `info` may be None, and `poses` if no file has them. Raises BopError.
+    """One image's record; `info` may be None, and `poses` if no file has them: `info` then tells nothing. Raises
+    BopError.
 
     The targets' poses are those of their body axes.
     """
     key = str(image_id)
+    targets = [] if poses is None else _targets(source, key, poses or [], info)
     K = matrix(source.camera, key, camera, "cam_K", (3, 3))
     if min(K[0, 0], K[1, 1]) <= 0:
         raise BopError(f"{source.camera}: 'cam_K' of {key!r} has no positive focal lengths")
@@ -37,7 +39,7 @@ def frame_of(source: Source, image_id: int, camera: Any, poses: Any, info: Any, 
     return BopFrame(
         image_id=image_id,
         K=K,
-        targets=tuple(models.in_body(target) for target in _targets(source, key, poses or [], info)),
+        targets=tuple(models.in_body(target) for target in targets),
         R_cam_world=rotation(source.camera, key, camera, "cam_R_w2c") if has_world else None,
         t_cam_world_m=length_m(source.camera, key, camera, "cam_t_w2c", (3,)) if has_world else None,
         distortion=distortion_of(source.camera, key, camera),

@@ -168,6 +168,7 @@ def test_pictures_whose_truth_is_kept_back_are_not_taken_for_empty_ones(
 ) -> None:
     every = ids(open_dataset(root, "test"))
     (root / "test" / "000002" / "scene_gt.json").unlink()
+    write_json(root / "test" / "000002" / "scene_gt_info.json", {"1": [{"bbox_visib": BOX}]})  # tells no pose
     write_json(root / "test" / "000048" / "scene_gt.json", {})  # a file that leaves a picture out
     labelled = open_dataset(root, "test").labelled_frames()
     assert [(frame.scene_id, frame.image_id) for frame in labelled] == [one for one in every if one[0] != 2]
