@@ -83,6 +83,7 @@ def _refine(arguments: argparse.Namespace) -> None:
         arguments.strangers,
         tuple(arguments.dataset),
         arguments.dataset_share,
+        arguments.split,
     )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")
@@ -157,6 +158,11 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         default=[],
         metavar="DIR",
         help="BOP datasets with images on which no run was trained, to take windows from (default: all are rendered)",
+    )
+    refine.add_argument(
+        "--split",
+        help="split of each --dataset, such as val (default: all splits in the folder; if one of them is a test split, "
+        "--split is required)",
     )
     refine.add_argument(
         "--dataset-share", type=share, default=0.5, help="share of windows from --dataset (default %(default)s)"

@@ -12,9 +12,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from sim_replay.bop import BopError, find_scenes, names_split
+from sim_replay.datasets import open_dataset
 from trainer import equations as eq
 from trainer.checkpoint import RESUME_NAME, TRAINING_ONLY_PREFIX, WEIGHTS_NAME, load_file, save_weights, weights_sha256
-from trainer.config import ConfigError, DataConfig, TrainerConfig, made_folder, parse_config, refuse_no_folder
+from trainer.config import (
+    ConfigError,
+    DataConfig,
+    DatasetSource,
+    TrainerConfig,
+    made_folder,
+    parse_config,
+    refuse_no_folder,
+)
 from trainer.data import Feed, Sampler, TrainingBatch
 from trainer.losses import pose_residual, refinement_nll, to_tensors
 from trainer.model import Perception, PoseNet
@@ -38,6 +48,7 @@ class RefinePlan(NamedTuple):
     epochs: int = 8
     strangers: float = 0.35  # share of rendered targets that are generated airframes, unseen by the network
     datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
+    split: str | None = None  # of each dataset; None: all that are there, as long as none is a test split
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
 
 
@@ -60,7 +71,7 @@ def refine(
     plan: RefinePlan,
     *,
     open_sampler: Callable[
-        [DataConfig, int, int, float, tuple[Path, ...], float], Callable[[], Sampler]
+        [DataConfig, int, int, float, tuple[Path, ...], float, str | None], Callable[[], Sampler]
     ] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
@@ -82,11 +93,10 @@ def refine(
     head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
     model.head_refine = head.eval()
     model.to(device)
-    for path in plan.datasets:
-        if any(_holds(path.resolve(), source.path.resolve(), source.split) for source in config.data.datasets):
-            raise ConfigError(f"--dataset {path}: the network was trained on it; give another")
+    _refuse_datasets(plan, config.data)
     size_px = config.schedule.sizes[-1].size_px
-    opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, plan.datasets, plan.dataset_share)
+    from_datasets = plan.datasets, plan.dataset_share, plan.split
+    opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, *from_datasets)
     kept = look(model, config, opener, plan.windows, say)
     fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
     training = content["training"] | {
@@ -103,12 +113,32 @@ def refine(
     return out / WEIGHTS_NAME
 
 
-def _holds(folder: Path, dataset: Path, split: str) -> bool:
-    """Whether a folder holds images of a dataset's split, which may be `test_primesense` for `test`."""
-    if folder == dataset or folder in dataset.parents:
-        return True
-    within = folder.relative_to(dataset).parts[0] if dataset in folder.parents else ""
-    return within == split or within.startswith(f"{split}_")
+def _refuse_datasets(plan: RefinePlan, data: DataConfig) -> None:
+    """Raises ConfigError if a dataset has images on which the network was trained, or a test split that nobody named,
+    or is unreadable."""
+    trained_on = {folder for source in data.datasets for folder in _trained_scenes(source)}
+    for path in plan.datasets:
+        try:
+            scenes = open_dataset(path, plan.split).scenes
+        except BopError as error:
+            raise ConfigError(f"--dataset {error}") from error
+        if trained_on & {scene.folder.resolve() for scene in scenes}:
+            raise ConfigError(f"--dataset {path}: the network was trained on it; give another, or another --split")
+        tests = [s.split for s in scenes if (s.split or "").startswith("test") and not names_split(path, s)]
+        if plan.split is None and tests:
+            raise ConfigError(f"--dataset {path}: contains the split {tests[0]!r}, for evaluation; choose by --split")
+
+
+def _trained_scenes(source: DatasetSource) -> set[Path]:
+    """Folders of the scenes of a training split, without links; none where the dataset is no longer there.
+
+    A split `train` takes in every `train_...`: the one that there was need not be the only one now.
+    """
+    try:
+        scenes = find_scenes(source.path)
+    except BopError:
+        return set()
+    return {s.folder.resolve() for s in scenes if s.split and f"{s.split}_".startswith(f"{source.split}_")}
 
 
 def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:

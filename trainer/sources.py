@@ -107,6 +107,7 @@ def _open_refinement_sampler(
     strangers: float,
     datasets: Sequence[Path],
     dataset_share: float,
+    split: str | None,
     flown: FlownShare,
 ) -> Sampler:
     from sim_replay.airframes.invented import KEPT_BACK_VARIANTS, Invention
@@ -118,7 +119,7 @@ def _open_refinement_sampler(
     rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, *drawn)
     if not datasets or dataset_share == 0.0:
         return rendered
-    cut = [DatasetSampler(path, None, seed, size_px, acquire, config.acquire_view) for path in datasets]
+    cut = [DatasetSampler(path, split, seed, size_px, acquire, config.acquire_view) for path in datasets]
     each = dataset_share / len(cut)
     return MixedSampler([rendered, *cut], [1.0 - dataset_share, *[each] * len(cut)])
 
@@ -130,11 +131,12 @@ def refinement_sampler(
     strangers: float,
     datasets: Sequence[Path] = (),
     dataset_share: float = 0.0,
+    split: str | None = None,
 ) -> Callable[[], Sampler]:
     """Like `window_sampler`, for the refinement head. In each rendered window there is a target, a share of `strangers`
     being generated aircraft that training never uses. The `datasets` must be others than those trained on, where the
     network's errors are too small; an unreadable one raises ConfigError."""
     for path in datasets:
-        DatasetSampler(path, None, seed, size_px, config.acquire_share, config.acquire_view)
-    with_flown = dataset_share, _flown(config)
-    return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, *with_flown)
+        DatasetSampler(path, split, seed, size_px, config.acquire_share, config.acquire_view)
+    rest = dataset_share, split, _flown(config)
+    return partial(_open_refinement_sampler, config, seed, size_px, strangers, datasets, *rest)

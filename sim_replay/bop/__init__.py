@@ -5,7 +5,7 @@ Lengths are millimetres in the files and metres here. A scene's world is local N
 
 from __future__ import annotations
 
-from sim_replay.bop.layout import find_root, find_scenes, read_scene
+from sim_replay.bop.layout import find_root, find_scenes, names_split, read_scene
 from sim_replay.bop.model_frame import MODEL_FRAME_FILE, ModelFrame, ModelFrames, read_model_frames
 from sim_replay.bop.models import Model, ModelInfo, object_names, read_models, read_models_info
 from sim_replay.bop.ply import read_ply_vertices_m, write_ply
@@ -28,6 +28,7 @@ __all__ = [
     "SceneWriter",
     "find_root",
     "find_scenes",
+    "names_split",
     "object_names",
     "read_model_frames",
     "read_models",

@@ -59,6 +59,11 @@ def dataset_of(scene: BopScene) -> Path | None:
     return None if scene.root == _absolute(scene.folder) else scene.root
 
 
+def names_split(path: Path, scene: BopScene) -> bool:
+    """Whether `path`, in which find_scenes found the scene, is its split or lies in it, and is not a whole dataset."""
+    return scene.split is not None and scene.split not in scene.folder.relative_to(path).parts
+
+
 def _absolute(folder: Path) -> Path:
     return Path(os.path.abspath(folder))  # a split may be a link to another disk: its dataset is where the link is
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.airframes import AIRFRAMES
-from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, names_split
 from sim_replay.bop.fields import load_object
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
 
@@ -57,19 +57,29 @@ NONE_FLOWN = FlownShare()
 
 def read_flown(folders: Sequence[Path], airframe_ids: Sequence[int]) -> FlownFrames:
     """The frames of generated datasets, or splits of them, that show one of those airframes; of an airframe that is
-    given several times, each frame is drawn so many times as often.
+    given several times, each frame is drawn so many times as often. Of a whole dataset, only its training splits count.
 
-    Raises BopError if a folder is no dataset of the fleet in frames of 1920 x 1080 pixels, was filmed through a lens
-    that distorts, or shows none of them.
+    Raises BopError if a folder is no dataset of the fleet in frames of 1920 x 1080 pixels, has no training split, was
+    filmed through a lens that distorts, or shows none of them.
     """
     found = []
     for folder in folders:
-        of_folder = [frame for scene in find_scenes(folder) for frame in _shown(folder, scene, airframe_ids)]
+        of_folder = [frame for scene in _to_train_on(folder) for frame in _shown(folder, scene, airframe_ids)]
         if not of_folder:
             raise BopError(f"{folder}: none of its frames shows one of the airframes to train on")
         for frame in of_folder:
             found += [frame] * list(airframe_ids).count(frame.targets[0].object_id - 1)
     return _stacked(found)
+
+
+def _to_train_on(folder: Path) -> list[BopScene]:
+    """The scenes of a folder, except those of validation and test splits, unless the folder is one or lies in it."""
+    found = find_scenes(folder)
+    kept = [s for s in found if s.split is None or s.split.startswith("train") or names_split(folder, s)]
+    if not kept:
+        splits = sorted({scene.split for scene in found if scene.split})
+        raise BopError(f"{folder}: has no training split, but {', '.join(splits)}; to train on one, give its folder")
+    return kept
 
 
 def _shown(folder: Path, scene: BopScene, airframe_ids: Sequence[int]) -> Iterator[BopFrame]:

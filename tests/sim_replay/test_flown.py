@@ -109,6 +109,22 @@ def test_an_airframe_given_twice_is_drawn_twice_as_often(flown: Path) -> None:
     assert np.sum(twice == male) == 2 * np.sum(once == male) > 0
 
 
+def test_of_a_whole_dataset_only_training_flights_are_drawn(flown: Path, tmp_path: Path) -> None:
+    """The others are there to validate and to test on; whoever wants one of them gives its folder."""
+    whole = tmp_path / "whole"
+    shutil.copytree(flown, whole)
+    for split in ("val", "test"):
+        shutil.copytree(flown / "train", whole / split)
+    frames = len(read_flown([flown], FLEET).airframe_id)
+    assert len(read_flown([whole], FLEET).airframe_id) == frames
+    assert len(read_flown([whole / "val"], FLEET).airframe_id) == frames
+    shutil.rmtree(whole / "train")
+    with pytest.raises(
+        BopError, match=r"whole: has no training split, but test, val; to train on one, give its folder"
+    ):
+        read_flown([whole], FLEET)
+
+
 def test_what_cannot_be_drawn_anew_is_refused(flown: Path, tmp_path: Path) -> None:
     with pytest.raises(BopError, match="shows one of the airframes"):
         read_flown([flown], [airframe_id("glider")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from synthetic_sampler import PlateSampler
 
 from sim_replay.airframes.invented import draw_invented
 from sim_replay.sample import SampleBatch
+from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.config import ConfigError, DataConfig
 from trainer.equations import heatmap_peaks
@@ -104,15 +106,70 @@ def test_its_strangers_are_none_that_training_draws() -> None:
     assert not names & of_training
 
 
+def write_splits(root: Path, *splits: str) -> None:
+    """A dataset with a scene in each split."""
+    write_models_info(root)
+    for number, split in enumerate(splits):
+        write_scene(root / split / f"{number:06d}")
+
+
+def run_on(folder: Path, path: Path) -> Path:
+    """A run that was trained on the split train of a dataset."""
+    named = f'[data]\ndatasets = [{{ path = "{path}", share = 0.5 }}]\n'
+    return write_run(folder, tiny.TOML.replace("[data]\n", named))
+
+
+def refine_on(run: Path, path: Path, split: str | None = None) -> None:
+    plan = PLAN._replace(datasets=(path,), split=split)
+    refine(run, run.with_name("out"), plan, open_sampler=open_plates, say=silent)
+
+
 def test_images_that_the_network_was_trained_on_are_refused(tmp_path: Path) -> None:
     own = tmp_path / "own"
-    named = f'[data]\ndatasets = [{{ path = "{own}", share = 0.5 }}]\n'
-    run = write_run(tmp_path / "run", tiny.TOML.replace("[data]\n", named))
-    for folder in ("run/../own", "own/train", "own/train_pbr", "own/train/000003", "."):
-        plan = PLAN._replace(datasets=(tmp_path / folder,))
+    write_splits(own, "train_pbr", "val")
+    run = run_on(tmp_path / "run", own)
+    for folder in ("run/../own", "own/train_pbr", "own/train_pbr/000000", "."):
         with pytest.raises(ConfigError, match=r"--dataset .*: the network was trained on it; give another"):
-            refine(run, tmp_path / "out", plan, open_sampler=open_plates, say=silent)
-    refine(run, tmp_path / "out", PLAN._replace(datasets=(own / "val",)), open_sampler=open_plates, say=silent)
+            refine_on(run, tmp_path / folder)
+    refine_on(run, own / "val")
+    refine_on(run, own, "val")
+
+
+def test_images_that_the_network_was_trained_on_are_refused_where_they_are_linked_or_lie_deeper(
+    tmp_path: Path,
+) -> None:
+    """A split may be a link to another disk, and the dataset a folder below the one that training was given."""
+    own, disk = tmp_path / "unpacked" / "own", tmp_path / "disk" / "hawks"
+    write_splits(own, "val")
+    write_scene(disk / "000007")
+    (own / "train").symlink_to(disk)
+    for number, trained_on in enumerate((own, own.parent)):
+        run = run_on(tmp_path / f"run{number}", trained_on)
+        for given in (own, own / "train", own / "train" / "000007", disk, disk / "000007"):
+            with pytest.raises(ConfigError, match=r"--dataset .*: the network was trained on it; give another"):
+                refine_on(run, given)
+        refine_on(run, own / "val")
+
+
+def test_a_test_split_is_refined_on_only_if_named(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    write_splits(tmp_path / "other", "train", "test")
+    with pytest.raises(ConfigError, match=r"--dataset .*other: contains the split 'test', .* --split"):
+        refine_on(run, tmp_path / "other")
+    with pytest.raises(ConfigError, match=r"--dataset .*other: no split 'val'; it has test, train"):
+        refine_on(run, tmp_path / "other", "val")
+    refine_on(run, tmp_path / "other", "train")
+    refine_on(run, tmp_path / "other" / "test")
+
+
+def test_windows_are_cut_from_the_split_that_is_named(tmp_path: Path) -> None:
+    write_splits(tmp_path, "train", "val")
+    target = json.loads((tmp_path / "val" / "000001" / "scene_gt.json").read_text())
+    target["0"][0]["cam_t_m2c"][2] = 4e5
+    write_json(tmp_path / "val" / "000001" / "scene_gt.json", target)
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0])
+    batch = refinement_sampler(data, 12, 32, 0.0, (tmp_path,), 1.0, "val")().batch(0, 8)
+    assert set(batch.t_cam_target_m[batch.present, 2]) == {400.0}
 
 
 def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:
