@@ -48,7 +48,11 @@ def _export(arguments: argparse.Namespace) -> None:
         float_out=arguments.float_out,
         contract=contract,
         tolerance=Tolerance(
-            arguments.tolerance, arguments.tolerance_depth, arguments.tolerance_pose, arguments.tolerance_sigma
+            arguments.tolerance,
+            arguments.tolerance_depth,
+            arguments.tolerance_pose,
+            arguments.tolerance_sigma,
+            arguments.tolerance_recall,
         ),
         samples=arguments.samples,
         say=lambda text: print(text, flush=True),
@@ -237,6 +241,7 @@ def _add_export(commands: argparse._SubParsersAction) -> None:
         ("--tolerance-depth", "PERCENT", 2.0, "the median depth difference from FP32 is larger, %%"),
         ("--tolerance-pose", "POINTS", 5.0, "Pose@10°/5 %% is lower than FP32's by more, percentage points"),
         ("--tolerance-sigma", "PERCENT", 10.0, "the median sigma is smaller than FP32's by more, %%"),
+        ("--tolerance-recall", "POINTS", 5.0, "the recall is lower than FP32's by more, percentage points"),
     ):
         export.add_argument(
             option,

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import ValidationError
 
 from msgs.contract import CONTRACT_VERSION, ModelContract
+from msgs.settings import faults_of
 from trainer.checkpoint import load_model, weights_sha256
 from trainer.config import Z_RANGE_M, ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
 from trainer.data import Sampler, TrainingBatch, render_once
@@ -57,6 +59,7 @@ class Tolerance(NamedTuple):
     depth_percent: float = 2.0  # median
     pose_points: float = 5.0  # loss of Pose@10°/5 %; a few hundred windows measure it to within a few points
     sigma_percent: float = 10.0  # decrease of sigma, median
+    recall_points: float = 5.0  # loss of recall at the promised thresholds
 
 
 class Measured(NamedTuple):
@@ -208,12 +211,13 @@ def airframe_names(ids: list[int] | None) -> list[str]:
 
 
 class Strayed(NamedTuple):
-    """Differences in the worse stage: medians, loss of Pose@10°/5 % in points, and decrease of sigma."""
+    """Differences in the worse stage: medians, loss of Pose@10°/5 % in points, decrease of sigma, loss of recall."""
 
     rotation_deg: float = 0.0
     depth_percent: float = 0.0
     pose_points: float = 0.0
     sigma_percent: float = 0.0
+    recall_points: float = 0.0
 
     def refusal(self, tolerance: Tolerance) -> str | None:
         """Text for the first difference that exceeds its tolerance; None if none does."""
@@ -222,33 +226,47 @@ class Strayed(NamedTuple):
             ("median depth differs from FP32's by {:.4g} %, more than --tolerance-depth {:g}"),
             ("Pose@10°/5 % is {:.4g} points worse than FP32's, more than --tolerance-pose {:g}"),
             ("median sigma is smaller than FP32's by {:.4g} %, more than --tolerance-sigma {:g}"),
+            ("recall is {:.4g} points worse than FP32's, more than --tolerance-recall {:g}"),
         )
         pairs = zip(told, self, tolerance, strict=True)
         return next((text.format(value, limit) for text, value, limit in pairs if not value <= limit), None)
 
 
-def comparison_table(views: Views, title: str, a: Measured, b: Measured) -> tuple[str, Strayed]:
-    """Differences of `a` from `b` as text, and the larger of both stages."""
-    columns = ("rotation deg", "depth %", "centre px", "sigma %", "score", "Pose@10°/5 %")
+def comparison_table(
+    views: Views, title: str, a: Measured, b: Measured, thresholds: tuple[float, float]
+) -> tuple[str, Strayed]:
+    """Differences of `a` from `b` as text, and the larger of both stages; `thresholds` of acquire and track.
+
+    False alarms are only told: there are too few windows without a target for a tolerance.
+    """
+    columns = ("rotation deg", "depth %", "centre px", "sigma %", "score", "Pose@10°/5 %", "recall %", "false alarms %")
     lines = [f"{title:24}" + "".join(f"{column:>18}" for column in columns)]
     worst = Strayed()
-    stages = (("track", a.track, b.track, views.track), ("acquire", a.acquire, b.acquire, views.acquire))
-    for stage, one, other, batches in stages:
+    acquire_min, track_min = thresholds
+    stages = (
+        ("track", a.track, b.track, views.track, track_min),
+        ("acquire", a.acquire, b.acquire, views.acquire, acquire_min),
+    )
+    for stage, one, other, batches, score_min in stages:
         if one is None or other is None:
             continue
         present = np.concatenate([batch.present for batch in batches])
         d = difference(one, other, present)
-        pose = [100 * measure(predicted, batches)["pose_10deg_5pct"] for predicted in (one, other)]
-        lost = pose[1] - pose[0] if tell_of_poses(batches) else 0.0
+        measured = [measure(predicted, batches, score_min) for predicted in (one, other)]
+        shares = {k: [100 * m[k] for m in measured] for k in ("pose_10deg_5pct", "recall", "false_alarms")}
+        tells = tell_of_poses(batches)
+        lost = {k: of_other - of_one if tells else 0.0 for k, (of_one, of_other) in shares.items()}
         smaller = 100 * sigma_shortfall(one, other, present)
-        strayed = Strayed(d["rotation_deg_median"], 100 * d["depth_rel_median"], lost, smaller)
+        strayed = Strayed(
+            d["rotation_deg_median"], 100 * d["depth_rel_median"], lost["pose_10deg_5pct"], smaller, lost["recall"]
+        )
         worst = Strayed(*(np.maximum(x, y) for x, y in zip(worst, strayed, strict=True)))  # keeps NaN
         scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "sigma_rel": 100, "score": 1}
-        cells = (f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items())
-        lines.append(f"  {stage:22}" + "".join(cells) + f"{pose[0]:9.1f} /{pose[1]:7.1f}")
-    return "\n".join(
-        [*lines, "  (differences: median / 95th percentile over windows with a target; Pose@10°/5 %: both values)"]
-    ), worst
+        cells = [f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items()]
+        cells += ["{:9.1f} /{:7.1f}".format(*of_both) for of_both in shares.values()]
+        lines.append(f"  {stage:22}" + "".join(cells))
+    told = "differences: median / 95th percentile over windows with a target; the last three columns: both values"
+    return "\n".join([*lines, f"  ({told})"]), worst
 
 
 def export_models(
@@ -264,13 +282,13 @@ def export_models(
 ) -> tuple[Path, Path]:
     """Write NAME-fp32.onnx into `float_out` (default `out`) and NAME-int8.onnx into `out`; returns their paths.
 
-    `contract` replaces the [contract] section of the checkpoint's configuration. If INT8's poses differ from FP32's by
-    more than the tolerance, on windows not used for calibration, it raises ConfigError and writes no INT8 file (an
-    existing one is kept).
+    `contract` replaces the [contract] section of the checkpoint's configuration. If INT8's poses or recall
+    differ from FP32's by more than the tolerance, on windows not used for calibration, it raises ConfigError and writes
+    no INT8 file (an existing one is kept).
     """
     model, config, training, sha256 = load_model(checkpoint)
     if contract is not None:
-        config = config.model_copy(update={"contract": contract})
+        config = _with_contract(config, contract)
     held_out = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share))
     trained_on = open_view or (lambda seed, size, share: stage_sampler(config.data, seed, size, share, held_out=False))
     float_path = (float_out or out) / f"{config.contract.name}-fp32.onnx"
@@ -296,7 +314,7 @@ def export_models(
     finally:
         unmeasured.unlink(missing_ok=True)
     by_torch = _predict(torch_predictor(model), comparison)
-    say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch)[0])
+    say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch, thresholds)[0])
 
     say("quantising")
     write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance, say)
@@ -326,7 +344,7 @@ def export_unmeasured(
     else:
         model, config, training, sha256 = load_model(source)
     if contract is not None:
-        config = config.model_copy(update={"contract": contract})
+        config = _with_contract(config, contract)
     made_folder(out)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
     part = path.with_suffix(".part")
@@ -339,6 +357,15 @@ def export_unmeasured(
     finally:
         part.unlink(missing_ok=True)
     return path
+
+
+def _with_contract(config: TrainerConfig, contract: ContractConfig) -> TrainerConfig:
+    """The configuration with another [contract]. Raises ConfigError if that contradicts how the network was trained."""
+    try:
+        return TrainerConfig.model_validate(config.model_dump() | {"contract": contract.model_dump()})
+    except ValidationError as error:
+        told = "; ".join(fault.reason for fault in faults_of(error))
+        raise ConfigError(f"--config: its [contract] contradicts the network's training: {told}") from error
 
 
 def write_int8(
@@ -359,12 +386,12 @@ def write_int8(
     try:
         quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire])
         int8 = _predict(onnx_predictor(unproved), comparison)
-        table, strayed = comparison_table(comparison, "INT8 vs. FP32", int8, floats)
+        thresholds = (promise.acquire_score_min, promise.track_score_min)
+        table, strayed = comparison_table(comparison, "INT8 vs. FP32", int8, floats, thresholds)
         say(table)
         refusal = strayed.refusal(tolerance)
         if refusal is not None:
             raise ConfigError(f"{int8_path}: not written: {refusal}")
-        thresholds = (promise.acquire_score_min, promise.track_score_min)
         measured = {"precision": "int8", "metrics": _metrics(int8, comparison, thresholds)}
         write_contract(unproved, promise.model_copy(update=measured))
         unproved.replace(int8_path)

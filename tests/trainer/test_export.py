@@ -25,12 +25,22 @@ from trainer.evaluate import (
     predict_all,
     sigma_shortfall,
 )
-from trainer.export import Measured, Strayed, Tolerance, Views, export_models, stage_sampler, write_int8
+from trainer.export import (
+    Measured,
+    Strayed,
+    Tolerance,
+    Views,
+    comparison_table,
+    export_models,
+    export_unmeasured,
+    stage_sampler,
+    write_int8,
+)
 from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
 from trainer.sources import window_sampler
 
-ANY = Tolerance(180.0, 100.0, 100.0, 100.0)
+ANY = Tolerance(180.0, 100.0, 100.0, 100.0, 100.0)
 
 
 def open_view(seed: int, size_px: int, acquire_share: float) -> partial:
@@ -121,6 +131,7 @@ def windows(seed: int, size_px: int) -> TrainingBatch:
         (ANY._replace(depth_percent=0.0), r"median depth differs .* --tolerance-depth 0"),
         (ANY._replace(pose_points=-1.0), r"Pose@10°/5 % is 0 points worse .* --tolerance-pose -1"),
         (ANY._replace(sigma_percent=-200.0), r"median sigma is smaller .* --tolerance-sigma -200"),
+        (ANY._replace(recall_points=-1.0), r"recall is 0 points worse .* --tolerance-recall -1"),
     ],
 )
 def test_an_int8_file_that_strays_is_not_written(
@@ -142,6 +153,33 @@ def test_an_int8_file_that_strays_is_not_written(
             exported.said.append,
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_detects_nothing_is_refused_however_right_its_highest_peaks_are() -> None:
+    """Here half of the targets, of one stage, are below the threshold."""
+    batch = windows(1, 64)
+    on = batch.present
+    nothing = np.zeros((len(on), 6), np.float32)
+    labels = batch.center_px, batch.size_px, batch.center_px, batch.t_cam_target_m, batch.R_cam_target
+    right = Predictions(np.where(on, 0.8, 0.2).astype(np.float32), *labels, nothing + 1.0)
+    half = right._replace(score=np.where(np.cumsum(on) <= on.sum() // 2, right.score, 0.2 * right.score))
+    views = Views([batch], [batch])
+    for other, lost_points in ((right, 0.0), (half, 100.0 * (1 - on.sum() // 2 / on.sum()))):
+        for int8 in (Measured(other, right), Measured(right, other)):
+            table, strayed = comparison_table(views, "INT8 vs. FP32", int8, Measured(right, right), (0.5, 0.5))
+            assert strayed.recall_points == pytest.approx(lost_points)
+            assert (strayed.refusal(Tolerance()) is None) == (other is right)
+            assert f"{100.0 - lost_points:9.1f} /  100.0" in table
+
+
+def test_a_contract_that_contradicts_how_the_network_was_trained_is_refused(exported: Exported, tmp_path: Path) -> None:
+    """Its acquire stage would be given squashed frames, of which training showed none."""
+    contract = tiny.config().contract.model_copy(update={"acquire_fit": "squash", "acquire_size_wh": (64, 64)})
+    for export in (export_models, export_unmeasured):
+        with pytest.raises(ConfigError, match=r"--config: its \[contract\] contradicts .*: data\.acquire_view"):
+            export(exported.run, tmp_path / "out", contract=contract)
+    other = tiny.config().contract.model_copy(update={"name": "another"})
+    assert export_unmeasured(exported.run, tmp_path, contract=other).name == "another-unmeasured-fp32.onnx"
 
 
 def test_an_answer_that_is_no_number_is_refused() -> None:

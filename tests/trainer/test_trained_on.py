@@ -21,7 +21,7 @@ from trainer.export import Tolerance, Views, export_models, make_contract
 from trainer.graph import read_contract
 from trainer.train import run_training
 
-ANY = Tolerance(180.0, 100.0, 100.0, 100.0)
+ANY = Tolerance(180.0, 100.0, 100.0, 100.0, 100.0)
 WIDTH, HEIGHT, RADIUS_PX = 640, 360, 12
 
 
