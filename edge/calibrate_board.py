@@ -114,7 +114,9 @@ def draw_board(settings: BoardSettings) -> Gray:
 
 
 def write_board(settings: BoardSettings, out: Path) -> None:
-    """Raises InputError if it cannot be written."""
+    """Raises InputError if `out` is not the name of a PNG or cannot be written."""
+    if out.suffix.lower() != ".png":
+        raise InputError(f"--draw {out}: the board is a PNG; its name must end in .png")
     _, data = cv2.imencode(".png", draw_board(settings))
     try:
         out.write_bytes(data.tobytes())

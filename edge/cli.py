@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         help="number of distortion coefficients: k1 k2 p1 p2, k3, k4 k5 k6 (default 4)",
     )
     calibrate.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    calibrate.add_argument("--draw", type=Path, metavar="IMAGE", help="only write an image of the board, for printing")
+    calibrate.add_argument("--draw", type=Path, metavar="PNG", help="only write an image of the board, for printing")
     calibrate.set_defaults(act=_calibrate)
 
     keygen = commands.add_parser("keygen", help="write a new MAVLink signing key, for [mavlink] signing_key")

@@ -175,6 +175,7 @@ def test_a_board_that_is_never_tilted_is_refused_with_a_sentence(cli: Cli, tmp_p
         (["mixed"], "is 320x240, earlier images 640x480"),
         (["grey", "--pattern", "chessboard", "--squares", "3x9"], "a chessboard needs at least 4x4 squares"),
         (["grey", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners, and a view needs 8"),
+        (["--draw", "board.xyz"], "--draw board.xyz: the board is a PNG; its name must end in .png"),
         (["--draw", "board.png", "--squares", "4x3"], "a board of 4x3 squares has 6 inner corners"),
         (["--draw", "board.png", "--squares", "2x9"], "a ChArUco board needs at least 3x3 squares"),
     ],
