@@ -161,7 +161,10 @@ class Pipeline:
         clock.lap("track")
         estimates = self._estimate(frame, expected, pointed_at, clock)
         chosen_id = self._by_hand.chosen_id
-        tracks = self._tracker.update(capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion, chosen_id)
+        doubtful_below = self._estimator.model.doubtful_below
+        tracks = self._tracker.update(
+            capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion, chosen_id, doubtful_below
+        )
         if self._slept():
             return
         self._by_hand.settle(tracks)
@@ -200,8 +203,9 @@ class Pipeline:
         searches = self._by_hand.searches(capture_ns)
         held = [track.box_xyxy_px for track in expected]
         twice = [looked_at_twice(track.state, unhurried) for track in expected]
-        room = searches and len(held) < self._max_targets
-        places = self.search.places(capture_ns, held, PLACES_MOST - len(held) if room else 0)
+        probable = sum(track.score >= self._estimator.model.doubtful_below for track in expected)
+        room = searches and probable < self._max_targets  # the others give way
+        places = self.search.places(capture_ns, held, max(PLACES_MOST - len(held), 1) if room else 0)
         found = self._look_into(held, twice, places, frame, pointed_at, clock)
         self._since_acquire += 1
         if not searches:
@@ -213,7 +217,7 @@ class Pipeline:
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (
             self._since_acquire >= self._acquire_every_n
-            and len(held) < self._max_targets
+            and probable < self._max_targets
             and self.search.begin(self._estimator, frame, [*held, *(place.box_xyxy_px for place in places)])
         ):
             self._since_acquire = 0
@@ -250,10 +254,9 @@ class Pipeline:
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
     ) -> Report:
-        model, chosen_id = self._estimator.model, self._by_hand.chosen_id
-        calibrated = model.contract.scores_calibrated
+        model, chosen_id, lens = self._estimator.model, self._by_hand.chosen_id, frame.distortion
         report = Report(
-            frame.meta, frame.K, size_wh, tracks, own_ship, model.sha256, chosen_id, frame.distortion, calibrated
+            frame.meta, frame.K, size_wh, tracks, own_ship, model.sha256, chosen_id, lens, model.doubtful_below
         )
         self._outlets.publish(report)
         self._outlets.show(frame)

@@ -86,6 +86,9 @@ class OwnShip:
         return Mount(self.R_body_gimbal @ mount.R_body_cam, mount.t_body_cam_m)
 
 
+PROBABLE_SCORE = 0.8  # of a track; below: what looks like an aircraft in one frame and not in the next, mostly a bird
+
+
 class TrackState(Enum):
     TENTATIVE = "tentative"
     CONFIRMED = "confirmed"
@@ -124,4 +127,4 @@ class Report:
     model_sha256: str
     chosen_id: int | None = None  # track_id of the target that the operator selected
     distortion: tuple[float, ...] = ()  # of the frame's lens, as in Frame
-    scores_calibrated: bool = True  # the tracks' scores are probabilities
+    doubtful_below: float = PROBABLE_SCORE  # score of a track; 0 if the model's scores are no probabilities

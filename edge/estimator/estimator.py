@@ -121,7 +121,7 @@ class Estimator:
         turns = quarter_turns(frame.up_cam)
         peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), contract.acquire_size_wh, turns)
         found = decode(peaks, 0, shown, contract, "acquire", score_min, refused)
-        return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 0)]
+        return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 1)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows.

@@ -20,6 +20,7 @@ from edge import clock
 from edge.errors import InputError
 from edge.estimator.providers import ChosenProvider, Provider, choose_provider
 from edge.threads import yield_to_the_loop
+from edge.types import PROBABLE_SCORE
 from msgs.contract import CONTRACT_VERSION, INPUT_NAMES, METADATA_KEY, OUTPUT_NAMES, ModelContract
 from msgs.settings import dotted, faults_of
 
@@ -76,6 +77,12 @@ class Model:
         self.sha256 = sha256
         self.provider = provider  # the one it really runs on
         self.fallback_reason = fallback_reason  # a sentence; None: runs on the requested provider
+
+    @property
+    def doubtful_below(self) -> float:
+        """Score below which a track is probably no aircraft; 0 where scores were not calibrated and so are no
+        probabilities."""
+        return PROBABLE_SCORE if self.contract.scores_calibrated else 0.0
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""

@@ -9,7 +9,6 @@ import numpy as np
 from edge.types import Report, Track, TrackState
 from msgs.wire import is_covariance
 
-UNSURE_SCORE = 0.8  # below: what looks like an aircraft in one frame and not in the next is mostly a bird
 UNSURE_RANGE_SHARE = 0.5  # 1-sigma over range above which a pose is not sent
 UNSURE_ROTATION_RAD = 1.0  # root mean square over the axes; 1.33 for a completely unknown rotation
 ROTATION_TOLERANCE = 1e-3
@@ -33,8 +32,7 @@ def sendable(report: Report, now_ns: int, max_age_ms: float) -> list[Track]:
 
 def probable(track: Track, report: Report) -> bool:
     """Whether the track is most probably an aircraft, or what the operator selected."""
-    # The height of a peak that was not calibrated says nothing: aircraft are often below 0.8.
-    return not report.scores_calibrated or track.score >= UNSURE_SCORE or track.track_id == report.chosen_id
+    return track.score >= report.doubtful_below or track.track_id == report.chosen_id
 
 
 def rotation_known(track: Track) -> bool:

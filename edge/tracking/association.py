@@ -15,6 +15,11 @@ from edge.tracking.view import View
 from edge.types import Array, Estimate
 
 POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; wide, as motion.py has a soft gate inside
+# In `cam` any place is plausible soon, as the camera may have turned: a target missed for this long is taken up again
+# only within this many times its apparent size. What is seen farther off may be another aircraft.
+OUT_OF_SIGHT_NS = 250_000_000
+SIZES_OFF_MAX = 5.0
+FRESH_NS = 150_000_000  # a target seen that recently is predicted well, whatever the camera does
 ROTATION_D2_MAX = 9.0  # limit of a rotation's cost: the network may be wrong, and aircraft roll
 
 
@@ -32,7 +37,9 @@ def associate(
 ) -> list[Pair]:
     """Pairs inside the gate, each target and estimate at most once: as many pairs as possible, at least total distance.
 
-    If a target or an estimate has several candidates, rotation counts too: crossing aircraft differ in it.
+    If a target or an estimate has several candidates, rotation counts too: crossing aircraft differ in it. An estimate
+    that fits a target seen just now goes to the likeliest: by distance alone, one long missed, which fits everywhere,
+    would take the detections of its neighbour.
     """
     seen: dict[tuple[int, int], Innovation] = {}
     cost = np.full((len(targets), len(estimates)), np.inf)
@@ -40,13 +47,16 @@ def associate(
         for j, estimate in enumerate(estimates):
             one = ekf.innovation(motion, estimate, K, view)
             d2 = distance_d2(one, estimate)
-            if d2 < POSITION_GATE_D2:
+            if d2 < POSITION_GATE_D2 and not _elsewhere(motion, estimate, one.predicted_m, K, view):
                 seen[i, j], cost[i, j] = one, d2
     contested = np.isfinite(cost)
-    for i, j in seen:
+    fresh = np.array([view.time_ns - motion.seen_ns <= FRESH_NS for motion, _ in targets], dtype=bool)
+    for (i, j), one in seen.items():
         if contested[i].sum() > 1 or contested[:, j].sum() > 1:
             d2 = rotation.disagreement_d2(targets[i][1], estimates[j], view)
             cost[i, j] += min(d2, ROTATION_D2_MAX)
+            if np.any(contested[:, j] & fresh):
+                cost[i, j] += float(np.linalg.slogdet(sum(_covariances(one)))[1])
     best = best_pairs(cost)
     idle = set(range(len(targets))) - {i for i, _ in best}
     return [Pair(i, j, seen[i, j], sorted(k for k in idle if (k, j) in seen)) for i, j in best]
@@ -59,12 +69,32 @@ def distance_d2(seen: Innovation, estimate: Estimate) -> float:
     range alone, a target predicted to be near, give or take a good part of that range, would fit any other beyond it.
     """
     ray = seen.predicted_m
-    predicted = seen.predicted_covariance + seen.attitude
-    measured = seen.across + seen.log_range_variance * np.outer(ray, ray)
+    predicted, measured = _covariances(seen)
     apart_m = estimate.t_cam_target_m - ray
     farther = max(float(np.linalg.norm(estimate.t_cam_target_m) / np.linalg.norm(ray)), 1.0)
     in_metres = apart_m @ np.linalg.solve(predicted + farther**2 * measured, apart_m)
     return max(float(seen.residual_m @ np.linalg.solve(predicted + measured, seen.residual_m)), float(in_metres))
+
+
+def out_of_sight(motion: Motion, view: View) -> bool:
+    """Whether a target was missed for so long that it could be anywhere; `view` is in the motion's frame."""
+    return motion.kind == "cam" and view.time_ns - motion.seen_ns >= OUT_OF_SIGHT_NS
+
+
+def _elsewhere(motion: Motion, estimate: Estimate, predicted_m: Array, K: Array, view: View) -> bool:
+    if not out_of_sight(motion, view):
+        return False
+    size_rad = float(np.linalg.norm(estimate.box_xyxy_px[2:] - estimate.box_xyxy_px[:2])) / K[0, 0]
+    cosine = (
+        predicted_m @ estimate.t_cam_target_m / np.linalg.norm(predicted_m) / np.linalg.norm(estimate.t_cam_target_m)
+    )
+    return bool(np.arccos(np.clip(cosine, -1.0, 1.0)) > SIZES_OFF_MAX * size_rad)
+
+
+def _covariances(seen: Innovation) -> tuple[Array, Array]:
+    """Of the predicted and of the measured position, [3, 3] each."""
+    ray = seen.predicted_m
+    return seen.predicted_covariance + seen.attitude, seen.across + seen.log_range_variance * np.outer(ray, ray)
 
 
 def best_pairs(cost: Array) -> list[tuple[int, int]]:

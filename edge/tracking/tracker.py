@@ -14,7 +14,7 @@ import numpy as np
 from edge.estimator.lens import Lens
 from edge.tracking import motion as ekf
 from edge.tracking import rotation
-from edge.tracking.association import Pair, associate
+from edge.tracking.association import Pair, associate, out_of_sight
 from edge.tracking.boxes import RANGE_MIN_M, SAME_BOX_IOU, BoxModel, inside, iou
 from edge.tracking.doubles import Doubles
 from edge.tracking.heading import Flight
@@ -115,10 +115,12 @@ class Tracker:
         image_size_wh: Size,
         distortion: tuple[float, ...] = (),
         chosen_id: int | None = None,
+        doubtful_below: float = 0.0,
     ) -> tuple[Track, ...]:
         """Update with the estimates of the frame taken at `capture_ns`; returns all tracks, by track_id.
 
-        `chosen_id`: the target that the operator selected.
+        `chosen_id`: the target that the operator selected. `doubtful_below`: a target of a lower score gives way, if
+        there is no free slot, to an estimate that is not below.
         A frame not later than the last one is dropped and counted; the tracks stay unchanged.
         """
         if self.is_late(capture_ns):
@@ -145,7 +147,7 @@ class Tracker:
                 _miss(target)
         double = self._double(pairs, bool(spare), chosen_id, capture_ns)
         self._targets = [t for t in self._targets if t.track_id != double and _alive(t, lens, view, image_size_wh)]
-        self._give_birth(spare, lens, view)
+        self._give_birth(spare, lens, view, chosen_id, doubtful_below)
         if self._motion_doubted:
             self._forget_motion()
             self._motion_doubted = False
@@ -193,18 +195,33 @@ class Tracker:
                 return missed[0]
         return None
 
-    def _give_birth(self, estimates: list[Estimate], lens: Lens, view: View) -> None:
+    def _give_birth(
+        self, estimates: list[Estimate], lens: Lens, view: View, chosen_id: int | None, doubtful_below: float
+    ) -> None:
         wanted, self._wanted = self._wanted, None
         for estimate in sorted(estimates, key=lambda e: (e is not wanted, -e.score)):
-            free = sorted(set(range(self.max_targets)) - {t.track_id for t in self._targets})
             boxes = [_box(target, view, lens) for target in self._targets]
-            if not free:
-                return
             if any(iou(estimate.box_xyxy_px, box) > SAME_BOX_IOU for box in boxes):
                 continue  # two windows showed one target
+            if len(self._targets) >= self.max_targets:
+                doubtful = doubtful_below if estimate.score >= doubtful_below else 0.0
+                gives_way = self._least(view, chosen_id, doubtful)
+                if gives_way is None:
+                    return
+                self._targets.remove(gives_way)
+            free = sorted(set(range(self.max_targets)) - {t.track_id for t in self._targets})
             motion, attitude = ekf.begin(estimate, lens.K, view), rotation.begin(estimate, view)
             box = BoxModel.measured(estimate.box_xyxy_px, estimate.t_cam_target_m, lens)
             self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
+
+    def _least(self, view: View, chosen_id: int | None, doubtful_below: float) -> Target | None:
+        """The target, if any, whose slot another may take: out of sight or of a lower score, and never the selected."""
+        candidates = [
+            target
+            for target in self._targets
+            if target.track_id != chosen_id and (target.score < doubtful_below or out_of_sight(target.motion, view))
+        ]
+        return min(candidates, key=lambda target: (target.measured_ns, target.score), default=None)
 
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view: View) -> None:

@@ -159,11 +159,12 @@ def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[
     started_ns = time.monotonic_ns()
     expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
     estimates = _estimate(estimator, sequence, frame, expected)
-    tracks = sequence.tracker.update(capture_ns, estimates, own_ship, shown.K, size_wh)
-    time_ms = (time.monotonic_ns() - started_ns) * 1e-6
     model = estimator.model
-    calibrated = model.contract.scores_calibrated
-    report = Report(frame.meta, shown.K, size_wh, tracks, own_ship, model.sha256, scores_calibrated=calibrated)
+    tracks = sequence.tracker.update(
+        capture_ns, estimates, own_ship, shown.K, size_wh, doubtful_below=model.doubtful_below
+    )
+    time_ms = (time.monotonic_ns() - started_ns) * 1e-6
+    report = Report(frame.meta, shown.K, size_wh, tracks, own_ship, model.sha256, doubtful_below=model.doubtful_below)
     return report, estimates, time_ms
 
 

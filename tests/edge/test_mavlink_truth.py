@@ -149,7 +149,7 @@ def test_what_is_hardly_a_target_is_not_sent_unless_the_operator_selected_it() -
     report = make_report(likely, doubtful, now_ns=NOW_NS)
     assert sendable(report, NOW_NS, 500.0) == [likely]
     assert sendable(replace(report, chosen_id=1), NOW_NS, 500.0) == [likely, doubtful]
-    assert sendable(replace(report, scores_calibrated=False), NOW_NS, 500.0) == [likely, doubtful]
+    assert sendable(replace(report, doubtful_below=0.0), NOW_NS, 500.0) == [likely, doubtful]
 
 
 @pytest.mark.parametrize("variance", [-1e-9, -4.0])

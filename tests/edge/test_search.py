@@ -13,6 +13,7 @@ import pytest
 from edge import threads
 from edge.config import SHIPPED_MODEL
 from edge.daemon import Pipeline
+from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
 from edge.estimator.lens import Lens
 from edge.estimator.model import load_model
@@ -341,6 +342,32 @@ def test_where_there_is_room_for_one_more_a_likelier_false_place_hides_no_target
         for index in range(6, 10):
             loop._process(frame(index, HELD, OTHER))
     assert [track.state for track in ear.reports[-1].tracks] == [TrackState.CONFIRMED] * 2
+
+
+class Doubting(Gated):
+    """Takes what flies at HELD for a bird."""
+
+    def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
+        seen = super().track(frame, boxes_xyxy_px, twice)
+        bird = box_around(HELD)
+        return [one and (replace(one, score=0.6) if lies_on(one.box_xyxy_px, [bird]) else one) for one in seen]
+
+
+def test_a_bird_in_the_only_slot_hides_no_aircraft(toy_model: Path) -> None:
+    doubting = Doubting(load_model(toy_model, 1), 1)
+    doubting.model.contract = doubting.model.contract.model_copy(update={"track_score": ScoreCalibration(offset=0.01)})
+    with looping(doubting, max_targets=1) as (loop, ear, _):
+        doubting.sees = [e for e in doubting.track(frame(0, OTHER), [box_around(OTHER)]) if e]
+        doubting.gate.set()
+        for index in range(6):
+            loop._process(frame(index, HELD))
+        assert [track.score < 0.8 for track in ear.reports[-1].tracks] == [True]
+        until(lambda: loop.search.counters()["searches"] == 1)
+        for index in range(6, 10):
+            loop._process(frame(index, HELD, OTHER))
+    (track,) = ear.reports[-1].tracks
+    assert track.state is TrackState.CONFIRMED
+    assert lies_on(track.box_xyxy_px, [box_around(OTHER)])
 
 
 def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQueue], gated: Gated) -> None:

@@ -64,8 +64,8 @@ def test_what_is_no_aircraft_is_neither_acquired_nor_lost(
 ) -> None:
     news = TargetNews()
     seen = [report(track(frame * FRAME_NS, score=score)) for frame, score in enumerate(scores)]
-    chosen_id = 0 if chosen else None
-    reports = [replace(one, scores_calibrated=calibrated, chosen_id=chosen_id) for one in [*seen, report()]]
+    judged = {"doubtful_below": 0.8 if calibrated else 0.0, "chosen_id": 0 if chosen else None}
+    reports = [replace(one, **judged) for one in [*seen, report()]]
     assert [text.split(",")[0] for one in reports for _, text in news.words(one)] == told
 
 
