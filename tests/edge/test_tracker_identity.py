@@ -1,0 +1,109 @@
+"""Who is who: what is seen after a target was missed, beside one that went, and where there is no free slot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge.tracking.tracker import Tracker
+from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
+
+from .noisy_flights import SIZE_WH, K, known, seen
+
+LOOKING_NORTH = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.zeros(3))
+R_CAM_TARGET = LOOKING_NORTH.R_body_cam.T
+TURNED = R_CAM_TARGET @ np.diag([-1.0, -1.0, 1.0])  # flying the other way
+
+
+class Flight:
+    """Frames of a camera that stands still, at 30 a second unless told otherwise."""
+
+    def __init__(self, kind: str, max_targets: int = 4, rate_hz: float = 30.0) -> None:
+        self.kind, self.rate_hz = kind, rate_hz
+        self.tracker, self.rng, self.frames = Tracker(max_targets, LOOKING_NORTH), np.random.default_rng(0), 0
+
+    def sight(self, t_m: Array, score: float = 0.95, R_cam_target: Array = R_CAM_TARGET) -> Estimate:
+        return replace(seen(self.rng, t_m, R_cam_target, 0.0), score=score)
+
+    def frame(self, *sights: Estimate, chosen_id: int | None = None, doubtful_below: float = 0.0) -> tuple[Track, ...]:
+        time_ns = 1 + round(self.frames * 1e9 / self.rate_hz)
+        self.frames += 1
+        own = known(self.kind, OwnShip(time_ns, np.eye(3), np.zeros(3), np.zeros(3), None))
+        return self.tracker.update(time_ns, list(sights), own, K, SIZE_WH, (), chosen_id, doubtful_below)
+
+
+def towards(degrees: float, range_m: float) -> Array:
+    return range_m * np.array([np.sin(np.deg2rad(degrees)), 0.0, np.cos(np.deg2rad(degrees))])
+
+
+@pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
+@pytest.mark.parametrize(
+    ("missed_s", "degrees", "range_m"),
+    [(0.3, 10.0, 250.0), (0.5, 10.0, 300.0), (1.0, 20.0, 350.0), (1.5, 20.0, 150.0), (1.9, 25.0, 450.0)],
+)
+def test_another_aircraft_is_not_taken_for_one_that_was_missed(
+    kind: str, missed_s: float, degrees: float, range_m: float
+) -> None:
+    flight = Flight(kind)
+    for _ in range(60):
+        flight.frame(flight.sight(towards(-5.0, 250.0)))
+    for _ in range(round(missed_s * 30)):
+        flight.frame()
+    for count in range(1, 6):
+        tracks = flight.frame(flight.sight(towards(degrees - 5.0, range_m), R_cam_target=TURNED))
+        (told,) = (track for track in tracks if track.measured_ns == track.time_ns)
+        assert told.track_id == 1
+        assert (told.state is TrackState.TENTATIVE) == (count < 3)
+        assert np.linalg.norm(told.t_cam_target_m) == pytest.approx(range_m, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
+@pytest.mark.parametrize("apart_m", [8.0, 12.0, 20.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0])
+def test_of_two_abreast_the_one_that_goes_takes_nothing_of_the_other(kind: str, apart_m: float, rate_hz: float) -> None:
+    flight, stays, goes = Flight(kind, rate_hz=rate_hz), np.array([apart_m, 0.0, 250.0]), np.array([0.0, 0.0, 250.0])
+    for _ in range(round(2 * rate_hz)):
+        flight.frame(flight.sight(goes), flight.sight(stays), chosen_id=0)
+    for _ in range(round(4 * rate_hz)):
+        tracks = flight.frame(flight.sight(stays), chosen_id=0)
+        assert [track.track_id for track in tracks if track.measured_ns == track.time_ns] == [1]
+    assert [track.track_id for track in tracks] == [1]
+
+
+@pytest.mark.parametrize(
+    ("score", "doubtful_below", "chosen_id", "held"),
+    [
+        (0.95, 0.8, None, [0.65, 0.95]),
+        (0.75, 0.8, None, [0.6, 0.65]),
+        (0.95, 0.0, None, [0.6, 0.65]),
+        (0.95, 0.8, 1, [0.6, 0.95]),
+    ],
+    ids=["aircraft", "bird", "not calibrated", "selected"],
+)
+def test_birds_give_way_to_an_aircraft(
+    score: float, doubtful_below: float, chosen_id: int | None, held: list[float]
+) -> None:
+    flight, birds = Flight("ned", max_targets=2), [towards(-8.0, 200.0), towards(8.0, 200.0)]
+    for _ in range(10):
+        flight.frame(flight.sight(birds[0], 0.65), flight.sight(birds[1], 0.6))
+    last = [flight.sight(birds[0], 0.65), flight.sight(birds[1], 0.6)]
+    tracks = flight.frame(
+        *last, flight.sight(towards(0.0, 300.0), score), chosen_id=chosen_id, doubtful_below=doubtful_below
+    )
+    assert sorted(track.score for track in tracks) == pytest.approx(held)
+
+
+@pytest.mark.parametrize(("chosen_id", "seen_ids"), [(None, [0]), (0, [])])
+def test_without_own_attitude_a_slot_is_not_kept_for_what_could_be_anywhere(
+    chosen_id: int | None, seen_ids: list[int]
+) -> None:
+    flight = Flight("cam", max_targets=1)
+    for _ in range(30):
+        flight.frame(flight.sight(towards(0.0, 250.0)))
+    for _ in range(20):
+        flight.frame()
+    tracks = flight.frame(flight.sight(towards(15.0, 250.0)), chosen_id=chosen_id)
+    assert [track.track_id for track in tracks if track.born_ns == track.time_ns] == seen_ids
+    assert len(tracks) == 1
