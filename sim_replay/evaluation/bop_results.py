@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge.errors import InputError
 from sim_replay.bop.records import MM_PER_M
 from sim_replay.datasets import Dataset, DatasetFrame
-from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame, is_seen
+from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame, is_hidden, is_seen
 from sim_replay.score import TargetPose
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -101,7 +101,8 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
     def answer(index: int, picture: DatasetFrame) -> Answer:
         rows = by_picture.get((picture.scene_id, picture.image_id), [])
         times_s = [row.time_s for row in rows if row.time_s >= 0]
-        best = _best(rows, [t.object_id for t in (*picture.targets, *picture.unlisted) if is_seen(t)])
+        present = [t for t in (*picture.targets, *picture.unlisted) if is_seen(t) or is_hidden(t)]
+        best = _best(rows, [target.object_id for target in present])
         kept, surplus = ([row for row in rows if (id(row) in best) is one] for one in (True, False))
         return Answer(
             tuple(_pose(index, row, picture) for row in kept),

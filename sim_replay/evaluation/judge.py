@@ -36,7 +36,7 @@ class JudgedFrame:
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
     measured: tuple[Match, ...] = ()  # matches of the tracker's inputs with the same targets; empty without a tracker
-    not_asked: tuple[Truth, ...] = ()  # others that are present: detecting them is neither right nor wrong
+    not_asked: tuple[Truth, ...] = ()  # hidden or unlisted, but present: detecting them is neither right nor wrong
 
 
 def is_seen(target: BopTarget) -> bool:
@@ -45,14 +45,22 @@ def is_seen(target: BopTarget) -> bool:
     return target.visible_px != 0 if known else bool(target.t_cam_target_m[2] > 0)
 
 
+def is_hidden(target: BopTarget) -> bool:
+    """Whether it is in the picture, entirely behind something: its outline has pixels, none of them visible."""
+    return target.visible_px == 0 and bool(target.whole_px)
+
+
 def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
-    """The image's visible targets, with size, name and model points; then those that are not to be estimated.
+    """The image's targets, with size, name and model points, then the unlisted ones; to be estimated are the visible
+    ones among the former.
 
     Raises InputError for an object without a model that is to be estimated; others are as large as their box tells.
     """
     truths = []
-    for target, wanted in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
-        if not is_seen(target):
+    for target, listed in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
+        visible = is_seen(target)
+        wanted = listed and visible
+        if not visible and not is_hidden(target):
             continue
         model = models.get(target.object_id) or (None if wanted else _as_it_looks(target, picture))
         if model is None and not wanted:
@@ -71,6 +79,7 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
                 model.diameter_m,
                 model.name,
                 model.points_m,
+                visible=visible,
                 wanted=wanted,
             )
         )

@@ -146,6 +146,27 @@ def test_a_picture_that_shows_but_what_is_not_asked_for_is_not_empty(root: Path)
         assert overall["false_positives_per_1000"] == false_alarms
 
 
+def test_a_pose_of_a_listed_aircraft_that_is_entirely_occluded_is_neither_right_nor_wrong(root: Path) -> None:
+    """Behind a cloud, right of the one that is seen; in picture 1 alone."""
+    scene = root / "test" / "000000"
+    truth = json.loads((scene / "scene_gt.json").read_text())
+    write_json(scene / "scene_gt.json", truth | {"1": truth["0"][1:]})
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60, "px_count_all": 60}
+    places = ((LEFT, RIGHT), (RIGHT,))
+    for px_count_all, false_poses, false_alarms in ((60, 0, None), (0, 2, 1000.0)):  # the latter: outside the image
+        hidden = {"bbox_visib": [-1, -1, -1, -1], "px_count_visib": 0, "px_count_all": px_count_all}
+        write_json(scene / "scene_gt_info.json", {"0": [seen, hidden], "1": [hidden]})
+        dataset = open_dataset(root)
+        rows = [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)]
+        from_file = [*judged(root, rows)[:1], *judged(root, rows[1:], picture=1)[1:]]
+        pictures = dataset.labelled_frames()
+        from_model = judge_frames(pictures, dataset.models, lambda index, picture: said(*places[index])(index, picture))
+        for frames in (from_file, from_model):
+            overall = score_of(dataset, {}, frames)["overall"]
+            assert (overall["targets"], overall["recall"], overall["false_poses"]) == (1, 1.0, false_poses)
+            assert overall["false_positives_per_1000"] == false_alarms
+
+
 def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
     """Rich takes brackets for markup: it had left them out, and refused a closing one with a traceback."""
     root = root.rename(root.with_name("hawks [v2]"))
