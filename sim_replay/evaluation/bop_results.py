@@ -7,6 +7,7 @@ three numbers separated by spaces, of the dataset's model axes, t in millimetres
 from __future__ import annotations
 
 import csv
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ _ROTATION_TOLERANCE = 0.02
 _LARGEST = 1e15  # beyond it, squares and sums exceed what JSON can represent
 
 Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +143,12 @@ def results_name(method: str, dataset: Dataset) -> str:
 
 def write_results(path: Path, judged: Sequence[JudgedFrame]) -> None:
     """Write every pose, matched ones under their true obj_id (a model-free method names none), others under 0, or a
-    negative number if an object has that one."""
+    negative number if an object has that one.
+
+    Poses of unknown rotation are left out, with a warning: the format cannot mark them, and a reader would score the
+    placeholder.
+    """
+    left_out = 0
     there = {target.object_id for frame in judged for target in (*frame.picture.targets, *frame.picture.unlisted)}
     no_object = NO_OBJECT if NO_OBJECT not in there else min(there) - 1
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -151,12 +158,17 @@ def write_results(path: Path, judged: Sequence[JudgedFrame]) -> None:
             time_s = UNKNOWN_TIME_S if frame.time_ms is None else frame.time_ms * 1e-3
             found = [(m.truth.object_id, m.estimate) for m in frame.matches if m.estimate is not None]
             for object_id, pose in [*found, *((no_object, pose) for pose in frame.false_poses)]:
+                if not pose.rotation_known:
+                    left_out += 1
+                    continue
                 model = frame.picture.scene.models.of(object_id)
                 R = pose.R_cam_target @ model.R_body_model
                 t_mm = (pose.t_cam_target_m + pose.R_cam_target @ model.t_body_model_m) * MM_PER_M
                 score = 1.0 if pose.score is None else pose.score
                 ids = (frame.picture.scene_id, frame.picture.image_id, object_id)
                 writer.writerow([*ids, f"{score:.6f}", _numbers(R.ravel(), 9), _numbers(t_mm, 4), f"{time_s:.6f}"])
+    if left_out:
+        _log.warning("%s: %d poses are left out, as the format cannot say that a rotation is unknown", path, left_out)
 
 
 def _numbers(values: Array, digits: int) -> str:

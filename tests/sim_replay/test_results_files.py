@@ -101,6 +101,27 @@ def test_a_false_pose_is_not_written_as_one_of_an_object_that_a_dataset_numbers_
     assert [pose.score for pose in again[0].false_poses] == [0.9]
 
 
+def test_poses_of_unknown_rotation_are_not_written_and_their_number_is_told(
+    root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Their placeholder happens to be right here; from the file it would be taken for an answer."""
+    dataset = open_dataset(root)
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        sure, unsure, false = said(LEFT, RIGHT, 40.0)(index, picture).poses
+        return Answer((sure, *(replace(pose, rotation_known=False) for pose in (unsure, false))), None)
+
+    pictures = dataset.labelled_frames()[:1]
+    first = judge_frames(pictures, dataset.models, answer)
+    path = root.parent / "m_hawks-test.csv"
+    write_results(path, first)
+    assert f"{path}: 2 poses are left out" in caplog.text
+    again = judge_frames(pictures, dataset.models, file_answers(path, dataset))
+    of_both = [score_of(dataset, {}, frames)["overall"] for frames in (first, again)]
+    assert [overall["rot_10deg"] for overall in of_both] == [0.5, 0.5]
+    assert [overall["recall"] for overall in of_both] == [1.0, 0.5]
+
+
 def test_poses_in_an_empty_picture_stay_false_alarms(root: Path) -> None:
     dataset = open_dataset(root)
     score = score_of(dataset, {}, judged(root, [(1, 0.9, LEFT, True)], picture=1))
