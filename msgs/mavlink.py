@@ -29,6 +29,17 @@ MAVError = dialect.MAVError
 
 TARGET_OBS_FRAME_OTHER = 3
 CANDIDATES_MAX = 256  # false frame starts in the bytes of one `feed`: with more, the rest is discarded as a flood
+# Messages in which MAVLink frames of another time or vehicle may travel: passed through, or from a log.
+CARRIERS = frozenset((
+    dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL,
+    dialect.MAVLINK_MSG_ID_LOG_DATA,
+    dialect.MAVLINK_MSG_ID_SERIAL_CONTROL,
+    dialect.MAVLINK_MSG_ID_ENCAPSULATED_DATA,
+    dialect.MAVLINK_MSG_ID_V2_EXTENSION,
+    dialect.MAVLINK_MSG_ID_LOGGING_DATA,
+    dialect.MAVLINK_MSG_ID_LOGGING_DATA_ACKED,
+    dialect.MAVLINK_MSG_ID_TUNNEL,
+))  # fmt: skip
 _Q_UNKNOWN = (0.0, 0.0, 0.0, 0.0)
 _TYPES = {
     "uint64_t": ("Q", 8), "int64_t": ("q", 8), "double": ("d", 8),
@@ -173,8 +184,9 @@ class FrameReader:
     """Extracts MAVLink messages from bytes, skipping garbage between them.
 
     After a false frame start it skips one byte, not the length claimed there, so a truncated header hides nothing that
-    follows, nor delays it. Use `datagram=True` for datagram transports, where no frame continues in the next datagram;
-    for byte streams use one reader per connection.
+    follows, nor delays it, unless it is that of a message of CARRIERS: what those carry is not taken for messages. Use
+    `datagram=True` for datagram transports, where no frame continues in the next datagram; for byte streams use one
+    reader per connection.
     """
 
     def __init__(self, datagram: bool) -> None:
@@ -207,8 +219,11 @@ class FrameReader:
                     at, begun = end, None
                     continue
                 spoilt += 1
-            elif begun is None and not self.datagram:
-                begun = at  # what follows is read all the same: a false start must not hold it back
+            elif not self.datagram:
+                begun = at if begun is None else begun
+                if self._may_carry_frames(at):
+                    break
+                # What follows is read all the same: a false start must not hold it back.
             at += 1
         keep_from = len(self._buffer) if begun is None or spoilt > CANDIDATES_MAX else begun
         self._skip(keep_from)
@@ -230,6 +245,11 @@ class FrameReader:
         if header[2] & ~dialect.MAVLINK_IFLAG_SIGNED:
             return 0
         return at + 12 + header[1] + (13 if header[2] else 0)
+
+    def _may_carry_frames(self, at: int) -> bool:
+        """Whether this is the start of a message whose payload may be MAVLink of another time or vehicle."""
+        header = self._buffer[at : at + 10]
+        return len(header) == 10 and header[0] == 0xFD and int.from_bytes(header[7:], "little") in CARRIERS
 
     def _decoded(self, at: int, end: int) -> Any | None:
         """The message of this frame, unchecked and with a negative id if its id is not in our dialects."""

@@ -14,6 +14,7 @@ import sys
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -268,6 +269,21 @@ def test_no_false_start_in_a_stream_delays_what_follows(before: bytes) -> None:
         frame = mavlink.pack(mav, HEARTBEAT)
         assert [len(reader.feed(part)) for part in (frame[:5], frame[5:])] == [0, 1]
     assert reader.bad_runs == 1
+
+
+@given(cuts=st.sets(st.integers(1, 400), max_size=6), before=st.sampled_from([b"", b"\xfe\xff", b"\xfd\xff\x00"]))
+def test_what_a_message_carries_is_not_taken_for_messages_wherever_the_stream_is_cut(
+    cuts: set[int], before: bytes
+) -> None:
+    mav, reader = mavlink.MAVLink(None, 1, 1), mavlink.FrameReader(datagram=False)
+    frame = mavlink.pack(mav, HEARTBEAT)
+    block = list((4 * frame)[:70])
+    port = mavlink.dialect.MAVLink_serial_control_message(0, 0, 0, 0, len(block), block).pack(mav)
+    tunnel = mavlink.dialect.MAVLink_tunnel_message(0, 0, 0, 128, list((8 * frame)[:128])).pack(mav)
+    stream = before + port + frame + tunnel + frame
+    ends = [0, *sorted(cut for cut in cuts if cut < len(stream)), len(stream)]
+    heard = [message.get_type() for one, two in pairwise(ends) for message in reader.feed(stream[one:two])]
+    assert heard == ["SERIAL_CONTROL", "HEARTBEAT", "TUNNEL", "HEARTBEAT"]
 
 
 @pytest.mark.parametrize("datagram", [True, False])
