@@ -26,6 +26,12 @@ POINT_HALF_SHARE = 0.02  # of the image width: half the box to examine around a 
 RECTANGLE_MIN_SHARE = 1e-3
 REQUESTABLE = frozenset((HEARTBEAT, CAMERA_INFORMATION, *RATE_LIMITS_HZ))
 
+CAMERA_COMMANDS = frozenset((
+    dialect.MAV_CMD_CAMERA_TRACK_POINT,
+    dialect.MAV_CMD_CAMERA_TRACK_RECTANGLE,
+    dialect.MAV_CMD_CAMERA_STOP_TRACKING,
+))  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -53,6 +59,14 @@ def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
     if command.command == dialect.MAV_CMD_CAMERA_STOP_TRACKING:
         return Answer(dialect.MAV_RESULT_ACCEPTED, request=StopTracking())
     return Answer(dialect.MAV_RESULT_UNSUPPORTED)
+
+
+def concerns_us(command: Any) -> bool:
+    """Whether a COMMAND_LONG or COMMAND_INT to all components of the vehicle is for ours too. The others are left to the
+    autopilot: an UNSUPPORTED beside its answer would only confuse."""
+    if command.command in (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL):
+        return command.param1 in REQUESTABLE - {HEARTBEAT}
+    return command.command in CAMERA_COMMANDS
 
 
 def _request_message(number: float, enabled: Container[int]) -> Answer:

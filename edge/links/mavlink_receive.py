@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from edge.links.mavlink_commands import concerns_us
 from edge.links.mavlink_table import (
     ATTITUDE,
     ATTITUDE_QUATERNION,
@@ -168,7 +169,8 @@ def _finite(message: Any) -> bool:
 def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], bool]) -> str | None:
     """Why a valid message is not for us: telemetry must be from our vehicle's autopilot, commands addressed to us."""
     if message.get_msgId() in COMMANDS:
-        ours = message.target_system == vehicle_id and our_components(message.target_component)
+        to_all = message.target_component == 0 and concerns_us(message)
+        ours = message.target_system == vehicle_id and (to_all or our_components(message.target_component))
         return None if ours else "not_for_us"
     if message.get_srcSystem() != vehicle_id:
         return "not_our_autopilot"

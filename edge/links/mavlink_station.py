@@ -280,7 +280,7 @@ class Station:
         refused = reply.request is not None and not self._requests.put(reply.request)
         if refused or (reply.send_once is not None and not self._tells(reply.send_once, now_ns)):
             result = dialect.MAV_RESULT_TEMPORARILY_REJECTED
-        camera = command.target_component == self._settings.camera_component_id
+        camera = command.target_component in (0, self._settings.camera_component_id)
         asker = (command.get_srcSystem(), command.get_srcComponent())
         ack = dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *asker)
         out = [self._letter(ack, camera=camera)]

@@ -22,6 +22,8 @@ from .reports import BOX_XYXY_PX, SIZE_WH, K
 from .reports import make_report as report
 from .reports import make_track as track
 
+CAMERA_COMPONENT = MavlinkSettings().camera_component_id
+
 
 def test_commands_to_others_are_not_answered() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
@@ -31,6 +33,24 @@ def test_commands_to_others_are_not_answered() -> None:
         peer.settle(lambda: link.counters().get("refused_not_for_us") == 2, "refusal")
         peer.command(2010)
         assert peer.named("COMMAND_ACK").command == 2010, "the first answer is to the command that was ours"
+
+
+def test_commands_to_all_components_are_answered_once_by_the_camera_where_they_concern_it() -> None:
+    requests = RequestQueue()
+    with linked(requests=requests) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        peer.command(400, 1.0, component=0)
+        peer.command(512, 148.0, component=0)
+        peer.settle(lambda: link.counters().get("refused_not_for_us") == 2, "refusal")
+        peer.command(512, 259.0, component=0)
+        acknowledged = peer.named("COMMAND_ACK")
+        assert (acknowledged.command, acknowledged.result) == (512, dialect.MAV_RESULT_ACCEPTED)
+        assert acknowledged.get_srcComponent() == CAMERA_COMPONENT
+        peer.named("CAMERA_INFORMATION")
+        peer.command(2010, component=0)
+        acknowledged = peer.named("COMMAND_ACK")
+        assert (acknowledged.command, acknowledged.get_srcComponent()) == (2010, CAMERA_COMPONENT)
+        assert requests.take() == [StopTracking()]
 
 
 ACCEPTED, DENIED, UNSUPPORTED = (

@@ -40,6 +40,8 @@ def test_targets_have_a_rhythm_each_and_off_is_off(gaps_ns: list[int]) -> None:
     assert not schedule.due(MESSAGE, 0, now_ns + 10**12)
     schedule.ask_once(MESSAGE, now_ns + 10**12)
     assert [schedule.due(MESSAGE, 0, now_ns + 10**12) for _ in range(2)] == [True, False]
+    assert schedule.due(MESSAGE, 1, now_ns + 10**12), "one request is for all targets of a frame"
+    assert not schedule.due(MESSAGE, 2, now_ns + 10**12 + 1)
     schedule.set_rate(MESSAGE, None)
     assert schedule.due(MESSAGE, 0, now_ns + 2 * 10**12)
 
