@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.bop import BopError
+from sim_replay.bop import BopError, BopTarget
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.sample import AcquireView, SampleBatch
 from trainer.config import Z_RANGE_M, ConfigError
@@ -95,7 +95,8 @@ class DatasetSampler:
         image = _resampled(picture, to_window, self.size_px)
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None and box is not None:
-            self._label(out, frame, chosen, box, to_window)
+            mask = _mask(frame, chosen, frame_wh) if frame.distortion is None else None
+            self._label(out, frame.targets[chosen], box, mask, to_window)
         for k, other in enumerate([*boxes, *frame.undistorted_boxes_xyxy_px(frame_wh, frame.unlisted)]):
             if other is not None and k != chosen:
                 _mark(out.others[0], other, to_window)
@@ -112,9 +113,13 @@ class DatasetSampler:
         return low, np.full(2, side)
 
     def _label(
-        self, out: TrainingBatch, frame: DatasetFrame, chosen: int, box_xyxy_px: Array, to_window: Array
+        self,
+        out: TrainingBatch,
+        target: BopTarget,
+        box_xyxy_px: Array,
+        mask: NDArray[np.bool_] | None,
+        to_window: Array,
     ) -> None:
-        target = frame.targets[chosen]
         corners = box_xyxy_px.reshape(2, 2) @ to_window[:, :2].T + to_window[:, 2]
         inside = np.clip(corners, -0.5, self.size_px - 0.5)
         if np.prod(inside[1] - inside[0]) < VISIBLE_MIN * np.prod(corners[1] - corners[0]):
@@ -124,8 +129,20 @@ class DatasetSampler:
         out.R_cam_target[0], out.t_cam_target_m[0] = target.R_cam_target, target.t_cam_target_m
         out.center_px[0], out.size_px[0] = inside.mean(axis=0), inside[1] - inside[0]
         out.diameter_m[0] = self._diameter_m.get(target.object_id, 0.0)
-        mask = frame.mask(chosen) if frame.distortion is None else None
         out.coverage[0] = np.nan if mask is None else _coverage(mask, to_window, self.size_px)
+
+
+def _mask(frame: DatasetFrame, index: int, frame_wh: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """The visible mask of a target, if the dataset has masks. Raises ConfigError if it is unreadable or of another size
+    than the image."""
+    try:
+        mask = frame.mask(index)
+    except BopError as error:
+        raise ConfigError(str(error)) from error
+    if mask is not None and mask.shape != frame_wh[::-1]:
+        sizes = "{} x {} pixels, its mask {} x {}".format(*frame_wh, *mask.shape[::-1])
+        raise ConfigError(f"{frame.scene.folder}: picture {frame.image_id} has {sizes}")
+    return mask
 
 
 def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:

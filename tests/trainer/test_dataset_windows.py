@@ -297,6 +297,18 @@ def test_the_examples_of_the_page_on_datasets_are_configurations() -> None:
     assert parse_config(copied + examples[0], "own").data.flown_share == 0.55
 
 
+def test_a_mask_that_cannot_belong_to_its_image_is_named(dataset: Path, tmp_path: Path) -> None:
+    """Of another size, it would teach the mask head that the aircraft is background."""
+    root = tmp_path / "dots"
+    shutil.copytree(dataset, root)
+    half = cv2.imencode(".png", np.full((HEIGHT // 2, WIDTH // 2), 255, np.uint8))[1].tobytes()
+    for content, told in ((half, "640 x 360 pixels, its mask 320 x 180"), (b"", r"_000000\.png is not a readable")):
+        for path in (root / "train" / "000003" / "mask_visib").iterdir():
+            path.write_bytes(content)
+        with pytest.raises(ConfigError, match=told):
+            DatasetSampler(root, "train", 5, 64, 0.0).batch(0, 40)
+
+
 def test_what_cannot_be_trained_on_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=str(tmp_path)):
         DatasetSampler(tmp_path, None, 1, 64, 0.3)
