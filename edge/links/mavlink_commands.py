@@ -62,7 +62,7 @@ def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
 
 
 def concerns_us(command: Any) -> bool:
-    """Whether a COMMAND_LONG or COMMAND_INT to all components of the vehicle is for ours too. The others are left to the
+    """Whether a COMMAND_LONG or COMMAND_INT to all components is for ours too. All others are left to the
     autopilot: an UNSUPPORTED beside its answer would only confuse."""
     if command.command in (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL):
         return command.param1 in REQUESTABLE - {HEARTBEAT}
