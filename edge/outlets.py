@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import logging
-import re
-from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from edge import clock
-from edge.errors import InputError
 from edge.health import Condition, HealthSnapshot, HealthState
 from edge.requests import AskReload, RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
@@ -149,7 +146,7 @@ def start_outlets(
         with file.blame("zenoh", "listen"):
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)
-            _start_zenoh(zenoh, config.zenoh.listen)
+            zenoh.start()
         from edge.pictures import Pictures
 
         pictures = Pictures(zenoh, config.zenoh.image_max_hz, config.recorder.image_max_hz)
@@ -177,15 +174,3 @@ def start_outlets(
         with file.blame("health", "prometheus_port"):
             cleanup.callback(MetricsServer(board, config.health.prometheus_port).stop)
     return outlets
-
-
-def _start_zenoh(zenoh: ZenohLink, listen: Sequence[str]) -> None:
-    """Raises InputError when an endpoint cannot be listened on; one that is taken is told in our own words."""
-    try:
-        zenoh.start()
-    except InputError as error:
-        taken = re.search(r"(:\d+): Address already in use", str(error))
-        if taken is None:
-            raise
-        endpoints = " or ".join(endpoint for endpoint in listen if taken[1] in endpoint)
-        raise InputError(f"{endpoints} is in use: does another daemon run?") from error

@@ -8,6 +8,7 @@ recorder; with zenoh disabled it is only recorded.
 from __future__ import annotations
 
 import logging
+import re
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
@@ -108,6 +109,9 @@ class ZenohLink:
             )
             return zenoh.open(config)
         except zenoh.ZError as error:
+            if taken := re.search(r"(:\d+): Address already in use", str(error)):
+                endpoints = " or ".join(endpoint for endpoint in settings.listen if taken[1] in endpoint)
+                raise LinkError(f"{endpoints} is in use: does another daemon run?") from error
             endpoints = ", ".join(settings.listen) or "none"
             reason = str(error).partition(" at /")[0]  # the rest is a location in zenoh's source
             raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
