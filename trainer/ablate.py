@@ -102,8 +102,9 @@ def ablate(
     say: Callable[[str], None],
     open_view: OpenView = window_sampler,
 ) -> dict[str, Any]:
-    """Train the variants not trained yet, evaluate all on held-out windows, write ablation.json and table.md.
+    """Train the variants not trained yet, evaluate them on held-out windows, write ablation.json and table.md.
 
+    Rows of other variants that are in `out` already are kept, unless they were measured on another number of windows.
     The held-out windows are the same for all, except that a variant trained only on whole reduced frames is evaluated
     on those.
 
@@ -112,24 +113,58 @@ def ablate(
     """
     result: dict[str, Any] = {"samples": scale.samples, "size_px": scale.size_px, "windows": scale.windows, "rows": {}}
     result["seed"], result["validation_seed"] = base.data.seed, base.data.validation_seed
+    result |= _earlier(out / RESULT_NAME, result)
+    for variant in chosen([*result["rows"]]):
+        _refuse_another_run(out / variant.name, parse_config(varied(base, variant, scale), f"variant {variant.name}"))
     for variant in variants:
         text = varied(base, variant, scale)
         config = parse_config(text, f"variant {variant.name}")
         folder = out / variant.name
         say(f"{variant.name}: {variant.says}")
         started = (folder / WEIGHTS_NAME).exists()
-        if started and parse_config(load_file(folder)["config"], f"{folder} (config)") != config:
-            raise ConfigError(f"{folder}: contains a run of another configuration or scale; give another --out")
+        _refuse_another_run(folder, config)
         if not started or int(load_model(folder)[2]["samples"]) < scale.samples:
             opener = lambda seed, size, data=config.data: open_view(data, seed, size)  # noqa: E731
             if run_training(config, text, folder, resume=started, open_sampler=opener).samples < scale.samples:
                 say(f"{variant.name}: interrupted; the same command continues here")
                 break
-        result["rows"][variant.name] = {"says": variant.says, **_measured(folder, config, scale, open_view)}
-        result["windows"] = int(result["rows"][variant.name]["windows"])  # rounded up to whole chunks
+        row = {"says": variant.says, **_measured(folder, config, scale, open_view)}
+        result["windows"] = int(row["windows"])  # rounded up to whole chunks
+        result["rows"] = _with_row(result["rows"], variant.name, row, say)
         (out / RESULT_NAME).write_text(json.dumps(result, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         (out / "table.md").write_text(table(result), encoding="utf-8")
     return result
+
+
+def _earlier(path: Path, of: dict[str, Any]) -> dict[str, Any]:
+    """ablation.json, if there is one. Raises ConfigError if its rows cannot be in one table with those of a result."""
+    if not path.exists():
+        return {}
+    try:
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        same = all(earlier[key] == of[key] for key in of.keys() - {"windows", "rows"})
+        same &= earlier["rows"].keys() <= {variant.name for variant in VARIANTS}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path}: not a result of `ablate`; remove it or give another --out") from error
+    if not same:
+        raise ConfigError(f"{path}: has rows of another configuration or scale; give another --out")
+    return dict(earlier)
+
+
+def _refuse_another_run(folder: Path, config: TrainerConfig) -> None:
+    if not (folder / WEIGHTS_NAME).exists():
+        return
+    if parse_config(load_file(folder)["config"], f"{folder} (config)") != config:
+        raise ConfigError(f"{folder}: contains a run of another configuration or scale; give another --out")
+
+
+def _with_row(rows: dict[str, Any], name: str, row: dict[str, Any], say: Callable[[str], None]) -> dict[str, Any]:
+    """The rows with another one, in the table's order, without those measured on another number of windows."""
+    rows = rows | {name: row}
+    kept = {v.name: rows[v.name] for v in VARIANTS if v.name in rows and rows[v.name]["windows"] == row["windows"]}
+    for left_out in sorted(rows.keys() - kept.keys()):
+        say(f"{left_out}: its row is dropped: it was measured on {rows[left_out]['windows']:.0f} windows")
+    return kept
 
 
 def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: OpenView) -> dict[str, Any]:

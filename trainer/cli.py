@@ -191,8 +191,10 @@ def _add_ablate(commands: argparse._SubParsersAction) -> None:
         "ablate",
         help="train variants of a network with one change at a time, and print a table",
         description="Train every variant for the same number of windows, evaluate all on the same held-out ones, and "
-        "write table.md and ablation.json. Existing runs are kept, and an interrupted one is continued. Exception: a "
-        "variant trained on whole reduced frames alone is evaluated on such frames.",
+        "write table.md and ablation.json. Existing runs are kept, and an interrupted one is continued. Rows of other "
+        "variants in --out stay in the table if they were measured on as many windows; another scale, seed or "
+        "configuration is refused. Exception: a variant trained on whole reduced frames alone is evaluated on such "
+        "frames.",
     )
     ablate.add_argument(
         "--config", type=Path, default=EDGE_CONFIG, help="base configuration (default: configs/edge.toml)"

@@ -26,6 +26,10 @@ def open_view(data: DataConfig, seed: int, size_px: int) -> partial:
     return synthetic_sampler.opener(seed, size_px)
 
 
+def silent(_: str) -> None:
+    pass
+
+
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.name)
 def test_a_variant_is_another_configuration_of_the_same_code(variant) -> None:
     base, config = tiny.config(), parse_config(varied(tiny.config(), variant, SCALE), variant.name)
@@ -79,6 +83,41 @@ def test_rows_are_trained_once_and_stand_in_one_table(tmp_path: Path) -> None:
     assert f"the code of `an-older-one`, `{commit}`" in (tmp_path / "table.md").read_text()
     with pytest.raises(ConfigError, match="another configuration or scale"):
         ablate(tiny.config(), [FULL], Scale(12, 64, 16), tmp_path, said.append, open_view)
+
+
+def test_rows_of_other_variants_stay_where_one_is_added(tmp_path: Path) -> None:
+    said: list[str] = []
+    full = ablate(tiny.config(), [FULL], SCALE, tmp_path, said.append, open_view)
+    both = ablate(tiny.config(), chosen(["direct-depth"]), SCALE, tmp_path, said.append, open_view)
+    assert list(both["rows"]) == ["full", "direct-depth"]
+    assert both["rows"]["full"] == full["rows"]["full"]
+    assert json.loads((tmp_path / "ablation.json").read_text()) == both
+    more = ablate(tiny.config(), [FULL], Scale(8, 64, 32), tmp_path, said.append, open_view)
+    assert (list(more["rows"]), more["windows"]) == (["full"], 32)
+    assert said[-1] == "direct-depth: its row is dropped: it was measured on 16 windows"
+
+
+def test_rows_of_another_scale_seed_or_configuration_are_not_mixed_in(tmp_path: Path) -> None:
+    ablate(tiny.config(), [FULL], SCALE, tmp_path, silent, open_view)
+    before = (tmp_path / "ablation.json").read_text()
+    added = chosen(["direct-depth"])
+    other_seed = parse_config(tiny.TOML.replace("seed = 3", "seed = 5", 1), "other seed")
+    other_batches = parse_config(tiny.TOML.replace("batch_size = 4", "batch_size = 2"), "other batches")
+    for config, scale, told in (
+        (
+            tiny.config(),
+            Scale(16, 64, 16),
+            r"ablation\.json: has rows of another configuration or scale",
+        ),
+        (other_seed, SCALE, r"ablation\.json: has rows of another configuration or scale"),
+        (other_batches, SCALE, "full: contains a run of another configuration"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            ablate(config, added, scale, tmp_path, silent, open_view)
+    assert (tmp_path / "ablation.json").read_text() == before
+    (tmp_path / "ablation.json").write_text(before[:20])
+    with pytest.raises(ConfigError, match=r"ablation\.json: not a result of `ablate`"):
+        ablate(tiny.config(), added, SCALE, tmp_path, silent, open_view)
 
 
 def test_an_interrupted_variant_has_no_row_and_the_next_call_goes_on(tmp_path: Path) -> None:
