@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import zenoh
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from zenoh import handlers
 
 from edge import clock
@@ -48,12 +49,19 @@ class Track(_Body):
     def _corners(self) -> Track:
         x0, y0, x1, y1 = self.box
         if x1 <= x0 or y1 <= y0:
-            raise ValueError("a box is [left, top, right, bottom]")
+            raise ValueError("a box is [left, top, right, bottom] with left < right and top < bottom")
         return self
 
 
 class Select(_Body):
-    target: Annotated[str, Field(pattern=r"^t[0-9]{1,3}$")]
+    target: str
+
+    @field_validator("target")
+    @classmethod
+    def _named(cls, target: str) -> str:
+        if not re.fullmatch(r"t[0-9]{1,3}", target):
+            raise ValueError("a target is named t0, t1, …")
+        return target
 
 
 class Stop(_Body):
