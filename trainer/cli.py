@@ -117,7 +117,8 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--samples",
         type=count,
-        help="total number of training samples (default: the resumed run's, or the configuration's)",
+        help="total number of training samples (default: the resumed run's, or the configuration's); with --resume, "
+        "what is left of the time budget still applies, unless nothing is",
     )
     train.add_argument("--start-from", type=Path, metavar="WEIGHTS", help="initialise from another run's weights.pt")
     train.add_argument("--resume", action="store_true", help="continue from the run folder's checkpoint")

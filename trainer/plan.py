@@ -22,14 +22,13 @@ class Plan(NamedTuple):
     def resumed(self, out: Path, budget_s: float | None, samples: int | None) -> Plan:
         """The plan of the next start, with this much more time and so many samples in total; None: as before.
 
-        Raises ConfigError if the time is used up.
+        If the time is used up, a number of samples lifts its limit; without one, raises ConfigError.
         """
         if budget_s is not None:
             return Plan(samples or self.samples, self.used_before_s, self.used_before_s + budget_s)
-        if samples is not None:
-            return Plan(samples, self.used_before_s)
-        if self.budget_s is not None and self.used_before_s >= self.budget_s:
+        used_up = self.budget_s is not None and self.used_before_s >= self.budget_s
+        if used_up and samples is None:
             raise ConfigError(
                 f"{out}: the run's time budget is used up; give --budget-minutes for more time, or --samples"
             )
-        return self
+        return Plan(samples or self.samples, self.used_before_s, None if used_up else self.budget_s)

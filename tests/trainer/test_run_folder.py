@@ -23,6 +23,7 @@ from trainer.checkpoint import load_file, save_weights, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
+from trainer.plan import Plan
 from trainer.runlog import RunLog, commit_of
 from trainer.train import Trainer, run_training
 
@@ -201,6 +202,13 @@ def test_a_resumed_run_goes_on_within_its_budget(tmp_path: Path) -> None:
     torch.save(state, tmp_path / "resume.pt")
     with pytest.raises(ConfigError, match=f"{tmp_path}: the run's time budget is used up; give --budget-minutes"):
         train(tmp_path, LONG, resume=True)
+
+
+def test_another_number_of_samples_leaves_the_time_budget_as_it_is_until_it_is_used_up() -> None:
+    plan = Plan(1000, used_before_s=40.0, budget_s=60.0)
+    assert plan.resumed(Path("run"), None, 500) == Plan(500, 40.0, 60.0)
+    assert plan.resumed(Path("run"), 5.0, 500) == Plan(500, 40.0, 45.0)
+    assert plan._replace(used_before_s=60.0).resumed(Path("run"), None, 2000) == Plan(2000, 60.0, None)
 
 
 def test_a_plan_that_takes_the_schedule_back_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
