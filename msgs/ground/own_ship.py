@@ -28,6 +28,7 @@ class OwnShip:
     root: str  # reference frame: NED axes at a fixed origin or at the own ship
     R_ned_cam: Array
     t_ned_own_m: Array
+    t_ned_cam_m: Array  # beside it by the mount's lever arm
 
 
 class OwnShipHistory:
@@ -62,8 +63,9 @@ class OwnShipHistory:
             return None
         share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
         turn = so3_log(before.R_ned_cam.T @ after.R_ned_cam)
-        t_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
-        return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), t_m)
+        own_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
+        cam_m = before.t_ned_cam_m + share * (after.t_ned_cam_m - before.t_ned_cam_m)
+        return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), own_m, cam_m)
 
     def near(self, stamp_ns: int) -> OwnShip | None:
         """The state at a time or, if it cannot be interpolated, the nearest one within `NEAR_NS`."""
@@ -80,11 +82,11 @@ def own_ship(message: TFMessage) -> OwnShip | None:
     if topics.FRAME_CAMERA not in links:
         return None
     stamp_ns, place = links[topics.FRAME_CAMERA].stamp_ns, links.get(topics.FRAME_BODY_NED)
-    R, frame = np.eye(3), topics.FRAME_CAMERA
+    R, t_m, frame = np.eye(3), np.zeros(3), topics.FRAME_CAMERA
     while frame in links:
         link = links.pop(frame)
-        R = R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1)) @ R
-        frame = link.frame_id
+        R_link = R_from_q_wxyz(np.roll(link.q_frame_child_xyzw, 1))
+        R, t_m, frame = R_link @ R, link.t_frame_child_m + R_link @ t_m, link.frame_id
     if frame not in (topics.FRAME_NED, topics.FRAME_BODY_NED):
         return None
-    return OwnShip(stamp_ns, frame, R, np.zeros(3) if place is None else place.t_frame_child_m)
+    return OwnShip(stamp_ns, frame, R, np.zeros(3) if place is None else place.t_frame_child_m, t_m)

@@ -111,11 +111,13 @@ def log_image(rec: rr.RecordingStream, uav: str, image: CompressedImage) -> None
     rec.log(f"{uav}/ned/camera/image", rr.EncodedImage(contents=image.data, media_type=_MEDIA_TYPES.get(image.format)))
 
 
-def log_ship(rec: rr.RecordingStream, uav: str, R_ned_body: Array, t_ned_m: Array, R_ned_cam: Array) -> None:
-    """The own ship and its camera, drawn at the ship's position; on the map the ship is at the centre."""
+def log_ship(
+    rec: rr.RecordingStream, uav: str, R_ned_body: Array, t_ned_m: Array, R_ned_cam: Array, t_ned_cam_m: Array
+) -> None:
+    """The own ship and its camera; on the map the ship is at the centre."""
     rec.log(f"{uav}/ned/place", rr.Transform3D(translation=t_ned_m))
     rec.log(f"{uav}/ned/place/ship", rr.Transform3D(mat3x3=R_ned_body))
-    rec.log(f"{uav}/ned/camera", rr.Transform3D(translation=t_ned_m, mat3x3=R_ned_cam))
+    rec.log(f"{uav}/ned/camera", rr.Transform3D(translation=t_ned_cam_m, mat3x3=R_ned_cam))
     rec.log(f"{uav}/ned/trail/ship", rr.Points3D([t_ned_m], colors=[OWN_RGB], radii=[0.6]))
     ahead = rr.Arrows2D(vectors=[30.0 * _on_map(R_ned_body[:, 0])], colors=[OWN_RGB], radii=[2.0])
     rec.log(f"{uav}/map/ship", ahead)
@@ -195,12 +197,12 @@ def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array | Non
 
 
 def log_placed(
-    rec: rr.RecordingStream, row: TargetRow, pose: TargetPose, R_ned_cam: Array, t_ned_own_m: Array,
+    rec: rr.RecordingStream, row: TargetRow, pose: TargetPose, R_ned_cam: Array, t_ned_cam_m: Array,
     size_m: Sequence[float],
 ) -> None:  # fmt: skip
     """The target in space and from above."""
     color, uav, name = rgb(row.target), row.uav, row.target
-    t_m = t_ned_own_m + R_ned_cam @ pose.pose.t_cam_target_m
+    t_m = t_ned_cam_m + R_ned_cam @ pose.pose.t_cam_target_m
     covariance = R_ned_cam @ pose.pose.covariance[:3, :3] @ R_ned_cam.T
     where = f"{uav}/ned/target/{name}"
     label = f"{name}  {row.range_m:.0f} m"
@@ -211,9 +213,9 @@ def log_placed(
         fill_mode="majorwireframe",
     )  # fmt: skip
     rec.log(f"{where}/sigma", doubt)
-    rec.log(f"{where}/line_of_sight", rr.LineStrips3D([[t_ned_own_m, t_m]], colors=[DOUBT_RGB]))
+    rec.log(f"{where}/line_of_sight", rr.LineStrips3D([[t_ned_cam_m, t_m]], colors=[DOUBT_RGB]))
     rec.log(f"{uav}/ned/trail/targets", rr.Points3D([t_m], colors=[color], radii=[0.8]))
-    above_m = _on_map(t_m - t_ned_own_m)
+    above_m = _on_map(t_m - t_ned_cam_m)
     above = f"{uav}/map/target/{name}"
     rec.log(f"{above}/place", rr.Points2D([above_m], colors=[color], labels=[label], radii=[4.0]))
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])

@@ -20,12 +20,11 @@ from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.ground.view import entities
 from msgs.ground.view.layout import TIMELINE
 from msgs.receive import TargetPose
-from msgs.wire import PayloadError
+from msgs.wire import Array, PayloadError
 
 GONE_NS = 1_000_000_000
 _WAITING_MAX = 256
-_ORIGIN_M = np.zeros(3)
-# Without own attitude the camera is drawn level and looking north.
+# Without own attitude the own ship is drawn where it was last, level and heading north, and the camera looking north.
 _R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -33,6 +32,7 @@ _R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 class _Vehicle:
     camera: CameraInfo | None = None
     own: OwnShipHistory = field(default_factory=OwnShipHistory)
+    t_own_m: Array = field(default_factory=lambda: np.zeros(3))  # in ned, the last known
     waiting: deque[tuple[TargetRow, TargetPose]] = field(  # for the own-ship state at their stamps
         default_factory=lambda: deque(maxlen=_WAITING_MAX)
     )
@@ -184,7 +184,8 @@ class Scene:
             return
         self._at(ship.stamp_ns)
         R_ned_body = R_from_q_wxyz(np.roll(body.q_frame_child_xyzw, 1))
-        entities.log_ship(self._rec, uav, R_ned_body, ship.t_ned_own_m, ship.R_ned_cam)
+        entities.log_ship(self._rec, uav, R_ned_body, ship.t_ned_own_m, ship.R_ned_cam, ship.t_ned_cam_m)
+        vehicle.t_own_m = ship.t_ned_own_m
         self._place(uav, vehicle, ship.stamp_ns)
 
     def _place(self, uav: str, vehicle: _Vehicle, until_ns: int | None) -> None:
@@ -198,6 +199,10 @@ class Scene:
             ship = vehicle.own.near(row.stamp_ns)
             if ship is None and not vehicle.told_no_attitude:
                 entities.log_event(self._rec, uav, 30, "own attitude unknown: drawn as if level and looking north")
+                here_m = vehicle.t_own_m
+                entities.log_ship(self._rec, uav, np.eye(3), here_m, _R_NED_CAM_UNKNOWN, here_m)
             vehicle.told_no_attitude = ship is None
-            R_ned_cam, t_own_m = (_R_NED_CAM_UNKNOWN, _ORIGIN_M) if ship is None else (ship.R_ned_cam, ship.t_ned_own_m)
-            entities.log_placed(self._rec, row, pose, R_ned_cam, t_own_m, self._size_m)
+            R_ned_cam, t_ned_cam_m = (
+                (_R_NED_CAM_UNKNOWN, vehicle.t_own_m) if ship is None else (ship.R_ned_cam, ship.t_ned_cam_m)
+            )
+            entities.log_placed(self._rec, row, pose, R_ned_cam, t_ned_cam_m, self._size_m)

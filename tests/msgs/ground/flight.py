@@ -20,6 +20,7 @@ LATE_NS = 12_000_000  # from exposure to being recorded
 SIZE_WH = (1920, 1080)
 K = np.array([[2600.0, 0.0, 959.5], [0.0, 2600.0, 539.5], [0.0, 0.0, 1.0]])
 R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+T_BODY_CAM_M = np.array([3.0, -1.0, 0.5])
 
 Sample = tuple[Topic, str | None, bytes, int]
 
@@ -67,7 +68,7 @@ def samples(frames: int) -> Iterator[Sample]:
 def frame(stamp_ns: int, log_ns: int) -> Iterator[Sample]:
     own_m, target_m = places_m(stamp_ns)
     R_ned_cam = attitude(stamp_ns).as_matrix() @ R_BODY_CAM
-    t_cam_m = R_ned_cam.T @ (target_m - own_m)
+    t_cam_m = R_ned_cam.T @ (target_m - own_m - attitude(stamp_ns).apply(T_BODY_CAM_M))
     q_xyzw = Rotation.from_matrix(R_ned_cam.T @ target_attitude(stamp_ns).as_matrix()).as_quat()
     away = t_cam_m / np.linalg.norm(t_cam_m)
     covariance = np.diag([0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
@@ -82,7 +83,7 @@ def frame(stamp_ns: int, log_ns: int) -> Iterator[Sample]:
         cdr.TransformStamped(stamp_ns, topics.FRAME_NED, topics.FRAME_BODY_NED, own_m, upright),
         cdr.TransformStamped(stamp_ns, topics.FRAME_BODY_NED, topics.FRAME_BODY, np.zeros(3), q_body),
         cdr.TransformStamped(
-            stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, np.zeros(3), Rotation.from_matrix(R_BODY_CAM).as_quat()
+            stamp_ns, topics.FRAME_BODY, topics.FRAME_CAMERA, T_BODY_CAM_M, Rotation.from_matrix(R_BODY_CAM).as_quat()
         ),
     )
     yield topics.TF, None, cdr.TFMessage(chain).encode(), log_ns

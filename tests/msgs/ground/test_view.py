@@ -31,7 +31,21 @@ from msgs.publish import Node
 from tests.waiting import until
 
 from ..conftest import Network, free_endpoint
-from .flight import PERIOD_NS, START_NS, UAV, K, attitude, frame, places_m, record, samples, stamps_ns, target_attitude
+from .flight import (
+    PERIOD_NS,
+    R_BODY_CAM,
+    START_NS,
+    T_BODY_CAM_M,
+    UAV,
+    K,
+    attitude,
+    frame,
+    places_m,
+    record,
+    samples,
+    stamps_ns,
+    target_attitude,
+)  # fmt: skip
 
 FRAMES = 30
 
@@ -99,7 +113,7 @@ def test_the_box_on_the_picture_is_the_projection_of_the_target_s_box(saved: Pat
     own_m, target_m = places_m(stamp_ns)
     corner_m = target_m + target_attitude(stamp_ns).as_matrix() @ np.array([4.0, 6.0, 1.25])
     R_cam_ned = (attitude(stamp_ns) * Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])).inv().as_matrix()
-    x, y, z = R_cam_ned @ (corner_m - own_m)
+    x, y, z = R_cam_ned @ (corner_m - own_m - attitude(stamp_ns).apply(T_BODY_CAM_M))
     expected = [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]
     strips = component(row, "strips").reshape(-1, 2)
     assert np.abs(strips - expected).max(axis=1).min() < 0.05
@@ -215,7 +229,33 @@ def test_where_the_own_ship_is_told_seldom_targets_stand_where_they_were_all_the
     ]
     assert unknown == [stamps_ns(31)[-1]]
     sight = {stamp_ns: component(row, "strips")[0][0] for stamp_ns, row in rows(path, "ned/target/t0/line_of_sight")}
-    assert all(sight[stamp_ns].tolist() == [0.0, 0.0, 0.0] for stamp_ns in stamps_ns(40)[30:])
+    last_m = places_m(stamps_ns(40)[28])[0]
+    for stamp_ns in stamps_ns(40)[30:]:
+        np.testing.assert_allclose(sight[stamp_ns], last_m, atol=1e-3)
+
+
+def test_without_own_attitude_ship_camera_and_targets_are_drawn_as_if_it_flew_level_and_north(tmp_path: Path) -> None:
+    path, last_ns = tmp_path / "flight.mcap", stamps_ns(FRAMES)[9]
+    file = McapFile(path)
+    for topic, target, payload, log_ns in samples(FRAMES):
+        if topic is not topics.TF or log_ns < stamps_ns(FRAMES)[10]:
+            file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.close()
+    assert main(["view", str(path), "--save", str(tmp_path / "flight.rrd")]) == 0
+    own_m = places_m(last_ns)[0]
+    for entity, R in (("ned/place/ship", np.eye(3)), ("ned/camera", R_BODY_CAM)):
+        *_, (_, row) = rows(tmp_path / "flight.rrd", entity)
+        np.testing.assert_allclose(component(row, "mat3x3").reshape(3, 3).T, R, atol=1e-6)
+    *_, (_, row) = rows(tmp_path / "flight.rrd", "map/ship")
+    assert component(row, "vectors") == pytest.approx(np.array([[0.0, -30.0]]))
+    *_, (stamp_ns, row) = rows(tmp_path / "flight.rrd", "ned/target/t0/place")
+    assert stamp_ns == stamps_ns(FRAMES)[-1]
+    t_cam_m = next(
+        cdr.PoseWithCovarianceStamped.decode(payload).t_cam_target_m
+        for topic, _, payload, _ in frame(stamp_ns, stamp_ns)
+        if topic is topics.POSE
+    )
+    np.testing.assert_allclose(component(row, "positions")[0], own_m + R_BODY_CAM @ t_cam_m, atol=1e-3)
 
 
 def test_targets_are_taken_away_by_when_they_came_also_after_our_clock_was_set_back(tmp_path: Path) -> None:
