@@ -96,8 +96,8 @@ class PlaySettings:
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
     """Run the sequence once in real time; `on_record` is called with each record of a peer as it arrives.
 
-    Raises InputError if the daemon rejects its input, PlayError if it is late, fails or does not terminate, or if a
-    peer terminates before it or gives no summary.
+    Raises InputError if the daemon rejects its input, PlayError if it is late, fails, terminates before the last frame
+    or not at all, or if a peer terminates before it or gives no summary.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     for lead_s in LEADS_S:
@@ -134,16 +134,17 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
         }
         if not _wait_until_ready(daemon, peers, recording, records, on_record):
             return None
-        frames_s = len(settings.sequence.scene.images) / settings.sequence.fps
-        deadline_ns = start_at_ns + round((frames_s + _OVERTIME_S) * 1e9)
+        last_ns = start_at_ns + round((len(settings.sequence.scene.images) - 1) * 1e9 / settings.sequence.fps)
+        deadline_ns = last_ns + round(_OVERTIME_S * 1e9)
         while daemon.poll() is None and time.monotonic_ns() < deadline_ns:
             _pass_on(records, recording, on_record, timeout_s=0.05)
             _check_peers_run(peers)
+        left_ns = last_ns - time.monotonic_ns()
         recording.daemon_exit = daemon.poll()
         settled_ns = time.monotonic_ns() + round((_SETTLE_S + settings.link.late_ms_max * 1e-3) * 1e9)
         while time.monotonic_ns() < settled_ns:
             _pass_on(records, recording, on_record, timeout_s=0.05)
-        _check_exit(recording.daemon_exit, settings.out / "daemon.log")
+        _check_exit(recording.daemon_exit, left_ns, settings.out / "daemon.log")
         _check_peers_run(peers)
     while not records.empty():
         _pass_on(records, recording, on_record, timeout_s=0.0)
@@ -160,8 +161,10 @@ def last_counters(log: str) -> dict[str, int]:
     return {name: int(count) for name, count in re.findall(r"(\w+)=(\d+)", stopped[-1].rpartition("|")[2])}
 
 
-def _check_exit(code: int | None, log: Path) -> None:
-    """Raise what the daemon's exit code means, with its last output: InputError for bad input, PlayError otherwise."""
+def _check_exit(code: int | None, left_ns: int, log: Path) -> None:
+    """Raise what the daemon's end means, `left_ns` before the last frame: InputError for bad input, else PlayError."""
+    if code == 0 and left_ns > 0:
+        raise PlayError(f"the daemon ended {left_ns * 1e-9:.1f} s before the last frame, with exit code 0; see {log}")
     if code == 0:
         return
     if code is None:

@@ -18,9 +18,13 @@ from tests.sim_replay.toy_flight import write_toy_flight
 
 
 def peer_pid(name: str) -> int:
+    return child_pid(f"sim_replay.{name}")
+
+
+def child_pid(word: str) -> int:
+    """Of the child process that has this word on its command line."""
     children = " ".join(path.read_text() for path in Path("/proc/self/task").glob("*/children")).split()
-    module = f"sim_replay.{name}".encode()
-    (pid,) = [int(pid) for pid in children if module in Path("/proc", pid, "cmdline").read_bytes().split(b"\0")]
+    (pid,) = [int(pid) for pid in children if word.encode() in Path("/proc", pid, "cmdline").read_bytes().split(b"\0")]
     return pid
 
 
@@ -45,6 +49,20 @@ def test_a_peer_that_is_lost_in_the_flight_fails_it(
     with pytest.raises(PlayError, match=words):
         play(PlaySettings(read_sequence(BUNDLED_SEQUENCE), tmp_path, SHIPPED_MODEL), lose)
     assert not Path("/proc", str(lost[0])).exists()
+
+
+@pytest.mark.parametrize("awaited", ["diagnostics", "pose"])  # before frame 0, and in the flight
+def test_a_daemon_that_is_told_to_stop_before_the_last_frame_fails_the_flight(awaited: str, tmp_path: Path) -> None:
+    stopped: list[int] = []
+
+    def stop(_recording: Recording, record: Record) -> None:
+        if record["event"] == awaited and not stopped:
+            stopped.append(child_pid(str(tmp_path / "out/config.toml")))
+            os.kill(stopped[0], signal.SIGTERM)
+
+    sequence, model = read_sequence(write_toy_flight(tmp_path / "scene")), write_toy_model(tmp_path / "toy.onnx")
+    with pytest.raises(PlayError, match=r"the daemon ended \d+\.\d s before the last frame, with exit code 0"):
+        play(PlaySettings(sequence, tmp_path / "out", model), stop)
 
 
 def test_what_a_slow_link_still_carries_when_the_daemon_has_ended_is_received(tmp_path: Path) -> None:
