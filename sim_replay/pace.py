@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_replay.gimbal import GimbalTrack
 from sim_replay.ground_truth import PlayedSequence
-from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+from sim_replay.telemetry import FLOWN_CSV, Telemetry, read_telemetry, write_telemetry
 
 
 def at_speed(sequence: PlayedSequence, speed: float, folder: Path) -> PlayedSequence:
@@ -20,7 +20,7 @@ def at_speed(sequence: PlayedSequence, speed: float, folder: Path) -> PlayedSequ
     telemetry = read_telemetry(sequence.telemetry_csv)
     values = telemetry.values.copy()
     values[:, np.r_[4:7, 10:13]] *= speed  # rates, velocity
-    path = folder / "telemetry.csv"
+    path = folder / FLOWN_CSV
     write_telemetry(path, Telemetry(_scaled_ns(telemetry.t_ns, sequence.frame0_ns, speed), values))
     track = sequence.gimbal
     gimbal = track and GimbalTrack(_scaled_ns(track.t_ns, sequence.frame0_ns, speed), track.q_ned_gimbal_wxyz)

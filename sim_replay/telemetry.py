@@ -16,7 +16,7 @@ COLUMNS = (
     *("north_m", "east_m", "down_m", "v_north_mps", "v_east_mps", "v_down_mps", "lat_deg", "lon_deg", "alt_m"),
 )
 
-
+FLOWN_CSV = "flown_telemetry.csv"  # in output folders: an output folder may be the scene's, which keeps its own file
 GAP_NS = 500_000_000  # without rows for longer than this, own attitude is unknown, as in the daemon
 GAP_ROWS = 5  # or this many rows, if they are further apart
 

@@ -33,7 +33,7 @@ from sim_replay.faults.relay import LOOPBACK, TcpRelay, UdpRelay, free_port
 from sim_replay.faults.timeline import Start, Who
 from sim_replay.faults.witness import Witness
 from sim_replay.play import PlayError
-from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
+from sim_replay.telemetry import COLUMNS, FLOWN_CSV, Telemetry, write_telemetry
 
 START_S = 120.0
 UPTIME_NS = 734_567_891_234  # of an autopilot that was already running
@@ -185,7 +185,7 @@ class Rig:
         now_ns = time.monotonic_ns()
         self._boot_at_ns = now_ns if step.rebooted else self._boot_at_ns - round(step.clock_ahead_s * 1e9)
         return [
-            *(*python, "sim_replay.autopilot", "--all", "--telemetry", self.settings.out / "telemetry.csv"),
+            *(*python, "sim_replay.autopilot", "--all", "--telemetry", self.settings.out / FLOWN_CSV),
             *("--endpoint", f"{LOOPBACK}:{self.mavlink.port}", "--start-at-ns", str(now_ns)),
             *("--boot-at-ns", str(self._boot_at_ns), "--system-id", str(step.system_id)),
             *(("--signing-key", self.settings.out / KEY) if self.settings.signed else ()),
@@ -203,7 +203,7 @@ class Rig:
         if self.settings.signed and not (out / KEY).exists():
             write_new_key(out / KEY)
         (out / "router.toml").write_text(f'listen = ["tcp/{LOOPBACK}:{self._router_port}"]\n', encoding="utf-8")
-        write_telemetry(out / "telemetry.csv", at_rest())
+        write_telemetry(out / FLOWN_CSV, at_rest())
         (out / "config.toml").write_text(self._config(), encoding="utf-8")
 
     def _config(self) -> str:

@@ -24,7 +24,7 @@ from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.pipeline.usage import Usage, usage_of
 from sim_replay.play import LEADS_S, READY_MARGIN_NS, PlayError
-from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+from sim_replay.telemetry import FLOWN_CSV, Telemetry, read_telemetry, write_telemetry
 
 UAV = "uav1"
 SAMPLE_S = 1.0
@@ -101,7 +101,7 @@ def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
     rounds = math.ceil(settings.minutes * 60 / settings.period_s) + 1
     sequence = settings.sequence
     telemetry = sped_up(read_telemetry(sequence.telemetry_csv), sequence.frame0_ns, settings.fps / sequence.fps)
-    looped_csv = settings.out / "telemetry.csv"
+    looped_csv = settings.out / FLOWN_CSV
     write_telemetry(looped_csv, looped(telemetry, sequence.frame0_ns, settings.period_s, rounds))
     for lead_s in LEADS_S:
         flight = _attempt(settings, looped_csv, lead_s, on_second)

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 
 from sim_replay.cli import main
+from sim_replay.faults.rig import Rig, RigSettings
+from sim_replay.ground_truth import read_sequence
+from sim_replay.pace import at_speed
 from sim_replay.pipeline.flight import Flight
 from sim_replay.pipeline.soak import silences, trends
 from sim_replay.pipeline.usage import Usage
@@ -133,6 +136,17 @@ def test_a_soak_without_a_pose_fails(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(flown) == 1
     assert "the autopilot received no pose" in capsys.readouterr().out
     assert "the subscriber received no pose" in json.loads((tmp_path / "soak.json").read_text())["silences"]
+
+
+def test_a_scene_that_is_its_own_output_folder_stays_as_it_was(tmp_path: Path) -> None:
+    scene, model = write_toy_flight(tmp_path / "scene"), write_toy_model(tmp_path / "toy.onnx")
+    before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
+    flown = ["bench-pipeline", "--minutes", "0.02", "--sequence", str(scene), "--model", str(model)]
+    assert main([*flown, "--out", str(scene)]) == 0
+    at_speed(read_sequence(scene), 2.0, scene)
+    with Rig(RigSettings(scene, scene, model)):
+        pass
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_an_interrupted_run_does_not_leave_the_report_of_an_earlier_one(tmp_path: Path) -> None:
