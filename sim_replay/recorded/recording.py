@@ -24,6 +24,7 @@ from msgs.cdr import CameraInfo, CompressedImage, TFMessage, TransformStamped
 from msgs.geometry import R_from_q_wxyz, q_wxyz_from_R, so3_log
 from msgs.ground.errors import InputError as RecordingError
 from msgs.ground.view.recorded import samples
+from msgs.recording import CLOCK_STEP_NS
 from msgs.wire import PayloadError
 from sim_replay.bop.records import BopFrame
 from sim_replay.bop.write import SceneWriter
@@ -50,11 +51,20 @@ class Recorded:
     picture_ns: list[int] = field(default_factory=list)
     lens: list[CameraInfo] = field(default_factory=list)  # of each image
     own_of: dict[str, Stamped] = field(default_factory=dict)  # by vehicle
+    newest_ns: dict[tuple[str, str], int] = field(default_factory=dict)  # stamp, by vehicle and topic
+    set_back_in: dict[str, Path] = field(default_factory=dict)  # the first file with a clock set back, by vehicle
 
     @property
     def own(self) -> Stamped:
         """Of the vehicle whose images they are."""
         return self.own_of.get(self.uav or "", {})
+
+    def note_stamp(self, uav: str, topic: topics.Topic, stamp_ns: int, path: Path) -> None:
+        """Notice if the vehicle's clock has been set back by more than the recorder keeps in one file."""
+        newest_ns = max(self.newest_ns.get((uav, topic.name), stamp_ns), stamp_ns)
+        self.newest_ns[uav, topic.name] = newest_ns
+        if stamp_ns < newest_ns - CLOCK_STEP_NS:
+            self.set_back_in.setdefault(uav, path)
 
 
 def unpack_recordings(paths: Sequence[Path], folder: Path, on_picture: Callable[[], None]) -> None:
@@ -99,6 +109,7 @@ def _read(paths: Sequence[Path], on_picture: Callable[[int, CompressedImage], No
                         raise InputError(f"{path}: holds pictures of both {recorded.uav} and {one.uav}")
                     recorded.uav = one.uav
                     image = CompressedImage.decode(one.payload)
+                    recorded.note_stamp(one.uav, one.topic, image.stamp_ns, path)
                     if not recorded.picture_ns or image.stamp_ns > recorded.picture_ns[-1]:
                         on_picture(len(recorded.picture_ns), image)
                         recorded.picture_ns.append(image.stamp_ns)
@@ -106,7 +117,9 @@ def _read(paths: Sequence[Path], on_picture: Callable[[int, CompressedImage], No
                 elif one.topic is topics.TF:
                     links = {link.child_frame_id: link for link in TFMessage.decode(one.payload).transforms}
                     if topics.FRAME_BODY in links and topics.FRAME_CAMERA in links:
-                        recorded.own_of.setdefault(one.uav, {})[links[topics.FRAME_BODY].stamp_ns] = links
+                        stamp_ns = links[topics.FRAME_BODY].stamp_ns
+                        recorded.note_stamp(one.uav, one.topic, stamp_ns, path)
+                        recorded.own_of.setdefault(one.uav, {})[stamp_ns] = links
         except (RecordingError, PayloadError) as error:
             raise InputError(str(error) if isinstance(error, RecordingError) else f"{path}: {error}") from error
     return recorded
@@ -118,6 +131,9 @@ def _check(paths: Sequence[Path], recorded: Recorded) -> None:
         raise InputError(f"{path}: holds no pictures: set [recorder] image_max_hz where it is recorded")
     if len(recorded.own) < 2:
         raise InputError(f"{path}: holds no attitude of the own ship (/{recorded.uav}/tf): no autopilot was heard")
+    if (set_back_in := recorded.set_back_in.get(recorded.uav or "")) is not None:
+        remedy = "give the files one by one" if len(paths) > 1 else "only times that increase can be played"
+        raise InputError(f"{set_back_in}: the clock of {recorded.uav} was set back: {remedy}")
     gap_s = float(np.diff(recorded.picture_ns).max()) * 1e-9
     if gap_s > GAP_S_MAX:
         raise InputError(f"{path}: is more than one flight: no picture for {gap_s:.0f} s; give its files one by one")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rich.console import Console
 
+from edge.errors import InputError
 from edge.pictures import Rate
 from msgs import topics
 from msgs.cdr import CompressedImage, TFMessage
@@ -130,6 +132,40 @@ def test_another_vehicle_in_the_recording_does_not_move_this_one(recorded: Path,
     alone, beside = opened(recorded, tmp_path / "alone"), opened(both, tmp_path / "beside")
     np.testing.assert_array_equal(beside.t_ns, alone.t_ns)
     np.testing.assert_array_equal(beside.values, alone.values)
+
+
+def test_files_of_a_flight_whose_clock_was_set_back_are_refused_together_and_played_one_by_one(
+    recorded: Path, tmp_path: Path
+) -> None:
+    def earlier(topic: str, data: bytes) -> Iterator[tuple[str, bytes]]:
+        if topic.endswith("/image/compressed"):
+            image = CompressedImage.decode(data)
+            data = replace(image, stamp_ns=image.stamp_ns - 2 * 10**9).encode()
+        elif topic.endswith("/tf"):
+            links = TFMessage.decode(data).transforms
+            data = TFMessage(tuple(replace(one, stamp_ns=one.stamp_ns - 2 * 10**9) for one in links)).encode()
+        yield topic, data
+
+    flight = tmp_path / "flight"
+    flight.mkdir()
+    shutil.copyfile(recorded, flight / "uav1_000000.mcap")
+    second = rewritten(recorded, flight / "uav1_000001.mcap", earlier)
+    with pytest.raises(InputError, match=rf"^{second}: the clock of uav1 was set back: give the files one by one$"):
+        open_sequence(flight, tmp_path / "both", Console(quiet=True))
+    np.testing.assert_array_equal(opened(second, tmp_path / "one").t_ns, opened(recorded, tmp_path / "other").t_ns)
+
+
+def test_a_clock_of_another_vehicle_that_was_set_back_is_no_obstacle(recorded: Path, tmp_path: Path) -> None:
+    stamps_s = iter([100, *range(1000)])
+
+    def also_heard(topic: str, data: bytes) -> Iterator[tuple[str, bytes]]:
+        yield topic, data
+        if topic.endswith("/tf"):
+            links, stamp_ns = TFMessage.decode(data).transforms, next(stamps_s) * 10**9
+            yield "/uav2/tf", TFMessage(tuple(replace(one, stamp_ns=stamp_ns) for one in links)).encode()
+
+    both = rewritten(recorded, tmp_path / "both.mcap", also_heard)
+    np.testing.assert_array_equal(opened(both, tmp_path / "out").t_ns, opened(recorded, tmp_path / "alone").t_ns)
 
 
 @pytest.mark.parametrize(("camera_hz", "image_max_hz", "resolution_ns"), [(30, 20, 1), (25, 10, 1), (60, 60, 10**6)])
