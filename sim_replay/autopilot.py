@@ -276,9 +276,10 @@ def _emit(record: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _fly(autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event) -> None:
+def _fly(
+    autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event, parent: int
+) -> None:
     """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process has ended."""
-    parent = os.getppid()
     outward, inward = Lane(faults), Lane(faults, seed=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((address[0] if address[0].startswith("127.") else "0.0.0.0", 0))
@@ -331,6 +332,7 @@ def _address(text: str) -> tuple[str, int]:
 
 
 def main(argv: list[str] | None = None) -> int:
+    parent = os.getppid()  # now: later, it may already be the process that inherits orphans
     parser = argparse.ArgumentParser(prog="python -m sim_replay.autopilot", description=__doc__.splitlines()[0])
     parser.add_argument("--telemetry", type=Path, required=True, help="telemetry.csv of the sequence")
     parser.add_argument("--endpoint", type=_address, required=True, help="HOST:PORT the daemon listens on (udpin)")
@@ -366,7 +368,7 @@ def main(argv: list[str] | None = None) -> int:
         autopilot = Autopilot(
             telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
         )
-        _fly(autopilot, args.endpoint, link_faults(args), stop)
+        _fly(autopilot, args.endpoint, link_faults(args), stop, parent)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0
 

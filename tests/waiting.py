@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 WITHIN_S = 60.0  # what a test waits for takes well under a second, but the machine may be busy
 LOOK_EVERY_S = 0.01
@@ -23,3 +24,11 @@ def until(
         if act is not None:
             act()
         time.sleep(LOOK_EVERY_S)
+
+
+def runs(pid: int) -> bool:
+    """Whether the process has not ended; one that nobody has waited for yet has (Linux: state Z of /proc/PID/stat)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
