@@ -22,7 +22,7 @@ from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 from msgs.cdr import CompressedImage
 from msgs.session import client_config
-from msgs.topics import parse_attachment
+from msgs.topics import IMAGE, dds_type, parse_attachment
 from msgs.wire import PayloadError
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,8 @@ class ZenohSource:
     """The newest picture of a topic, with its header's timestamp as long as the sender's UTC agrees with ours.
 
     A picture that cannot be decoded or whose shape does not fit the calibration is counted and dropped, and so are
-    those of a second publisher: of two cameras, or a camera and a recording of it, only one is used.
+    those of a second publisher: of two cameras, or a camera and a recording of it, only one is used. So is whatever
+    comes on a topic below this one, or is of another type.
     """
 
     live = True
@@ -66,12 +67,14 @@ class ZenohSource:
         self._session: zenoh.Session | None = None
         self._arrived = threading.Condition()
         self._sample: tuple[int, bytes, bytes] | None = None  # arrival_ns, payload, attachment
+        self._stem = f"{settings.domain}/{settings.topic}"
+        self._other_key = ""  # of the last sample that was not on the topic or not of its type
         self._clock = UtcClock()
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # publisher of the last picture, and its sequence number
         self._heeded: tuple[bytes, int] | None = None  # the publisher in use, and when its last picture arrived (ns)
-        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0)
+        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0, other_topic=0)
 
     def nominal(self) -> CameraInfo:
         lens = self._intrinsics
@@ -82,8 +85,7 @@ class ZenohSource:
         tls = self._settings.tls.files() if self._settings.tls is not None else None
         try:
             self._session = zenoh.open(client_config([self._settings.connect], tls=tls))
-            key = f"{self._settings.domain}/{self._settings.topic}/**"
-            self._session.declare_subscriber(key, handlers.Callback(self._take, indirect=False))
+            self._session.declare_subscriber(f"{self._stem}/**", handlers.Callback(self._take, indirect=False))
         except zenoh.ZError as error:
             self.close()
             reason = str(error).partition(" at /")[0].rstrip("! ")  # the rest is a location in zenoh's source
@@ -93,7 +95,7 @@ class ZenohSource:
     def read(self, stop: threading.Event) -> Frame:
         """The next picture. Raises SourceLost if none arrived for three seconds, or none that can be used."""
         silent_ns = time.monotonic_ns() + round(SILENCE_S * 1e9)
-        unusable, why = 0, ""
+        unusable, why, others = 0, "", self.counts["other_topic"]
         while time.monotonic_ns() < silent_ns:
             if stop.is_set():
                 raise EndOfStream
@@ -111,6 +113,10 @@ class ZenohSource:
         if unusable:
             # "No picture" would make the user check the cable instead of the calibration.
             raise SourceLost(f"of {unusable} pictures on {topic} in {seconds} none can be used: the last {why}")
+        if self.counts["other_topic"] > others:
+            raise SourceLost(
+                f"no sensor_msgs/CompressedImage on {topic} for {seconds}, but samples on {self._other_key}"
+            )
         raise SourceLost(f"no picture on {topic} for {seconds}")
 
     def close(self) -> None:
@@ -120,6 +126,12 @@ class ZenohSource:
 
     def _take(self, sample: zenoh.Sample) -> None:
         """On zenoh's thread: keep the newest picture; a replaced one shows as a gap in the sequence numbers."""
+        key = str(sample.key_expr)
+        if not of_topic(key, self._stem):
+            with self._arrived:
+                self._other_key = key
+                self.counts["other_topic"] += 1
+            return
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         parsed, now_ns = parse_attachment(attachment), time.monotonic_ns()
         publisher = b"" if parsed is None else parsed[2]
@@ -168,6 +180,13 @@ class ZenohSource:
             self._sent = (publisher, sent)
         self._sequence += step
         return self._sequence - 1
+
+
+def of_topic(key: str, stem: str) -> bool:
+    """Whether a key is that of pictures on the topic `stem` (`<domain>/<topic>`): with their type and any hash, as
+    rmw_zenoh has it, or without both. `stem/**` also matches the topics below."""
+    below = key.removeprefix(stem).split("/")[1:]
+    return not below or (len(below) == 2 and below[0] == dds_type(IMAGE))
 
 
 def decode_picture(data: bytes) -> NDArray[np.uint8] | None:

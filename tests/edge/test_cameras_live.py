@@ -7,6 +7,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from msgs import topics
 from msgs.cdr import CompressedImage
 from msgs.publish import Node, TopicPublisher
 from msgs.session import client_config, router_config
+from tests.waiting import until
 
 from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
 
@@ -81,7 +83,7 @@ def zenoh_camera(port: int) -> ZenohCamera:
     )
 
 
-def put_until_read(source: ZenohSource, publisher: TopicPublisher, payload: bytes) -> Frame:
+def put_until_read(source: ZenohSource, publisher: TopicPublisher | zenoh.Publisher, payload: bytes) -> Frame:
     """The first pictures may be lost while the subscription spreads."""
     frames: list[Frame] = []
     reader = threading.Thread(target=lambda: frames.append(source.read(threading.Event())))
@@ -189,6 +191,53 @@ def test_of_two_cameras_on_one_topic_one_alone_is_looked_through_until_it_is_gon
             assert source.counts["other_publisher"] > 0
             # The camera falls silent: what else there is takes its place.
             assert number_of(put_until_read(source, recording, message(9))) == 9
+
+
+IMAGE_TYPE = "sensor_msgs::msg::dds_::CompressedImage_"
+
+
+@pytest.mark.parametrize(
+    "below",
+    [
+        f"thermal/{IMAGE_TYPE}/RIHS01_1",
+        "info/sensor_msgs::msg::dds_::CameraInfo_/RIHS01_1",
+        "sensor_msgs::msg::dds_::Image_/RIHS01_1",
+        "thermal",
+    ],
+)
+def test_another_topic_below_the_camera_s_or_another_type_is_not_taken_for_the_camera(below: str) -> None:
+    port = free_port()
+    with router(port) as camera, closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        with zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+            key = f"0/nose/image/compressed/{below}"
+            until(lambda: source.counts["other_topic"] > 0, lambda: session.put(key, message(9)))
+            assert number_of(put_until_read(source, camera, message(1))) == 1
+        assert source.counts["other_publisher"] == 0
+
+
+@pytest.mark.parametrize("below", ["", f"/{IMAGE_TYPE}/{topics.HASH_UNSUPPORTED}"])
+def test_pictures_on_the_topic_are_taken_from_any_ros_and_from_a_plain_publisher(below: str) -> None:
+    port = free_port()
+    with router(port), closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        with zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+            publisher = session.declare_publisher(f"0/nose/image/compressed{below}")
+            assert number_of(put_until_read(source, publisher, message(5))) == 5
+
+
+def test_a_topic_of_another_type_is_told_apart_from_one_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_topic, "SILENCE_S", 0.5)
+    port, key = free_port(), "0/nose/image/compressed/sensor_msgs::msg::dds_::Image_/RIHS01_1"
+    with router(port), closing(ZenohSource(zenoh_camera(port))) as source, ThreadPoolExecutor() as pool:
+        source.open()
+        reading = pool.submit(source.read, threading.Event())
+        with zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+            while not reading.done():
+                session.put(key, b"raw")
+                time.sleep(0.02)
+        with pytest.raises(SourceLost, match=f"no sensor_msgs/CompressedImage on .* but samples on {key}"):
+            reading.result()
 
 
 def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None:
