@@ -15,7 +15,7 @@ from edge.cameras import open_source
 from edge.cameras.capture import Capture
 from edge.cameras.source import EndOfStream
 from edge.config import ConfigFile
-from edge.doctor_links import CAMERA_REASONS, link_findings, running_daemon, told_reasons
+from edge.doctor_links import CAMERA_REASONS, STARTING, is_starting, link_findings, running_daemon, told_reasons
 from edge.doctor_machine import machine_findings
 from edge.errors import InputError
 from edge.estimator.model import Model
@@ -26,9 +26,16 @@ from edge.reload import load_configured
 FRAME_S = 8.0
 TIMED_RUNS = 10
 LIVE_FRAMES = 20
-STAMPS = "camera_stamps"
-ADVICE = {  # by the kind of edge.health.Reason
+WATCHED_S = 2.0  # at least: the first images of many cameras come irregularly
+RATED_NS = 1_000_000_000  # less says little about the rate
+RATE_SHARE_MIN, BAD_SHARE_MAX = 0.8, 0.1
+STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
+USABLE = {STAMPS, UNSTAMPED, UNDECODABLE, SLOW}  # a busy machine may cause these too; there are images nevertheless
+ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     STAMPS: "see docs/cameras.md on timestamps; images that arrive in bursts also cause this",
+    UNSTAMPED: "see docs/cameras.md on timestamps; arrival is later than exposure, so measure [camera] latency_ms",
+    UNDECODABLE: "check cable, USB port or radio link; zenoh: also that images are JPEG or PNG with 8 bits a channel",
+    SLOW: "ask for a rate and a format that the camera has, give it more light, or stop other programs",
     "camera_frozen": "point it at something that moves; if it stays frozen, unplug it and plug it in again",
 }
 ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"
@@ -63,6 +70,9 @@ def findings(file: ConfigFile) -> Iterator[Finding]:
 
 def camera_as_told(running: Mapping[str, Any]) -> Iterator[tuple[Finding, float | None]]:
     """Findings as reported by the running daemon: a camera serves one program at a time."""
+    if is_starting(running):
+        yield poor("camera", *STARTING), None
+        return
     of_camera = [(kind, text) for kind, text in told_reasons(running) if kind.startswith(CAMERA_REASONS)]
     if of_camera:
         said = "; ".join(text for _, text in of_camera)
@@ -91,28 +101,46 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
     try:
         seen_ns, size_wh = _see_frames(capture)
         reasons = [(one.kind, one.text) for one in capture.reasons(time.monotonic_ns())]
+        counters = capture.counters()
     except InputError as error:
         yield wrong("camera", str(error), "correct this in [camera]"), None
         return
     finally:
         capture.stop()
-    said = "; ".join(text for _, text in reasons)
     if size_wh is None:
+        said = "; ".join(text for _, text in reasons)
         advice = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
         why = f": {said}" if said else ""
         yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
     # Stamps may all be the same, of a driver that gives whole seconds, or jump back.
     took_ns = seen_ns[-1] - seen_ns[0]
-    rate_hz = (len(seen_ns) - 1) / (took_ns / 1e9) if len(seen_ns) > 2 and took_ns > 0 else None
+    came = len(seen_ns) - 1 + counters["dropped_overtaken"]
+    rate_hz = came / (took_ns / 1e9) if len(seen_ns) > 2 and took_ns > 0 else None
+    asked_hz = getattr(camera, "fps", None) if took_ns >= RATED_NS else None
+    reasons += shortfalls(counters, rate_hz, asked_hz)
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
     text = f"{name}: {size_wh[0]}x{size_wh[1]}{rate}"
     if not reasons:
         yield good("camera", text), rate_hz
         return
-    # Jumping timestamps may be due to a busy machine; a camera that is frozen or lost again gives no usable frames.
-    bad = poor if all(kind == STAMPS for kind, _ in reasons) else wrong
+    said = "; ".join(text for _, text in reasons)
+    # A camera that is frozen or lost again gives no usable frames.
+    bad = poor if all(kind in USABLE for kind, _ in reasons) else wrong
     yield bad("camera", f"{text}; {said}", _advice(reasons)), rate_hz
+
+
+def shortfalls(counters: Mapping[str, int], rate_hz: float | None, asked_hz: float | None) -> Iterator[tuple[str, str]]:
+    """Kind and text of each fault of a camera that gives images nevertheless. `counters`: of Capture; `asked_hz`: None
+    if no rate is configured, or too little was seen to judge it."""
+    captured = counters["captured"]
+    unstamped, undecodable = counters.get("camera_unstamped", 0), counters.get("camera_undecodable", 0)
+    if unstamped > BAD_SHARE_MAX * captured:
+        yield UNSTAMPED, f"{unstamped} impossible timestamps replaced by the arrival time, {captured} images captured"
+    if undecodable > BAD_SHARE_MAX * captured:
+        yield UNDECODABLE, f"{undecodable} images could not be decoded, {captured} could"
+    if rate_hz is not None and asked_hz is not None and rate_hz < RATE_SHARE_MIN * asked_hz:
+        yield SLOW, f"[camera] fps is {asked_hz:g}, but only {rate_hz:.1f} a second arrive"
 
 
 def _advice(reasons: Iterable[tuple[str, str]]) -> str:
@@ -123,12 +151,15 @@ def _advice(reasons: Iterable[tuple[str, str]]) -> str:
 def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
     """Exposure times of the first frames received, and the size of the last; None: no frame. Raises InputError."""
     until_s, seen_ns, size_wh = time.monotonic() + FRAME_S, list[int](), None
-    while time.monotonic() < until_s and len(seen_ns) < LIVE_FRAMES:
+    enough_s = until_s
+    while (now_s := time.monotonic()) < until_s and (len(seen_ns) < LIVE_FRAMES or now_s < enough_s):
         try:
             frame = capture.newest(0.2)
         except EndOfStream:
             break
         if frame is not None:
+            if not seen_ns:
+                enough_s = time.monotonic() + WATCHED_S
             seen_ns.append(frame.meta.capture_ns)
             size_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
     return seen_ns, size_wh

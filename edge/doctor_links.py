@@ -40,6 +40,7 @@ NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = (
     "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
 )
+STARTING = ("the daemon is still starting", "run doctor again in a few seconds")
 ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
 HEARING_S = 4.0
 LOOK_S = 0.1
@@ -47,8 +48,11 @@ LOOK_S = 0.1
 
 def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator[Finding]:
     """`running`: the running daemon's `info`, if any: its endpoints are then in use and not tried."""
+    if running is not None and is_starting(running):
+        yield poor("daemon", *STARTING)
+        return
     if running is not None:
-        said = f"running (process {running['pid']}), state {running.get('state', 'starting')}"
+        said = f"running (process {running['pid']}), state {running['state']}"
         others = {kind: text for kind, text in told_reasons(running) if not kind.startswith(CAMERA_REASONS)}
         if NO_AUTOPILOT in others:
             yield wrong("daemon", f"{said}: {'; '.join(others.values())}", ADVICE_AUTOPILOT)
@@ -64,6 +68,11 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
         yield from _mavlink(config.mavlink)
     if config.health.prometheus_port is not None:
         yield metrics_finding(config.health.prometheus_port)
+
+
+def is_starting(running: Mapping[str, Any]) -> bool:
+    """Whether a daemon has not judged itself yet: it knows nothing of its camera and links then."""
+    return "state" not in running
 
 
 def told_reasons(running: Mapping[str, Any]) -> list[tuple[str, str]]:
