@@ -13,6 +13,7 @@ import cv2
 from edge.addresses import no_password
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
+from edge.cameras.losses import Losses
 from edge.cameras.source import SourceLost
 from edge.cameras.stamps import CAUGHT_UP_NS, StreamClock
 from edge.cameras.video import is_counted, may_be_bare_jpeg, open_video
@@ -21,8 +22,14 @@ from edge.errors import InputError
 from edge.types import Frame
 
 TIMEOUT_MS = 3000
+LOSSY = ("udp:", "rtp:")
+KEY_FRAME = ord("I")
 BEHIND_MAX_NS = 250_000_000  # a permanent backlog; a reopened stream begins with current frames
-# The only way to pass options to ffmpeg through OpenCV. Unlike ffmpeg's defaults, these keep no frames in a buffer.
+# The decoder holds back one frame fewer than it has threads, and OpenCV gives it one thread per core: the delay would
+# differ from computer to computer.
+DECODER_THREADS = 1
+# The only way to pass options to ffmpeg through OpenCV. Unlike ffmpeg's defaults, these let no frames wait before the
+# decoder.
 OPTIONS_VARIABLE = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 LOW_DELAY = "fflags;nobuffer|flags;low_delay"
 
@@ -35,25 +42,38 @@ class StreamSource(LiveSource):
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
+        # Over TCP nothing is lost; a step is then of the camera's own, which predicts its pictures from those it sent.
+        self._lossy = settings.url.startswith(LOSSY) or (
+            settings.url.startswith("rtsp") and settings.rtsp_transport == "udp"
+        )
+        self._losses = Losses()
+        self._damaged = False  # the picture read last
         self._timeless = False
         self._unread_since_ns: int | None = None  # since when it is open without anything having been read
-        self.counts["catching_up"] = 0
+        self.counts["catching_up"] = self.counts["damaged"] = 0
 
     def read(self, stop: threading.Event) -> Frame:
-        """The next frame; frames that were buffered, here or in the server, are skipped, as their age is unknown."""
+        """The next frame. Skipped are frames that were buffered, here or in the server, as their age is unknown, and
+        those that are damaged by a loss before them."""
         if self._waited_unnoticed():
             self._call_again()
         self._unread_since_ns = None
         while True:
             frame = super().read(stop)
-            if self._clock.caught_up:
+            if not self._clock.caught_up:
+                self.counts["catching_up"] += 1
+            elif self._damaged:
+                self.counts["damaged"] += 1
+            else:
                 return frame
-            self.counts["catching_up"] += 1
 
     def _connect(self) -> cv2.VideoCapture:
         transport = f"rtsp_transport;{self._settings.rtsp_transport}|" if self._settings.url.startswith("rtsp") else ""
-        self._clock = StreamClock()
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
+        self._clock, self._losses, self._damaged = StreamClock(), Losses(), False
+        limits = [
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS,
+            cv2.CAP_PROP_N_THREADS, DECODER_THREADS,
+        ]  # fmt: skip
         with _ffmpeg_options(transport + LOW_DELAY):
             capture = open_video(self._settings.url, limits)
         self._timeless = not transport and may_be_bare_jpeg(capture)
@@ -77,6 +97,9 @@ class StreamSource(LiveSource):
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
         self._timeless = self._timeless and is_counted(position_ms)
+        if self._lossy and self._capture is not None:
+            key = int(self._capture.get(cv2.CAP_PROP_FRAME_TYPE)) == KEY_FRAME
+            self._damaged = self._losses.damaged(position_ms, key)
         stamp_ns = self._clock.monotonic_ns(0 if self._timeless else round(position_ms * 1e6), arrival_ns)
         if (behind_ns := self._clock.behind_ns(arrival_ns)) > BEHIND_MAX_NS:
             raise SourceLost(f"the stream runs {behind_ns / 1e9:.1f} s behind itself")

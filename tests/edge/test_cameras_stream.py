@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from fractions import Fraction
 
 import av
@@ -14,34 +14,39 @@ import numpy as np
 import pytest
 
 from edge.cameras.capture import Capture
+from edge.cameras.losses import Losses
 from edge.cameras.source import SourceLost
 from edge.cameras.stream import StreamSource
 from edge.config_camera import StreamCamera
 from edge.types import Frame
 from tests.waiting import until
 
-from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, picture
+from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
 
 WAITING = 40  # frames
+TENTH_IS_KEY = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "keyint=10:min-keyint=10:scenecut=0"}
 
 
 class UdpCamera(threading.Thread):
-    """An encoder that sends MPEG-TS over UDP in real time until told to stop."""
+    """An encoder that sends MPEG-TS over UDP in real time until told to stop, with a key frame each tenth."""
 
-    def __init__(self, port: int, fps: int) -> None:
+    def __init__(self, port: int, fps: int, lost: int | None = None) -> None:
+        """`lost`: the number of a picture, modulo 50, that does not arrive."""
         super().__init__()
         self._url, self._fps, self.stop = f"udp://127.0.0.1:{port}?pkt_size=1316", fps, threading.Event()
+        self._lost = lost
 
     def run(self) -> None:
         with av.open(self._url, "w", format="mpegts") as out:
-            stream = out.add_stream("mpeg2video", rate=self._fps)
+            stream = out.add_stream("libx264", rate=self._fps, options=TENTH_IS_KEY)
             stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
-            stream.codec_context.gop_size, stream.codec_context.max_b_frames = 5, 0
             start_s, index = time.monotonic(), 0
             while not self.stop.wait(max(start_s + index / self._fps - time.monotonic(), 0)):
                 frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
                 frame.pts, frame.time_base = index, Fraction(1, self._fps)
-                out.mux(stream.encode(frame))
+                packets = stream.encode(frame)
+                if index % 50 != self._lost:
+                    out.mux(packets)
                 index += 1
 
 
@@ -64,6 +69,71 @@ def test_a_udp_stream_is_stamped_by_its_own_clock() -> None:
     # However the frames bunched on their way, most steps are the camera's own to the microsecond.
     assert np.median(np.abs(np.diff(stamps_ns) - 50_000_000)) < 100_000
     assert all(frame.distortion == tuple(LENS) for frame in frames)
+
+
+def test_what_is_damaged_by_a_loss_before_it_is_not_shown() -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    encoder = UdpCamera(port, fps=20, lost=33)
+    encoder.start()
+    try:
+        source = StreamSource(StreamCamera(type="stream", url=f"udp://127.0.0.1:{port}", intrinsics=INTRINSICS))
+        with closing(source):
+            source.open()
+            numbers = []
+            while source.counts["damaged"] == 0:
+                numbers.append(number_of(source.read(threading.Event())))
+    finally:
+        encoder.stop.set()
+        encoder.join()
+    assert source.counts["damaged"] == 6
+    assert numbers[-2:] == [32 % 25, 40 % 25]
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0])
+def test_a_picture_is_damaged_from_a_loss_to_the_next_key_frame_or_for_two_seconds(rate_hz: float) -> None:
+    losses, step_ms = Losses(), 1000.0 / rate_hz
+    times_ms = [index * step_ms for index in range(200) if index not in (50, 130)]
+    damaged = [time_ms for time_ms in times_ms if losses.damaged(time_ms, key=time_ms in (0.0, 60 * step_ms))]
+    assert damaged[:9] == pytest.approx([index * step_ms for index in range(51, 60)])
+    assert damaged[9] == pytest.approx(131 * step_ms)
+    assert damaged[-1] - damaged[9] == pytest.approx(2000.0, abs=1.01 * step_ms)
+
+
+class SilentCamera(threading.Thread):
+    """A server that sends so many pictures of H.264 in MPEG-TS and then nothing, until told to stop."""
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__(daemon=True)
+        self._server, self._pictures, self.stop = socket.create_server(("127.0.0.1", 0)), pictures, threading.Event()
+        self.port = int(self._server.getsockname()[1])
+
+    def run(self) -> None:
+        with self._server, self._server.accept()[0] as connected:
+            out = av.open(Caller(connected), "w", format="mpegts")
+            stream = out.add_stream("libx264", rate=50, options=TENTH_IS_KEY)
+            stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
+            start_s = time.monotonic()
+            for index in range(self._pictures):
+                time.sleep(max(start_s + index / 50 - time.monotonic(), 0))
+                frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
+                frame.pts, frame.time_base = index, Fraction(1, 50)
+                out.mux(stream.encode(frame))
+            self.stop.wait()
+
+
+def test_the_decoder_holds_no_picture_back() -> None:
+    """Only what is read ahead waits, here until nothing came for seconds: that a picture is complete, the next tells."""
+    camera, frames = SilentCamera(pictures=200), list[Frame]()
+    camera.start()
+    settings = StreamCamera(type="stream", url=f"tcp://127.0.0.1:{camera.port}", intrinsics=INTRINSICS)
+    with closing(StreamSource(settings)) as source:
+        source.open()
+        with suppress(SourceLost):
+            while True:
+                frames.append(source.read(threading.Event()))
+    camera.stop.set()
+    late = [frame for frame in frames if frame.meta.arrival_ns - frames[-1].meta.arrival_ns > -1_000_000_000]
+    assert [number_of(frame) for frame in late] == [198 % 25, 199 % 25]
 
 
 class Caller:
@@ -157,6 +227,7 @@ def test_all_that_a_stream_counts_is_told_from_the_start() -> None:
         "camera_unstamped",
         "camera_undecodable",
         "camera_catching_up",
+        "camera_damaged",
     }
 
 

@@ -1,0 +1,33 @@
+"""Pictures of a stream that were lost on the way, told by the steps of its own times. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from statistics import median
+
+STEPS = 30  # the usual step is their median
+STEPS_MIN = 8
+LOST_STEP = 1.5  # usual steps
+HEALED_MS = 2000.0  # without a key frame for so long, the encoder refreshes its pictures bit by bit
+
+
+class Losses:
+    """Says which pictures are damaged: those after a lost one are predicted from it, up to the next key frame."""
+
+    def __init__(self) -> None:
+        self._steps_ms: deque[float] = deque(maxlen=STEPS)
+        self._last_ms: float | None = None
+        self._since_ms: float | None = None  # of the latest loss that no key frame has followed yet
+
+    def damaged(self, position_ms: float, key: bool) -> bool:
+        """Whether the picture at this time of the stream is; `key`: it was coded without others. Call it for each."""
+        step_ms = 0.0 if self._last_ms is None else position_ms - self._last_ms
+        self._last_ms = position_ms
+        lost = len(self._steps_ms) >= STEPS_MIN and step_ms > LOST_STEP * median(self._steps_ms)
+        if step_ms > 0.0:
+            self._steps_ms.append(step_ms)
+        if key or (self._since_ms is not None and not lost and position_ms - self._since_ms >= HEALED_MS):
+            self._since_ms = None
+        elif lost:
+            self._since_ms = position_ms
+        return self._since_ms is not None
