@@ -27,6 +27,7 @@ FRAME_S = 8.0
 TIMED_RUNS = 10
 LIVE_FRAMES = 20
 WATCHED_S = 2.0  # at least: the first images of many cameras come irregularly
+PERIOD_NS_MIN = 1_000_000  # no camera is faster
 RATED_NS = 1_000_000_000  # less says little about the rate
 RATE_SHARE_MIN, BAD_SHARE_MAX = 0.8, 0.1
 STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
@@ -113,10 +114,10 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         why = f": {said}" if said else ""
         yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
-    # Stamps may all be the same, of a driver that gives whole seconds, or jump back.
+    # Stamps may all be the same, of a driver that gives whole seconds, but for new measurements of UTC, or jump back.
     took_ns = seen_ns[-1] - seen_ns[0]
     came = len(seen_ns) - 1 + counters["dropped_overtaken"]
-    rate_hz = came / (took_ns / 1e9) if len(seen_ns) > 2 and took_ns > 0 else None
+    rate_hz = came / (took_ns / 1e9) if len(seen_ns) > 2 and took_ns > came * PERIOD_NS_MIN else None
     asked_hz = getattr(camera, "fps", None) if took_ns >= RATED_NS else None
     reasons += shortfalls(counters, rate_hz, asked_hz)
     rate = f", {rate_hz:.0f} a second" if rate_hz else ""
