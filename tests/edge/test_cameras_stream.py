@@ -108,8 +108,11 @@ class SilentCamera(threading.Thread):
         self.port = int(self._server.getsockname()[1])
 
     def run(self) -> None:
-        with self._server, self._server.accept()[0] as connected:
-            out = av.open(Caller(connected), "w", format="mpegts")
+        with (
+            self._server,
+            self._server.accept()[0] as connected,
+            av.open(Caller(connected), "w", format="mpegts") as out,
+        ):
             stream = out.add_stream("libx264", rate=50, options=TENTH_IS_KEY)
             stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
             start_s = time.monotonic()
@@ -122,7 +125,7 @@ class SilentCamera(threading.Thread):
 
 
 def test_the_decoder_holds_no_picture_back() -> None:
-    """Only what is read ahead waits, here until nothing came for seconds: that a picture is complete, the next tells."""
+    """Only what is read ahead waits, here until nothing came for seconds: the next one tells that it is complete."""
     camera, frames = SilentCamera(pictures=200), list[Frame]()
     camera.start()
     settings = StreamCamera(type="stream", url=f"tcp://127.0.0.1:{camera.port}", intrinsics=INTRINSICS)
@@ -132,6 +135,7 @@ def test_the_decoder_holds_no_picture_back() -> None:
             while True:
                 frames.append(source.read(threading.Event()))
     camera.stop.set()
+    camera.join()
     late = [frame for frame in frames if frame.meta.arrival_ns - frames[-1].meta.arrival_ns > -1_000_000_000]
     assert [number_of(frame) for frame in late] == [198 % 25, 199 % 25]
 
