@@ -149,7 +149,7 @@ class Recorder:
             if lost:
                 self._counters["lost"] += lost
         if lost:
-            text = f"recording ended before the disk had taken all: {lost} messages were lost"
+            text = f"recording ended before the disk had taken all: {lost} messages may be lost"
             log.warning("%s", text)
             self._tell(logging.WARNING, text)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from statistics import median
 
-STEPS = 30  # the usual step is their median
+STEPS = 30
 STEPS_MIN = 8
+USUAL_SHARE = 0.85  # of the steps are no longer than a usual one: some encoders leave out every fifth picture
 LOST_STEP = 1.5  # usual steps
 HEALED_MS = 2000.0  # without a key frame for so long, the encoder refreshes its pictures bit by bit
 
@@ -23,7 +23,8 @@ class Losses:
         """Whether the picture at this time of the stream is; `key`: it was coded without others. Call it for each."""
         step_ms = 0.0 if self._last_ms is None else position_ms - self._last_ms
         self._last_ms = position_ms
-        lost = len(self._steps_ms) >= STEPS_MIN and step_ms > LOST_STEP * median(self._steps_ms)
+        usual_ms = sorted(self._steps_ms)[int(USUAL_SHARE * len(self._steps_ms))] if self._steps_ms else 0.0
+        lost = len(self._steps_ms) >= STEPS_MIN and step_ms > LOST_STEP * usual_ms
         if step_ms > 0.0:
             self._steps_ms.append(step_ms)
         if key or (self._since_ms is not None and not lost and position_ms - self._since_ms >= HEALED_MS):

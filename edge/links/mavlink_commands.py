@@ -61,11 +61,16 @@ def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
     return Answer(dialect.MAV_RESULT_UNSUPPORTED)
 
 
-def concerns_us(command: Any) -> bool:
-    """Whether a COMMAND_LONG or COMMAND_INT to all components is for ours too. All others are left to the
-    autopilot: an UNSUPPORTED beside its answer would only confuse."""
-    if command.command in (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL):
-        return command.param1 in REQUESTABLE - {HEARTBEAT}
+def concerns_us(command: Any, enabled: Container[int]) -> bool:
+    """Whether a COMMAND_LONG or COMMAND_INT to all components is for ours too; `enabled` as for `answer`.
+
+    All others are left to the autopilot: a refusal beside its answer would only confuse.
+    """
+    ours = command.param1 in RATE_LIMITS_HZ and command.param1 in enabled
+    if command.command == dialect.MAV_CMD_REQUEST_MESSAGE:
+        return ours or command.param1 == CAMERA_INFORMATION
+    if command.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+        return ours
     return command.command in CAMERA_COMMANDS
 
 

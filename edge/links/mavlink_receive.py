@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any
 
 from edge.links.mavlink_commands import concerns_us
@@ -166,10 +166,12 @@ def _finite(message: Any) -> bool:
     return True
 
 
-def misaddressed(message: Any, vehicle_id: int, our_components: Callable[[int], bool]) -> str | None:
+def misaddressed(
+    message: Any, vehicle_id: int, our_components: Callable[[int], bool], enabled: Container[int]
+) -> str | None:
     """Why a valid message is not for us: telemetry must be from our vehicle's autopilot, commands addressed to us."""
     if message.get_msgId() in COMMANDS:
-        to_all = message.target_component == 0 and concerns_us(message)
+        to_all = message.target_component == 0 and concerns_us(message, enabled)
         ours = message.target_system == vehicle_id and (to_all or our_components(message.target_component))
         return None if ours else "not_for_us"
     if message.get_srcSystem() != vehicle_id:

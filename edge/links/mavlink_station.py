@@ -231,7 +231,7 @@ class Station:
         vehicle_id = self.vehicle.system_id
         if vehicle_id is None:
             return "before_heartbeat"
-        reason = misaddressed(message, vehicle_id, self._components.__contains__)
+        reason = misaddressed(message, vehicle_id, self._components.__contains__, self._enabled())
         if reason is not None:
             return reason
         if message.get_msgId() in COMMANDS:

@@ -33,24 +33,26 @@ class Pair(NamedTuple):
 
 
 def associate(
-    targets: Sequence[tuple[Motion, Attitude]], estimates: Sequence[Estimate], K: Array, view: View
+    targets: Sequence[tuple[Motion, Attitude, int]], estimates: Sequence[Estimate], K: Array, view: View
 ) -> list[Pair]:
     """Pairs inside the gate, each target and estimate at most once: as many pairs as possible, at least total distance.
 
-    If a target or an estimate has several candidates, rotation counts too: crossing aircraft differ in it. An estimate
-    that fits a target seen just now goes to the likeliest: by distance alone, one long missed, which fits everywhere,
-    would take the detections of its neighbour.
+    `targets`: each with the number of frames in which it was missed since it was seen. If a target or an estimate has
+    several candidates, rotation counts too: crossing aircraft differ in it. An estimate that fits a target seen just
+    now goes to the likeliest: by distance alone, one long missed, which fits everywhere, would take the detections of
+    its neighbour.
     """
     seen: dict[tuple[int, int], Innovation] = {}
     cost = np.full((len(targets), len(estimates)), np.inf)
-    for i, (motion, _) in enumerate(targets):
+    for i, (motion, _, misses) in enumerate(targets):
         for j, estimate in enumerate(estimates):
             one = ekf.innovation(motion, estimate, K, view)
             d2 = distance_d2(one, estimate)
-            if d2 < POSITION_GATE_D2 and not _elsewhere(motion, estimate, one.predicted_m, K, view):
+            elsewhere = out_of_sight(motion, misses, view) and _elsewhere(estimate, one.predicted_m, K)
+            if d2 < POSITION_GATE_D2 and not elsewhere:
                 seen[i, j], cost[i, j] = one, d2
     contested = np.isfinite(cost)
-    fresh = np.array([view.time_ns - motion.seen_ns <= FRESH_NS for motion, _ in targets], dtype=bool)
+    fresh = np.array([view.time_ns - motion.seen_ns <= FRESH_NS for motion, *_ in targets], dtype=bool)
     for (i, j), one in seen.items():
         if contested[i].sum() > 1 or contested[:, j].sum() > 1:
             d2 = rotation.disagreement_d2(targets[i][1], estimates[j], view)
@@ -76,14 +78,15 @@ def distance_d2(seen: Innovation, estimate: Estimate) -> float:
     return max(float(seen.residual_m @ np.linalg.solve(predicted + measured, seen.residual_m)), float(in_metres))
 
 
-def out_of_sight(motion: Motion, view: View) -> bool:
-    """Whether a target was missed for so long that it could be anywhere; `view` is in the motion's frame."""
-    return motion.kind == "cam" and view.time_ns - motion.seen_ns >= OUT_OF_SIGHT_NS
+def out_of_sight(motion: Motion, misses: int, view: View) -> bool:
+    """Whether a target was missed for so long that it could be anywhere; `view` is in the motion's frame.
+
+    After a gap in the frames, what is seen is most probably what was seen before.
+    """
+    return motion.kind == "cam" and misses > 0 and view.time_ns - motion.seen_ns >= OUT_OF_SIGHT_NS
 
 
-def _elsewhere(motion: Motion, estimate: Estimate, predicted_m: Array, K: Array, view: View) -> bool:
-    if not out_of_sight(motion, view):
-        return False
+def _elsewhere(estimate: Estimate, predicted_m: Array, K: Array) -> bool:
     size_rad = float(np.linalg.norm(estimate.box_xyxy_px[2:] - estimate.box_xyxy_px[:2])) / K[0, 0]
     cosine = (
         predicted_m @ estimate.t_cam_target_m / np.linalg.norm(predicted_m) / np.linalg.norm(estimate.t_cam_target_m)

@@ -31,7 +31,8 @@ class ByHand:
 
     @property
     def chosen_id(self) -> int | None:
-        return None if self._chosen is None else self._chosen[0]
+        """Of the target that is chosen, or is to be after this frame; None: of neither."""
+        return self._wanted_id if self._chosen is None else self._chosen[0]
 
     def take(self, request: Request, now_ns: int) -> None:
         """Process a request that arrived before the frame of `now_ns`."""
@@ -89,7 +90,7 @@ class ByHand:
 
     def _choose_by_id(self, tracks: Iterable[Track], track_id: int) -> None:
         for track in tracks:
-            if track.track_id == track_id:
+            if track.track_id == track_id and track.born_ns < track.time_ns:  # a newborn was not meant
                 return self._choose(track)
         self._news.append(f"target {track_id} is gone: not chosen")
         return None

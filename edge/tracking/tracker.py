@@ -136,7 +136,8 @@ class Tracker:
         lens = Lens(K, distortion)
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
-        pairs = associate([(target.motion, target.attitude) for target in self._targets], finite, lens.K, view)
+        held = [(target.motion, target.attitude, target.misses) for target in self._targets]
+        pairs = associate(held, finite, lens.K, view)
         for pair in pairs:
             _hit(self._targets[pair.target], finite[pair.estimate], pair.seen, lens, view)
         used = {pair.estimate for pair in pairs}
@@ -204,8 +205,7 @@ class Tracker:
             if any(iou(estimate.box_xyxy_px, box) > SAME_BOX_IOU for box in boxes):
                 continue  # two windows showed one target
             if len(self._targets) >= self.max_targets:
-                doubtful = doubtful_below if estimate.score >= doubtful_below else 0.0
-                gives_way = self._least(view, chosen_id, doubtful)
+                gives_way = self._least(view, chosen_id, doubtful_below) if estimate.score >= doubtful_below else None
                 if gives_way is None:
                     return
                 self._targets.remove(gives_way)
@@ -215,11 +215,14 @@ class Tracker:
             self._targets.append(Target(free[0], motion, attitude, box, estimate.score, view.time_ns, view.time_ns))
 
     def _least(self, view: View, chosen_id: int | None, doubtful_below: float) -> Target | None:
-        """The target, if any, whose slot another may take: out of sight or of a lower score, and never the selected."""
+        """The target, if any, whose slot another may take: out of sight or of a lower score. Never the selected one,
+        nor one born in this frame, which may be what the operator points at."""
         candidates = [
             target
             for target in self._targets
-            if target.track_id != chosen_id and (target.score < doubtful_below or out_of_sight(target.motion, view))
+            if target.track_id != chosen_id
+            and target.born_ns < view.time_ns
+            and (target.score < doubtful_below or out_of_sight(target.motion, target.misses, view))
         ]
         return min(candidates, key=lambda target: (target.measured_ns, target.score), default=None)
 

@@ -162,9 +162,10 @@ def test_a_target_found_once_and_gone_for_good_is_told_as_not_found() -> None:
 
 
 def test_a_target_selected_by_its_name_is_chosen_unless_it_is_gone() -> None:
-    hand, both = ByHand(), [track(0), track(0, track_id=1)]
+    hand, both = ByHand(), [track(1, born_ns=0), track(1, track_id=1, born_ns=0)]
     hand.take(SelectTarget(1), 0)
     assert hand.box_xyxy_px(0, SIZE_WH, both) is None
+    assert hand.chosen_id == 1, "before the frame is over too, so that it keeps its slot"
     hand.settle(both)
     assert (hand.chosen_id, hand.news()) == (1, ["target 1 chosen"])
     hand.take(SelectTarget(3), 0)
@@ -172,6 +173,9 @@ def test_a_target_selected_by_its_name_is_chosen_unless_it_is_gone() -> None:
     assert (hand.chosen_id, hand.news()) == (None, ["target 3 is gone: not chosen"])
     hand.settle(both)
     assert hand.news() == []
+    hand.take(SelectTarget(2), 0)
+    hand.settle([*both, track(1, track_id=2)])
+    assert hand.news() == ["target 2 is gone: not chosen"], "another was born with its number"
 
 
 def test_the_search_rests_after_stopping_until_the_next_box_or_ten_seconds() -> None:
@@ -239,7 +243,7 @@ def test_who_gives_way_to_a_target_pointed_at_is_missed_or_not_yet_sure_or_faint
 
 
 def test_the_choice_ends_with_its_target_though_another_has_its_number_at_once() -> None:
-    by_hand, first = ByHand(), track(0)
+    by_hand, first = ByHand(), track(1, born_ns=0)
     by_hand.take(SelectTarget(0), 0)
     by_hand.settle([first])
     assert by_hand.chosen_id == 0

@@ -99,6 +99,14 @@ def test_a_picture_is_damaged_from_a_loss_to_the_next_key_frame_or_for_two_secon
     assert damaged[-1] - damaged[9] == pytest.approx(2000.0, abs=1.01 * step_ms)
 
 
+@pytest.mark.parametrize("left_out", [5, 3])
+def test_an_encoder_that_leaves_out_pictures_by_itself_loses_few_of_those_it_sends(left_out: int) -> None:
+    """Each fifth or third of 30 a second, with a key frame each two seconds."""
+    losses, sent = Losses(), [index for index in range(1800) if index % left_out]
+    damaged = [losses.damaged(index * 1000.0 / 30.0, key=index % 60 == 1) for index in sent]
+    assert sum(damaged) < 0.1 * len(sent)
+
+
 class SilentCamera(threading.Thread):
     """A server that sends so many pictures of H.264 in MPEG-TS and then nothing, until told to stop."""
 

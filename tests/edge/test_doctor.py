@@ -197,7 +197,7 @@ class Driver:
 @pytest.mark.parametrize(
     ("driver", "verdict", "words", "advice"),
     [
-        (Driver(12, utc=False, torn_every=0), "good", "320x180", ""),
+        (Driver(20, utc=False, torn_every=0), "good", "320x180", ""),
         (
             Driver(12, utc=True, torn_every=0),
             "poor",

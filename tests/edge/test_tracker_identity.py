@@ -59,6 +59,17 @@ def test_another_aircraft_is_not_taken_for_one_that_was_missed(
         assert np.linalg.norm(told.t_cam_target_m) == pytest.approx(range_m, rel=0.02)
 
 
+@pytest.mark.parametrize("rate_hz", [2.0, 3.0, 4.0])
+def test_a_turning_camera_with_few_frames_a_second_keeps_what_it_sees_in_each(rate_hz: float) -> None:
+    flight = Flight("cam", rate_hz=rate_hz)
+    for index in range(30):
+        turned_deg = 16.0 * np.sin(2.0 * np.pi * index / rate_hz / 5.0)  # at up to 20 degrees a second
+        tracks = flight.frame(flight.sight(towards(turned_deg, 600.0)))
+        assert [track.track_id for track in tracks if track.measured_ns == track.time_ns] == [0] or index < 4
+    (seen,) = (track for track in tracks if track.measured_ns == track.time_ns)
+    assert seen.state is TrackState.CONFIRMED
+
+
 @pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
 @pytest.mark.parametrize("apart_m", [8.0, 12.0, 20.0])
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0])
@@ -104,6 +115,18 @@ def test_without_own_attitude_a_slot_is_not_kept_for_what_could_be_anywhere(
         flight.frame(flight.sight(towards(0.0, 250.0)))
     for _ in range(20):
         flight.frame()
-    tracks = flight.frame(flight.sight(towards(15.0, 250.0)), chosen_id=chosen_id)
+    (kept,) = flight.frame(flight.sight(towards(15.0, 250.0), 0.6), doubtful_below=0.8)
+    assert kept.born_ns == 1, "a bird takes the slot of no aircraft"
+    tracks = flight.frame(flight.sight(towards(15.0, 250.0)), chosen_id=chosen_id, doubtful_below=0.8)
     assert [track.track_id for track in tracks if track.born_ns == track.time_ns] == seen_ids
     assert len(tracks) == 1
+
+
+def test_what_is_pointed_at_keeps_the_slot_that_was_made_for_it() -> None:
+    flight = Flight("ned", max_targets=2)
+    for _ in range(10):
+        flight.frame(flight.sight(towards(-8.0, 200.0)), flight.sight(towards(8.0, 200.0)))
+    pointed_at, other = flight.sight(towards(0.0, 300.0), 0.6), flight.sight(towards(-15.0, 300.0), 0.9)
+    flight.tracker.make_room(pointed_at)
+    tracks = flight.frame(flight.sight(towards(-8.0, 200.0)), pointed_at, other, doubtful_below=0.8)
+    assert sorted(track.score for track in tracks) == pytest.approx([0.6, 0.95])
