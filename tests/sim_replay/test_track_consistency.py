@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,9 +47,11 @@ class Listening(Tracker):
         own_ship: OwnShip | None,
         K: Array,
         image_size_wh: tuple[int, int],
+        *more: Any,
+        **named: Any,
     ) -> tuple[Track, ...]:
         Listening.given = estimates
-        return super().update(capture_ns, estimates, own_ship, K, image_size_wh)
+        return super().update(capture_ns, estimates, own_ship, K, image_size_wh, *more, **named)
 
 
 def nearest(poses: list[Estimate] | tuple[TargetPose, ...], t_cam_m: Array) -> Estimate | TargetPose | None:
