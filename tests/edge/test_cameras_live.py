@@ -233,9 +233,7 @@ def test_a_topic_of_another_type_is_told_apart_from_one_that_is_silent(monkeypat
         source.open()
         reading = pool.submit(source.read, threading.Event())
         with zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
-            while not reading.done():
-                session.put(key, b"raw")
-                time.sleep(0.02)
+            until(reading.done, lambda: session.put(key, b"raw"), what="that it gives up")
         with pytest.raises(SourceLost, match=f"no sensor_msgs/CompressedImage on .* but samples on {key}"):
             reading.result()
 

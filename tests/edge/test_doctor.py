@@ -8,20 +8,16 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import serial
 
 from edge.config import load_config
-from edge.doctor import _camera, camera_as_told, shortfalls
+from edge.doctor import camera_as_told
 from edge.doctor_links import link_findings, signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.links.signing import timestamp_of
@@ -29,14 +25,12 @@ from edge.reload import load_configured
 from edge.status import ask
 from edge.status_board import StatusBoard
 from edge.types import CameraInfo
-from msgs.publish import TopicPublisher
 from sim_replay.faults.rig import can_mount
 from tests.waiting import until
 
 from . import pictures
 from .conftest import Cli
 from .flying import flying, free_port, toml, write_swaying_scene
-from .test_cameras_live import message, router
 from .test_cameras_stream import UdpCamera
 
 
@@ -136,104 +130,6 @@ def test_a_serial_port_that_another_program_holds_is_not_taken_for_a_silent_auto
     assert "serial:/dev/null:57600 does not open" in found["mavlink"]["says"]
 
 
-def test_a_camera_whose_stamps_do_not_advance_has_no_rate(tmp_path: Path) -> None:
-    """As of a driver that stamps in whole seconds."""
-    port, over = pictures.free_port(), threading.Event()
-    intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
-    (tmp_path / "config.toml").write_text(
-        '[camera]\ntype = "zenoh"\ntopic = "nose/image/compressed"\n'
-        f'connect = "tcp/127.0.0.1:{port}"\nintrinsics = {intrinsics}\n'
-    )
-
-    def publish(publisher: TopicPublisher, stamp_ns: int) -> None:
-        index = count()
-        while not over.wait(0.02):
-            publisher.put(message(next(index), stamp_ns=stamp_ns))
-
-    with router(port) as publisher, ThreadPoolExecutor() as pool:
-        pool.submit(publish, publisher, time.time_ns())
-        try:
-            ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
-        finally:
-            over.set()
-    assert (found.says.partition(";")[0], rate_hz) == ("nose/image/compressed: 320x180", None)
-
-
-class Driver:
-    """In place of cv2.VideoCapture: `given_hz` pictures a second, stamped in UTC or on our clock, some torn."""
-
-    def __init__(self, given_hz: float, utc: bool, torn_every: int) -> None:
-        self._given_hz, self._utc, self._torn_every = given_hz, utc, torn_every
-        self._grabbed = 0
-
-    def __call__(self, device: str, api: int) -> Driver:
-        return self
-
-    def isOpened(self) -> bool:
-        return True
-
-    def set(self, prop: int, value: float) -> bool:
-        return True
-
-    def get(self, prop: int) -> float:
-        size = {cv2.CAP_PROP_FRAME_WIDTH: pictures.SIZE_WH[0], cv2.CAP_PROP_FRAME_HEIGHT: pictures.SIZE_WH[1]}
-        if prop == cv2.CAP_PROP_POS_MSEC:
-            return time.time() * 1e3 if self._utc else time.monotonic() * 1e3 - 1
-        return size.get(prop, 0.0)
-
-    def grab(self) -> bool:
-        time.sleep(1 / self._given_hz)
-        self._grabbed += 1
-        return True
-
-    def retrieve(self) -> tuple[bool, Any]:
-        torn = self._torn_every > 0 and self._grabbed % self._torn_every == 0
-        return not torn, None if torn else pictures.picture(self._grabbed % 8)
-
-    def release(self) -> None:
-        pass
-
-
-@pytest.mark.parametrize(
-    ("driver", "verdict", "words", "advice"),
-    [
-        (Driver(20, utc=False, torn_every=0), "good", "320x180", ""),
-        (
-            Driver(12, utc=True, torn_every=0),
-            "poor",
-            "impossible timestamps replaced by the arrival time",
-            "latency_ms",
-        ),
-        (Driver(24, utc=False, torn_every=2), "poor", "images could not be decoded", "cable"),
-        (Driver(7, utc=False, torn_every=0), "poor", "[camera] fps is 12, but only ", "light"),
-    ],
-)
-def test_a_device_with_wrong_stamps_torn_pictures_or_half_its_rate_is_not_told_as_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driver: Driver, verdict: str, words: str, advice: str
-) -> None:
-    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", driver)
-    monkeypatch.setattr("edge.doctor.LIVE_FRAMES", 10)
-    monkeypatch.setattr("edge.doctor.WATCHED_S", 1.3)
-    (tmp_path / "config.toml").write_text(
-        '[camera]\ntype = "device"\ndevice = "/dev/null"\nfps = 12\nwidth = 320\nheight = 180\n'
-        "intrinsics = { fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }\n"
-    )
-    ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
-    assert (found.verdict, words in found.says, advice in found.advice) == (verdict, True, True), found
-    assert rate_hz is not None
-
-
-def test_a_tenth_of_bad_pictures_and_four_fifths_of_the_rate_are_tolerated() -> None:
-    counted = {"captured": 50, "camera_unstamped": 5, "camera_undecodable": 5}
-    assert list(shortfalls(counted, 24.0, 30.0)) == []
-    assert list(shortfalls({"captured": 50}, 5.0, None)) == []  # a recording; too little seen to judge the rate
-    assert list(shortfalls({"captured": 50}, None, 30.0)) == []
-    counted = {"captured": 50, "camera_unstamped": 6, "camera_undecodable": 6}
-    assert [kind for kind, _ in shortfalls(counted, 23.9, 30.0)] == [
-        "camera_unstamped", "camera_undecodable", "camera_slow",
-    ]  # fmt: skip
-
-
 def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path: Path) -> None:
     (tmp_path / "config.toml").write_text("[camera]\ntype = 'film'\n")
     done = cli("doctor", "--config", "config.toml")
@@ -330,30 +226,6 @@ def test_what_the_running_daemon_says_of_its_links_is_taken(cli: Cli, tmp_path: 
     assert (code, found["daemon"]["verdict"]) == (1, "wrong")
     assert "no own attitude" in found["daemon"]["says"]
     assert "autopilot" in found["daemon"]["advice"]
-
-
-@pytest.mark.parametrize(
-    ("kind", "advice"),
-    [
-        ("camera_stamps", "timestamp"),
-        ("camera_frozen", "moves"),
-        ("camera_lost", "plugged in"),
-        ("no_frame", "plugged"),
-    ],
-)
-def test_each_fault_of_a_camera_that_the_daemon_has_gets_its_own_advice(kind: str, advice: str) -> None:
-    running = {
-        "camera": "/dev/video0",
-        "state": "degraded",
-        "reason_kinds": ["drops", kind],
-        "reasons": ["3 % of frames dropped", "so it is"],
-    }
-    ((found, _),) = camera_as_told(running)
-    assert (found.verdict, found.says, advice in found.advice) == (
-        "wrong",
-        "reported by the running daemon: so it is",
-        True,
-    )
 
 
 def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model: Path) -> None:

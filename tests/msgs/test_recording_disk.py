@@ -16,6 +16,19 @@ from tests.waiting import until
 from .recordings import ROOM, read, record_some
 
 
+def standing(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Events of a disk: it stands still since something was written, and it goes on."""
+    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
+
+    def sync(fd: int) -> None:
+        stands.set()
+        goes_on.wait()
+        real_sync(fd)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    return stands, goes_on
+
+
 def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -50,14 +63,7 @@ def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is
 ) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     monkeypatch.setattr(recording, "WAITING_MAX", 50)
-    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
-
-    def sync(fd: int) -> None:
-        stands.set()
-        goes_on.wait()
-        real_sync(fd)
-
-    monkeypatch.setattr(os, "fdatasync", sync)
+    stands, goes_on = standing(monkeypatch)
     told: list[tuple[int, str]] = []
     recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
     recorder.start()
@@ -95,13 +101,7 @@ def test_what_a_disk_that_stands_still_has_not_taken_at_the_end_is_told_as_lost(
 ) -> None:
     monkeypatch.setattr(recording, "STOP_TIMEOUT_S", 0.2)
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    stands, goes_on = threading.Event(), threading.Event()
-
-    def sync(_: int) -> None:
-        stands.set()
-        goes_on.wait()
-
-    monkeypatch.setattr(os, "fdatasync", sync)
+    stands, goes_on = standing(monkeypatch)
     told: list[tuple[int, str]] = []
     recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
     recorder.start()

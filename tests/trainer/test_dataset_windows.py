@@ -13,8 +13,6 @@ import pytest
 import synthetic_sampler
 import tiny
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
@@ -224,41 +222,6 @@ def test_mixing_keeps_the_share_and_unknown_labels_teach_nothing(dataset: Path) 
     (terms["noc"].sum() + terms["mask"].sum()).backward()
     assert torch.isfinite(dense.grad).all()
     assert (dense.grad[:2, 1:] == 0).all()
-
-
-class Numbered:
-    """Samples that carry nothing but their index and whose they are."""
-
-    def __init__(self, name: int) -> None:
-        self.name = name
-
-    def batch(self, first_index: int, count: int) -> TrainingBatch:
-        numbers = np.arange(first_index, first_index + count)
-        return TrainingBatch(*[np.column_stack([np.full(count, self.name), numbers])] * len(TrainingBatch._fields))
-
-
-def drawn_by(shares: list[float], first_index: int, count: int) -> list[tuple[int, int]]:
-    """Whose and which sample each of a batch is."""
-    mixed = MixedSampler([Numbered(name) for name in range(len(shares))], shares)
-    return [(int(name), int(number)) for name, number in mixed.batch(first_index, count).K]
-
-
-def test_a_share_of_less_than_a_sample_comes_in_some_batches() -> None:
-    counts = [sum(name == 0 for name, _ in drawn_by([0.02, 0.98], 24 * b, 24)) for b in range(50)]
-    assert sum(counts) == 24  # 2 % of 1,200
-    assert set(counts) == {0, 1}
-
-
-@given(st.lists(st.integers(1, 60), min_size=2, max_size=4), st.integers(0, 10**7), st.integers(1, 64))
-def test_every_stretch_of_the_stream_keeps_the_shares_and_repeats_nothing_however_it_is_cut(
-    parts: list[int], first: int, count: int
-) -> None:
-    shares = [part / sum(parts) for part in parts]
-    whole = drawn_by(shares, first, 2 * count)
-    assert len(set(whole)) == 2 * count
-    assert sorted(drawn_by(shares, first, count) + drawn_by(shares, first + count, count)) == sorted(whole)
-    for name, share in enumerate(shares):
-        assert abs(sum(one == name for one, _ in whole) - share * 2 * count) < len(shares)
 
 
 def test_a_network_trains_on_a_dataset_named_in_its_configuration(dataset: Path, tmp_path: Path) -> None:

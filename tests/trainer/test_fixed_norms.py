@@ -15,7 +15,7 @@ from trainer.backbones import build_backbone
 from trainer.config import parse_config
 from trainer.data import training_batch
 from trainer.fixed_norms import folded_norms
-from trainer.train import Trainer
+from trainer.trainer import Trainer
 
 
 def norm_statistics(model: nn.Module) -> list[torch.Tensor]:

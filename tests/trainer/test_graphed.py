@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 
 from trainer.graphed import Graphed
 from trainer.guidance import drawn_guide
-from trainer.train import Trainer
+from trainer.trainer import Trainer
 
 CPU = torch.device("cpu")
 EITHER = pytest.mark.parametrize("with_rounding", [False, True], ids=["float", "rounded"])

@@ -19,7 +19,8 @@ from trainer.config import ConfigError, parse_config
 from trainer.data import DENSE_STRIDE, TrainingBatch, training_batch
 from trainer.losses import Labels, to_tensors
 from trainer.replay import Replay, mirrored, relit
-from trainer.train import Trainer, run_training
+from trainer.train import run_training
+from trainer.trainer import Trainer
 
 CPU = torch.device("cpu")
 SIZE_PX = 128

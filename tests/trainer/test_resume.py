@@ -15,7 +15,8 @@ import torch
 
 from trainer.checkpoint import load_model
 from trainer.config import ConfigError, parse_config
-from trainer.train import Trainer, run_training
+from trainer.train import run_training
+from trainer.trainer import Trainer
 
 
 def train(out: Path, steps: int | None, text: str = tiny.TOML, **options: object) -> Trainer:

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from trainer.config import parse_config
 from trainer.data import training_batch
 from trainer.rounding import rounded, rounded_activations, rounded_weights
-from trainer.train import Trainer
+from trainer.trainer import Trainer
 
 finite = st.floats(-50, 50, width=32)
 

@@ -25,7 +25,8 @@ from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
 from trainer.plan import Plan
 from trainer.runlog import RunLog, commit_of
-from trainer.train import Trainer, run_training
+from trainer.train import run_training
+from trainer.trainer import Trainer
 
 LONG = tiny.TOML.replace("samples = 16\nw", "samples = 1000000\nw")
 
