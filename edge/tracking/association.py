@@ -88,9 +88,7 @@ def out_of_sight(motion: Motion, misses: int, view: View) -> bool:
 
 def _elsewhere(estimate: Estimate, predicted_m: Array, K: Array) -> bool:
     size_rad = float(np.linalg.norm(estimate.box_xyxy_px[2:] - estimate.box_xyxy_px[:2])) / K[0, 0]
-    cosine = (
-        predicted_m @ estimate.t_cam_target_m / np.linalg.norm(predicted_m) / np.linalg.norm(estimate.t_cam_target_m)
-    )
+    cosine = rotation.unit(predicted_m) @ rotation.unit(estimate.t_cam_target_m)
     return bool(np.arccos(np.clip(cosine, -1.0, 1.0)) > SIZES_OFF_MAX * size_rad)
 
 
