@@ -328,7 +328,16 @@ def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise argparse.ArgumentTypeError(f"'{text}' is not HOST:PORT")
-    return socket.gethostbyname(host), int(port)
+    try:
+        return socket.gethostbyname(host), int(port)
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"'{host}' is no known host") from error
+
+
+def _system_id(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= 255):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a system id, 1 to 255")
+    return int(text)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -340,9 +349,7 @@ def main(argv: list[str] | None = None) -> int:
         "--start-at-ns", type=int, required=True, help="monotonic ns at which the telemetry's t_ns is 0"
     )
     parser.add_argument("--boot-at-ns", type=int, help="monotonic ns of its boot (default: long before)")
-    parser.add_argument(
-        "--system-id", type=int, choices=range(1, 256), metavar="ID", default=SYSTEM_ID, help="its own (1)"
-    )
+    parser.add_argument("--system-id", type=_system_id, metavar="ID", default=SYSTEM_ID, help="its own (1)")
     parser.add_argument("--gimbal", type=Path, metavar="CSV", help="gimbal.csv: how its gimbal turns, same clock")
     parser.add_argument("--signing-key", type=Path, metavar="FILE", help="sign all, and believe nothing unsigned")
     parser.add_argument(

@@ -315,7 +315,8 @@ def _refuse_boxes_outside(
         if box is not None and (np.any(box[:2] >= np.array(size_wh) - 0.5) or np.any(box[2:] <= -0.5)):
             raise BopError(
                 f"{scene.folder}: picture {frame.image_id} has {size_wh[0]} x {size_wh[1]} pixels, but the visible box "
-                f"of its obj_id {target.object_id} lies outside: are its labels those of another size?"
+                f"of its obj_id {target.object_id} lies outside: "
+                "are scene_gt_info.json and scene_camera.json for another size?"
             )
 
 

@@ -215,9 +215,11 @@ def _gimbal(folder: Path, frames: list[int], frame0_ns: int, fps: float) -> Gimb
     """
     R_cam_ned = [frame.R_cam_world for frame in read_scene(folder).pictured]
     known = [R for R in R_cam_ned if R is not None]
-    if len(known) < max(len(R_cam_ned), 2):
-        path = folder / "scene_camera.json"
+    path = folder / "scene_camera.json"
+    if len(known) < len(R_cam_ned):
         raise InputError(f"{path}: 'cam_R_w2c' is missing: it says how the gimbal was turned at every frame")
+    if len(known) < 2:
+        raise InputError(f"{path}: has a single picture; how a gimbal turns is known from two on")
     return track_of(known, frame0_ns, fps, frames)
 
 

@@ -42,20 +42,30 @@ def run(args: argparse.Namespace) -> int:
     with _alone_in(args.out):
         claim(args.out, recipe, text, args.resume)
         job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
-        write_manifest(job, recipe, plans)
-        names = {airframe_id(name) + 1: name for name in preset.airframe_names()}
-        write_models(args.out / "models", {number: airframe_of(number - 1).mesh() for number in names}, names)
         try:
-            _make(job, plans, chosen, workers)
+            _generate(job, recipe, plans, chosen, workers)
         except CrewError as error:
-            print(f"{error}; --resume goes on from here", file=sys.stderr)
+            print(f"{args.out}: {error}; --resume goes on from here", file=sys.stderr)
+            return 1
+        except OSError as error:
+            print(f"{args.out}: {error.strerror}; --resume goes on from here", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
             print(f"stopped; --resume goes on with {args.out}", file=sys.stderr)
             raise
-        finally:
-            write_manifest(job, recipe, plans)
     return 0
+
+
+def _generate(
+    job: Job, recipe: Recipe, plans: Sequence[SequencePlan], chosen: Sequence[SequencePlan], workers: int
+) -> None:
+    write_manifest(job, recipe, plans)
+    names = {airframe_id(name) + 1: name for name in job.preset.airframe_names()}
+    write_models(job.out / "models", {number: airframe_of(number - 1).mesh() for number in names}, names)
+    try:
+        _make(job, plans, chosen, workers)
+    finally:
+        write_manifest(job, recipe, plans)
 
 
 def _make(job: Job, plans: Sequence[SequencePlan], chosen: Sequence[SequencePlan], workers: int) -> None:

@@ -21,6 +21,7 @@ Gust = Literal["calm", "light", "moderate"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 SHIPPED = ("fw-uav6d", "unseen", "stress")
+SIDE_MAX_PX = 8192  # of a picture: what OpenGL in software draws
 RANGE_LIMITS_M = (95.0, 510.0)  # in the middle of a sequence; sim_replay.flight finds no encounter outside them
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -172,8 +173,8 @@ class Preset(Section):
         shortest, longest = self.sequence_frames
         if shortest < 2:
             raise ValueError("sequence_frames must be at least 2")
-        if min(self.size_wh_px) < 64:
-            raise ValueError("size_wh_px must be at least 64 by 64")
+        if min(self.size_wh_px) < 64 or max(self.size_wh_px) > SIDE_MAX_PX:
+            raise ValueError(f"size_wh_px must be at least 64 by 64 and at most {SIDE_MAX_PX} by {SIDE_MAX_PX}")
         if any(side % 2 for side in self.size_wh_px) and any(c.h264_kbps for c in self.compression):
             raise ValueError("size_wh_px must be even where compression has h264_kbps")
         frame_ms = 1000.0 / max(self.fps)

@@ -46,8 +46,12 @@ class Pointing:
 
     def at(self, t_s: Array) -> Array:
         """R_body_cam [M, 3, 3] at times [M]."""
+        return self.still_at(t_s) @ self.jitter.rotation(t_s)
+
+    def still_at(self, t_s: Array) -> Array:
+        """R_body_cam [M, 3, 3] at times [M], without jitter: a fixed camera's mount."""
         i, share, _ = spans(self.t_s, t_s)
-        return slerp(self.R_body_cam, i, share) @ self.jitter.rotation(t_s)
+        return slerp(self.R_body_cam, i, share)
 
 
 def look(direction_ned: Array) -> Array:

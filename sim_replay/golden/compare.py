@@ -63,6 +63,7 @@ TOLERANCES = {
     ("CAMERA_TRACKING_GEO_STATUS", "hdg_acc"): DEVIATION_RAD,
 }
 OTHER = Tolerance(0.005, 0.01)
+QUATERNION_LENGTH_OFF = 1e-3
 QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
 # Fields of a pose that are kept unchanged.
 POSE_FIELDS = ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
@@ -88,10 +89,7 @@ def reduced(outputs: Outputs) -> list[Record]:
     records = []
     for pose in outputs.poses:
         std = [math.sqrt(max(pose["covariance"][k][k], 0.0)) for k in range(6)]
-        kept = {
-            name: pose[name]
-            for name in ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
-        }
+        kept = {name: pose[name] for name in POSE_FIELDS}
         records.append({"kind": "pose", **kept, "std": std})
     for message in outputs.mavlink:
         fields = {name: value for name, value in message.items() if name != "message"}
@@ -160,7 +158,11 @@ def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
     old, new = _numbers(expected), _numbers(actual)
     if old is None or new is None or len(old) != len(new):
         return said
+    if any(str(a) != str(b) for a, b in zip(old, new, strict=True) if not (math.isfinite(a) and math.isfinite(b))):
+        return said
     if field in QUATERNIONS:
+        if abs(math.hypot(*old) - math.hypot(*new)) > QUATERNION_LENGTH_OFF:
+            return f"{said}: of another length"
         angle_deg = math.degrees(2.0 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(old, new, strict=True))))))
         return None if angle_deg <= ROTATION_DEG else f"{said}: {angle_deg:.2f}° apart, {ROTATION_DEG:.0f}° allowed"
     tolerance = TOLERANCES.get((kind, field))
@@ -168,8 +170,10 @@ def _field_off(kind: str, field: str, expected: Any, actual: Any) -> str | None:
         if all(isinstance(value, int) for value in (*old, *new)):
             return said
         tolerance = OTHER
-    off = [(abs(a - b), allowed) for a, b, allowed in zip(old, new, tolerance.allows(old), strict=True)]
-    error, allowed = max(off, key=lambda one: one[0] - one[1])
+    off = [
+        (abs(a - b), allowed) for a, b, allowed in zip(old, new, tolerance.allows(old), strict=True) if math.isfinite(a)
+    ]
+    error, allowed = max(off, key=lambda one: one[0] - one[1], default=(0.0, 0.0))
     return None if error <= allowed else f"{said}: {error:.4g} off, {allowed:.4g} allowed"
 
 

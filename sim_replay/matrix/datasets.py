@@ -25,7 +25,7 @@ def flyable(dataset: Path, count: int) -> list[Path]:
         if (scene.folder / "sequence.toml").is_file() and (scene.folder / "telemetry.csv").is_file()
     ]
     if len(folders) < count:
-        raise InputError(f"{dataset}: holds {len(folders)} sequences that can be flown, not {count}")
+        raise InputError(f"{dataset}: holds {len(folders)} test sequences that can be flown, not {count}")
     return sorted(folders, key=lambda folder: (_mount(folder / "sequence.toml") != FIXED, folder))[:count]
 
 

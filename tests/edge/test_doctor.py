@@ -1,3 +1,5 @@
+"""`uavpose-edge doctor` on real cameras, links, models and folders, as its user reads it."""
+
 from __future__ import annotations
 
 import json

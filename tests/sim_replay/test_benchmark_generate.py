@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from msgs.geometry import R_from_q_wxyz, rotation_angle
+from msgs.geometry import R_from_q_wxyz, rotation_angle, so3_log
 from sim_replay.bop import BopFrame, BopScene, read_ply_vertices_m, read_scene
 from sim_replay.cli import main
 from sim_replay.ground_truth import read_sequence
@@ -135,6 +135,28 @@ def test_a_bolted_cameras_pose_is_the_own_ships_through_its_mount(dataset: Path)
             t_ned_cam_m = -frame.R_cam_world.T @ frame.t_cam_world_m
             np.testing.assert_allclose(t_ned_cam_m, own.t_ned_body_m + R_ned_body @ lever, atol=0.02)
     assert fixed >= 1
+
+
+def test_the_mount_of_a_bolted_camera_is_what_it_trembles_about(tmp_path: Path) -> None:
+    text = (
+        PRESET.replace("[4, 5]", "[60, 60]").replace("frames = 8", "frames = 120").replace("frames = 5", "frames = 60")
+    )
+    preset = tmp_path / "long.toml"
+    preset.write_text(text.replace("gimbal_share = 0.5", "gimbal_share = 0.0"))
+    out = tmp_path / "long"
+    assert _generate(preset, out, "--labels-only", "--split", "train", "--workers", "1") == 0
+    for name in ("train/000000", "train/000001"):
+        settings = tomllib.loads((out / name / "sequence.toml").read_text())
+        assert settings["mount"] == "fixed"
+        telemetry = read_telemetry(out / name / "telemetry.csv")
+        trembling = []
+        for frame in read_scene(out / name).frames:
+            own = telemetry.at(round(frame.image_id / settings["fps"] * 1e9))
+            assert frame.R_cam_world is not None
+            R_body_cam = R_from_q_wxyz(own.q_ned_body_wxyz).T @ frame.R_cam_world.T
+            trembling.append(so3_log(np.array(settings["R_body_cam"]).T @ R_body_cam))
+        rms_rad = np.sqrt(np.mean(np.square(trembling), axis=0))
+        assert np.all(np.abs(np.mean(trembling, axis=0)) < 0.35 * rms_rad)
 
 
 def _projected(dataset: Path, frame: BopFrame, k: int) -> np.ndarray:

@@ -73,6 +73,19 @@ def test_a_rotation_is_judged_by_its_angle(angle_deg: float) -> None:
         assert all(f"{angle_deg:.2f}° apart" in text for text in found)
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"t_cam_target_m": [-12.0, math.nan, 200.0]},
+        {"q_cam_target_wxyz": [math.nan] * 4},
+        {"q_cam_target_wxyz": [5.0 * S, 0.0, 5.0 * S, 0.0]},
+        {"covariance": [[math.nan] * 6] * 6},
+    ],
+)
+def test_what_is_no_number_and_a_quaternion_that_is_no_rotation_are_differences(changed: dict[str, Any]) -> None:
+    assert len(told(held(), held(**changed))) == 1
+
+
 def with_std(std: list[float]) -> list[dict[str, Any]]:
     covariance = [[std[row] ** 2 if row == column else 0.0 for column in range(6)] for row in range(6)]
     return held(covariance=covariance)

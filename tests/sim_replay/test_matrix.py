@@ -89,7 +89,7 @@ def test_a_flight_is_scored_and_a_fault_that_is_not_met_is_wrong(
         (["--fault", "no-such-thing"], "no-such-thing"),
         (["--take", "0"], "--take 0"),
         (["--sequence", "nowhere"], "nowhere"),
-        (["--dataset", str(BUNDLED_SEQUENCE), "--take", "2"], "holds 1 sequences"),
+        (["--dataset", str(BUNDLED_SEQUENCE), "--take", "2"], "holds 1 test sequences"),
     ],
 )
 def test_what_cannot_be_flown_is_named(
