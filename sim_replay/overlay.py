@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,8 +26,6 @@ _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 _SUBPIXEL_BITS = 4
 _PLACE_PX = 12  # size of a cross, per pixel of line width
 _INSET_SCALE = 2.2  # window side over the target's longer projected side
-_VIDEO_WIDTH_PX = 1280
-_CODECS = ("vp09", "mp4v")  # browsers play the first; not every build of OpenCV can write it
 
 
 @dataclass(frozen=True)
@@ -254,18 +251,3 @@ def showcase_index(views: Sequence[FrameView]) -> int:
         if view.match is not None and view.match.rotation_error_deg is not None
     ]
     return sorted(scored)[len(scored) // 2][1] if scored else len(views) // 2
-
-
-def write_video(path: Path, frames: Iterable[Image], fps: float, size_wh: tuple[int, int]) -> None:
-    """Encode frames of `size_wh`, scaled down to 1280 wide, as MP4. Raises OSError if no codec can write it."""
-    scale = min(1.0, _VIDEO_WIDTH_PX / size_wh[0])
-    video_wh = (round(size_wh[0] * scale / 2) * 2, round(size_wh[1] * scale / 2) * 2)
-    for codec in _CODECS:
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, video_wh)
-        if writer.isOpened():
-            break
-    else:
-        raise OSError(f"{path}: no video codec can write it")
-    for frame in frames:
-        writer.write(cv2.resize(frame, video_wh, interpolation=cv2.INTER_AREA))
-    writer.release()

@@ -12,7 +12,7 @@ import cv2
 
 from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
-from sim_replay.overlay import Image, Overlay, showcase_index, write_video
+from sim_replay.overlay import Image, Overlay, showcase_index
 from sim_replay.report.flight_files import RecordedFlight
 from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, score_json, told_ages
 
@@ -67,6 +67,8 @@ def _by_frame(peer: PeerResult, ages: Iterable[tuple[int, float]]) -> defaultdic
 
 def _draw(sequence: PlayedSequence, result: Result, out: Path, on_frame: Callable[[], None]) -> None:
     """overlay.png of a typical frame and overlay.mp4 of all."""
+    from sim_replay.report.film import write_video  # the trainer, which has no PyAV, imports this module
+
     scene = sequence.scene
     views = frame_views(sequence, result)
     first = scene.undistorted_bgr(0)

@@ -22,8 +22,8 @@ from sim_replay.overlay import (
     project,
     showcase_index,
     window_camera,
-    write_video,
 )
+from sim_replay.report.film import write_video
 from sim_replay.score import Match, TargetPose, Truth
 
 K = np.array([[900.0, 0.0, 319.5], [0.0, 900.0, 179.5], [0.0, 0.0, 1.0]])
