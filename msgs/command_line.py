@@ -1,4 +1,4 @@
-"""How commands exit on invalid input (a message on standard error, exit code 2) or when interrupted."""
+"""How commands exit on invalid input or a full disk (a message on standard error, exit code 2) or when interrupted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import os
 import re
 import select
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, requires
 
 EXIT_BAD_INPUT = 2
@@ -17,26 +18,33 @@ _DISTRIBUTIONS = {"rerun": "rerun-sdk", "PIL": "pillow"}  # where the distributi
 EXIT_INTERRUPTED, EXIT_UNREAD = 130, 141
 
 
+class OutputError(Exception):
+    """Standard output cannot be written, as on a full disk; the text is a complete message."""
+
+
 def exit_code(
     act: Callable[[], int], bad_input: type[Exception] | tuple[type[Exception], ...], extras: Sequence[str] = ()
 ) -> int:
-    """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or needs a missing
-    package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as by `| head`."""
+    """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or OutputError, or
+    needs a missing package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as
+    by `| head`."""
+    told: list[type[Exception]] = [OutputError, *(bad_input if isinstance(bad_input, tuple) else [bad_input])]
     if isinstance(sys.stdout, io.TextIOWrapper):
         # As on standard error, characters that the locale's encoding lacks, in paths or our own, are escaped.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         code = act()
-        print(end="", flush=True)  # also where there is no standard output: sys.stdout is then None
-    except bad_input as error:
-        print(error, file=sys.stderr)
+        with output():
+            print(end="", flush=True)  # also where there is no standard output: sys.stdout is then None
+    except tuple(told) as error:
+        say_aside(str(error))
         return EXIT_BAD_INPUT
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         extra = next((extra for extra in extras if _brings(extra, package)), None)
         if extra is None:
             raise
-        print(f"the package {package} is missing: pip install '.[{extra}]'", file=sys.stderr)
+        say_aside(f"the package {package} is missing: pip install '.[{extra}]'")
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -46,6 +54,25 @@ def exit_code(
         discard_output()
         return EXIT_UNREAD
     return code
+
+
+@contextmanager
+def output() -> Iterator[None]:
+    """Around what prints: raises OutputError if standard output cannot be written, and BrokenPipeError if nobody reads
+    it any more."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        discard_output()
+        raise OutputError(f"standard output: cannot be written: {error.strerror}") from error
+
+
+def say_aside(text: str) -> None:
+    """Print a message on standard error; it is lost if nobody reads it there, or its disk is full."""
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 def discard_output() -> None:

@@ -9,7 +9,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
@@ -22,6 +22,13 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _PROFILE = "ros2"
 
 
+class Publisher(NamedTuple):
+    """Who published a sample, as the metadata of its channel tells."""
+
+    zenoh_session: str  # its id; empty: unknown
+    gid: str  # of the publisher of this topic, hexadecimal
+
+
 class McapFile:
     """A file being written; every method may raise OSError. Not compressed: CDR floats hardly compress."""
 
@@ -30,7 +37,7 @@ class McapFile:
         self._stream = _Stream(path)
         self._writer = Writer(self._stream, compression=CompressionType.NONE)  # type: ignore[arg-type]
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, Publisher | None], int] = {}
         try:
             self._writer.start(profile=_PROFILE, library="uavpose")
         except OSError:
@@ -42,11 +49,19 @@ class McapFile:
         """Bytes in the file, without the chunk still in memory."""
         return self._stream.tell()
 
-    def write(self, name: str, ros_type: str, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Add a CDR payload of the topic `/name`; times are UTC."""
-        channel = self._channels.get(name)
+    def write(
+        self,
+        name: str,
+        ros_type: str,
+        payload: bytes,
+        log_ns: int,
+        publish_ns: int,
+        publisher: Publisher | None = None,
+    ) -> None:
+        """Add a CDR payload of the topic `/name`, in a channel for each `publisher`; times are UTC."""
+        channel = self._channels.get((name, publisher))
         if channel is None:
-            channel = self._channels[name] = self._register(name, ros_type)
+            channel = self._channels[name, publisher] = self._register(name, ros_type, publisher)
         self._writer.add_message(channel, log_ns, payload, publish_ns)
 
     def flush(self) -> None:
@@ -69,11 +84,12 @@ class McapFile:
         with contextlib.suppress(OSError):
             finish_unfinished(self.path)
 
-    def _register(self, name: str, ros_type: str) -> int:
+    def _register(self, name: str, ros_type: str, publisher: Publisher | None) -> int:
         if ros_type not in self._schemas:
             text = definition(ros_type).encode()
             self._schemas[ros_type] = self._writer.register_schema(ros_type, "ros2msg", text)
-        return self._writer.register_channel(f"/{name}", "cdr", self._schemas[ros_type])
+        metadata = {} if publisher is None else publisher._asdict()
+        return self._writer.register_channel(f"/{name}", "cdr", self._schemas[ros_type], metadata)
 
 
 class _Stream:

@@ -1,5 +1,5 @@
-"""Validating received poses: decodes them, refuses those that are old, repeated, out of order or from a second
-publisher, and counts refusals by reason."""
+"""Validating received poses: decodes them, refuses those that are old, repeated, out of order, from a second publisher
+or cannot be a measurement of our camera, and counts refusals by reason."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from msgs.wire import PayloadError, Refusal
 
 _NS = 1_000_000_000
 _PUBLISHERS_REMEMBERED = 16
+POSITION_MAX_M = 100_000.0  # of each coordinate and its standard deviation: far beyond what a camera measures
 _SILENT_NS = _NS  # silence of a publisher after which another is accepted as its successor
 
 
@@ -100,6 +101,7 @@ class PoseReceiver:
             raise PayloadError(Refusal.ATTACHMENT)
         sequence, _, gid = parsed
         pose = PoseWithCovarianceStamped.decode(payload)
+        _check_measurable(pose)
         last = self._last.get(target)
         if not self.believes(sender, now_ns):
             raise PayloadError(Refusal.PUBLISHER)
@@ -123,3 +125,15 @@ class PoseReceiver:
         self._sequences[target, gid] = sequence
         while len(self._sequences) > _PUBLISHERS_REMEMBERED:
             del self._sequences[next(iter(self._sequences))]
+
+
+def _check_measurable(pose: PoseWithCovarianceStamped) -> None:
+    """Raise PayloadError for a well-formed pose that is none of a target in `cam` with a known position."""
+    if pose.frame_id != topics.FRAME_CAMERA:
+        raise PayloadError(Refusal.FRAME)
+    x_m, y_m, z_m = pose.t_cam_target_m.tolist()  # in plain floats: called at frame rate
+    xx_m2, yy_m2, zz_m2 = map(pose.covariance.item, (0, 7, 14))
+    if min(xx_m2, yy_m2, zz_m2) <= 0.0:  # ROS programs set zeros where they know none
+        raise PayloadError(Refusal.VARIANCE)
+    if max(abs(x_m), abs(y_m), abs(z_m)) > POSITION_MAX_M or max(xx_m2, yy_m2, zz_m2) > POSITION_MAX_M**2:
+        raise PayloadError(Refusal.POSITION)

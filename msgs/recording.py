@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from msgs import topics
-from msgs.mcap_file import McapFile, finish_unfinished, is_written
+from msgs.mcap_file import McapFile, Publisher, finish_unfinished, is_written
 from msgs.topics import Topic
 
 log = logging.getLogger(__name__)
@@ -61,6 +61,7 @@ class Sample:
     log_ns: int  # UTC, when it was recorded
     publish_ns: int  # UTC, when it was put
     clock_ns: int  # UTC minus monotonic clock at the time of recording
+    publisher: Publisher | None
 
     @property
     def monotonic_ns(self) -> int:
@@ -75,9 +76,9 @@ class Recorder:
     """
 
     def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell, *, on: bool = True) -> None:
-        self._store = Store(folder, stem, limits, tell)
+        self._tell = _harmless(tell)
+        self._store = Store(folder, stem, limits, self._tell)
         self._limits = limits
-        self._tell = tell
         self._changed = threading.Condition()
         self._waiting: deque[Sample] = deque()
         self._waiting_bytes = 0
@@ -108,10 +109,18 @@ class Recorder:
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, topic: Topic, uav: str, target: str | None, payload: bytes, publish_ns: int) -> None:
+    def record(
+        self,
+        topic: Topic,
+        uav: str,
+        target: str | None,
+        payload: bytes,
+        publish_ns: int,
+        publisher: Publisher | None = None,
+    ) -> None:
         """Queue a sample for writing if recording is on; never blocks. Dropped and counted if the disk fails."""
-        log_ns, clock_ns = time.time_ns(), _utc_ahead_ns()
-        sample = Sample(topic, topics.topic_name(topic, uav, target), payload, log_ns, publish_ns, clock_ns)
+        name, log_ns, clock_ns = topics.topic_name(topic, uav, target), time.time_ns(), _utc_ahead_ns()
+        sample = Sample(topic, name, payload, log_ns, publish_ns, clock_ns, publisher)
         with self._changed:
             if topic.cache == 1 and (sample.name in self._standing or len(self._standing) < STANDING_MAX):
                 self._standing[sample.name] = sample
@@ -205,8 +214,8 @@ class Recorder:
             self._open(samples)
         if self._file is None:
             return
-        for sample in samples:
-            self._file.write(sample.name, sample.topic.ros_type, sample.payload, sample.log_ns, sample.publish_ns)
+        for one in samples:
+            self._file.write(one.name, one.topic.ros_type, one.payload, one.log_ns, one.publish_ns, one.publisher)
         self._file.flush()
         written = len(samples)
         if written:
@@ -242,7 +251,7 @@ class Recorder:
         began_ns = min((one.log_ns for one in samples), default=time.time_ns())
         for one in standing:
             if one not in samples and (not samples or one.monotonic_ns <= samples[-1].monotonic_ns):
-                self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns)
+                self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns, one.publisher)
         if self._failure is not None:
             self._set_failure(None)
 
@@ -279,6 +288,18 @@ class Recorder:
                 self._in_hand = 0
                 self._waiting.clear()
                 self._waiting_bytes = 0
+
+
+def _harmless(tell: Tell) -> Tell:
+    """The same, except that what it raises ends no recording."""
+
+    def told(level: int, text: str) -> None:
+        try:
+            tell(level, text)
+        except Exception as error:
+            log.warning("this could not be told: %r", error)
+
+    return told
 
 
 def _utc_ahead_ns() -> int:

@@ -19,6 +19,8 @@ from typing import Any
 
 import zenoh
 
+from msgs import topics
+
 LEASE_MS = 2000
 # How long a peer that accepts a connection and then stays silent can block opening (or closing) a session.
 OPEN_TIMEOUT_MS = 4000
@@ -30,6 +32,10 @@ RETRY_PERIOD_MAX_MS = 500
 # zenoh's default of 2 is too small: on a busy machine both may still be being sent, and poses of the same frame are
 # then dropped.
 POSE_BATCHES = 4
+# zenoh drops a sample that comes earlier than a period after the last one it passed. Given the cap itself, it would
+# drop each frame that a camera of just that rate delivers a little early, nearly every second one. With this factor,
+# frames may come early by a sixth of their period; a higher one would send more than a narrow link is meant to carry.
+CAP_SLACK = 1.2
 # Rates on a link whose poses are capped: enough for a human operator.
 TF_RATE_MAX_HZ = 5.0
 DETECTIONS_RATE_MAX_HZ = 2.0
@@ -161,9 +167,9 @@ def peer_config(
 ) -> zenoh.Config:
     """The daemon's session: opens whether or not anything listens at `connect`, and keeps retrying.
 
-    `pose_rate_max_hz` limits the rate of poses and odometry on quic, tls and udp links; the own ship's transforms and
-    the detections, also sent with each frame, are limited further. Plain tcp, for tools on board, is not limited.
-    Raises zenoh.ZError for a malformed endpoint.
+    `pose_rate_max_hz` limits the rate of each target's poses and odometry on quic, tls and udp links, to at most
+    CAP_SLACK times this; the own ship's transforms and the detections, also sent with each frame, are limited further.
+    Plain tcp, for tools on board, is not limited. Raises zenoh.ZError for a malformed endpoint.
     """
     config = _config("peer", listen, connect, discovery, tls)
     _insert(config, "connect/timeout_ms", -1)
@@ -171,15 +177,7 @@ def peer_config(
     retry = {"period_init_ms": RETRY_PERIOD_MS, "period_max_ms": RETRY_PERIOD_MAX_MS, "period_increase_factor": 2}
     _insert(config, "connect/retry", retry)
     if pose_rate_max_hz is not None:
-        rates_hz = {
-            "target/*/pose": pose_rate_max_hz,
-            "target/*/odom": pose_rate_max_hz,
-            "target/detections": min(pose_rate_max_hz, DETECTIONS_RATE_MAX_HZ),
-            "tf": min(pose_rate_max_hz, TF_RATE_MAX_HZ),
-        }
-        rules = [{"key_expr": f"*/*/{name}/**", "freq": rate_hz} for name, rate_hz in rates_hz.items()]
-        rule_set = {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}
-        _insert(config, "downsampling", [rule_set])
+        _insert(config, "downsampling", [_thinned_by_radio(pose_rate_max_hz)])
     _insert(config, "access_control", _no_pictures_by_radio())
     return config
 
@@ -199,6 +197,20 @@ def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zen
     """A tool's session. Opening it raises zenoh.ZError if no endpoint answers: immediately if nothing listens there,
     over QUIC after QUIC_OPEN_TIMEOUT_MS."""
     return _config("client", [], connect, False, tls)
+
+
+def _thinned_by_radio(pose_rate_max_hz: float) -> dict[str, Any]:
+    """zenoh's downsampling rules for tls, quic and udp links."""
+    rates_hz = {
+        "target/detections": min(pose_rate_max_hz, DETECTIONS_RATE_MAX_HZ),
+        "tf": min(pose_rate_max_hz, TF_RATE_MAX_HZ),
+    }
+    # zenoh counts per rule, not per key: in a rule for all targets, the first of each frame would use it up.
+    for number in range(topics.TARGETS_MAX):
+        for name in ("pose", "odom"):
+            rates_hz[f"target/t{number}/{name}"] = CAP_SLACK * pose_rate_max_hz
+    rules = [{"key_expr": f"*/*/{name}/**", "freq": rate_hz} for name, rate_hz in rates_hz.items()]
+    return {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}
 
 
 def _no_pictures_by_radio() -> dict[str, Any]:

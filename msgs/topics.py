@@ -29,6 +29,7 @@ FRAME_BODY = "base_link_frd"
 FRAME_NED = "ned"
 # NED axes with the origin at the own ship, moving with it: the targets' frame while the own position is unknown.
 FRAME_BODY_NED = "base_link_ned"
+TARGETS_MAX = 4  # of one vehicle at a time: t0 to t3
 
 _ROS_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _TARGET_NAME = re.compile(r"t[0-9]{1,3}")

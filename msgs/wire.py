@@ -39,6 +39,9 @@ class Refusal(Enum):
     STALE = "stamp is too old, or older than one already taken"
     FUTURE = "stamp lies in the future"
     TOPIC = "key is no topic of the table"
+    FRAME = "frame is not the camera's"
+    POSITION = "position, or its standard deviation, is beyond what any camera measures"
+    VARIANCE = "a variance of the position is not positive: it is not known"
     PUBLISHER = "another publisher of this target was heard within the last second"
 
 

@@ -9,19 +9,21 @@ import threading
 from pathlib import Path
 from typing import TypeAlias
 
-from msgs.command_line import exit_code
+from msgs.command_line import exit_code, output, say_aside
 from msgs.ground.errors import InputError
 from msgs.session import CALLING, TlsFiles
 from msgs.signals import stop_on_signals
 from msgs.topics import check_uav_name, table_markdown
 
 DOMAIN_MAX = 232  # of any daemon and router
+NUMBER_MAX = 1e9  # of seconds, 31 years; of megabytes, a petabyte
 HANGING_UP_S = 0.5  # time for a pending connection attempt to end if nothing listens
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input (the message names file and key), 130 interrupted, 141 output pipe closed."""
+    """Exit codes: 0 done, 2 bad input (the message names file and key) or output that cannot be written, 130
+    interrupted, 141 output pipe closed."""
     options = _parser().parse_args(arguments)
     code = exit_code(lambda: int(options.act(options)), InputError, ["ground"])
     if _still_calls():
@@ -180,15 +182,15 @@ def _add_tools(commands: Commands) -> None:
 
 def _positive(text: str) -> float:
     value = _number(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    if not 0.0 < value <= NUMBER_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number of at most {NUMBER_MAX:.0f}")
     return value
 
 
 def _not_negative(text: str) -> float:
     value = _number(text)
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
+    if not 0.0 <= value <= NUMBER_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0 and at most {NUMBER_MAX:.0f}")
     return value
 
 
@@ -240,9 +242,7 @@ def _uav(name: str) -> str:
 
 
 def _watch(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from msgs.ground.watch import WatchOptions, watch
+    from msgs.ground.watch import Terminal, WatchOptions, watch
 
     asked = WatchOptions(
         options.connect,
@@ -252,7 +252,7 @@ def _watch(options: argparse.Namespace) -> int:
         options.max_age,
         options.json,
     )
-    return watch(asked, _stop_on_signal(options.seconds), Console(), _say_aside)
+    return watch(asked, _stop_on_signal(options.seconds), Terminal(), say_aside)
 
 
 def _view(options: argparse.Namespace) -> int:
@@ -271,7 +271,7 @@ def _view(options: argparse.Namespace) -> int:
         options.save,
         options.web,
     )
-    return view(asked, _stop_on_signal(options.seconds), _say_aside)
+    return view(asked, _stop_on_signal(options.seconds), say_aside)
 
 
 def _record(options: argparse.Namespace) -> int:
@@ -288,14 +288,14 @@ def _record(options: argparse.Namespace) -> int:
     if options.total_mb is not None and options.total_mb < 2 * options.file_mb:
         raise InputError("--total-mb must be at least twice --file-mb: otherwise nothing is left when a file begins")
     stop, uavs = _stop_on_signal(options.seconds), [_uav(name) for name in options.uav]
-    return record(options.connect, _tls(options), uavs, options.domain, options.dir, limits, stop, _say_aside)
+    return record(options.connect, _tls(options), uavs, options.domain, options.dir, limits, stop, say_aside)
 
 
 def _command(options: argparse.Namespace) -> int:
     from msgs.ground.command import command
 
     uav, stop = _uav(options.uav), _stop_on_signal()
-    return command(options.connect, _tls(options), uav, options.name, options.words, stop, _say_aside)
+    return command(options.connect, _tls(options), uav, options.name, options.words, stop, say_aside)
 
 
 def _bench(options: argparse.Namespace) -> int:
@@ -309,12 +309,9 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _topics(_: argparse.Namespace) -> int:
-    print(table_markdown(), end="")
+    with output():
+        print(table_markdown(), end="")
     return 0
-
-
-def _say_aside(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def _stop_on_signal(after_s: float | None = None) -> threading.Event:

@@ -11,6 +11,7 @@ from typing import Any
 
 import zenoh
 
+from msgs.command_line import OutputError, output
 from msgs.ground.errors import InputError
 from msgs.ground.feed import session
 from msgs.session import TlsFiles
@@ -75,25 +76,39 @@ def ask(
     timeout_s: float = ANSWER_S,
     stop: threading.Event | None = None,
 ) -> dict[str, Any]:
-    """Send a command and wait for the answer, or until `stop` is set; `ok` is false, with an `error`, if the vehicle
-    refuses or does not answer."""
+    """Send a command and wait until every vehicle of that name has answered, or `stop` is set; `ok` is false, with an
+    `error`, if the vehicle refuses or does not answer, or if more than one answers."""
     stop = stop or threading.Event()
     key, why = f"uavpose/@v1/{uav}/cmd/{name}", f"{uav} does not answer: not there, or not for you to command"
-    replies = opened.get(key, payload=json.dumps(asked), encoding=zenoh.Encoding.APPLICATION_JSON, timeout=timeout_s)
+    replies = opened.get(
+        key,
+        payload=json.dumps(asked),
+        encoding=zenoh.Encoding.APPLICATION_JSON,
+        timeout=timeout_s,
+        # Of answers of one key, zenoh would otherwise pass on the last one only.
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
+    answers: list[dict[str, Any]] = []
     # Polling, because a blocking wait inside zenoh cannot be interrupted by signals.
-    while not stop.is_set():
+    while True:
         try:
             reply = replies.try_recv()
         except zenoh.ZError:  # no further replies
-            return {"ok": False, "command": name, "error": why}
-        if reply is None:
-            stop.wait(LOOK_EVERY_S)
-            continue
-        answer = _answer(reply)
-        if answer is not None:
-            return answer
-        why = f"{uav} does not answer within {timeout_s:.0f} s: it may have done it, or it is not for you to command"
-    return {"ok": False, "command": name, "error": f"broken off before {uav} answered: it may have done it"}
+            break
+        if reply is not None:
+            answer = _answer(reply)
+            if answer is not None:
+                answers.append(answer)
+            else:
+                late = f"{uav} does not answer within {timeout_s:.0f} s"
+                why = f"{late}: it may have done it, or it is not for you to command"
+        elif stop.wait(LOOK_EVERY_S):
+            why = f"broken off before {uav} answered: it may have done it"
+            break
+    if len(answers) > 1:
+        said = "; ".join(json.dumps(one.get("done") if one["ok"] is True else one.get("error")) for one in answers)
+        why = f"{len(answers)} vehicles named {uav} have answered: {said}"
+    return answers[0] if len(answers) == 1 else {"ok": False, "command": name, "error": why}
 
 
 def _answer(reply: zenoh.Reply) -> dict[str, Any] | None:
@@ -115,8 +130,8 @@ def command(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send one command and print the answer as JSON; returns 0, or 1 if it was refused, not answered, or `stop` was set
-    first. Raises InputError for an invalid command."""
+    """Send one command and print the answer as JSON, with `say` if standard output cannot be written; returns 0, or 1
+    if it was refused, not answered, or `stop` was set first. Raises InputError for an invalid command."""
     asked = body(name, words)
     giving_up = threading.Timer(LINK_S, stop.set)
     giving_up.daemon = True
@@ -126,5 +141,9 @@ def command(
         answer = {"ok": False, "command": name, "error": f"no link to {endpoint}"}
         if opened is not None:
             answer = ask(opened, uav, name, asked, RELOAD_ANSWER_S if name == "reload" else ANSWER_S, stop)
-    print(json.dumps(answer))
+    try:
+        with output():
+            print(json.dumps(answer), flush=True)
+    except OutputError as error:  # whoever repeats the command should know whether it was carried out
+        say(f"{error}; the answer is {json.dumps(answer)}")
     return 0 if answer["ok"] is True else EXIT_REFUSED

@@ -131,7 +131,7 @@ def listening(
     # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
     handler = handlers.Callback(sample, indirect=False)
     declared: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
-    for uav in uavs or ("*",):
+    for uav in dict.fromkeys(uavs or ("*",)):
         for topic in wanted:
             key = topics.subscription_key(topic, uav, domain=domain)
             if not topic.cache:

@@ -2,7 +2,8 @@
 
 Range and closing speed are relative to the camera. Bearing (clockwise from north), elevation and attitude are in NED
 while the vehicle sends its own attitude; otherwise bearing and elevation are measured to the right of and above the
-optical axis. The own attitude arrives after the pose and, over radio, less often: a row waits for the one of its time.
+optical axis. The own attitude arrives after the pose and, over radio, less often: it is predicted for the row that is
+returned at once, and the row that is shown waits for the one of its time.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from msgs import topics
 from msgs.cdr import DECODERS, Detection3DArray, DiagnosticArray, Log, TFMessage
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.ground.feed import Incoming
-from msgs.ground.own_ship import GAP_NS, OwnShipHistory
+from msgs.ground.own_ship import GAP_NS, OwnShip, OwnShipHistory
 from msgs.receive import PoseReceiver, TargetPose
-from msgs.wire import Array, PayloadError, Refusal
+from msgs.wire import PayloadError, Refusal
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
@@ -52,6 +53,7 @@ class TargetRow:
     bearing_deg: float
     elevation_deg: float
     frame: Literal["ned", "cam"]  # of bearing and elevation
+    own_age_s: float | None  # from the own attitude that they are predicted from to the exposure; None: in cam
     closing_mps: float | None  # positive: approaching
     attitude_deg: tuple[float, float, float] | None  # roll, pitch, heading in NED; None: own or target's unknown
     score: float | None
@@ -97,7 +99,7 @@ class _Target:
             pose, row = self.waiting[index]
             ship = own.at(pose.stamp_ns)
             if ship is not None:
-                self.settled = target_row(pose, row.closing_mps, ship.R_ned_cam, row.score)
+                self.settled = target_row(pose, row.closing_mps, ship, row.score)
                 for _ in range(index + 1):
                     self.waiting.popleft()
                 return
@@ -193,8 +195,7 @@ class Fleet:
         while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
             ranges.popleft()
         ship = vehicle.own.near(pose.stamp_ns)
-        R_ned_cam = None if ship is None else ship.R_ned_cam
-        row = target_row(pose, closing_mps(ranges), R_ned_cam, vehicle.score(pose))
+        row = target_row(pose, closing_mps(ranges), ship, vehicle.score(pose))
         if known is None:
             known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
         known.newest, known.seen_ns = row, pose.arrival_ns
@@ -275,8 +276,9 @@ def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
     return -float(np.polyfit((points[:, 0] - points[0, 0]) / 1e9, points[:, 1], 1)[0])
 
 
-def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None, score: float | None) -> TargetRow:
-    """Row for a pose; `R_ned_cam` [3, 3], or None if the own attitude is unknown."""
+def target_row(pose: TargetPose, closing: float | None, ship: OwnShip | None, score: float | None) -> TargetRow:
+    """Row for a pose; `ship` is None if the own attitude is unknown."""
+    R_ned_cam = None if ship is None else ship.R_ned_cam
     t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
     range_m = float(np.linalg.norm(t_m))
     along = t_m / max(range_m, 1e-9)
@@ -301,6 +303,7 @@ def target_row(pose: TargetPose, closing: float | None, R_ned_cam: Array | None,
         bearing_deg=bearing_deg if R_ned_cam is None else bearing_deg % 360.0,
         elevation_deg=math.degrees(math.atan2(-down, math.hypot(right, ahead))),
         frame="cam" if R_ned_cam is None else "ned",
+        own_age_s=None if ship is None else (pose.stamp_ns - ship.stamp_ns) / 1e9,
         closing_mps=closing,
         attitude_deg=attitude,
         score=score,

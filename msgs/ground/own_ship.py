@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import numpy as np
@@ -14,7 +14,9 @@ from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
 from msgs.wire import Array
 
 GAP_NS = 500_000_000  # longest gap to interpolate over; at five messages a second, one may be lost
-NEAR_NS = 100_000_000
+# Longest time to predict over. Where transforms are cut to five a second, up to 300 ms lie between two, as only whole
+# frames pass, and that of a frame arrives after its poses.
+NEAR_NS = 350_000_000
 KEPT_NS = 2_000_000_000
 KEPT_MAX = 512
 _stamp_ns = attrgetter("stamp_ns")
@@ -24,7 +26,7 @@ _stamp_ns = attrgetter("stamp_ns")
 class OwnShip:
     """The own ship at one instant."""
 
-    stamp_ns: int
+    stamp_ns: int  # UTC; if it is predicted, of the message that it is predicted from
     root: str  # reference frame: NED axes at a fixed origin or at the own ship
     R_ned_cam: Array
     t_ned_own_m: Array
@@ -61,19 +63,33 @@ class OwnShipHistory:
         before, after = self._told[index - 1], self._told[index]
         if after.stamp_ns - before.stamp_ns > GAP_NS:
             return None
-        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        turn = so3_log(before.R_ned_cam.T @ after.R_ned_cam)
-        own_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
-        cam_m = before.t_ned_cam_m + share * (after.t_ned_cam_m - before.t_ned_cam_m)
-        return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), own_m, cam_m)
+        return _between(before, after, stamp_ns)
 
     def near(self, stamp_ns: int) -> OwnShip | None:
-        """The state at a time or, if it cannot be interpolated, the nearest one within `NEAR_NS`."""
+        """The state at a time or, if it cannot be interpolated, the one predicted from the nearest within `NEAR_NS`:
+        turned on as fast as before, by at most as much as between the last two."""
         own = self.at(stamp_ns)
         if own is not None or not self._told:
             return own
         nearest = min(self._told, key=lambda one: abs(one.stamp_ns - stamp_ns))
-        return nearest if abs(nearest.stamp_ns - stamp_ns) <= NEAR_NS else None
+        if abs(nearest.stamp_ns - stamp_ns) > NEAR_NS:
+            return None
+        index = bisect_left(self._told, nearest.stamp_ns, key=_stamp_ns)
+        before = self._told[index - 1] if index else nearest
+        step_ns = nearest.stamp_ns - before.stamp_ns
+        if stamp_ns < nearest.stamp_ns or not 0 < step_ns <= GAP_NS:
+            return nearest
+        predicted = _between(before, nearest, min(stamp_ns, nearest.stamp_ns + step_ns))
+        return replace(predicted, stamp_ns=nearest.stamp_ns)
+
+
+def _between(before: OwnShip, after: OwnShip, stamp_ns: int) -> OwnShip:
+    """The state between two others of the same root, or beyond the second, at a constant turn rate and velocity."""
+    share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+    turn = so3_log(before.R_ned_cam.T @ after.R_ned_cam)
+    own_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
+    cam_m = before.t_ned_cam_m + share * (after.t_ned_cam_m - before.t_ned_cam_m)
+    return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), own_m, cam_m)
 
 
 def own_ship(message: TFMessage) -> OwnShip | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, linked, listening, session
+from msgs.mcap_file import Publisher
 from msgs.recording import Recorder, RecordingLimits
 from msgs.session import TlsFiles
 
@@ -38,8 +39,9 @@ def record(
 
     def take(one: Incoming) -> None:
         attachment = topics.parse_attachment(one.attachment)
-        publish_ns = attachment[1] if attachment is not None else time.time_ns()
-        recorder.record(one.topic, one.uav, one.target, one.payload, max(publish_ns, 0))
+        _, publish_ns, gid = attachment if attachment is not None else (0, time.time_ns(), b"")
+        publisher = Publisher(one.sender, gid.hex())
+        recorder.record(one.topic, one.uav, one.target, one.payload, max(publish_ns, 0), publisher)
 
     def alive(uav: str, here: bool) -> None:
         say(f"{uav}: {'here' if here else 'gone'}")

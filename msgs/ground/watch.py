@@ -10,14 +10,14 @@ from dataclasses import asdict, dataclass
 
 import zenoh
 from rich import box
-from rich.console import Console, Group
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.live import Live
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from msgs.cdr import DiagnosticArray, Log
-from msgs.command_line import discard_output
-from msgs.ground.errors import InputError
+from msgs.command_line import output
 from msgs.ground.feed import Incoming, linked, listening, session
 from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
 from msgs.session import TlsFiles
@@ -27,6 +27,13 @@ PLAIN_PERIOD_S = 2.0
 STALE_S = 1.0
 _LEVEL_STYLE = {0: "green", 1: "yellow", 2: "bold red"}
 _NS = 1_000_000_000
+
+
+class Terminal(Console):
+    """Standard output. Leaves it to the command line what follows when nobody reads it any more."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
 
 
 @dataclass(frozen=True)
@@ -42,8 +49,8 @@ class WatchOptions:
 
 
 def watch(options: WatchOptions, stop: threading.Event, console: Console, say: Callable[[str], None]) -> int:
-    """Show the vehicles until `stop` is set; returns 0. Raises InputError for a bad endpoint, or if JSON lines cannot
-    be written."""
+    """Show the vehicles until `stop` is set; returns 0. Raises InputError for a bad endpoint, OutputError on a full
+    disk, BrokenPipeError if nobody reads them any more."""
     fleet = Fleet(domain=options.domain, max_age_s=options.max_age_s)
     show = _watch_json if options.as_json else _watch_table
     with session(options.endpoint, options.tls, stop, say) as opened:
@@ -58,21 +65,41 @@ def _watch_table(
     def take(incoming: Incoming) -> None:
         fleet.take(incoming, time.time_ns())
 
-    def picture() -> Group:
+    def picture(*, one_line: bool) -> Group:
         now_ns = time.time_ns()
-        return table(fleet.rows(now_ns), linked(opened), options.endpoint, now_ns)
+        return table(fleet.rows(now_ns), linked(opened), options.endpoint, now_ns, one_line=one_line)
 
     with listening(opened, options.uavs, options.domain, take, fleet.alive, TAKEN):
         if not console.is_terminal or console.is_dumb_terminal:  # a picture cannot be replaced there
             ended = False
             while not ended:
                 ended = stop.wait(PLAIN_PERIOD_S)
-                console.print(picture())
+                with output():
+                    console.print(picture(one_line=False))
             return
-        with Live(picture(), console=console, auto_refresh=False) as live:
-            while not stop.wait(REFRESH_S):
-                live.update(picture(), refresh=True)
-            live.update(picture(), refresh=True)
+        with Live(Fitted(picture(one_line=True)), console=console, auto_refresh=False) as live:
+            ended = False
+            while not ended:
+                ended = stop.wait(REFRESH_S)
+                live.update(Fitted(picture(one_line=True)), refresh=True)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A picture cut to the height of the screen; the last line then says how many lines are hidden."""
+
+    picture: Group
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        lines = console.render_lines(self.picture, options, pad=False)
+        if len(lines) > console.height:
+            hidden = len(lines) - (console.height - 1)
+            lines = lines[: console.height - 1]
+            told = Text(f"… {hidden} more lines: enlarge the window, or choose with --uav", "yellow", no_wrap=True)
+            lines += console.render_lines(told, options, pad=False)
+        for line in lines:
+            yield from line
+            yield Segment.line()
 
 
 def _watch_json(
@@ -80,7 +107,8 @@ def _watch_json(
 ) -> None:
     """One JSON object per line: `pose`, `health`, `event`, `vehicle` (present or gone) and `link` (up or down).
 
-    Raises InputError if the lines cannot be written, as into a file on a full disk.
+    Raises OutputError if the lines cannot be written, as into a file on a full disk, BrokenPipeError if nobody reads
+    them any more.
     """
     lock, broken = threading.Lock(), list[OSError]()
 
@@ -127,13 +155,14 @@ def _watch_json(
                 told = up
             if stop.wait(REFRESH_S):
                 break
-    if broken and not isinstance(broken[0], BrokenPipeError):
-        discard_output()
-        raise InputError(f"standard output: cannot be written: {broken[0].strerror}")
+    if broken:
+        with output():
+            raise broken[0]
 
 
-def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) -> Group:
-    """The tables at `now_ns` (UTC): one row per vehicle, and one per target.
+def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int, *, one_line: bool = False) -> Group:
+    """The tables at `now_ns` (UTC): one row per target, and one per vehicle; with `one_line`, health and event are cut
+    to what fits on one line, and are wrapped otherwise.
 
     A bearing with a `c` is measured from the optical axis to the right, as the vehicle's attitude is unknown.
     """
@@ -141,19 +170,21 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int) 
     fleet = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     found = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     # Eighty columns suffice for short names; longer cells wrap: truncated, 1218.2 m would read 12….
-    for name in ("vehicle", "link", "health", "poses/s", "refused", "last event"):
-        fleet.add_column(name, overflow="fold")
     found.add_column("target", overflow="fold")
     for name in ("range m", "±", "close m/s", "brg °", "el °", "hdg/pit/rol °", "±°", "score", "age s"):
         found.add_column(name, justify="right", overflow="fold")
+    for name in ("vehicle", "link", "health", "poses/s", "refused", "last event"):
+        fleet.add_column(name, overflow="fold")
     for one in vehicles:
-        here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
-        event = Text(_printable(one.event) or "–")
-        fleet.add_row(one.uav, here, _health(one, now_ns), f"{one.pose_rate_hz:.1f}", str(one.refused), event)
         for target in one.targets:
             stale = (now_ns - target.heard_ns) / _NS > STALE_S
             found.add_row(*_cells(target, now_ns), style="dim" if stale else None)
-    return Group(link, fleet, found)
+        here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
+        health, event = _health(one, now_ns), Text(_printable(one.event) or "–")
+        for text in (health, event) if one_line else ():
+            text.no_wrap, text.overflow = True, "ellipsis"
+        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused), event)
+    return Group(link, found, fleet)
 
 
 def _health(row: VehicleRow, now_ns: int) -> Text:

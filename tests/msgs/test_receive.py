@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -90,6 +91,26 @@ def test_keys_and_attachments_are_judged_too() -> None:
     assert receiver.receive(topics.publication_key(POSE, "uav2", "t0"), payload, attachment, NOW_NS) is None
     assert receiver.receive(KEY, payload, b"", NOW_NS) is None
     assert dict(receiver.refused) == {Refusal.TOPIC: 2, Refusal.ATTACHMENT: 1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"frame_id": "ned"}, Refusal.FRAME),
+        ({"frame_id": ""}, Refusal.FRAME),
+        ({"covariance": np.zeros((6, 6))}, Refusal.VARIANCE),
+        ({"covariance": np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])}, Refusal.VARIANCE),
+        ({"t_cam_target_m": np.array([0.0, -1e200, 300.0])}, Refusal.POSITION),
+        ({"t_cam_target_m": np.array([0.0, 0.0, 100_001.0])}, Refusal.POSITION),
+        ({"covariance": np.diag([1e308, 1e308, 1e308, 1.0, 1.0, 1.0])}, Refusal.POSITION),
+    ],
+)
+def test_what_no_camera_measured_is_refused(changes: dict[str, object], reason: Refusal) -> None:
+    receiver, good = PoseReceiver("uav1"), dataclasses.replace(pose_now(), stamp_ns=NOW_NS)
+    bad = dataclasses.replace(good, **changes).encode()  # type: ignore[arg-type]
+    assert receiver.receive(KEY, bad, topics.attachment(1, NOW_NS, GID), NOW_NS) is None
+    assert dict(receiver.refused) == {reason: 1}
+    assert receiver.receive(KEY, good.encode(), topics.attachment(1, NOW_NS, GID), NOW_NS)
 
 
 @settings(max_examples=60)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 from collections import Counter
@@ -56,6 +57,23 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
     assert (kept[0], kept[-1]) == (b"before", b"after")
     assert b"lost" not in kept
+
+
+def test_recording_goes_on_where_its_messages_reach_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message each time old recordings make room, and nobody reads them any more."""
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    refused: list[str] = []
+
+    def refuse(_: int, text: str) -> None:
+        refused.append(text)
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    recorder = Recorder(tmp_path, "uav1", RecordingLimits(5_000, total_bytes_max=15_000, free_bytes_min=0), refuse)
+    recorder.start()
+    until(lambda: len(refused) >= 3, lambda: record_some(recorder, [bytes(2000)]), what="old recordings to go")
+    recorder.stop()
+    assert recorder.counters().keys() == {"recorded"}
+    assert all("old recordings removed" in one for one in refused)
 
 
 def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is_told_once(

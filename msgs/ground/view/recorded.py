@@ -16,10 +16,10 @@ from mcap.records import Channel, Message, Schema
 from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming
-from msgs.mcap_file import unfinished_bytes
+from msgs.mcap_file import Publisher, unfinished_bytes
 
-# Recordings contain no attachments: everything gets one publisher, with sequence numbers continuing across files.
-_GID, _numbers = bytes(16), count(1)
+# Recordings contain no sequence numbers: these continue across files.
+_numbers = count(1)
 _TIME_MAX_NS = 2**63 - 1  # largest time of numpy and Rerun; MCAP's times are unsigned
 
 
@@ -49,8 +49,15 @@ def samples(path: Path) -> Iterator[tuple[Incoming, int]]:
                 continue
             if message.log_time > _TIME_MAX_NS:
                 raise ValueError("recorded after the year 2262")
-            attachment = topics.attachment(next(_numbers), message.publish_time, _GID)
-            yield Incoming(*row, key, message.data, attachment), message.log_time
+            sender, gid = _publisher(channel)
+            attachment = topics.attachment(next(_numbers), message.publish_time, gid)
+            yield Incoming(*row, key, message.data, attachment, sender), message.log_time
+
+
+def _publisher(channel: Channel) -> tuple[str, bytes]:
+    """zenoh session and gid; one for all where the recording does not tell, as those made on board and older ones."""
+    told = Publisher("", "")._asdict() | dict(channel.metadata)
+    return told["zenoh_session"], bytes.fromhex(told["gid"])
 
 
 def _messages(stream: BinaryIO) -> Iterator[tuple[Schema | None, Channel, Message]]:

@@ -16,6 +16,7 @@ from zenoh import handlers
 from msgs.client import connect
 from msgs.ground.command import RELOAD_ANSWER_S, ask, body
 from msgs.ground.errors import InputError
+from msgs.session import peer_config
 from tests.waiting import until
 
 from ..conftest import Network
@@ -51,6 +52,50 @@ def test_a_command_without_an_answer_in_time_may_have_been_done(network: Network
         until(lambda: held, lambda: said.update(ask(session, "uav1", "stop", {}, timeout_s=0.5)), what="the command")
     assert said["error"].startswith("uav1 does not answer within ")
     assert "it may have done it" in said["error"]
+
+
+def test_of_two_vehicles_of_one_name_both_answers_are_told(network: Network) -> None:
+    """Each has carried it out: whoever meant one of them must know."""
+
+    def answers(said: dict[str, Any]) -> handlers.Callback:
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                query.reply(str(query.key_expr), json.dumps(said))
+
+        return handlers.Callback(reply, indirect=False)
+
+    key = "uavpose/@v1/uav1/cmd/*"
+    done = {"ok": True, "command": "rate", "done": {"max_hz": 10.0}}
+    refused = {"ok": False, "command": "rate", "error": "too many requests wait"}
+    with (
+        zenoh.open(peer_config([], [network.endpoint])) as second,
+        connect(network.endpoint) as session,
+        network.daemon.declare_queryable(key, answers(done)),
+    ):
+        said = dict[str, Any]()
+        until(lambda: said.get("ok"), lambda: said.update(ask(session, "uav1", "rate", {})), what="the only answer")
+        assert said == done
+        with second.declare_queryable(key, answers(refused)):
+            until(lambda: not said["ok"], lambda: said.update(ask(session, "uav1", "rate", {})), what="both answers")
+    assert said["error"].startswith("2 vehicles named uav1 have answered: ")
+    assert '{"max_hz": 10.0}' in said["error"]
+    assert "too many requests wait" in said["error"]
+
+
+def test_what_was_done_is_told_also_where_it_cannot_be_written(network: Network) -> None:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(str(query.key_expr), '{"ok": true, "command": "stop", "done": {}}')
+
+    words = [sys.executable, "-m", "msgs.ground.cli", "command", "-e", network.endpoint, "uav1", "stop"]
+    handler = handlers.Callback(reply, indirect=False)
+    with network.daemon.declare_queryable("uavpose/@v1/uav1/cmd/*", handler), open("/dev/full", "w") as full:
+        told = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert told.stderr == (
+        "standard output: cannot be written: No space left on device; "
+        'the answer is {"ok": true, "command": "stop", "done": {}}\n'
+    )
+    assert told.returncode == 0
 
 
 @pytest.mark.parametrize(

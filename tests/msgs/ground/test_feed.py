@@ -9,8 +9,13 @@ import threading
 
 import pytest
 
-from msgs.ground.feed import session
+from msgs import topics
+from msgs.client import connect
+from msgs.ground.feed import Incoming, listening, session
+from msgs.publish import Node
+from tests.waiting import until
 
+from ..conftest import Network, pose_now
 from .conftest import Ground
 
 
@@ -82,3 +87,21 @@ def test_where_certificates_may_be_at_fault_who_waits_is_told_so(ground: Ground)
             assert opened is None
         assert said[-1].startswith(f"waiting for {endpoint}")
         assert ("refuses the other's certificate" in said[-1]) == certificates
+
+
+def test_a_vehicle_that_is_named_twice_is_heard_once(network: Network) -> None:
+    came = list[int]()
+
+    def take(one: Incoming) -> None:
+        attachment = topics.parse_attachment(one.attachment)
+        assert attachment is not None
+        came.append(attachment[0])
+
+    with (
+        connect(network.endpoint) as opened,
+        listening(opened, ["uav1", "uav1"], 0, take, lambda *_: None, [topics.POSE]),
+        Node(network.daemon, "uav1") as node,
+    ):
+        publisher = node.publisher(topics.POSE, "t0")
+        until(lambda: len(came) >= 5, lambda: publisher.put(pose_now().encode()))
+    assert came == list(range(came[0], came[0] + len(came)))

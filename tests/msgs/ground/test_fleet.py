@@ -171,9 +171,23 @@ def test_bearings_of_a_turning_vehicle_are_by_its_attitude_of_that_instant(own_e
             assert stamp_ns - vehicle.targets[0].stamp_ns <= own_every * FRAME_NS
     assert {row.frame for row in shown} == {"ned"}
     assert max(map(off_north_deg, shown)) < 0.01
-    at_once = [row for row in told if row.frame == "ned"]
-    assert len(at_once) >= 40
-    assert max(map(off_north_deg, at_once)) < 0.1 * YAW_DEG_S + 0.01
+    # What is told at once, before the frame's own attitude, is predicted from the last two.
+    at_once = [row for row in told if row.stamp_ns > NOW_NS + 2 * own_every * FRAME_NS]
+    assert {row.frame for row in at_once} == {"ned"}
+    assert max(map(off_north_deg, at_once)) < 0.01
+    assert {round((row.own_age_s or 0.0) * S / FRAME_NS) for row in at_once} == set(range(1, own_every + 1))
+
+
+def test_own_attitude_is_predicted_by_no_more_than_it_was_seen_to_turn_and_not_for_long() -> None:
+    fleet, rows = Fleet(), list[TargetRow]()
+    for k in range(30):
+        for one in turning_frame(NOW_NS + k * FRAME_NS, k + 1, own=k < 10):
+            news = fleet.take(one, NOW_NS + k * FRAME_NS)
+            rows += [news] if isinstance(news, TargetRow) else []
+    assert [row.frame for row in rows[2:]] == ["ned"] * 16 + ["cam"] * 12  # up to 320 ms after the tenth
+    assert off_north_deg(rows[10]) < 0.01
+    assert off_north_deg(rows[17]) == pytest.approx(7 * YAW_DEG_S * FRAME_NS / S, abs=0.01)
+    assert [row.own_age_s for row in rows[17:19]] == [pytest.approx(0.32), None]
 
 
 def test_without_own_attitude_a_row_is_by_the_camera_and_a_lost_target_keeps_its_bearing() -> None:

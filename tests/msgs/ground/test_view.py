@@ -23,7 +23,7 @@ from msgs.ground.feed import Incoming
 from msgs.ground.fleet import Fleet
 from msgs.ground.view.command import ViewOptions, view
 from msgs.ground.view.scene import Scene
-from msgs.mcap_file import McapFile
+from msgs.mcap_file import McapFile, Publisher
 from msgs.publish import Node
 from tests.waiting import until
 
@@ -207,7 +207,7 @@ def clears(row: dict[str, object]) -> bool:
 
 
 def test_where_the_own_ship_is_told_seldom_targets_stand_where_they_were_all_the_same(tmp_path: Path) -> None:
-    """Each fourth of a frame's transforms comes, then none: half a second on nobody knows any more."""
+    """Each fourth of a frame's transforms comes, then none: 0.4 s on nobody knows any more."""
     file = McapFile(tmp_path / "thin.mcap")
     for topic, target, payload, log_ns in samples(40):
         number = (log_ns - START_NS) // PERIOD_NS
@@ -224,10 +224,10 @@ def test_where_the_own_ship_is_told_seldom_targets_stand_where_they_were_all_the
     unknown = [
         stamp_ns for stamp_ns, row in rows(path, "events") if "own attitude unknown" in text(row, "TextLog:text")
     ]
-    assert unknown == [stamps_ns(31)[-1]]
+    assert unknown == [stamps_ns(33)[-1]]
     sight = {stamp_ns: component(row, "strips")[0][0] for stamp_ns, row in rows(path, "ned/target/t0/line_of_sight")}
     last_m = places_m(stamps_ns(40)[28])[0]
-    for stamp_ns in stamps_ns(40)[30:]:
+    for stamp_ns in stamps_ns(40)[32:]:
         np.testing.assert_allclose(sight[stamp_ns], last_m, atol=1e-3)
 
 
@@ -307,6 +307,24 @@ def test_what_is_refused_of_a_recording_is_told(
     out = tmp_path / "twice.rrd"
     assert main(["view", str(halves[0]), str(halves[0]), "--max-age", "0.001", "--save", str(out)]) == 0
     assert capsys.readouterr().err.splitlines()[-1] == f"0 poses drawn into {out}, 20 samples refused"
+
+
+def test_of_two_vehicles_of_one_name_one_is_drawn_from_a_recording_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second one's frames are exposed half a period after the first one's."""
+    file, late_ns = McapFile(tmp_path / "both.mcap"), PERIOD_NS // 2
+    first, second = (Publisher(zenoh_session=name, gid=16 * name) for name in ("0a", "0b"))
+    for topic, target, payload, log_ns in samples(10):
+        if topic is topics.POSE:
+            name, pose = topics.topic_name(topic, UAV, target), cdr.PoseWithCovarianceStamped.decode(payload)
+            file.write(name, topic.ros_type, payload, log_ns, log_ns, first)
+            late = dataclasses.replace(pose, stamp_ns=pose.stamp_ns + late_ns).encode()
+            file.write(name, topic.ros_type, late, log_ns + late_ns, log_ns + late_ns, second)
+    file.close()
+    out = tmp_path / "both.rrd"
+    assert main(["view", str(tmp_path / "both.mcap"), "--save", str(out)]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == f"10 poses drawn into {out}, 10 samples refused"
 
 
 def test_a_recording_is_left_when_told_to_stop_and_what_was_drawn_is_kept(

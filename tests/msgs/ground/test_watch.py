@@ -25,7 +25,7 @@ from msgs import cdr, client, topics
 from msgs.ground.cli import main
 from msgs.ground.feed import Incoming, linked, listening
 from msgs.ground.fleet import Fleet
-from msgs.ground.watch import WatchOptions, _watch_json, table
+from msgs.ground.watch import Fitted, WatchOptions, _watch_json, table
 from msgs.publish import Node, TopicPublisher
 from msgs.session import peer_config, router_config
 from tests.waiting import until
@@ -217,7 +217,10 @@ def test_what_is_recorded_is_what_came_from_every_vehicle(network: Network, tmp_
         assert process.wait(60.0) == 0
     (path,) = tmp_path.iterdir()
     with open(path, "rb") as file:
-        came = [(channel.topic, message) for _, channel, message in make_reader(file).iter_messages()]
+        read = [(channel, message) for _, channel, message in make_reader(file).iter_messages()]
+    came = [(channel.topic, message) for channel, message in read]
+    assert {channel.metadata["zenoh_session"] for channel, _ in read} == {str(network.daemon.zid())}
+    assert all(len(bytes.fromhex(channel.metadata["gid"])) == 16 for channel, _ in read)
     for uav in ("uav1", "uav2"):
         poses = [cdr.PoseWithCovarianceStamped.decode(m.data) for name, m in came if name == f"/{uav}/target/t0/pose"]
         assert all(pose.t_cam_target_m[0] == 30.0 for pose in poses)
@@ -239,10 +242,12 @@ NOW_NS, S = 1_700_000_000_000_000_000, 1_000_000_000
 DIM = "\x1b[2m"
 
 
-def tell(fleet: Fleet, topic: topics.Topic, message: cdr.Payload, now_ns: int, target: str | None = None) -> None:
+def tell(
+    fleet: Fleet, topic: topics.Topic, message: cdr.Payload, now_ns: int, target: str | None = None, uav: str = "uav1"
+) -> None:
     """A first sample of this topic."""
-    key, attachment = topics.publication_key(topic, "uav1", target), topics.attachment(1, now_ns, bytes(16))
-    fleet.take(Incoming("uav1", topic, target, key, message.encode(), attachment), now_ns)
+    key, attachment = topics.publication_key(topic, uav, target), topics.attachment(1, now_ns, bytes(16))
+    fleet.take(Incoming(uav, topic, target, key, message.encode(), attachment), now_ns)
 
 
 def told_health(level: int, text: str) -> cdr.DiagnosticArray:
@@ -314,6 +319,28 @@ def test_a_narrow_terminal_cuts_neither_names_nor_numbers(columns: int) -> None:
     assert shown(columns) == shown(200)
 
 
+def test_a_screen_shows_targets_first_one_line_each_and_says_how_many_lines_are_hidden() -> None:
+    fleet, uavs = Fleet(), [f"uav{number}" for number in range(10)]
+    for uav in uavs:
+        told, event = told_health(1, "degraded, tracking; no own attitude"), "target 0 lost: held for 3.7 s"
+        tell(fleet, topics.DIAGNOSTICS, told, NOW_NS, uav=uav)
+        tell(fleet, topics.EVENTS, cdr.Log(NOW_NS, 20, "uavpose_edge", event), NOW_NS, uav=uav)
+        tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS), NOW_NS, "t0", uav)
+
+    def shown(lines: int) -> list[str]:
+        console = Console(file=io.StringIO(), width=80, height=lines)
+        console.print(Fitted(table(fleet.rows(NOW_NS), True, "tcp/127.0.0.1:7447", NOW_NS, one_line=True)))
+        assert isinstance(console.file, io.StringIO)
+        return console.file.getvalue().splitlines()
+
+    whole, cut = shown(100), shown(24)
+    assert [one.split()[0] for one in whole if "uav" in one] == [*(f"{uav}/t0" for uav in uavs), *uavs]
+    assert sum("degraded" in one and "target 0" in one and one.count("…") == 2 for one in whole) == 10
+    assert len(cut) == 24
+    assert cut[:-1] == whole[:23]
+    assert cut[-1].startswith(f"… {len(whole) - 23} more lines")
+
+
 def test_a_link_that_is_down_is_told_so_from_the_first() -> None:
     endpoint = free_endpoint()
     with ExitStack() as stack:
@@ -339,7 +366,7 @@ def test_who_bears_no_vehicle_s_name_is_not_told_of(network: Network) -> None:
     assert set(here) == {"uav1"}
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "-1", "much"])
+@pytest.mark.parametrize("number", ["nan", "inf", "-1", "much", "1e305"])
 @pytest.mark.parametrize("option", ["watch --max-age", "view --max-age", "record --free-mb"])
 def test_what_is_no_number_from_nought_on_is_a_sentence(
     option: str, number: str, capsys: pytest.CaptureFixture[str]
@@ -347,6 +374,17 @@ def test_what_is_no_number_from_nought_on_is_a_sentence(
     with pytest.raises(SystemExit, match="2"):
         main([*option.split(), number, "--seconds", "0.1"])
     assert f"argument {option.split()[1]}: {number} is not a number of at least 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", ["watch --seconds 1e10", "watch --seconds 0", "view --seconds 1e10", "record --file-mb 1e305"]
+)
+def test_what_is_no_positive_number_or_a_huge_one_is_a_sentence(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command, option, number = words.split()
+    with pytest.raises(SystemExit, match="2"):
+        main([command, option, number, "-e", free_endpoint()])
+    said = f"argument {option}: {number} is not a positive number of at most 1000000000\n"
+    assert capsys.readouterr().err.endswith(said)
 
 
 @pytest.mark.parametrize("domain", ["-1", "233", "0.5", "uav1", ""])
