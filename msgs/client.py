@@ -45,7 +45,7 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
         session = zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
         reason = str(error).partition(" at /")[0].strip()  # cuts off the location in zenoh's source
-        raise ConnectionError(f"no zenoh session with {endpoint}: {reason}") from error
+        raise ConnectionError(f"no zenoh session with {endpoint}: {reason}. Is a router or daemon there?") from None
     with _opened_lock:
         _opened[:] = [*(one for one in _opened if not one.is_closed()), session]
     return session

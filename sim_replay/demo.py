@@ -21,7 +21,7 @@ from sim_replay.offline import method_of
 from sim_replay.play import PlaySettings, Record, Recording, play
 from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 from sim_replay.report.write import write_report
-from sim_replay.result import frame_of_record, latency_ms, pose_of
+from sim_replay.result import drops_told, frame_of_record, latency_ms, pose_of
 from sim_replay.score import match_poses
 
 BUNDLED_SEQUENCE = Path(__file__).parent / "data" / "crossing"
@@ -152,6 +152,8 @@ def report_flight(sequence: PlayedSequence, flight: RecordedFlight, out: Path, c
         task = progress.add_task("rendering", total=len(sequence.scene.images))
         score, files = write_report(sequence, flight, out, lambda: progress.advance(task))
     console.print(summary_table(score))
+    if drops := drops_told(sequence, score):
+        say(drops)
     say(f"written to {out}: {', '.join(files)}")
     return score
 

@@ -164,6 +164,17 @@ def _latency_ms(recording: Recording) -> dict[str, float | None]:
     return {**told, "tracks_withheld": withheld}
 
 
+def drops_told(sequence: PlayedSequence, score: dict[str, Any]) -> str | None:
+    """A sentence on the frames that the daemon dropped, misses that are not the model's; None if it dropped none."""
+    # It counts those that were never recorded as well, which no machine would have got.
+    dropped = score["dropped_frames"] - len(sequence.scene.unrecorded)
+    if dropped <= 0:
+        return None
+    were = "was" if dropped == 1 else "were"
+    told = f"{dropped} of {score['overall']['frames']} frames {were} dropped: this machine was too busy or too slow"
+    return f"{told}; each with a target in view counts as a miss."
+
+
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
     """Overlay data of each frame: its targets, as the subscriber received them.
 

@@ -34,7 +34,8 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from trainer.export import Tolerance, export_models, export_unmeasured
+    from trainer.comparison import Tolerance
+    from trainer.export import export_models, export_unmeasured
 
     contract = load_config(arguments.config).contract if arguments.config else None
     if arguments.untrained is not None or arguments.unmeasured:

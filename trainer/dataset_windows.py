@@ -237,17 +237,24 @@ def joined(batches: Sequence[TrainingBatch]) -> TrainingBatch:
     return TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
 
 
+def spans(shares: Sequence[float], first: int, stop: int) -> list[tuple[int, int]]:
+    """Range of each source's own samples that first .. stop - 1 of the mixed stream consists of; the last source gets
+    the remainder."""
+    left, found = Fraction(1), []
+    for share in shares[:-1]:
+        exact = Fraction(share).limit_denominator(10**6)
+        of_rest = min(exact / left, Fraction(1))
+        left -= left * of_rest
+        found.append((int(of_rest * first), int(of_rest * stop)))
+        first, stop = first - found[-1][0], stop - found[-1][1]
+    return [*found, (first, stop)]
+
+
 class MixedSampler:
     """Mixes several samplers, each with its share of the stream; the last one gets the remainder."""
 
     def __init__(self, samplers: Sequence[Sampler], shares: Sequence[float]) -> None:
-        self._samplers = tuple(samplers)
-        left = Fraction(1)
-        self._shares = []  # of the remainder after the preceding samplers
-        for share in shares[:-1]:
-            exact = Fraction(share).limit_denominator(10**6)
-            self._shares.append(min(exact / left, Fraction(1)))
-            left -= left * self._shares[-1]
+        self._samplers, self._shares = tuple(samplers), tuple(shares)
 
     def batch(self, first_index: int, count: int) -> TrainingBatch:
         """Samples first_index .. first_index + count - 1 of the stream, sampler by sampler.
@@ -256,16 +263,9 @@ class MixedSampler:
         sample per batch appears in some batches only.
         """
         drawn = []
-        for sampler, (first, stop) in zip(self._samplers, self._spans(first_index, first_index + count), strict=True):
+        own = spans(self._shares, first_index, first_index + count)
+        for sampler, (first, stop) in zip(self._samplers, own, strict=True):
             if stop > first:
                 one = sampler.batch(first, stop - first)
                 drawn.append(training_batch(one) if isinstance(one, SampleBatch) else one)
         return joined(drawn)
-
-    def _spans(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Range of each sampler's own samples that the stream's first .. stop - 1 consists of."""
-        spans = []
-        for share in self._shares:
-            spans.append((int(share * first), int(share * stop)))
-            first, stop = first - spans[-1][0], stop - spans[-1][1]
-        return [*spans, (first, stop)]

@@ -136,6 +136,19 @@ def measure(
     }
 
 
+def measure_each(
+    predicted: Predictions, batches: list[TrainingBatch], parts: Mapping[str, NDArray[np.bool_]]
+) -> dict[str, dict[str, float]]:
+    """The metrics of parts of the windows, given as masks [N]; none of an empty part."""
+    labels = [np.concatenate(values) for values in zip(*batches, strict=True)]
+    found = {}
+    for name, own in parts.items():
+        if own.any():
+            of_part = Predictions(*(np.compress(own, value, axis=0) for value in predicted))
+            found[name] = measure(of_part, [TrainingBatch(*(value[own] for value in labels))])
+    return found
+
+
 def null_where_unknown(measured: Mapping[str, float]) -> dict[str, float | None]:
     """The metrics for JSON, which has no NaN: None instead."""
     return {name: value if math.isfinite(value) else None for name, value in measured.items()}

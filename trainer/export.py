@@ -8,31 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from msgs.contract import CONTRACT_VERSION, ModelContract
 from msgs.settings import faults_of
 from trainer.checkpoint import load_model, weights_sha256
+from trainer.comparison import Measured, Tolerance, Views, comparison_table, too_blind
 from trainer.config import Z_RANGE_M, ConfigError, ContractConfig, DataConfig, TrainerConfig, load_config, made_folder
 from trainer.data import Sampler, TrainingBatch, render_once
 from trainer.dataset_windows import DatasetSampler
-from trainer.evaluate import (
-    Predictions,
-    Predictor,
-    choose_threshold,
-    difference,
-    measure,
-    predict_all,
-    sigma_shortfall,
-    tell_of_poses,
-    torch_predictor,
-)
+from trainer.evaluate import Predictions, Predictor, choose_threshold, measure, predict_all, torch_predictor
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
 from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, PoseNet
 from trainer.sources import window_sampler
+from trainer.tally import Tally, windows_in
 
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
@@ -41,32 +33,9 @@ RENDERED_RANGE_M = (100.0, 500.0)  # well covered by rendered windows
 ANY_SIZE_PX = (1e-3, 1e6)  # for an unmeasured file: no size counts as untrained
 UNREACHABLE_SCORE = 1.0
 EMPTY_SHARE = 0.12
+RENDERED_AT_ONCE = 16
 
 OpenView = Callable[[int, int, float], Callable[[], Sampler]]  # (seed, size_px, acquire_share) to a picklable opener
-
-
-class Views(NamedTuple):
-    """Rendered windows of the kind each stage processes; `track` is empty for a model without that stage."""
-
-    track: list[TrainingBatch]
-    acquire: list[TrainingBatch]
-
-
-class Tolerance(NamedTuple):
-    """Largest allowed deviation of INT8 from FP32 on the comparison windows of either stage."""
-
-    rotation_deg: float = 2.0  # median angle between the two
-    depth_percent: float = 2.0  # median
-    pose_points: float = 5.0  # loss of Pose@10°/5 %; a few hundred windows measure it to within a few points
-    sigma_percent: float = 10.0  # decrease of sigma, median
-    recall_points: float = 5.0  # loss of recall at the promised thresholds
-
-
-class Measured(NamedTuple):
-    """One model file's predictions on the comparison windows."""
-
-    track: Predictions | None
-    acquire: Predictions
 
 
 def stage_sampler(
@@ -89,12 +58,23 @@ def acquire_window_px(contract: ContractConfig | ModelContract) -> int:
     return smaller_px if contract.acquire_fit == "squash" else min(ACQUIRE_CROP_PX, smaller_px)
 
 
-def render_views(config: TrainerConfig, seed: int, samples: int, open_view: OpenView) -> Views:
+def _windows_of(contract: ContractConfig, samples: int) -> tuple[int, int]:
+    """Number of windows of the track stage, `samples`, and of the acquire stage, half as many; as rendered at once."""
+    asked = samples if contract.track_size_wh else 0, max(samples // 2, 16)
+    track, acquire = (math.ceil(count / RENDERED_AT_ONCE) * RENDERED_AT_ONCE for count in asked)
+    return track, acquire
+
+
+def render_views(config: TrainerConfig, seed: int, samples: int, open_view: OpenView, tally: Tally) -> Views:
     """`samples` windows of the track stage and half as many of the acquire stage."""
-    track = config.contract.track_size_wh
-    windows = render_once(open_view(seed, track[0], 0.0), samples) if track else []
-    acquire_px = acquire_window_px(config.contract)
-    return Views(windows, render_once(open_view(seed + 1, acquire_px, 1.0), max(samples // 2, 16)))
+    track, acquire = _windows_of(config.contract, samples)
+    size_wh, acquire_px = config.contract.track_size_wh, acquire_window_px(config.contract)
+
+    def rendered(opener: Callable[[], Sampler], count: int) -> list[TrainingBatch]:
+        return render_once(opener, count, RENDERED_AT_ONCE, lambda _: tally.add(RENDERED_AT_ONCE))
+
+    windows = rendered(open_view(seed, size_wh[0], 0.0), track) if size_wh else []
+    return Views(windows, rendered(open_view(seed + 1, acquire_px, 1.0), acquire))
 
 
 def _refuse_without_targets(comparison: Views) -> None:
@@ -107,8 +87,15 @@ def _refuse_without_targets(comparison: Views) -> None:
             )
 
 
-def _predict(predict: Predictor, views: Views) -> Measured:
-    return Measured(predict_all(predict, views.track) if views.track else None, predict_all(predict, views.acquire))
+def _predict(predict: Predictor, views: Views, what: str, say: Callable[[str], None]) -> Measured:
+    tally = Tally(f"evaluating {what}", windows_in([*views.track, *views.acquire]), say)
+
+    def counted(image_bgr: NDArray[np.uint8], K: NDArray[np.float32]) -> Predictions:
+        predicted = predict(image_bgr, K)
+        tally.add(len(image_bgr))
+        return predicted
+
+    return Measured(predict_all(counted, views.track) if views.track else None, predict_all(counted, views.acquire))
 
 
 def _metrics(measured: Measured, views: Views, thresholds: tuple[float, float]) -> dict[str, float]:
@@ -210,65 +197,6 @@ def airframe_names(ids: list[int] | None) -> list[str]:
     return [AIRFRAMES[i].name for i in (range(len(AIRFRAMES)) if ids is None else ids)]
 
 
-class Strayed(NamedTuple):
-    """Differences in the worse stage: medians, loss of Pose@10°/5 % in points, decrease of sigma, loss of recall."""
-
-    rotation_deg: float = 0.0
-    depth_percent: float = 0.0
-    pose_points: float = 0.0
-    sigma_percent: float = 0.0
-    recall_points: float = 0.0
-
-    def refusal(self, tolerance: Tolerance) -> str | None:
-        """Text for the first difference that exceeds its tolerance; None if none does."""
-        told = (
-            ("median rotation differs from FP32's by {:.4g} degrees, more than --tolerance {:g}"),
-            ("median depth differs from FP32's by {:.4g} %, more than --tolerance-depth {:g}"),
-            ("Pose@10°/5 % is {:.4g} points worse than FP32's, more than --tolerance-pose {:g}"),
-            ("median sigma is smaller than FP32's by {:.4g} %, more than --tolerance-sigma {:g}"),
-            ("recall is {:.4g} points worse than FP32's, more than --tolerance-recall {:g}"),
-        )
-        pairs = zip(told, self, tolerance, strict=True)
-        return next((text.format(value, limit) for text, value, limit in pairs if not value <= limit), None)
-
-
-def comparison_table(
-    views: Views, title: str, a: Measured, b: Measured, thresholds: tuple[float, float]
-) -> tuple[str, Strayed]:
-    """Differences of `a` from `b` as text, and the larger of both stages; `thresholds` of acquire and track.
-
-    False alarms are only told: there are too few windows without a target for a tolerance.
-    """
-    columns = ("rotation deg", "depth %", "centre px", "sigma %", "score", "Pose@10°/5 %", "recall %", "false alarms %")
-    lines = [f"{title:24}" + "".join(f"{column:>18}" for column in columns)]
-    worst = Strayed()
-    acquire_min, track_min = thresholds
-    stages = (
-        ("track", a.track, b.track, views.track, track_min),
-        ("acquire", a.acquire, b.acquire, views.acquire, acquire_min),
-    )
-    for stage, one, other, batches, score_min in stages:
-        if one is None or other is None:
-            continue
-        present = np.concatenate([batch.present for batch in batches])
-        d = difference(one, other, present)
-        measured = [measure(predicted, batches, score_min) for predicted in (one, other)]
-        shares = {k: [100 * m[k] for m in measured] for k in ("pose_10deg_5pct", "recall", "false_alarms")}
-        tells = tell_of_poses(batches)
-        lost = {k: of_other - of_one if tells else 0.0 for k, (of_one, of_other) in shares.items()}
-        smaller = 100 * sigma_shortfall(one, other, present)
-        strayed = Strayed(
-            d["rotation_deg_median"], 100 * d["depth_rel_median"], lost["pose_10deg_5pct"], smaller, lost["recall"]
-        )
-        worst = Strayed(*(np.maximum(x, y) for x, y in zip(worst, strayed, strict=True)))  # keeps NaN
-        scales = {"rotation_deg": 1, "depth_rel": 100, "center_px": 1, "sigma_rel": 100, "score": 1}
-        cells = [f"{s * d[f'{k}_median']:8.3f} /{s * d[f'{k}_p95']:8.3f}" for k, s in scales.items()]
-        cells += ["{:9.1f} /{:7.1f}".format(*of_both) for of_both in shares.values()]
-        lines.append(f"  {stage:22}" + "".join(cells))
-    told = "differences: median / 95th percentile over windows with a target; the last three columns: both values"
-    return "\n".join([*lines, f"  ({told})"]), worst
-
-
 def export_models(
     checkpoint: Path,
     out: Path,
@@ -297,26 +225,29 @@ def export_models(
         made_folder(path.parent)
 
     say("rendering windows for calibration and comparison")
-    calibration = render_views(config, CALIBRATION_SEED, samples, trained_on)
-    comparison = render_views(config, COMPARISON_SEED, samples, held_out)
+    tally = Tally("rendering", 2 * sum(_windows_of(config.contract, samples)), say)
+    calibration = render_views(config, CALIBRATION_SEED, samples, trained_on, tally)
+    comparison = render_views(config, COMPARISON_SEED, samples, held_out, tally)
     _refuse_without_targets(comparison)
 
     unmeasured = float_path.with_suffix(".part")
     try:
         write_graph(model, unmeasured)
-        floats = _predict(onnx_predictor(unmeasured), comparison)
+        floats = _predict(onnx_predictor(unmeasured), comparison, "FP32", say)
         acquire_min = choose_threshold(floats.acquire, comparison.acquire)
         track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
         thresholds = (acquire_min, track_min)
         promise = make_contract(config, training, sha256, calibration, thresholds)
-        write_contract(unmeasured, promise.model_copy(update={"metrics": _metrics(floats, comparison, thresholds)}))
+        metrics = _metrics(floats, comparison, thresholds)
+        write_contract(unmeasured, promise.model_copy(update={"metrics": metrics}))
         unmeasured.replace(float_path)
     finally:
         unmeasured.unlink(missing_ok=True)
-    by_torch = _predict(torch_predictor(model), comparison)
+    by_torch = _predict(torch_predictor(model), comparison, "PyTorch", say)
     say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch, thresholds)[0])
+    for warning in too_blind(metrics):
+        say(warning)
 
-    say("quantising")
     write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance, say)
     say(f"wrote {float_path} and {int8_path}")
     return float_path, int8_path
@@ -384,8 +315,8 @@ def write_int8(
     """
     unproved = int8_path.with_suffix(".part")
     try:
-        quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire])
-        int8 = _predict(onnx_predictor(unproved), comparison)
+        quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire], say)
+        int8 = _predict(onnx_predictor(unproved), comparison, "INT8", say)
         thresholds = (promise.acquire_score_min, promise.track_score_min)
         table, strayed = comparison_table(comparison, "INT8 vs. FP32", int8, floats, thresholds)
         say(table)

@@ -6,7 +6,8 @@ import os
 import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,10 @@ from trainer.half_storage import store_halved
 from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
 from trainer.pixel_quads import take_quads
+from trainer.tally import Tally, windows_in
 
 OPSET = 17
+ORT_WARNING, ORT_ERROR = 2, 3  # severities of its log; the first is its default
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
 # Soft-argmax, ray, sampling, depth and rotation remain in float, and so does the last layer of each head.
 QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/", "/head_refine/convs/")
@@ -55,16 +58,18 @@ def write_graph(model: PoseNet, path: Path) -> None:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _one_by_one(batches: list[TrainingBatch]) -> Iterator[dict[str, np.ndarray]]:
-    """The graph's inputs, one image at a time."""
+def _one_by_one(batches: list[TrainingBatch], what: str, say: Callable[[str], None]) -> Iterator[dict[str, np.ndarray]]:
+    """The graph's inputs, one image at a time; `what` is said to be done with them."""
+    tally = Tally(what, windows_in(batches), say)
     for batch in batches:
         for image, K in zip(batch.image_bgr, batch.K, strict=True):
             yield {"image": image[None], "K": K[None]}
+            tally.add(1)
 
 
-class _Batches(CalibrationDataReader):
-    def __init__(self, batches: list[TrainingBatch]) -> None:
-        self._inputs = _one_by_one(batches)
+class _Inputs(CalibrationDataReader):
+    def __init__(self, inputs: Iterator[dict[str, np.ndarray]]) -> None:
+        self._inputs = inputs
 
     def get_next(self) -> dict[str, np.ndarray] | None:
         return next(self._inputs, None)
@@ -88,10 +93,23 @@ def fold_pads(graph: onnx.GraphProto) -> None:
     drop_unread(graph)
 
 
-def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBatch]) -> None:
+@contextmanager
+def _errors_alone() -> Iterator[None]:
+    """ONNX Runtime without its warnings, on graphs that we are still changing."""
+    ort.set_default_logger_severity(ORT_ERROR)
+    try:
+        yield
+    finally:
+        ort.set_default_logger_severity(ORT_WARNING)
+
+
+@_errors_alone()
+def quantise_graph(
+    source: Path, destination: Path, calibration: list[TrainingBatch], say: Callable[[str], None]
+) -> None:
     """Static INT8: QDQ, U8 activations, S8 weights per channel, calibrated on `calibration`, biases corrected on it.
 
-    Layers that remain in float have their weights stored in half precision.
+    Layers that remain in float have their weights stored in half precision. `say` is told how far it has come.
     """
     with tempfile.TemporaryDirectory() as folder:
         prepared = Path(folder) / "prepared.onnx"
@@ -105,7 +123,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
         quantize_static(
             str(prepared),
             str(destination),
-            _Batches(calibration),
+            _Inputs(_one_by_one(calibration, "quantising", say)),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=QUANTISED_OPS,
             nodes_to_quantize=nodes,
@@ -119,7 +137,7 @@ def quantise_graph(source: Path, destination: Path, calibration: list[TrainingBa
             },
         )
     quantised = onnx.load(str(destination))
-    correct_biases(quantised, prepared_model.graph, _one_by_one(calibration))
+    correct_biases(quantised, prepared_model.graph, _one_by_one(calibration, "correcting biases", say))
     feed_pixels(quantised.graph, INPUT_NAMES[0])
     take_quads(quantised.graph, INPUT_NAMES[0])
     store_halved(quantised.graph)
@@ -162,7 +180,7 @@ def open_session(path: Path, threads: int = 2) -> ort.InferenceSession:
         raise ConfigError(f"{path}: no such model file")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 3
+    options.log_severity_level = ORT_ERROR
     try:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:

@@ -38,6 +38,12 @@ EXPLANATION = (
     "frames in which no target is visible. *Pose, 95 %*: 95 % bootstrap confidence interval of Pose@10°/5 %, resampled "
     "over flights."
 )
+CURVES = (
+    "Held-out windows as training went on. Each run has its own curves: a thin vertical line marks its first "
+    "validation, and nothing was measured between that and the last of the run before, hence the gaps. Size, number "
+    "and airframes of the windows differ between some runs, so a step from one curve to the next need not be the "
+    "network's."
+)
 Cell = Callable[[Mapping[str, Any]], float | None]
 Pictures = tuple[str | int | None, ...]  # dataset, split, every, frames, targets, mode, own ship
 
@@ -179,7 +185,7 @@ def page(
     for score in beside:
         sha256 = score["method"].get("sha256", "")
         lines.append(f"- {_called(score['method'])}" + (f": sha256 `{sha256[:16]}`" if sha256 else ""))
-    lines += ["", trained, "", "![Held-out windows as training went on](learning.png)"]
+    lines += ["", trained, "", "![Held-out windows as training went on](learning.png)", "", CURVES]
     lines += ["", "## Overall", "", *_header("dataset", "model", "frames", "Pose, 95 %")]
     rows = [(score, named[score["method"]["sha256"]]) for score in scores]
     rows += [(score, _called(score["method"])) for score in beside]

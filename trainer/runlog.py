@@ -131,6 +131,8 @@ class RunLog:
         kept = [line for line in lines if _is_of_the_past(line, samples)]
         if len(kept) < len(lines):
             _write_whole(log, "".join(kept))
+        told = [record for record in map(json.loads, kept) if record.get("kind") == "validation"]
+        self.validated = (int(told[-1]["samples"]), int(told[-1]["size_px"])) if told else None  # samples and size
         self._lines = log.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(out / "tensorboard"), purge_step=samples + 1)
         self._started_s = time.monotonic()
@@ -163,8 +165,15 @@ class RunLog:
         self._record("train", samples, record)
         self._reset(samples)
 
-    def validation(self, step: int, samples: int, size_px: int, metrics: dict[str, float]) -> None:
-        """Metrics on held-out windows."""
+    def validation(
+        self,
+        step: int,
+        samples: int,
+        size_px: int,
+        metrics: dict[str, float],
+        each: Mapping[str, Mapping[str, float]],
+    ) -> None:
+        """Metrics on all held-out windows, and on `each` part of them, by its name; the latter are not printed."""
         print(
             f"validation at {size_px} px after {samples} samples: "
             f"rotation error mean {metrics['E_r_mean_deg']:.1f} median {metrics['E_r_median_deg']:.1f} deg, "
@@ -174,7 +183,10 @@ class RunLog:
             f"score AUC {metrics['score_auc']:.3f}",
             flush=True,
         )
-        self._record("validation", samples, {"step": step, "samples": samples, "size_px": size_px, **metrics})
+        here = {"step": step, "samples": samples, "size_px": size_px}
+        self._record("validation", samples, {**here, **metrics})
+        for name, measured in each.items():
+            self._record(f"validation/{name}", samples, {**here, **measured})
         self._reset(samples)
 
     def picture(self, name: str, samples: int, image_bgr: NDArray[np.uint8]) -> None:

@@ -7,13 +7,30 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sim_replay.bop import BopError
-from trainer.config import ConfigError, DataConfig
+from trainer.config import ConfigError, DataConfig, DatasetSource
 from trainer.data import Sampler
-from trainer.dataset_windows import DatasetSampler, MixedSampler
+from trainer.dataset_windows import DatasetSampler, MixedSampler, spans
 
 if TYPE_CHECKING:
     from sim_replay.render.flown import FlownFrames, FlownShare
+
+
+RENDERED = "rendered"  # name of the renderer among the datasets
+
+
+def _shares(config: DataConfig, judging: bool) -> list[tuple[DatasetSource | None, float]]:
+    """What windows are drawn from, with shares that add up to 1; None, the last, is the renderer."""
+    used = [one for one in config.datasets if (one.validation_split if judging else one.split) is not None]
+    found: list[tuple[DatasetSource | None, float]] = [(one, one.share) for one in used]
+    if not found or config.rendered_share > 0.0:
+        found.append((None, 1.0 - sum(one.share for one in used)))
+    # Datasets without a validation split leave their shares to the others in proportion.
+    whole = sum(share for _, share in found)
+    return [(source, share / whole) for source, share in found]
 
 
 def _open_window_sampler(config: DataConfig, seed: int, size_px: int, judging: bool, flown: FlownShare) -> Sampler:
@@ -22,22 +39,33 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, judging: b
 
     view = config.acquire_view
     samplers: list[Sampler] = []
-    shares: list[float] = []
-    for source in config.datasets:
-        split = source.validation_split if judging else source.split
-        if split is not None:
+    drawn = _shares(config, judging)
+    for source, _ in drawn:
+        if source is not None:
+            split = source.validation_split if judging else source.split
             samplers.append(DatasetSampler(source.path, split, seed, size_px, config.acquire_share, view))
-            shares.append(source.share)
-    if not samplers or config.rendered_share > 0.0:
+            continue
         # Evaluation windows show the fleet only, none of it flown, whatever the shares in training.
         invention = Invention(0.0 if judging else config.invented_share)
         shares_drawn = config.acquire_share, config.empty_share
         ids = config.airframe_ids if judging else _drawn_ids(config)
         samplers.append(WindowSampler(seed, size_px, ids, *shares_drawn, invention, view, flown))
-        shares.append(1.0 - sum(shares))
-    # Datasets without a validation split leave their shares to the others in proportion.
-    shares = [share / sum(shares) for share in shares]
-    return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, shares)
+    return samplers[0] if len(samplers) == 1 else MixedSampler(samplers, [share for _, share in drawn])
+
+
+def validated_from(config: DataConfig, counts: Sequence[int]) -> dict[str, NDArray[np.bool_]]:
+    """Which validation windows, in consecutive batches of `counts`, come from where: masks [N] by the dataset's folder
+    or RENDERED. Empty if all come from one place."""
+    drawn = _shares(config, judging=True)
+    names = [RENDERED if source is None else source.path.resolve().name for source, _ in drawn]
+    if len(set(names)) < 2:
+        return {}
+    whose: list[str] = []
+    for count in counts:
+        first = len(whose)
+        own = spans([share for _, share in drawn], first, first + count)
+        whose += [name for name, (start, stop) in zip(names, own, strict=True) for _ in range(start, stop)]
+    return {name: np.array([one == name for one in whose]) for name in names}
 
 
 def _drawn_ids(config: DataConfig) -> list[int] | None:

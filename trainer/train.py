@@ -14,11 +14,11 @@ from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, save_weight
 from trainer.config import ConfigError, TrainerConfig, parse_config
 from trainer.data import Feed, Sampler, TrainingBatch, render_once
 from trainer.distributed import joined_group
-from trainer.evaluate import measure, predict_all, torch_predictor
+from trainer.evaluate import measure, measure_each, predict_all, torch_predictor
 from trainer.pictures import example_sheet
 from trainer.plan import Plan
 from trainer.runlog import RunLog, provenance, run_folder
-from trainer.sources import refuse_unreadable, window_sampler
+from trainer.sources import refuse_unreadable, validated_from, window_sampler
 from trainer.trainer import Diverged, StepResult, Trainer, size_at
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
@@ -118,7 +118,8 @@ class _Loop:
         self.log = RunLog(out, config_text, start) if self.group.first else None
         self.size_px = size_at(self.config.schedule, 0.0)
         self.held_out: dict[int, list[TrainingBatch]] = {}
-        self.validated: tuple[int, int] | None = None  # samples and size at the last validation
+        # Samples and size at the last validation; of an earlier start, if it went no further.
+        self.validated = None if self.log is None else self.log.validated
 
     def used_s(self) -> float:
         return self.plan.used_before_s + time.monotonic() - self.started_s
@@ -205,7 +206,9 @@ class _Loop:
             self.held_out[size_px] = render_once(self.opener(data.validation_seed, size_px), data.validation_samples)
         batches = self.held_out[size_px]
         predicted = predict_all(torch_predictor(self.trainer.average), batches)
-        self.log.validation(self.trainer.steps, self.trainer.samples, size_px, measure(predicted, batches))
+        parts = validated_from(self.config.data, [len(batch.present) for batch in batches])
+        each = measure_each(predicted, batches, parts)
+        self.log.validation(self.trainer.steps, self.trainer.samples, size_px, measure(predicted, batches), each)
         self.log.picture("held out", self.trainer.samples, example_sheet(batches[0], predicted))
 
     def save(self) -> None:

@@ -35,7 +35,7 @@ class Cell:
     poses: int = 0  # at the autopilot
     found: float | None = None  # share of the visible targets
     rotation_error_deg: float | None = None  # median
-    range_error_rel: float | None = None  # mean
+    range_error_rel: float | None = None  # mean of the signed error, a bias
     age_p50_ms: float | None = None  # at the autopilot
     age_max_ms: float | None = None
     dropped: int | None = None  # frames, by the daemon

@@ -139,7 +139,7 @@ def table(cells: Sequence[Cell]) -> Table:
     shown = Table(title="matrix", title_justify="left")
     for name in ("sequence", "speed", "fault", ""):
         shown.add_column(name)
-    for name in ("poses", "recall", "E_r median", "range", "age p50", "age max", "dropped"):
+    for name in ("poses", "recall", "E_r median", "range bias", "age p50", "age max", "dropped"):
         shown.add_column(name, justify="right")
     for cell in cells:
         shown.add_row(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
 import cv2
@@ -24,7 +25,7 @@ def write_video(path: Path, frames: Iterable[Image], fps: float, size_wh: tuple[
     video_wh = (round(size_wh[0] * scale / 2) * 2, round(size_wh[1] * scale / 2) * 2)
     rate = Fraction(fps).limit_denominator(1001)
     with av.open(str(path), mode="w") as container:
-        stream = container.add_stream(CODEC, rate=rate, options=OPTIONS)
+        stream = cast(av.VideoStream, container.add_stream(CODEC, rate=rate, options=OPTIONS))
         stream.width, stream.height = video_wh
         stream.pix_fmt = "yuv420p"
         for count, image in enumerate(frames):

@@ -19,7 +19,7 @@ from sim_replay.play import Recording
 from sim_replay.report import plots
 from sim_replay.report.moments import film, jpeg_url, worst_moments
 from sim_replay.report.plots import HealthSample
-from sim_replay.result import PEERS, Result, told_ages
+from sim_replay.result import PEERS, Result, drops_told, told_ages
 
 TEMPLATE = "report.html.j2"
 _POSTER_WIDTH_PX = 960
@@ -59,6 +59,7 @@ def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any],
         stills=stills,
         moments=worst_moments(sequence, matches),
         spoken=spoken(health_of(result.recording)),
+        drops=drops_told(sequence, score),
         score_json=json.dumps(score, indent=2),
     )
 

@@ -26,7 +26,7 @@ from sim_replay.report.flight_files import RecordedFlight, read_flight, remove_f
 from sim_replay.report.page import health_of
 from sim_replay.report.plots import STATE_COLORS
 from sim_replay.report.write import write_report
-from sim_replay.result import judge, score_json
+from sim_replay.result import drops_told, judge, score_json
 from sim_replay.telemetry import COLUMNS, Telemetry, write_telemetry
 
 START_NS, UTC_NS, FPS = 50_000_000_000, 1_700_000_000_000_000_000, 30.0
@@ -197,6 +197,38 @@ def test_a_part_that_is_played_where_a_flight_was_does_not_pass_for_it(
     monkeypatch.setattr(command, "play_lockstep", dies)
     assert main(part) != 0
     assert list(flight.iterdir()) == []
+
+
+def card(page: str, label: str) -> str:
+    """Tone, value and note of a card, as text."""
+    found = re.search(rf'<div class="card (.*?)"><div class="label">{label}</div>(.*?</div>.*?)</div>', page)
+    assert found is not None
+    return re.sub(r"(<[^>]*>)+", " ", f"{found[1]}: {found[2]}")
+
+
+def test_ranges_that_are_too_far_and_too_near_are_not_right_on_average(flown: PlayedSequence, tmp_path: Path) -> None:
+    made = recording(flown, {0, 1, 2, 3})
+    for k, pose in enumerate(made.poses):
+        pose["t_cam_target_m"] = [(0.7, 1.3)[k % 2] / 0.95 * metres for metres in pose["t_cam_target_m"]]
+    write_report(flown, RecordedFlight(flown.scene.folder, MODEL, made), tmp_path, lambda: None)
+    assert re.match(r"bad:  30\.0 % mean; bias [+−]0\.", card((tmp_path / "report.html").read_text(), "Range error"))
+
+
+def test_frames_that_the_machine_dropped_are_told_apart_from_misses_of_the_model(
+    flown: PlayedSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = recording(flown, {0, 3})
+    made.daemon_counters["dropped"] = 2
+    write_flight(tmp_path, RecordedFlight(flown.scene.folder, MODEL, made))
+    assert main(["score", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text()
+    for text in (capsys.readouterr().out, page):
+        assert "2 of 5 frames were dropped: this machine was too busy or too slow; each with a target in view" in text
+    assert re.match(r"fair:  1 longest time without a pose 0\.10 s", card(page, "Gaps"))
+    score = json.loads((tmp_path / "score.json").read_text())
+    assert drops_told(flown, score | {"dropped_frames": 0}) is None
+    recorded = replace(flown, scene=replace(flown.scene, unrecorded=frozenset({1, 2})))
+    assert drops_told(recorded, score) is None  # they were never recorded
 
 
 def test_a_report_says_where_no_rotation_was_told(flown: PlayedSequence, tmp_path: Path) -> None:

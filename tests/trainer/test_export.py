@@ -14,6 +14,7 @@ from synthetic_sampler import PlateSampler
 from msgs.contract import OUTPUT_NAMES
 from msgs.geometry import R_from_euler
 from trainer.checkpoint import load_model, save_weights
+from trainer.comparison import Measured, Strayed, Tolerance, Views, comparison_table, too_blind
 from trainer.config import ConfigError
 from trainer.data import TrainingBatch, training_batch
 from trainer.evaluate import (
@@ -25,20 +26,11 @@ from trainer.evaluate import (
     predict_all,
     sigma_shortfall,
 )
-from trainer.export import (
-    Measured,
-    Strayed,
-    Tolerance,
-    Views,
-    comparison_table,
-    export_models,
-    export_unmeasured,
-    stage_sampler,
-    write_int8,
-)
-from trainer.graph import onnx_predictor, open_session, read_contract
+from trainer.export import export_models, export_unmeasured, stage_sampler, write_int8
+from trainer.graph import onnx_predictor, open_session, quantise_graph, read_contract
 from trainer.held_out import Request, evaluate_file
 from trainer.sources import window_sampler
+from trainer.tally import Tally
 
 ANY = Tolerance(180.0, 100.0, 100.0, 100.0, 100.0)
 
@@ -118,6 +110,33 @@ def test_both_files_carry_a_contract_with_what_was_measured(exported: Exported) 
     assert int8.metrics["track_windows"] == 16.0
     assert 0 <= int8.metrics["acquire_E_r_median_deg"] <= 180
     assert any("INT8 vs. FP32" in text for text in exported.said)
+
+
+def test_a_network_that_finds_few_targets_is_warned_of(exported: Exported) -> None:
+    """INT8 that finds as little as FP32 is within all tolerances."""
+    metrics = read_contract(exported.fp32).metrics
+    for stage in ("track", "acquire"):
+        recall = metrics[f"{stage}_recall"]
+        assert recall < 0.5  # it is untrained
+        told = f"WARNING: the {stage} stage finds {100 * recall:.0f} % of the targets"
+        assert sum(text.startswith(told) for text in exported.said) == 1
+    assert too_blind({"track_recall": 0.5, "acquire_recall": 0.9}) == []
+    assert len(too_blind({"acquire_recall": 0.49})) == 1  # of a model without a track stage
+
+
+def test_how_far_each_part_has_come_is_said_and_nothing_by_onnx_runtime(
+    exported: Exported, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for part, count in (("rendering", 64), ("evaluating FP32", 32), ("evaluating INT8", 32)):
+        assert f"{part}: {count} of {count} windows" in exported.said
+    said: list[str] = []
+    quantise_graph(exported.fp32, exported.run / "again.onnx", [windows(1, 32)], said.append)
+    assert said == ["quantising: 16 of 16 windows", "correcting biases: 16 of 16 windows"]
+    assert "onnxruntime" not in capfd.readouterr().err
+    tally = Tally("rendering", 464, said.append)
+    for _ in range(29):
+        tally.add(16)
+    assert [text.split()[1] for text in said[2:]] == ["160", "304", "464"]
 
 
 def windows(seed: int, size_px: int) -> TrainingBatch:

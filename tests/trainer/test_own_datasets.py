@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from edge.estimator.window import fit_frame
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
@@ -19,6 +20,8 @@ from trainer.config import DatasetSource, parse_config
 from trainer.dataset_windows import DatasetSampler
 from trainer.export import stage_sampler
 from trainer.held_out import Request, evaluate_file
+from trainer.sources import validated_from, window_sampler
+from trainer.train import run_training
 
 
 def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
@@ -67,6 +70,30 @@ def test_datasets_without_a_validation_split_leave_their_shares_to_the_others_in
     data = tiny.config().data.model_copy(update={"datasets": sources})
     Z_m = stage_sampler(data, 77, 64, 0.0)().batch(0, 20).t_cam_target_m[:, 2]
     assert [int(np.sum(Z_m == depth_m)) for depth_m in depths_m.values()] == [10, 10]
+
+
+def test_validation_windows_are_also_measured_by_where_they_come_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Improvement on one's own images does not show in the mean with many rendered windows."""
+    for split in ("train", "val"):
+        discs(tmp_path / "own" / split / "000001", 1500.0, (200.0, 260.0))
+    text = on_dataset(tmp_path / "own").replace("share = 1.0", "share = 0.3")
+    config, run = parse_config(text, "own.toml"), tmp_path / "run"
+    opened = window_sampler(config.data, config.data.validation_seed, 64)()
+    batches = [opened.batch(first, 16) for first in (0, 16)]
+    masks = validated_from(config.data, [16, 16])
+    on_own = np.isin(np.concatenate([batch.t_cam_target_m[:, 2] for batch in batches]), (200.0, 260.0))
+    np.testing.assert_array_equal(masks["own"], on_own)
+    np.testing.assert_array_equal(masks["rendered"], ~on_own)
+    run_training(config, text, run, max_steps=1)
+    assert capsys.readouterr().out.count("validation at 64 px") == 1
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    windows = {line["kind"]: line["windows"] for line in lines if line["kind"] != "train"}
+    assert windows == {"validation": 16, "validation/own": 4, "validation/rendered": 12}
+    tags = EventAccumulator(str(run / "tensorboard")).Reload().Tags()["scalars"]
+    assert {f"{kind}/recall" for kind in windows} <= set(tags)
+    assert validated_from(config.data.model_copy(update={"datasets": []}), [16]) == {}
 
 
 def test_rendered_windows_are_rendered_for_a_checkpoint_of_a_dataset_that_is_no_longer_there(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ from sim_replay.cli import main as replay
 from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.results import (
+    CURVES,
+    EXPLANATION,
     HISTORY,
     PAPER,
     datasets_in,
@@ -115,6 +117,8 @@ def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
     paper = next(line for line in text.splitlines() if "the paper, FP32" in line)
     assert f"{100 * PAPER['pose_10deg_5pct']:.1f}" in paper
     assert "the command" in text
+    shown = (ROOT / "docs" / "results.md").read_text()
+    assert all(words in text and words in shown for words in (EXPLANATION, CURVES))
 
 
 def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_path: Path) -> None:

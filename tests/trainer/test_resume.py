@@ -63,9 +63,10 @@ def test_a_file_that_is_no_run_is_not_gone_on_with(tmp_path: Path, content: obje
 
 def test_a_run_resumed_at_its_end_stays_what_it_was(tmp_path: Path) -> None:
     train(tmp_path, None)
-    before = load_model(tmp_path)
+    before, log = load_model(tmp_path), (tmp_path / "log.jsonl").read_text()
     train(tmp_path, None, resume=True)
     after = load_model(tmp_path)
+    assert (tmp_path / "log.jsonl").read_text() == log  # with no second validation
     assert after[2]["resolution_px"] == before[2]["resolution_px"] == 96
     assert after[3] == before[3]
 

@@ -14,10 +14,11 @@ from synthetic_sampler import PlateSampler
 from msgs.contract import ModelContract
 from sim_replay.bop import BopFrame, BopTarget, SceneWriter
 from trainer.checkpoint import save_weights
+from trainer.comparison import Tolerance, Views
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
 from trainer.dataset_windows import DatasetSampler
-from trainer.export import Tolerance, Views, export_models, make_contract
+from trainer.export import export_models, make_contract
 from trainer.graph import read_contract
 from trainer.train import run_training
 
