@@ -10,6 +10,7 @@ from edge.cameras import open_source
 from edge.config import ConfigFile, camera_key
 from edge.config_ground import ZenohTlsSettings
 from edge.errors import InputError
+from edge.estimator.model import NOT_CALIBRATED
 from edge.reload import load_configured
 from edge.types import CameraInfo
 
@@ -36,6 +37,7 @@ def check(file: ConfigFile) -> list[str]:
         f"vehicle  {config.vehicle.name}",
         f"model    {model.path.name}: {contract.name} {contract.precision}, {stages}, sha256 {model.sha256[:12]}",
         f"runs on  {model.provider}" + (f": {model.fallback_reason}" if model.fallback_reason else ""),
+        *([] if contract.scores_calibrated else [f"warning  {NOT_CALIBRATED}"]),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
         + ("" if opened else "; not reachable now, the daemon will keep trying"),

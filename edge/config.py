@@ -22,6 +22,7 @@ from edge.config_camera import SequenceCamera as SequenceCamera
 from edge.config_camera import camera_key as camera_key
 from edge.config_ground import RecorderSettings, ZenohSettings, ZenohTlsSettings
 from edge.config_path import ConfigPath
+from edge.config_ports import collision, mavlink_listener, metrics_listener, zenoh_listener
 from edge.errors import InputError
 from edge.estimator.providers import Provider
 from edge.links.mavlink_endpoints import parse_endpoint, plain_host
@@ -114,7 +115,8 @@ class MountSettings(Section):
 class ModelSettings(Section):
     path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file with its contract in the metadata")
     provider: Provider = Field(
-        default="cpu", description="execution provider; falls back to the CPU, with a warning, if it is not available"
+        default="cpu",
+        description="execution provider; if it is not available, or fails, the CPU takes over, with a warning",
     )
     threads: int = Field(default=2, ge=1, le=64, description="CPU threads per inference")
     spinning: bool = Field(
@@ -261,6 +263,16 @@ class Config(Section):
             raise ValueError('[camera] mount = "gimbal" needs [mavlink]: the gimbal\'s attitude comes by it')
         if self.camera.mount == "fixed" and self.mavlink.gimbal_component_id is not None:
             raise ValueError('[mavlink] gimbal_component_id needs [camera] mount = "gimbal": else none is heard')
+        return self
+
+    @model_validator(mode="after")
+    def _ports_are_free_of_each_other(self) -> Config:
+        zenoh = [zenoh_listener(endpoint) for endpoint in self.zenoh.listen if self.zenoh.enabled]
+        mavlink = [mavlink_listener(endpoint) for endpoint in self.mavlink.endpoints if self.mavlink.enabled]
+        port = self.health.prometheus_port
+        refused = collision([*zenoh, *mavlink, None if port is None else metrics_listener(port)])
+        if refused is not None:
+            raise ValueError(refused)
         return self
 
 

@@ -105,13 +105,14 @@ class Pipeline:
         self.search = Search()  # not started yet; until then each search runs in the caller's thread
         self._since_acquire = 0
         self._out_of_order = self._time_jumps = 0
+        self._warned: tuple[str, ...] = ()  # of the model in use
 
     def ready(self) -> None:
-        """Log and report that the daemon is ready, and any fallback from the configured execution provider."""
+        """Log and report that the daemon is ready, and what it lacks."""
         model = self._estimator.model
         name = f"{model.contract.name} ({model.contract.precision}) on {model.provider}"
         log.info("ready: %s, camera %s", name, self._board.camera.name)
-        self._tell_fallback()
+        self._warn_of_model()
         self.supervisor.ready()
 
     def fly(self, stop: threading.Event) -> None:
@@ -124,6 +125,7 @@ class Pipeline:
                     return
                 if frame is not None:
                     self._process(frame)
+                    self._warn_of_model()
                 self.supervisor.turn()
                 self._take_reload()
 
@@ -276,10 +278,14 @@ class Pipeline:
         log.info("%s", new.said)
         self._outlets.event(logging.INFO, new.said)
         if replaced:
-            self._tell_fallback()
+            self._warned = ()
+            self._warn_of_model()
 
-    def _tell_fallback(self) -> None:
-        reason = self._estimator.model.fallback_reason
-        if reason is not None:
-            log.warning("model: %s", reason)
-            self._outlets.event(logging.WARNING, f"model: {reason}")
+    def _warn_of_model(self) -> None:
+        """Of what has not been said yet: its execution provider may fail in flight."""
+        warnings = self._estimator.model.warnings
+        for text in warnings:
+            if text not in self._warned:
+                log.warning("model: %s", text)
+                self._outlets.event(logging.WARNING, f"model: {text}")
+        self._warned = warnings

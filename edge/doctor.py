@@ -18,7 +18,7 @@ from edge.config import ConfigFile
 from edge.doctor_links import CAMERA_REASONS, STARTING, is_starting, link_findings, running_daemon, told_reasons
 from edge.doctor_machine import machine_findings
 from edge.errors import InputError
-from edge.estimator.model import Model
+from edge.estimator.model import NOT_CALIBRATED, Model
 from edge.findings import Finding, device_fault, good, poor, wrong
 from edge.health import percentiles_ms
 from edge.reload import load_configured
@@ -30,6 +30,7 @@ WATCHED_S = 2.0  # at least: the first images of many cameras come irregularly
 PERIOD_NS_MIN = 1_000_000  # no camera is faster
 RATED_NS = 1_000_000_000  # less says little about the rate
 RATE_SHARE_MIN, BAD_SHARE_MAX = 0.8, 0.1
+DAMAGED = "camera_damaged"
 STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
 USABLE = {STAMPS, UNSTAMPED, UNDECODABLE, SLOW}  # a busy machine may cause these too; there are images nevertheless
 ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
@@ -37,9 +38,11 @@ ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     UNSTAMPED: "see docs/cameras.md on timestamps; arrival is later than exposure, so measure [camera] latency_ms",
     UNDECODABLE: "check cable, USB port or radio link; zenoh: also that images are JPEG or PNG with 8 bits a channel",
     SLOW: "ask for a rate and a format that the camera has, give it more light, or stop other programs",
+    DAMAGED: 'set [camera] rtsp_transport = "tcp", or improve the link; with more key frames, a stream recovers sooner',
     "camera_frozen": "point it at something that moves; if it stays frozen, unplug it and plug it in again",
 }
 ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"
+ADVICE_NO_IMAGE = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
 
 
 def doctor(file: ConfigFile, as_json: bool) -> int:
@@ -110,7 +113,7 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         capture.stop()
     if size_wh is None:
         said = "; ".join(text for _, text in reasons)
-        advice = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
+        advice = ADVICE[DAMAGED] if DAMAGED in dict(reasons) else ADVICE_NO_IMAGE
         why = f": {said}" if said else ""
         yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
@@ -175,6 +178,9 @@ def _model(file: ConfigFile, frame_ms: float | None) -> Iterator[Finding]:
     if model.fallback_reason is not None:
         yield wrong("provider", model.fallback_reason, 'install what is missing, or set [model] provider = "cpu"')
     contract = model.contract
+    if not contract.scores_calibrated:
+        advice = "calibrate them by `uavpose-trainer calibrate-score`, on images it was not trained on"
+        yield poor("scores", NOT_CALIBRATED, advice)
     sizes = {"acquire": contract.acquire_size_wh, "track": contract.track_size_wh}
     times = {stage: _time_ms(model, size) for stage, size in sizes.items() if size is not None}
     told = ", ".join(f"{stage} {ms:.1f} ms" for stage, ms in times.items())

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
+import os
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 from edge.errors import InputError
 
@@ -37,9 +38,9 @@ def register(commands: argparse._SubParsersAction) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Returns 0, or the exit status of the pipeline's command. Raises InputError."""
+    """Returns 0; with --pipeline, the process becomes that command. Raises InputError."""
     if options.pipeline:
-        return _pipeline(options)
+        _become_pipeline(options)
     for name in ("sequence", "minutes", "fps"):
         if getattr(options, name) is not None:
             raise InputError(f"--{name} needs --pipeline")
@@ -69,8 +70,9 @@ def _threads(text: str) -> list[int]:
     return sorted({int(number) for number in numbers})
 
 
-def _pipeline(options: argparse.Namespace) -> int:
-    """Runs the replay harness as a separate program; the daemon's package does not import it."""
+def _become_pipeline(options: argparse.Namespace) -> NoReturn:
+    """Replace this process by the replay harness, which the daemon's package does not import; signals then reach it,
+    and it ends the programs that it started."""
     for name in ("threads", "runs", "spinning", "alone"):
         if getattr(options, name) not in (None, False):
             raise InputError(f"--{name} cannot be combined with --pipeline, which runs the daemon as configured")
@@ -87,4 +89,4 @@ def _pipeline(options: argparse.Namespace) -> int:
         arguments += ["--model", str(options.models[0])]
     if options.json:
         arguments.append("--json")
-    return subprocess.run([str(command), *arguments], check=False).returncode
+    os.execv(command, [str(command), *arguments])

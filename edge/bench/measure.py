@@ -18,15 +18,16 @@ from edge.bench.engines import Engine, other_engines
 from edge.bench.macs import Macs, count_macs
 from edge.bench.peak import Peak
 from edge.bench.timing import Milliseconds, time_in_turns
-from edge.estimator.model import Model, load_model, session_options
+from edge.estimator.model import Model, load_model
 from msgs.contract import ModelContract
 
+ORT = "onnxruntime"
 CPU_INFO = Path("/proc/cpuinfo")
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row: a stage of a file on a number of threads of an engine (`onnxruntime`, `openvino`, `pytorch`)."""
+    """One row: a stage of a file on a number of threads of an engine (ORT, `openvino`, `pytorch`)."""
 
     file: str
     stage: str
@@ -42,7 +43,7 @@ class Row:
     size_wh: tuple[int, int]
     macs: Macs
     ms: Milliseconds
-    limit_ms: float  # least time, at the machine's peak on these threads
+    limit_ms: float | None  # least time, at the machine's peak on these threads; None: that is not known
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ def measure(
     others: bool,
     on_round: Callable[[int], None],
 ) -> Measured:
-    """Time all cases in turns, on noise, and `others` in every available engine.
+    """Time all cases in turns, on noise, and `others` in every available engine, after all else of a round: ONNX
+    Runtime's rows then follow each other as they do without other engines.
 
     Raises InputError for a file that is not a model.
     """
@@ -84,14 +86,17 @@ def measure(
             loaded[str(path)] = model = load_model(path, count, spinning)
             model.warm_up()
             calls |= _cases(model, count, engines)
+    counts = sorted({1, *threads})
     peaks: dict[Case, Callable[[], object]] = {
-        Case("", precision, count, "peak"): peak.product(precision, session_options(count, spinning))
-        for count in threads
+        Case("", precision, count, "peak"): peak.product(precision, count)
+        for count in counts
         for precision in ("int8", "fp32")
     }
-    ms = time_in_turns({**calls, **peaks}, rounds, on_round)
-    rate = {case: peak.MACS / ms[case].p10 / 1e6 for case in peaks}
-    by_threads = {n: Peak(n, rate[Case("", "int8", n, "peak")], rate[Case("", "fp32", n, "peak")]) for n in threads}
+    ours = {case: call for case, call in calls.items() if case.engine == ORT}
+    ms = time_in_turns({**ours, **peaks, **calls}, rounds, on_round, warm=peaks)
+    rates = {case: peak.MACS / ms[case].p10 / 1e6 for case in peaks}
+    measured = [Peak(n, rates[Case("", "int8", n, "peak")], rates[Case("", "fp32", n, "peak")]) for n in counts]
+    by_threads = {one.threads: one.beside(measured[0]) for one in measured}
     macs = {
         (file, stage): count_macs(model.path.read_bytes(), size_wh)
         for file, model in loaded.items()
@@ -112,7 +117,7 @@ def _cases(model: Model, threads: int, others: Mapping[str, Engine]) -> dict[Cas
     for stage, (width, height) in stages(model.contract).items():
         image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), dtype=np.uint8)
         K: NDArray[np.float32] = np.array([[[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]], np.float32)
-        calls[Case(str(model.path), stage, threads, "onnxruntime")] = partial(model.run, image, K.astype(np.float64))
+        calls[Case(str(model.path), stage, threads, ORT)] = partial(model.run, image, K.astype(np.float64))
         for name, engine in others.items():
             call = engine(model.path, model.contract, image, K, threads)
             if call is not None:

@@ -7,14 +7,17 @@ the `onnx` package.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from edge.estimator.model import session_options
+
 ROWS, INNER, COLUMNS = 512, 1024, 1024
 MACS = ROWS * INNER * COLUMNS
+MORE_THAN_ONE = 1.3
 _FLOAT, _UINT8, _INT8, _INT32 = 1, 2, 3, 6  # onnx.TensorProto.DataType
 _IR_VERSION, _OPSET = 8, 17
 
@@ -26,14 +29,26 @@ class Peak:
     threads: int
     int8_gmac_per_s: float
     fp32_gmac_per_s: float
+    shared: bool = False  # several threads are hardly faster than one: it is no peak of so many
 
-    def limit_ms(self, int8_macs: int, float_macs: int) -> float:
-        """Least time for these MACs, one after the other at the peak rate."""
+    def beside(self, one: Peak) -> Peak:
+        """The same, with `shared` by the peak of one thread."""
+        rates = (self.int8_gmac_per_s, one.int8_gmac_per_s), (self.fp32_gmac_per_s, one.fp32_gmac_per_s)
+        return replace(self, shared=self.threads > 1 and any(own < MORE_THAN_ONE * single for own, single in rates))
+
+    def limit_ms(self, int8_macs: int, float_macs: int) -> float | None:
+        """Least time for these MACs, one after the other at the peak rate; None: the peak is shared."""
+        if self.shared:
+            return None
         return int8_macs / self.int8_gmac_per_s / 1e6 + float_macs / self.fp32_gmac_per_s / 1e6
 
 
-def product(precision: str, options: ort.SessionOptions) -> Callable[[], object]:
-    """A call that multiplies once, `int8` (unsigned by signed, like the network's layers) or `fp32`."""
+def product(precision: str, threads: int) -> Callable[[], object]:
+    """A call that multiplies once, `int8` (unsigned by signed, like the network's layers) or `fp32`.
+
+    Its threads spin between calls. A thread that sleeps is often woken on the core that the first one uses, and moved
+    to one of its own only after longer than a product takes: the rate would be that of one thread.
+    """
     rng = np.random.default_rng(0)
     left: NDArray[np.generic]
     if precision == "int8":
@@ -42,6 +57,7 @@ def product(precision: str, options: ort.SessionOptions) -> Callable[[], object]
     else:
         left = rng.standard_normal((ROWS, INNER), dtype=np.float32)
         graph = matmul_model("MatMul", _FLOAT, _FLOAT, _FLOAT, rng.standard_normal((INNER, COLUMNS), np.float32))
+    options = session_options(threads, spinning=True)
     session = ort.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     return lambda: session.run(None, {"left": left})
 

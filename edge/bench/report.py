@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from edge.bench.measure import Measured, Row
+from edge.bench.measure import ORT, Measured, Row
 
-ORT = "onnxruntime"
 BETWEEN_ENGINES = ("ort_over_openvino", "ort_over_eager")
 STATISTICS = {"track_ms": "p50", "acquire_ms": "p50", "ratios": "p10", "all_ratios.cpu": "p50 of processor time"}
 HEADLINES = {  # each ratio's stage for the one figure in `ratios`; without that stage, the other
@@ -35,7 +34,7 @@ class Ratio:
     name: str
     stage: str
     threads: int
-    value: float  # of 10th percentiles
+    value: float | None  # of 10th percentiles; None: the denominator is not known
     cpu: float | None  # of processor time; None: the denominator has none
 
 
@@ -66,8 +65,9 @@ def _at(measured: Measured, stage: str, threads: int) -> Iterator[Ratio]:
     for name, (one, other) in pairs.items():
         if one is not None and other is not None:
             yield Ratio(name, stage, threads, one.ms.p10 / other.ms.p10, one.ms.cpu / other.ms.cpu)
-    if int8 is not None and int8.limit_ms > 0:
-        yield Ratio("over_vnni_limit", stage, threads, int8.ms.p10 / int8.limit_ms, None)
+    if int8 is not None and int8.limit_ms != 0:
+        value = None if int8.limit_ms is None else int8.ms.p10 / int8.limit_ms
+        yield Ratio("over_vnni_limit", stage, threads, value, None)
 
 
 def _kind(row: Row) -> tuple[str, str, str, str, int]:
@@ -131,29 +131,48 @@ def _ratio_lines(measured: Measured) -> Iterator[str]:
     for name, meaning in MEANING.items():
         own = [ratio for ratio in found if ratio.name == name]
         for ratio in own:
-            cpu = f"{ratio.cpu:7.2f}" if ratio.cpu is not None else f"{'-':>7}"
-            yield f"{meaning:64} {ratio.stage:8} {ratio.threads:7d} {ratio.value:7.2f} {cpu}"
+            yield f"{meaning:64} {ratio.stage:8} {ratio.threads:7d} {_known(ratio.value, 7)} {_known(ratio.cpu, 7)}"
         if not own:
             reason = "no such engine" if name in BETWEEN_ENGINES else "needs two such models"
             yield f"{meaning:64} {reason:>24}"
 
 
 def _row_lines(measured: Measured) -> Iterator[str]:
+    labels = told_apart(row.case.file for row in measured.rows)
+    width = max(34, *map(len, labels.values()))
     yield (
-        f"{'model':34} {'stage':8} {'input':>8} {'threads':>7} {'engine':12}"
+        f"{'model':{width}} {'stage':8} {'input':>8} {'threads':>7} {'engine':12}"
         f" {'p10 ms':>8} {'p50 ms':>8} {'p99 ms':>8} {'CPU ms':>8} {'INT8 MMAC':>10} {'FP32 MMAC':>10} {'limit ms':>9}"
     )
     for row in measured.rows:
         case, ms = row.case, row.ms
         size = "x".join(map(str, row.size_wh))
         yield (
-            f"{Path(case.file).stem:34} {case.stage:8} {size:>8} {case.threads:7d} {case.engine:12}"
+            f"{labels[case.file]:{width}} {case.stage:8} {size:>8} {case.threads:7d} {case.engine:12}"
             f" {ms.p10:8.2f} {ms.p50:8.2f} {ms.p99:8.2f} {ms.cpu:8.2f}"
-            f" {row.macs.int8 / 1e6:10.1f} {row.macs.float32 / 1e6:10.1f} {row.limit_ms:9.2f}"
+            f" {row.macs.int8 / 1e6:10.1f} {row.macs.float32 / 1e6:10.1f} {_known(row.limit_ms, 9)}"
         )
 
 
 def _peak_lines(measured: Measured) -> Iterator[str]:
     yield "peak of a large matrix product, GMAC/s"
     for peak in measured.peaks:
-        yield f"  {peak.threads} threads: INT8 {peak.int8_gmac_per_s:.0f}, FP32 {peak.fp32_gmac_per_s:.0f}"
+        doubt = ": hardly more than one, so no limit is told (other load, or one core's threads)" if peak.shared else ""
+        yield f"  {peak.threads} threads: INT8 {peak.int8_gmac_per_s:.0f}, FP32 {peak.fp32_gmac_per_s:.0f}{doubt}"
+
+
+def _known(value: float | None, width: int) -> str:
+    return f"{'-':>{width}}" if value is None else f"{value:{width}.2f}"
+
+
+def told_apart(files: Iterable[str]) -> dict[str, str]:
+    """For each file its name without suffix; where another has the same, as much of its path as tells them apart."""
+    paths = {file: Path(file).absolute() for file in files}
+    labels = {}
+    for file, path in paths.items():
+        namesakes = [other for other in paths.values() if other != path and other.stem == path.stem]
+        kept = 1
+        while any(other.parts[-kept:] == path.parts[-kept:] for other in namesakes):
+            kept += 1
+        labels[file] = str(Path(*path.parts[-kept:])) if namesakes else path.stem
+    return labels

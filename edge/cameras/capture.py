@@ -18,7 +18,7 @@ from edge.types import Frame
 
 log = logging.getLogger(__name__)
 
-FROZEN_TOLD_NS = 1_000_000_000
+FROZEN_TOLD_NS = DAMAGED_TOLD_NS = 1_000_000_000
 JUMPS_TOLD_S = 5  # how long a jump of the timestamps is reported
 JUMPS_KEPT = 1000
 
@@ -40,6 +40,8 @@ class Capture:
         self._watch = FrameWatch()
         self._frozen_since_ns: int | None = None
         self._frozen_told = False
+        self._sound_ns = 0  # time of the last picture that was not damaged, or since when there could be one
+        self._damaged_before = 0  # the source's count of damaged ones then
         self._withheld = 0  # repeats of a live camera: frames are numbered without them, so a gap is a drop
         self._jumped_ns: deque[int] = deque(maxlen=JUMPS_KEPT)  # when timestamps jumped, monotonic
         self._lost: str | None = None  # why there is no camera now
@@ -75,7 +77,8 @@ class Capture:
             return {**self._counts, **{f"camera_{name}": n for name, n in self._source.counts.items()}}
 
     def reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        """Faults of the camera at `now_ns` (monotonic): lost, frozen, jumping timestamps. From any thread."""
+        """Faults of the camera at `now_ns` (monotonic): lost, frozen, all damaged, jumping timestamps. From any
+        thread."""
         found = []
         with self._fresh:
             if self._lost is not None:
@@ -83,6 +86,10 @@ class Capture:
             since_ns = self._frozen_since_ns
             if since_ns is not None and now_ns - since_ns >= FROZEN_TOLD_NS:
                 found.append(Reason("camera_frozen", f"camera frozen for {(now_ns - since_ns) / 1e9:.0f} s"))
+            sound_ns = now_ns - self._sound_ns
+            if self._source.counts.get("damaged", 0) > self._damaged_before and sound_ns >= DAMAGED_TOLD_NS:
+                text = f"camera: all pictures damaged for {sound_ns / 1e9:.0f} s; the link loses packets"
+                found.append(Reason("camera_damaged", text))
             jumps = sum(now_ns - jumped_ns <= JUMPS_TOLD_S * 1_000_000_000 for jumped_ns in self._jumped_ns)
             if jumps:
                 found.append(Reason("camera_stamps", f"camera timestamps jump ({jumps} in {JUMPS_TOLD_S} s)"))
@@ -97,12 +104,14 @@ class Capture:
             self._source.close()
 
     def _run(self) -> None:
+        self._count_damage_anew()
         while True:
             try:
                 if not self._opened:
                     wait_until(self._link.retry_at_ns, self._stop)
                     self._open()
                     self._opened = self._fitted = True
+                    self._count_damage_anew()
                 frame = self._source.read(self._stop)
             except SourceLost as error:
                 self._lose(error)
@@ -138,12 +147,14 @@ class Capture:
             self._counts["reconnects"] += 1
             self._lost = str(error)
             self._frozen_since_ns = None
+        self._count_damage_anew()
 
     def _lives(self, frame: Frame) -> bool:
         """Whether the frame is new; from a live camera, a repeated picture is stale whatever its timestamp."""
         now_ns = time.monotonic_ns()
         jumps, repeats = self._watch.jumps(frame), self._watch.repeats(frame)
         frozen = repeats and self._source.live
+        self._count_damage_anew()
         with self._fresh:
             self._counts["time_jumps"] += jumps
             self._counts["frozen"] += repeats
@@ -161,6 +172,10 @@ class Capture:
             log.warning("the camera has sent the same picture for a second: it is frozen")
             self._frozen_told = True
         return not frozen
+
+    def _count_damage_anew(self) -> None:
+        with self._fresh:
+            self._sound_ns, self._damaged_before = time.monotonic_ns(), self._source.counts.get("damaged", 0)
 
     def _offer(self, frame: Frame) -> None:
         with self._fresh:

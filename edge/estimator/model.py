@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ SIZE_STEP_PX = 32
 FREE_SIDES = ("W", "H")  # names of the graph's free input dimensions
 RUNS_REMEMBERED = 16
 _LOG_FATAL = 4
+NOT_CALIBRATED = "scores are not calibrated: what is probably no aircraft, such as a bird, is reported as well"
 
 
 @dataclass(frozen=True)
@@ -53,30 +55,48 @@ class Peaks:
     sigma: NDArray[np.float32]  # [N, M, 6]
 
 
-class Model:
-    """A loaded file: one session for any input size, and others for one fixed size each.
+@dataclass(frozen=True)
+class Sessions:
+    """One file opened on one provider: for any input size, and for one fixed size each."""
 
-    `run` is for the loop's thread only and is timed; `infer` may be called from any thread.
-    """
+    free: ort.InferenceSession
+    fixed: Mapping[tuple[int, int], ort.InferenceSession]  # by (width, height)
+    chosen: ChosenProvider  # what they really run on
+
+
+class Model:
+    """A loaded file. `run` is for the loop's thread only and is timed; `infer` may be called from any thread."""
 
     def __init__(
         self,
-        session: ort.InferenceSession,
+        sessions: Sessions,
+        reopen: Callable[[ChosenProvider], Sessions],
         contract: ModelContract,
         path: Path,
         sha256: str,
-        provider: Provider = "cpu",
-        fallback_reason: str | None = None,
-        fixed: Mapping[tuple[int, int], ort.InferenceSession] | None = None,  # by (width, height)
     ) -> None:
-        self._session = session
-        self._fixed = dict(fixed or {})
+        self._sessions = sessions
+        self._reopen = reopen
         self._runs_ns: deque[tuple[int, int]] = deque(maxlen=RUNS_REMEMBERED)
         self.contract = contract
         self.path = path
         self.sha256 = sha256
-        self.provider = provider  # the one it really runs on
-        self.fallback_reason = fallback_reason  # a sentence; None: runs on the requested provider
+
+    @property
+    def provider(self) -> Provider:
+        """The one it really runs on."""
+        return self._sessions.chosen.provider
+
+    @property
+    def fallback_reason(self) -> str | None:
+        """A sentence; None: it runs on the requested provider."""
+        return self._sessions.chosen.fallback_reason
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences for whoever flies it; a provider that fails in flight adds one."""
+        doubts = (self.fallback_reason, None if self.contract.scores_calibrated else NOT_CALIBRATED)
+        return tuple(doubt for doubt in doubts if doubt is not None)
 
     @property
     def doubtful_below(self) -> float:
@@ -85,16 +105,24 @@ class Model:
         return PROBABLE_SCORE if self.contract.scores_calibrated else 0.0
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
-        """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels."""
+        """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels. If the provider fails, the CPU takes over,
+        from this inference on."""
         begin_ns = clock.monotonic_ns()
-        peaks = self.infer(images_bgr, K)
+        try:
+            peaks = self.infer(images_bgr, K)
+        except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
+            if self.provider == "cpu":
+                raise
+            self._sessions = self._reopen(self._sessions.chosen.failed(_first_line(error)))
+            peaks = self.infer(images_bgr, K)
         self._runs_ns.append((begin_ns, clock.monotonic_ns()))
         return peaks
 
     def infer(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
-        """As `run`, untimed."""
+        """As `run`, untimed; raises ONNX Runtime's error where the provider fails."""
         feeds = {"image": images_bgr, "K": K.astype(np.float32)}
-        session = self._fixed.get((images_bgr.shape[2], images_bgr.shape[1]), self._session)
+        sessions = self._sessions
+        session = sessions.fixed.get((images_bgr.shape[2], images_bgr.shape[1]), sessions.free)
         return Peaks(*session.run(list(OUTPUT_NAMES), feeds))
 
     def take_runs_ns(self) -> list[tuple[int, int]]:
@@ -139,24 +167,10 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"model {path} cannot be read: {error.strerror}") from error
-    chosen = choose_provider(provider, ort.get_available_providers())
-    with ThreadPoolExecutor(1, initializer=yield_to_the_loop) as opener:
-        # A session's threads inherit the priority of the thread that opens it, here a low one: a search of the whole
-        # frame then does not delay the track windows of the same time.
-        session = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
-    chosen = chosen.confirmed(session.get_providers())
-    contract = _contract(session.get_modelmeta().custom_metadata_map, path)
-    _check_graph(session, contract, path)
-    fixed = {}
-    if contract.track_size_wh is not None:
-        # With fixed dimensions, shapes are computed once, here. For the whole frame the gain is too small to be worth
-        # the memory of another session.
-        options = session_options(threads, spinning)
-        for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
-            options.add_free_dimension_override_by_name(name, side)
-        fixed[contract.track_size_wh] = _open(content, path, options, chosen)
-    sha256 = hashlib.sha256(content).hexdigest()
-    return Model(session, contract, path, sha256, chosen.provider, chosen.fallback_reason, fixed)
+    reopen = partial(_open_sessions, content, path, threads, spinning)
+    sessions = reopen(choose_provider(provider, ort.get_available_providers()))
+    contract = _contract(sessions.free, path)
+    return Model(sessions, reopen, contract, path, hashlib.sha256(content).hexdigest())
 
 
 def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
@@ -170,15 +184,47 @@ def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
     return options
 
 
-def _open(content: bytes, path: Path, options: ort.SessionOptions, chosen: ChosenProvider) -> ort.InferenceSession:
-    try:
-        return ort.InferenceSession(content, options, providers=list(chosen.names))
-    except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
-        reason = str(error).strip().splitlines()[0]
-        raise InputError(f"model {path} is not a loadable ONNX file: {reason}") from error
+def _open_sessions(content: bytes, path: Path, threads: int, spinning: bool, chosen: ChosenProvider) -> Sessions:
+    """Raises InputError."""
+    with ThreadPoolExecutor(1, initializer=yield_to_the_loop) as opener:
+        # A session's threads inherit the priority of the thread that opens it, here a low one: a search of the whole
+        # frame then does not delay the track windows of the same time.
+        free, chosen = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
+    contract = _contract(free, path)
+    _check_graph(free, contract, path)
+    fixed = {}
+    if contract.track_size_wh is not None:
+        # With fixed dimensions, shapes are computed once, here. For the whole frame the gain is too small to be worth
+        # the memory of another session.
+        options = session_options(threads, spinning)
+        for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
+            options.add_free_dimension_override_by_name(name, side)
+        fixed[contract.track_size_wh], chosen = _open(content, path, options, chosen)
+    return Sessions(free, fixed, chosen)
 
 
-def _contract(metadata: dict[str, str], path: Path) -> ModelContract:
+def _open(
+    content: bytes, path: Path, options: ort.SessionOptions, chosen: ChosenProvider
+) -> tuple[ort.InferenceSession, ChosenProvider]:
+    """The session, and what it really runs on: the first of the chosen providers that starts. Raises InputError."""
+    while True:
+        try:
+            # ONNX Runtime's own fallback, also of a provider that fails in flight, is only printed on standard output.
+            session = ort.InferenceSession(content, options, providers=list(chosen.names), enable_fallback=0)
+        except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
+            if chosen.provider == "cpu":
+                raise InputError(f"model {path} is not a loadable ONNX file: {_first_line(error)}") from error
+            chosen = chosen.not_started(_first_line(error))
+        else:
+            return session, chosen.confirmed(session.get_providers())
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or repr(error)).splitlines()[0]
+
+
+def _contract(session: ort.InferenceSession, path: Path) -> ModelContract:
+    metadata: dict[str, str] = session.get_modelmeta().custom_metadata_map
     if METADATA_KEY not in metadata:
         raise InputError(f"model {path} carries no contract (metadata key {METADATA_KEY}): not made by uavpose-trainer")
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
@@ -29,18 +29,34 @@ class ChosenProvider:
 
     provider: Provider
     names: tuple[str, ...]  # as ONNX Runtime calls them
-    fallback_reason: str | None = None
+    failures: tuple[str, ...] = ()  # of those preferred to these, each a clause
+
+    @property
+    def fallback_reason(self) -> str | None:
+        """A sentence; None: it is the requested provider."""
+        if not self.failures:
+            return None
+        return f"{'; '.join(self.failures)}; running on {'the CPU' if self.provider == 'cpu' else self.provider}"
 
     def confirmed(self, running: Sequence[str]) -> ChosenProvider:
         """Corrected by what the session really runs on: a built-in provider may still lack its driver or libraries."""
         if self.names[0] in running:
             return self
-        reason = (
-            f"{self.names[0]} is built in but did not start: its driver or libraries are missing; "
-            f"running on {running[0].removesuffix('ExecutionProvider')}"
+        return self._next(
+            running[0], f"{self.names[0]} is built in but did not start: its driver or libraries are missing"
         )
-        actual: Provider = "cuda" if running[0] == NAMES["cuda"][0] else "cpu"
-        return replace(self, provider=actual, fallback_reason=reason)
+
+    def not_started(self, why: str) -> ChosenProvider:
+        """The next one, where opening a session with this one raised the error `why`."""
+        return self._next(self.names[1], f"{self.names[0]} did not start: {why}")
+
+    def failed(self, why: str) -> ChosenProvider:
+        """The CPU, where an inference raised the error `why`: the device may be gone, whatever software drives it."""
+        return self._next(NAMES["cpu"][0], f"{self.names[0]} failed: {why}")
+
+    def _next(self, first: str, failure: str) -> ChosenProvider:
+        provider: Provider = "cuda" if first == NAMES["cuda"][0] else "cpu"
+        return ChosenProvider(provider, NAMES[provider], (*self.failures, failure))
 
 
 def choose_provider(wanted: Provider, available: Sequence[str]) -> ChosenProvider:
@@ -48,5 +64,5 @@ def choose_provider(wanted: Provider, available: Sequence[str]) -> ChosenProvide
     first = NAMES[wanted][0]
     if first in available:
         return ChosenProvider(wanted, tuple(name for name in NAMES[wanted] if name in available))
-    reason = f"this ONNX Runtime was built without {first} (the package {PACKAGES[wanted]} has it); running on the CPU"
-    return ChosenProvider("cpu", NAMES["cpu"], reason)
+    failure = f"this ONNX Runtime was built without {first} (the package {PACKAGES[wanted]} has it)"
+    return ChosenProvider("cpu", NAMES["cpu"], (failure,))

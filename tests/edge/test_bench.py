@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import onnx
@@ -15,7 +20,11 @@ from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_
 
 from edge.bench import peak
 from edge.bench.macs import Macs, count_macs
+from edge.bench.measure import measure
+from edge.bench.peak import Peak
+from edge.bench.report import table, to_tree
 from edge.bench.timing import UNTIMED_ROUNDS, time_in_turns
+from tests.waiting import until
 
 from .conftest import Cli
 from .toy_model import write_toy_model
@@ -106,6 +115,64 @@ def test_cases_take_turns() -> None:
     assert all(0 <= one.p10 <= one.p50 <= one.p99 for one in ms.values())
 
 
+def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
+    """As those of OpenVINO and PyTorch, which spin after a call has returned."""
+
+    def work() -> None:
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000)  # without Python's lock
+
+    left = list[Thread]()
+
+    def leaves_a_thread() -> None:
+        left.append(Thread(target=work))
+        left[-1].start()
+
+    ms = time_in_turns({"work": work, "leaves": leaves_a_thread, "next": lambda: left[-1].join()}, 2, lambda _: None)
+    assert ms["next"].cpu < ms["work"].cpu / 5
+
+
+def test_threads_without_cores_of_their_own_have_no_peak(tmp_path: Path) -> None:
+    model, cores = write_toy_model(tmp_path / "int8.onnx", precision="int8"), os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        measured = measure([model], [2], spinning=False, rounds=3, others=False, on_round=lambda _: None)
+    finally:
+        os.sched_setaffinity(0, cores)
+    tree, told = to_tree(measured), table(measured).splitlines()
+    assert [(peak["threads"], peak["shared"]) for peak in tree["peaks"]] == [(1, False), (2, True)]
+    assert {row["limit_ms"] for row in tree["rows"]} == {None}
+    assert tree["ratios"]["over_vnni_limit"] is None
+    assert told[-1].startswith("  2 threads: ")
+    assert "hardly more than one" in told[-1]
+
+
+def test_as_many_threads_as_cores_have_a_peak() -> None:
+    one = Peak(1, 200.0, 40.0)
+    assert not Peak(2, 390.0, 70.0).beside(one).shared
+    assert Peak(2, 390.0, 45.0).beside(one).limit_ms(10**9, 10**9) is None
+    assert not one.beside(one).shared
+
+
+def test_files_of_one_name_are_told_apart(cli: Cli, tmp_path: Path) -> None:
+    for name in ("old/toy.onnx", "new/toy.onnx", "new/other.onnx"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_toy_model(tmp_path / name, track_size_wh=None)
+    done = cli("bench", "old/toy.onnx", "new/toy.onnx", "new/other.onnx", "--runs", "1", "--threads", "1", "--alone")
+    rows = [line.split()[0] for line in done.stdout.splitlines() if " onnxruntime " in line]
+    assert rows == ["old/toy.onnx", "new/toy.onnx", "other"]
+
+
+def test_signals_to_the_pipeline_reach_the_harness(tmp_path: Path) -> None:
+    """A wrapper around it would have to end it, and with it the programs that it started."""
+    command = [sys.executable, "-m", "edge.cli", "bench", "--pipeline"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as bench:
+        words = Path(f"/proc/{bench.pid}/cmdline")
+        try:
+            until(lambda: b"bench-pipeline" in words.read_bytes(), what="the harness")
+        finally:
+            bench.kill()
+
+
 def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8")
     paper = write_toy_model(tmp_path / "paper.onnx", configuration="paper", track_size_wh=None)
@@ -177,7 +244,7 @@ def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
         (["--threads", "0"], "--threads 0"),
         (["--threads", "1,99999999999999999999"], "integers from 1 to 64"),
         (["--runs", "0"], "--runs 0"),
-        (["none.onnx"], "none.onnx"),
+        (["none.onnx", "--alone"], "none.onnx"),
         (["--minutes", "1"], "--minutes needs --pipeline"),
         (["--pipeline", "--threads", "1"], "--threads cannot be combined with --pipeline"),
         (["--pipeline", "--alone"], "--alone cannot be combined with --pipeline"),

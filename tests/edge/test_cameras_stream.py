@@ -28,13 +28,14 @@ TENTH_IS_KEY = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "ke
 
 
 class UdpCamera(threading.Thread):
-    """An encoder that sends MPEG-TS over UDP in real time until told to stop, with a key frame each tenth."""
+    """An encoder that sends MPEG-TS over UDP in real time until told to stop, with a key frame each tenth. While `bad`
+    is set, these do not arrive."""
 
     def __init__(self, port: int, fps: int, lost: int | None = None) -> None:
         """`lost`: the number of a picture, modulo 50, that does not arrive."""
         super().__init__()
         self._url, self._fps, self.stop = f"udp://127.0.0.1:{port}?pkt_size=1316", fps, threading.Event()
-        self._lost = lost
+        self._lost, self.bad = lost, threading.Event()
 
     def run(self) -> None:
         with av.open(self._url, "w", format="mpegts") as out:
@@ -45,7 +46,7 @@ class UdpCamera(threading.Thread):
                 frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
                 frame.pts, frame.time_base = index, Fraction(1, self._fps)
                 packets = stream.encode(frame)
-                if index % 50 != self._lost:
+                if index % 50 != self._lost and not (self.bad.is_set() and index % 10 == 0):
                     out.mux(packets)
                 index += 1
 
@@ -87,6 +88,33 @@ def test_what_is_damaged_by_a_loss_before_it_is_not_shown() -> None:
         encoder.join()
     assert source.counts["damaged"] == 6
     assert numbers[-2:] == [32 % 25, 40 % 25]
+
+
+def test_a_stream_of_which_all_is_damaged_is_told_of_until_it_recovers() -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    encoder = UdpCamera(port, fps=20)
+    settings = StreamCamera(type="stream", url=f"udp://127.0.0.1:{port}", intrinsics=INTRINSICS)
+    capture = Capture(StreamSource(settings), False)
+
+    def kinds() -> list[str]:
+        return [reason.kind for reason in capture.reasons(time.monotonic_ns())]
+
+    encoder.start()
+    capture.start()
+    try:
+        until(lambda: capture.counters()["captured"] >= 10, what="sound pictures")
+        assert "camera_damaged" not in kinds()
+        encoder.bad.set()
+        until(lambda: "camera_damaged" in kinds(), what="the reason")
+        encoder.bad.clear()
+        until(lambda: "camera_damaged" not in kinds(), what="a key frame")
+        counters = capture.counters()
+    finally:
+        capture.stop()
+        encoder.stop.set()
+        encoder.join()
+    assert counters["camera_damaged"] > 0
+    assert counters["reconnects"] == 0
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0])

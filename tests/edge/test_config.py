@@ -11,6 +11,7 @@ from edge.cameras.intrinsics import load_intrinsics, read_calibration
 from edge.config import load_config
 from edge.config_camera import IntrinsicsSettings
 from edge.errors import InputError
+from msgs.ground.keys import init_authority, issue
 
 LIVE = "[camera]\nintrinsics = { fx = 9, fy = 9, cx = 3, cy = 2, width = 6, height = 4 }\n"
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
@@ -100,6 +101,38 @@ def test_a_path_that_leads_nowhere_is_told_with_file_line_and_key(tmp_path: Path
     with pytest.raises(InputError) as error:
         load_config(write(tmp_path, f"{CAMERA}[recorder]\nfolder = '{path}'"))
     assert f"config.toml:5: [recorder] folder: '{path}' leads nowhere: " in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "excluded"),
+    [
+        ('[zenoh]\nlisten = ["tcp/127.0.0.1:7448"]', "[health]\nprometheus_port = 7448", True),
+        ('[zenoh]\nlisten = ["tls/0.0.0.0:7448?a=1#b=2"]\ntls = {tls}', "[health]\nprometheus_port = 7448", True),
+        ('[zenoh]\nlisten = ["quic/0.0.0.0:7448"]\ntls = {tls}', "[health]\nprometheus_port = 7448", False),
+        ('[zenoh]\nlisten = ["tcp/10.0.0.1:7448"]', "[health]\nprometheus_port = 7448", False),
+        ('[zenoh]\nenabled = false\nlisten = ["tcp/127.0.0.1:7448"]', "[health]\nprometheus_port = 7448", False),
+        ('[zenoh]\nlisten = ["tcp/[::]:5760"]', '[mavlink]\nendpoints = ["tcpin:10.0.0.1:5760"]', True),
+        ('[zenoh]\nlisten = ["tcp/[::1]:5760"]', '[mavlink]\nendpoints = ["tcpin:0.0.0.0:5760"]', False),
+        ('[zenoh]\nlisten = ["tcp/ground:5760"]', '[mavlink]\nendpoints = ["tcpin:Ground:5760"]', True),
+        ('[zenoh]\nlisten = ["tcp/ground:5760"]', '[mavlink]\nendpoints = ["tcpin:10.0.0.1:5760"]', False),
+        ('[zenoh]\nlisten = ["tcp/0.0.0.0:5760"]', '[mavlink]\nendpoints = ["tcpout:0.0.0.0:5760"]', False),
+        ('[zenoh]\nlisten = ["tcp/0.0.0.0:5760"]', '[mavlink]\nendpoints = ["udpin:0.0.0.0:5760"]', False),
+        ('[zenoh]\nlisten = ["tcp/0.0.0.0:0"]', '[mavlink]\nendpoints = ["tcpin:0.0.0.0:0"]', False),
+        ("", '[mavlink]\nendpoints = ["tcpin:[::ffff:10.0.0.1]:5760", "tcpin:10.0.0.1:5760"]', True),
+        ("", '[mavlink]\nendpoints = ["tcpin:10.0.0.1:5760", "tcpin:10.0.0.2:5760"]', False),
+        ("", '[zenoh]\nlisten = ["tcp/127.0.0.1:7448", "tcp/0.0.0.0:7448"]', True),
+    ],
+)
+def test_two_listeners_that_cannot_both_open_are_refused(tmp_path: Path, one: str, other: str, excluded: bool) -> None:
+    init_authority(tmp_path)
+    issue(tmp_path, "uav1")
+    tls = '{ root_ca = "ca.pem", certificate = "uav1.pem", private_key = "uav1.key" }'
+    path = write(tmp_path, f"{CAMERA}{one.replace('{tls}', tls)}\n{other}\n")
+    if not excluded:
+        load_config(path)
+        return
+    with pytest.raises(InputError, match=r"the file: \[.*\] .* and \[.*\] .* need the same TCP port; change"):
+        load_config(path)
 
 
 def test_every_fault_is_told_at_once(tmp_path: Path) -> None:

@@ -84,12 +84,10 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
     cli: Cli, tmp_path: Path, toy_model: Path
 ) -> None:
     scene = write_swaying_scene(tmp_path / "000001")
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as scraped:
         text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
         text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0", "tcpout:autopilot.invalid:5760"]\n'
-        text += f"[health]\nprometheus_port = {taken.getsockname()[1]}\n"
+        text += f"[health]\nprometheus_port = {scraped.getsockname()[1]}\n"
         code, found = findings(cli, tmp_path, text)
     assert code == 1
     assert "cannot listen on" in found["zenoh"]["says"]

@@ -123,6 +123,7 @@ def test_a_tenth_of_bad_pictures_and_four_fifths_of_the_rate_are_tolerated() -> 
     [
         ("camera_stamps", "timestamp"),
         ("camera_frozen", "moves"),
+        ("camera_damaged", "rtsp_transport"),
         ("camera_lost", "plugged in"),
         ("no_frame", "plugged"),
     ],

@@ -1,0 +1,143 @@
+"""What the commands say of a model that flies less well than it should: on another provider, without calibrated
+scores."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from zenoh import handlers
+
+from edge.config import load_config
+from edge.doctor import _model
+from edge.estimator.model import NOT_CALIBRATED
+from edge.status import ask
+from msgs.cdr import Log
+from msgs.client import connect, subscribe
+
+from .conftest import Cli
+from .flying import flying, free_port, toml, write_swaying_scene
+from .toy_model import write_toy_model
+
+# `uavpose-edge` with an ONNX Runtime that has a GPU, which the CPU stands in for until the file BROKEN is there.
+WITH_A_GPU = """
+import os, sys
+import onnxruntime
+import onnxruntime.capi.onnxruntime_inference_collection as collection
+from edge.cli import main
+
+GPU, names, native = "CUDAExecutionProvider", ["CUDAExecutionProvider", "CPUExecutionProvider"], collection.C
+broken = lambda: os.path.exists(os.environ["BROKEN"])
+real = native.InferenceSession
+
+class Session:
+    def __init__(self, *arguments):
+        self._session, self._on_gpu = real(*arguments), False
+
+    def initialize_session(self, providers, options, disabled):
+        self._on_gpu = GPU in providers
+        if self._on_gpu and broken():
+            raise RuntimeError("CUDA failure 100: no CUDA-capable device is detected")
+        self._session.initialize_session(["CPUExecutionProvider"], [{}], disabled)
+
+    def get_providers(self):
+        return names if self._on_gpu else names[1:]
+
+    def get_provider_options(self):
+        return {name: {} for name in self.get_providers()}
+
+    def run(self, *arguments):
+        if self._on_gpu and broken():
+            raise native.EPFail("CUDA failure 719: unspecified launch failure")
+        return self._session.run(*arguments)
+
+    def __getattr__(self, name):
+        return getattr(self._session, name)
+
+native.InferenceSession = Session
+native.get_available_providers = onnxruntime.get_available_providers = lambda: names
+sys.exit(main())
+"""
+
+
+@pytest.fixture
+def calibrated(tmp_path: Path) -> Path:
+    return write_toy_model(tmp_path / "calibrated.onnx", track_score={"offset": 0.1})
+
+
+@pytest.fixture
+def swaying(tmp_path: Path) -> Path:
+    return write_swaying_scene(tmp_path / "000001")
+
+
+def on_the_gpu(text: str) -> str:
+    return text.replace("threads = 1", 'threads = 1\nprovider = "cuda"')
+
+
+def test_a_gpu_that_fails_in_flight_is_told_of_and_the_cpu_goes_on(
+    tmp_path: Path, swaying: Path, calibrated: Path
+) -> None:
+    port, events, broken = free_port(), queue.Queue[Log](), tmp_path / "broken"
+    text, surroundings = on_the_gpu(toml(swaying, calibrated, port)), {"BROKEN": str(broken)}
+    with flying(tmp_path, text, surroundings, program=("-c", WITH_A_GPU)) as flight:
+        assert any("on cuda, camera" in line for line in flight.lines)
+        endpoint = f"tcp/127.0.0.1:{port}"
+        with connect(endpoint) as session, subscribe(session, "uav1") as poses:
+            heard = handlers.Callback(lambda sample: events.put(Log.decode(sample.payload.to_bytes())), indirect=False)
+            subscriber = session.declare_subscriber("*/uav1/events/**", heard)
+            broken.touch()
+            reason = "CUDAExecutionProvider failed: CUDA failure 719: unspecified launch failure; running on the CPU"
+            assert " WARNING " in flight.until(f"model: {reason}")
+            while not (event := events.get(timeout=60)).msg.startswith(f"model: {reason}"):
+                pass
+            assert event.level == logging.WARNING
+            for _ in range(3):
+                assert next(iter(poses)).target == "t0"
+            subscriber.undeclare()
+            assert not [later for later in events.queue if later.msg.startswith("model: ")]
+        told = ask(endpoint, "uav1")
+        assert told is not None
+        assert (told["info"]["model_provider"], told["model"]["fallback_reason"]) == ("cpu", reason)
+
+
+@pytest.mark.parametrize("command", ["doctor", "check"])
+def test_a_gpu_that_does_not_start_leaves_standard_output_to_the_command(
+    tmp_path: Path, swaying: Path, calibrated: Path, command: str
+) -> None:
+    (tmp_path / "config.toml").write_text(on_the_gpu(toml(swaying, calibrated, free_port())))
+    arguments = [sys.executable, "-c", WITH_A_GPU, command, "--config", str(tmp_path / "config.toml")]
+    surroundings = {**os.environ, "BROKEN": "/dev/null"}
+    reason = (
+        "CUDAExecutionProvider did not start: CUDA failure 100: no CUDA-capable device is detected; running on the CPU"
+    )
+    if command == "check":
+        done = subprocess.run(arguments, capture_output=True, text=True, env=surroundings, check=True)
+        assert done.stdout.splitlines()[0].endswith("config.toml: valid")
+        assert f"runs on  cpu: {reason}" in done.stdout
+        return
+    done = subprocess.run([*arguments, "--json"], capture_output=True, text=True, env=surroundings, check=False)
+    found: dict[str, Any] = {one["what"]: one for one in json.loads(done.stdout)["findings"]}
+    assert (found["provider"]["verdict"], found["provider"]["says"]) == ("wrong", reason)
+
+
+def test_scores_that_are_not_calibrated_are_told_of_by_every_command(
+    cli: Cli, tmp_path: Path, swaying: Path, toy_model: Path, calibrated: Path
+) -> None:
+    config = tmp_path / "config.toml"
+    config.write_text(toml(swaying, calibrated, free_port()))
+    assert NOT_CALIBRATED not in cli("check", "--config", config).stdout
+    assert "scores" not in {finding.what for finding in _model(load_config(config), None)}
+    config.write_text(toml(swaying, toy_model, free_port()))
+    assert f"warning  {NOT_CALIBRATED}\n" in cli("check", "--config", config).stdout
+    (scores,) = (finding for finding in _model(load_config(config), None) if finding.what == "scores")
+    assert (scores.verdict, scores.says) == ("poor", NOT_CALIBRATED)
+    assert "`uavpose-trainer calibrate-score`" in scores.advice
+    with flying(tmp_path, config.read_text()) as flight:
+        assert sum(" WARNING " in line and f"model: {NOT_CALIBRATED}" in line for line in flight.lines) == 1
