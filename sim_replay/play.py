@@ -26,9 +26,9 @@ from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.bad_link import LinkFaults
 from sim_replay.daemon_config import sequence_config
-from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
+from sim_replay.ports import free_port
 
 LEADS_S = (5.0, 15.0, 45.0)  # until frame 0, for the daemon to become ready; too slow: the next value is tried
 READY_MARGIN_NS = 100_000_000

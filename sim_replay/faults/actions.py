@@ -21,7 +21,7 @@ from pathlib import Path
 from msgs.mavlink import dialect
 from sim_replay.faults import hostile
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import LOOPBACK, LinkState, udp_queue
+from sim_replay.faults.relay import LinkState, udp_queue
 from sim_replay.faults.rig import START_S, UAV, Rig
 from sim_replay.faults.timeline import (
     Camera,
@@ -36,6 +36,7 @@ from sim_replay.faults.timeline import (
     Start,
 )
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK
 
 FILLER = "filler"
 _BUSY = "while True: pass"

@@ -14,8 +14,9 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
+from sim_replay.ports import LOOPBACK
+
 Address = tuple[str, int]
-LOOPBACK = "127.0.0.1"
 _LOOK_S = 0.2
 _CHUNK_BYTES = 65536
 _TAPE_DATAGRAMS = 4096
@@ -213,11 +214,6 @@ def udp_queue(port: int) -> tuple[int, int]:
         if int(columns[1].rpartition(":")[2], 16) == port:
             return int(columns[4].rpartition(":")[2], 16), int(columns[-1])
     return 0, 0
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with _bound(kind) as probe:
-        return int(probe.getsockname()[1])
 
 
 def _bound(kind: socket.SocketKind) -> socket.socket:

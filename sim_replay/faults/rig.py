@@ -29,10 +29,11 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.camera import TOPIC
 from sim_replay.faults.messages import OWN_LAT_LON_ALT, OWN_UP_M
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import LOOPBACK, TcpRelay, UdpRelay, free_port
+from sim_replay.faults.relay import TcpRelay, UdpRelay
 from sim_replay.faults.timeline import Start, Who
 from sim_replay.faults.witness import Witness
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK, free_port
 from sim_replay.telemetry import COLUMNS, FLOWN_CSV, Telemetry, write_telemetry
 
 START_S = 120.0

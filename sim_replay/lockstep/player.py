@@ -20,13 +20,13 @@ from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
 from sim_replay.daemon_config import sequence_config
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import free_port
 from sim_replay.gimbal import looped as looped_gimbal
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
 from sim_replay.pipeline.flight import looped
 from sim_replay.play import MESSAGES_JSONL, PlayError, Recording
+from sim_replay.ports import free_port
 from sim_replay.telemetry import read_telemetry
 
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot

@@ -20,10 +20,10 @@ from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.daemon_config import sequence_config
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.pipeline.usage import Usage, usage_of
 from sim_replay.play import LEADS_S, READY_MARGIN_NS, PlayError
+from sim_replay.ports import LOOPBACK, free_port
 from sim_replay.telemetry import FLOWN_CSV, Telemetry, read_telemetry, write_telemetry
 
 UAV = "uav1"

@@ -9,7 +9,8 @@ import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from sim_replay.faults.relay import LOOPBACK, Address
+from sim_replay.faults.relay import Address
+from sim_replay.ports import LOOPBACK
 from sim_replay.radio.channel import SEGMENT_BYTES, Channel, Lane
 
 _START_S = 10.0

@@ -15,8 +15,8 @@ from typing import Any, Literal
 from msgs.ground.router import AccessSettings, RouterSettings, TlsSettings, open_router
 from msgs.session import TlsFiles
 from sim_replay.faults.processes import Process
-from sim_replay.faults.relay import LOOPBACK, free_port
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK, free_port
 
 START_S = 60.0
 _NO_CAP_HZ = 240.0  # of poses: every pose is offered to the link, which thins the rest as on any radio

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -64,12 +63,6 @@ def write_swaying_scene(folder: Path) -> Path:
     cameras = {str(index): {"cam_K": K.ravel().tolist(), "depth_scale": 1.0} for index in range(len(order))}
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
     return folder
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def toml(scene: Path, model: Path, zenoh_port: int, more: str = "", fps: int = 10) -> str:

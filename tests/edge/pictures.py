@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from contextlib import closing
 
@@ -15,12 +14,6 @@ from edge.types import Frame
 SIZE_WH = (320, 180)
 LENS = [-0.2, 0.05, 0.001, -0.001, 0.0]
 INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=320, height=180, distortion=LENS)
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as bound:
-        bound.bind(("127.0.0.1", 0))
-        return int(bound.getsockname()[1])
 
 
 def picture(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -131,13 +130,10 @@ def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
     assert ms["next"].cpu < ms["work"].cpu / 5
 
 
-def test_threads_without_cores_of_their_own_have_no_peak(tmp_path: Path) -> None:
-    model, cores = write_toy_model(tmp_path / "int8.onnx", precision="int8"), os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(cores)})
-    try:
-        measured = measure([model], [2], spinning=False, rounds=3, others=False, on_round=lambda _: None)
-    finally:
-        os.sched_setaffinity(0, cores)
+def test_threads_without_cores_of_their_own_have_no_peak(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge.bench.peak.MORE_THAN_ONE", 100.0)  # no machine's two threads are so much faster
+    model = write_toy_model(tmp_path / "int8.onnx", precision="int8")
+    measured = measure([model], [2], spinning=False, rounds=3, others=False, on_round=lambda _: None)
     tree, told = to_tree(measured), table(measured).splitlines()
     assert [(peak["threads"], peak["shared"]) for peak in tree["peaks"]] == [(1, False), (2, True)]
     assert {row["limit_ms"] for row in tree["rows"]} == {None}

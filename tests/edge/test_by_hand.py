@@ -21,6 +21,7 @@ from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, TrackState
 from msgs.mavlink import dialect
+from sim_replay.ports import free_port
 
 from . import toy_scene
 from .looping import OTHER, Gated, box_around, looping
@@ -43,14 +44,8 @@ def still_scene(folder: Path) -> Path:
     return folder
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def test_stopping_drops_the_target_and_drawing_a_box_takes_it_up_again(tmp_path: Path, toy_model: Path) -> None:
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     config = tmp_path / "flight.toml"
     config.write_text(
         f'[camera]\ntype = "sequence"\npath = "{still_scene(tmp_path / "000001")}"\nfps = 10\nloop = true\n'

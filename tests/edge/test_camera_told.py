@@ -16,10 +16,11 @@ from edge.cameras.capture import Capture
 from edge.cameras.zenoh_topic import ZenohSource
 from edge.status import ask
 from msgs.cdr import CompressedImage
+from sim_replay.ports import free_port
 from tests.waiting import until
 
 from .conftest import Cli
-from .flying import flying, free_port
+from .flying import flying
 from .test_cameras_live import deep_png, message, router, zenoh_camera
 
 HALF_WH = (160, 90)  # of what the calibration is for

@@ -15,9 +15,10 @@ from edge.cameras.zenoh_topic import ZenohSource
 from edge.config import load_config
 from edge.config_camera import SequenceCamera, ZenohCamera
 from edge.types import Frame
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .pictures import INTRINSICS, free_port
+from .pictures import INTRINSICS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "cameras.md").read_text()

@@ -29,9 +29,10 @@ from msgs import topics
 from msgs.cdr import CompressedImage
 from msgs.publish import Node, TopicPublisher
 from msgs.session import client_config, router_config
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
+from .pictures import INTRINSICS, LENS, SIZE_WH, number_of, picture
 
 PERIOD_NS = 33_333_333
 

@@ -19,9 +19,10 @@ from edge.cameras.source import SourceLost
 from edge.cameras.stream import StreamSource
 from edge.config_camera import StreamCamera
 from edge.types import Frame
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .pictures import INTRINSICS, LENS, SIZE_WH, free_port, number_of, picture
+from .pictures import INTRINSICS, LENS, SIZE_WH, number_of, picture
 
 WAITING = 40  # frames
 TENTH_IS_KEY = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "keyint=10:min-keyint=10:scenecut=0"}

@@ -42,6 +42,7 @@ from edge.types import CameraInfo, Frame, Track, TrackState
 from msgs.client import connect, subscribe
 from msgs.ground.keys import init_authority, issue
 from msgs.session import QUIC_OPEN_TIMEOUT_MS
+from sim_replay.ports import free_endpoint
 
 from .looping import Ear
 from .toy_scene import center_of, true_t_cam_target_m
@@ -75,12 +76,6 @@ def flying(tmp_path: Path, text: str) -> Iterator[tuple[subprocess.Popen[str], l
             yield daemon, lines
         finally:
             daemon.kill()
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(

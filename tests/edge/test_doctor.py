@@ -28,11 +28,12 @@ from edge.status import ask
 from edge.status_board import StatusBoard
 from edge.types import CameraInfo
 from sim_replay.faults.rig import can_mount
+from sim_replay.ports import free_port
 from tests.waiting import until
 
 from . import pictures
 from .conftest import Cli
-from .flying import flying, free_port, toml, write_swaying_scene
+from .flying import flying, toml, write_swaying_scene
 from .test_cameras_stream import UdpCamera
 
 

@@ -38,9 +38,10 @@ from edge.types import CameraInfo, FrameMeta
 from msgs import topics
 from msgs.cdr import Log
 from msgs.client import connect
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .flying import flying, free_port, toml, write_swaying_scene
+from .flying import flying, toml, write_swaying_scene
 from .toy_scene import K
 
 STICKS_LATER = """

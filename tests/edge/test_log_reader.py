@@ -12,9 +12,10 @@ from pathlib import Path
 from edge.links.zenoh_commands import LOGGED_AT_ONCE
 from edge.logs import LINES_WAITING, PatientStream
 from msgs.client import connect
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .flying import flying, free_port, toml, write_swaying_scene
+from .flying import flying, toml, write_swaying_scene
 
 RELOADS = 25  # each is two lines of the log and more, of which forty fill the pipe
 

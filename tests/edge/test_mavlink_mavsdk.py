@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from edge.links.mavlink_link import MavlinkLink
 from edge.requests import RequestQueue, StopTracking, TrackBox
 from msgs.mavlink import DIALECT_XML
+from sim_replay.ports import free_port
 
 from .mavlink_peer import SYSTEM_ID, Peer, linked, meet
 from .reports import BOX_XYXY_PX, ORIGIN, R_CAM_TARGET, R_NED_CAM, SIZE_WH, T_CAM_TARGET_M, TRACKING, K
@@ -54,15 +55,9 @@ class Flight:
         return results[0]
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @contextmanager
 def flying(**settings: Any) -> Iterator[Flight]:
-    port, requests = free_port(), RequestQueue()
+    port, requests = free_port(socket.SOCK_DGRAM), RequestQueue()
     ground = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     assert ground.add_any_connection(f"udpin://127.0.0.1:{port}") == 0
     endpoints = ("udpin:127.0.0.1:0", f"udpout:127.0.0.1:{port}")

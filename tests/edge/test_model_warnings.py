@@ -21,9 +21,10 @@ from edge.estimator.model import NOT_CALIBRATED
 from edge.status import ask
 from msgs.cdr import Log
 from msgs.client import connect, subscribe
+from sim_replay.ports import free_port
 
 from .conftest import Cli
-from .flying import flying, free_port, toml, write_swaying_scene
+from .flying import flying, toml, write_swaying_scene
 from .toy_model import write_toy_model
 
 # `uavpose-edge` with an ONNX Runtime that has a GPU, which the CPU stands in for until the file BROKEN is there.

@@ -24,11 +24,12 @@ from msgs.cdr import CompressedImage, PoseWithCovarianceStamped
 from msgs.client import connect
 from msgs.recording import Recorder
 from msgs.session import TlsFiles, router_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import K, make_report, make_track
 from .test_zenoh_config import make_keys
-from .test_zenoh_link import MOUNT, free_endpoint
+from .test_zenoh_link import MOUNT
 
 
 def frame(sequence: int, capture_ns: int, seed: int | None = None) -> Frame:

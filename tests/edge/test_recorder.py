@@ -21,10 +21,11 @@ from edge.links.zenoh_link import ZenohLink
 from msgs import recording
 from msgs.client import connect
 from msgs.recording import Recorder, RecordingLimits
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint
+from .test_zenoh_link import MOUNT
 
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
 

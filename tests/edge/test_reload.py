@@ -31,10 +31,11 @@ from msgs.cdr import Log
 from msgs.client import connect, subscribe
 from msgs.contract import ModelContract
 from msgs.ground.keys import init_authority, issue
+from sim_replay.ports import free_port
 from tests.certificates import redate
 from tests.waiting import until
 
-from .flying import Flight, flying, free_port, toml, write_swaying_scene
+from .flying import Flight, flying, toml, write_swaying_scene
 from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
 
 

@@ -20,6 +20,7 @@ from edge.config_camera import StreamCamera
 from edge.daemon import Pipeline
 from edge.estimator.model import load_model
 from edge.types import Estimate, Frame, FrameMeta, TrackState
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .looping import HELD, PERIOD_NS, Gated, frame, looping
@@ -27,7 +28,6 @@ from .mavlink_peer import Peer, meet
 from .mavlink_peer import linked as mavlink
 from .reports import make_report, make_track
 from .test_stamps import INTRINSICS, Fed
-from .test_zenoh_link import free_endpoint
 from .test_zenoh_link import linked as zenoh
 from .toy_scene import SIZE_WH, K
 

@@ -27,10 +27,11 @@ from msgs import topics
 from msgs.cdr import DiagnosticArray
 from msgs.client import connect
 from msgs.session import router_config
+from sim_replay.ports import free_port
 from tests.waiting import until
 
 from .conftest import Cli
-from .flying import Flight, flying, free_port, toml, write_swaying_scene
+from .flying import Flight, flying, toml, write_swaying_scene
 
 SAMPLE = re.compile(r'^[a-z_]+(\{[a-z0-9_]+="[^"]*"(,[a-z0-9_]+="[^"]*")*\})? [-+0-9.e]+$')
 

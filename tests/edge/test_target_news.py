@@ -17,8 +17,9 @@ from edge.types import TrackState
 from msgs import topics
 from msgs.cdr import Log
 from msgs.client import connect
+from sim_replay.ports import free_port
 
-from .flying import flying, free_port, toml
+from .flying import flying, toml
 from .reports import make_report as report
 from .reports import make_track as track
 from .toy_scene import K, draw

@@ -24,10 +24,11 @@ from edge.requests import WAITING_MAX, RequestQueue, SelectTarget, StopTracking,
 from msgs.client import connect
 from msgs.ground.command import RATE_MAX_HZ, RATE_MIN_HZ, ask
 from msgs.recording import Recorder, RecordingLimits
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint
+from .test_zenoh_link import MOUNT
 
 
 @dataclass

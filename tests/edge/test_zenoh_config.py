@@ -16,10 +16,11 @@ from edge.links.zenoh_link import ZenohLink
 from msgs.client import connect, subscribe
 from msgs.ground.keys import init_authority, issue
 from msgs.session import TlsFiles, router_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import MOUNT, free_endpoint
+from .test_zenoh_link import MOUNT
 
 CAMERA = '[camera]\ntype = "sequence"\npath = "scene"\n'
 TLS = '[zenoh.tls]\nroot_ca = "ca.pem"\ncertificate = "uav1.pem"\nprivate_key = "uav1.key"\n'

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import socket
 import subprocess
 import sys
 import threading
@@ -26,6 +25,7 @@ from edge.types import Mount, TrackState
 from msgs import topics
 from msgs.client import connect, subscribe, subscribe_all
 from msgs.session import router_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import (
@@ -54,12 +54,6 @@ VISION_MSGS = {
 }
 for _name, _definition in VISION_MSGS.items():
     ROS.register(get_types_from_msg(_definition, f"vision_msgs/msg/{_name}"))
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @contextlib.contextmanager

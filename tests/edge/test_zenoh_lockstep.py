@@ -11,10 +11,11 @@ import zenoh
 from edge import clock
 from msgs import topics
 from msgs.client import connect
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
 from .reports import make_report, make_track
-from .test_zenoh_link import free_endpoint, linked
+from .test_zenoh_link import linked
 
 PER_FRAME = {"uav1/target/t0/pose", "uav1/target/t0/odom", "uav1/target/detections", "uav1/tf"}
 

@@ -24,6 +24,7 @@ from msgs import topics
 from msgs.client import connect
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.play import last_counters
+from sim_replay.ports import free_port
 from tests.waiting import until
 
 BIN = Path(sys.executable).parent
@@ -208,11 +209,7 @@ def test_a_demo_that_is_told_to_stop_takes_its_processes_with_it(number: signal.
 @pytest.fixture
 def running_daemon(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A daemon that plays the bundled sequence for ever, met once it has said how it is."""
-    ports = []
-    for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
-        with socket.socket(socket.AF_INET, kind) as probe:
-            probe.bind(("127.0.0.1", 0))
-            ports.append(probe.getsockname()[1])
+    ports = [free_port(), free_port(socket.SOCK_DGRAM)]
     config = tmp_path / "config.toml"
     config.write_text(
         f'[camera]\ntype = "sequence"\npath = "{BUNDLED_SEQUENCE}"\nloop = true\n'

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from sim_replay.cli import main
-from sim_replay.faults.relay import free_port
 from sim_replay.golden import run as golden
 from sim_replay.golden.run import CASES
+from sim_replay.ports import free_port
 
 BIN = Path(sys.executable).parent
 LAST_FRAMES = ["--start", "4.6"]  # of 150 at 30 Hz: the last twelve

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,12 +12,7 @@ import pytest
 import zenoh
 
 from msgs import cdr, session
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+from sim_replay.ports import free_endpoint
 
 
 def pose_now(z_m: float = 300.0, age_s: float = 0.0) -> cdr.PoseWithCovarianceStamped:

@@ -17,9 +17,10 @@ from msgs.publish import Node, TopicPublisher
 from msgs.receive import TargetPose
 from msgs.topics import POSE
 from msgs.wire import Refusal
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from .conftest import Network, free_endpoint, pose_now
+from .conftest import Network, pose_now
 
 
 def test_a_sample_is_what_a_ros_2_publisher_sends(network: Network) -> None:

@@ -16,9 +16,10 @@ import msgs.examples
 from msgs import topics
 from msgs.cdr import PoseWithCovarianceStamped
 from msgs.publish import Node
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from .conftest import Network, free_endpoint, pose_now
+from .conftest import Network, pose_now
 
 EXAMPLES = sorted(path.stem for path in Path(msgs.examples.__file__).parent.glob("*.py"))
 RUN = """

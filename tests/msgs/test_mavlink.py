@@ -28,6 +28,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect
 from pymavlink.dialects.v20 import ardupilotmega
 
 from msgs import mavlink
+from sim_replay.ports import free_port
 
 POSE: dict[str, Any] = {
     "utc_us": 1_700_000_000_123_456,
@@ -97,16 +98,10 @@ def test_upstream_s_generator_takes_the_dialect(tmp_path: Path, root: str) -> No
     assert rest == [[0.5, 0.75, 12.0], 0.125, [0.5, 0.5, -0.5, 0.5], [0.0, 1.0, 0.0, 0.0], 3]
 
 
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @pytest.fixture
 def ground() -> Iterator[tuple[Mavsdk, int]]:
     """MAVSDK as a ground station listening on a UDP port."""
-    port = _free_port()
+    port = free_port(socket.SOCK_DGRAM)
     peer = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     assert peer.add_any_connection(f"udpin://127.0.0.1:{port}") == 0
     yield peer, port

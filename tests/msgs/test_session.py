@@ -16,9 +16,10 @@ import zenoh
 
 from msgs import client, session, topics
 from msgs.publish import Node
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from .conftest import free_endpoint, pose_now
+from .conftest import pose_now
 
 
 def sockets() -> set[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import free_endpoint
+from sim_replay.ports import free_endpoint
 
 # Threads that start later inherit the main thread's mask: the first is the only one that can take a signal.
 ANOTHER_THREAD_TAKES_IT = """

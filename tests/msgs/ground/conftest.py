@@ -12,8 +12,7 @@ import zenoh
 from msgs.ground.keys import init_authority, issue
 from msgs.ground.router import load_router, open_router
 from msgs.session import TlsFiles
-
-from ..conftest import free_endpoint
+from sim_replay.ports import free_endpoint
 
 
 @dataclass(frozen=True)

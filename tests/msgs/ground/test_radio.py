@@ -15,9 +15,9 @@ import zenoh
 
 from msgs.ground.router import load_router, open_router
 from msgs.session import OPEN_TIMEOUT_MS, TlsFiles, peer_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from ..conftest import free_endpoint
 from .conftest import write_router_config
 from .test_watch import Vehicle, ground
 

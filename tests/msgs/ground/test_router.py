@@ -16,9 +16,10 @@ from msgs.ground.keys import init_authority, issue
 from msgs.ground.router import load_router, open_router
 from msgs.publish import Node
 from msgs.session import TlsFiles, peer_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from ..conftest import free_endpoint, pose_now
+from ..conftest import pose_now
 from .conftest import Ground, write_router_config
 
 

@@ -25,9 +25,10 @@ from msgs.ground.view.command import ViewOptions, view
 from msgs.ground.view.scene import Scene
 from msgs.mcap_file import McapFile, Publisher
 from msgs.publish import Node
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from ..conftest import Network, free_endpoint
+from ..conftest import Network
 from .flight import (
     PERIOD_NS,
     R_BODY_CAM,

@@ -16,8 +16,8 @@ from rerun.chunk import RrdReader
 from msgs.ground.cli import main
 from msgs.ground.errors import InputError
 from msgs.ground.view.saving import saved
+from sim_replay.ports import free_endpoint
 
-from ..conftest import free_endpoint
 from .flight import record
 
 OLD = b"an older file"

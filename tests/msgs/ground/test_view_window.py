@@ -16,14 +16,11 @@ import pytest
 from msgs.ground.cli import main
 from msgs.ground.view import viewer
 from msgs.ground.view.command import ViewOptions, view
+from sim_replay.ports import free_port
 from tests.waiting import until
 
-from ..conftest import Network, free_endpoint
+from ..conftest import Network
 from .flight import record
-
-
-def free_port() -> int:
-    return int(free_endpoint().rpartition(":")[2])
 
 
 @contextmanager

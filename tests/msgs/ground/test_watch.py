@@ -28,9 +28,10 @@ from msgs.ground.fleet import Fleet
 from msgs.ground.watch import Fitted, WatchOptions, _watch_json, table
 from msgs.publish import Node, TopicPublisher
 from msgs.session import peer_config, router_config
+from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
-from ..conftest import Network, free_endpoint, pose_now
+from ..conftest import Network, pose_now
 
 R_NED_BODY = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True)
 R_BODY_CAM = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
