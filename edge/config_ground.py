@@ -52,8 +52,8 @@ class ZenohSettings(Section):
         default=None,
         ge=0.1,
         le=240,
-        description="maximum rate of each target's poses and odometry on tls/ and quic/ links; delivered is the "
-        "largest whole fraction of the frame rate up to 1.2 times this; default: unlimited",
+        description="maximum rate of each target's poses and odometry on tls/ and quic/ links; best a whole fraction "
+        "of the frame rate, which is then delivered; default: unlimited",
     )
     image_max_hz: RateOrNone = Field(
         default=1.0,

@@ -20,6 +20,7 @@ from msgs.definitions import definition
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _PROFILE = "ros2"
+CHANNELS_MAX = 4096  # the format numbers them with 16 bits; more publishers are forged ones
 
 
 class Publisher(NamedTuple):
@@ -58,7 +59,11 @@ class McapFile:
         publish_ns: int,
         publisher: Publisher | None = None,
     ) -> None:
-        """Add a CDR payload of the topic `/name`, in a channel for each `publisher`; times are UTC."""
+        """Add a CDR payload of the topic `/name`, in a channel for each `publisher`; times are UTC.
+
+        Beyond CHANNELS_MAX channels, further publishers share one."""
+        if len(self._channels) >= CHANNELS_MAX and (name, publisher) not in self._channels:
+            publisher = None
         channel = self._channels.get((name, publisher))
         if channel is None:
             channel = self._channels[name, publisher] = self._register(name, ros_type, publisher)

@@ -85,7 +85,7 @@ class Recorder:
         self._in_hand = 0  # samples that the writer has taken and not written yet
         self._overflowed = 0  # lost to a full buffer since the last warning
         self._gaps_due_s = 0.0
-        self._standing: dict[str, Sample] = {}
+        self._standing: dict[tuple[str, Publisher | None], Sample] = {}
         self._counters: Counter[str] = Counter()
         self._wanted = on
         self._stopping = False
@@ -122,8 +122,9 @@ class Recorder:
         name, log_ns, clock_ns = topics.topic_name(topic, uav, target), time.time_ns(), _utc_ahead_ns()
         sample = Sample(topic, name, payload, log_ns, publish_ns, clock_ns, publisher)
         with self._changed:
-            if topic.cache == 1 and (sample.name in self._standing or len(self._standing) < STANDING_MAX):
-                self._standing[sample.name] = sample
+            whose = (name, publisher)
+            if topic.cache == 1 and (whose in self._standing or len(self._standing) < STANDING_MAX):
+                self._standing[whose] = sample
             if not self._wanted or self._stopping:
                 return
             full = len(self._waiting) >= WAITING_MAX or self._waiting_bytes + len(payload) > WAITING_BYTES_MAX

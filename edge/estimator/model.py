@@ -189,7 +189,7 @@ def _open_sessions(content: bytes, path: Path, threads: int, spinning: bool, cho
     with ThreadPoolExecutor(1, initializer=yield_to_the_loop) as opener:
         # A session's threads inherit the priority of the thread that opens it, here a low one: a search of the whole
         # frame then does not delay the track windows of the same time.
-        free, chosen = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
+        free, runs_on = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
     contract = _contract(free, path)
     _check_graph(free, contract, path)
     fixed = {}
@@ -199,8 +199,10 @@ def _open_sessions(content: bytes, path: Path, threads: int, spinning: bool, cho
         options = session_options(threads, spinning)
         for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
             options.add_free_dimension_override_by_name(name, side)
-        fixed[contract.track_size_wh], chosen = _open(content, path, options, chosen)
-    return Sessions(free, fixed, chosen)
+        fixed[contract.track_size_wh], too = _open(content, path, options, runs_on)
+        if too != runs_on:  # as where a device has memory for one session only: both then run on the next one
+            return _open_sessions(content, path, threads, spinning, too)
+    return Sessions(free, fixed, runs_on)
 
 
 def _open(

@@ -88,7 +88,7 @@ def ask(
         # Of answers of one key, zenoh would otherwise pass on the last one only.
         consolidation=zenoh.ConsolidationMode.NONE,
     )
-    answers: list[dict[str, Any]] = []
+    answers, silent = list[dict[str, Any]](), False
     # Polling, because a blocking wait inside zenoh cannot be interrupted by signals.
     while True:
         try:
@@ -100,15 +100,18 @@ def ask(
             if answer is not None:
                 answers.append(answer)
             else:
-                late = f"{uav} does not answer within {timeout_s:.0f} s"
+                silent, late = True, f"{uav} does not answer within {timeout_s:.0f} s"
                 why = f"{late}: it may have done it, or it is not for you to command"
         elif stop.wait(LOOK_EVERY_S):
             why = f"broken off before {uav} answered: it may have done it"
             break
-    if len(answers) > 1:
+    if len(answers) == 1 and not silent:
+        return answers[0]
+    if answers:
         said = "; ".join(json.dumps(one.get("done") if one["ok"] is True else one.get("error")) for one in answers)
-        why = f"{len(answers)} vehicles named {uav} have answered: {said}"
-    return answers[0] if len(answers) == 1 else {"ok": False, "command": name, "error": why}
+        also = f"; another did not within {timeout_s:.0f} s: it may have done it" if silent else ""
+        why = f"{len(answers)} of the vehicles named {uav} answered: {said}{also}"
+    return {"ok": False, "command": name, "error": why}
 
 
 def _answer(reply: zenoh.Reply) -> dict[str, Any] | None:

@@ -17,6 +17,7 @@ GAP_NS = 500_000_000  # longest gap to interpolate over; at five messages a seco
 # Longest time to predict over. Where transforms are cut to five a second, up to 300 ms lie between two, as only whole
 # frames pass, and that of a frame arrives after its poses.
 NEAR_NS = 350_000_000
+HELD_NS = 100_000_000  # longest time over which it counts as unchanged, where it cannot be predicted
 KEPT_NS = 2_000_000_000
 KEPT_MAX = 512
 _stamp_ns = attrgetter("stamp_ns")
@@ -67,7 +68,7 @@ class OwnShipHistory:
 
     def near(self, stamp_ns: int) -> OwnShip | None:
         """The state at a time or, if it cannot be interpolated, the one predicted from the nearest within `NEAR_NS`:
-        turned on as fast as before, by at most as much as between the last two."""
+        turned on as fast as before, by at most as much as between the last two. None if more than `HELD_NS` remain."""
         own = self.at(stamp_ns)
         if own is not None or not self._told:
             return own
@@ -77,10 +78,11 @@ class OwnShipHistory:
         index = bisect_left(self._told, nearest.stamp_ns, key=_stamp_ns)
         before = self._told[index - 1] if index else nearest
         step_ns = nearest.stamp_ns - before.stamp_ns
-        if stamp_ns < nearest.stamp_ns or not 0 < step_ns <= GAP_NS:
-            return nearest
-        predicted = _between(before, nearest, min(stamp_ns, nearest.stamp_ns + step_ns))
-        return replace(predicted, stamp_ns=nearest.stamp_ns)
+        predictable = stamp_ns > nearest.stamp_ns and 0 < step_ns <= GAP_NS
+        reached_ns = min(stamp_ns, nearest.stamp_ns + step_ns) if predictable else nearest.stamp_ns
+        if abs(stamp_ns - reached_ns) > HELD_NS:
+            return None
+        return replace(_between(before, nearest, reached_ns), stamp_ns=nearest.stamp_ns) if predictable else nearest
 
 
 def _between(before: OwnShip, after: OwnShip, stamp_ns: int) -> OwnShip:

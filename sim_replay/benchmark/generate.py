@@ -47,8 +47,10 @@ def run(args: argparse.Namespace) -> int:
         except CrewError as error:
             print(f"{args.out}: {error}; --resume goes on from here", file=sys.stderr)
             return 1
+        except BrokenPipeError:
+            raise
         except OSError as error:
-            print(f"{args.out}: {error.strerror}; --resume goes on from here", file=sys.stderr)
+            print(f"{args.out}: {error}; --resume goes on from here", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
             print(f"stopped; --resume goes on with {args.out}", file=sys.stderr)

@@ -9,15 +9,17 @@ import os
 import queue
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
+import onnxruntime as ort
 import pytest
 from zenoh import handlers
 
 from edge.config import load_config
 from edge.doctor import _model
-from edge.estimator.model import NOT_CALIBRATED
+from edge.estimator.model import NOT_CALIBRATED, load_model
 from edge.status import ask
 from msgs.cdr import Log
 from msgs.client import connect, subscribe
@@ -106,6 +108,37 @@ def test_a_gpu_that_fails_in_flight_is_told_of_and_the_cpu_goes_on(
         told = ask(endpoint, "uav1")
         assert told is not None
         assert (told["info"]["model_provider"], told["model"]["fallback_reason"]) == ("cpu", reason)
+
+
+def test_a_gpu_with_room_for_one_of_two_sessions_is_not_used_for_that_one(
+    calibrated: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gpu, cpu = "CUDAExecutionProvider", "CPUExecutionProvider"
+    lost, on_gpu = threading.Event(), list["Session"]()
+
+    class Session(ort.InferenceSession):
+        def __init__(self, content: bytes, options: Any, providers: list[str], enable_fallback: int) -> None:
+            if providers[0] == gpu and on_gpu:
+                raise RuntimeError("CUDA failure 2: out of memory")
+            super().__init__(content, options, providers=[cpu])
+            self.wanted = providers
+            on_gpu.extend([self] if providers[0] == gpu else [])
+
+        def get_providers(self) -> list[str]:
+            return self.wanted
+
+        def run(self, *arguments: Any) -> Any:
+            if self.wanted[0] == gpu and lost.is_set():
+                raise RuntimeError("CUDA failure 719: unspecified launch failure")
+            return super().run(*arguments)
+
+    monkeypatch.setattr(ort, "InferenceSession", Session)
+    monkeypatch.setattr(ort, "get_available_providers", lambda: [gpu, cpu])
+    model = load_model(calibrated, 1, provider="cuda")
+    assert model.provider == "cpu"
+    assert str(model.fallback_reason).startswith("CUDAExecutionProvider did not start: CUDA failure 2: out of memory")
+    lost.set()
+    model.warm_up()
 
 
 @pytest.mark.parametrize("command", ["doctor", "check"])

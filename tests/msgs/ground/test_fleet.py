@@ -184,10 +184,10 @@ def test_own_attitude_is_predicted_by_no_more_than_it_was_seen_to_turn_and_not_f
         for one in turning_frame(NOW_NS + k * FRAME_NS, k + 1, own=k < 10):
             news = fleet.take(one, NOW_NS + k * FRAME_NS)
             rows += [news] if isinstance(news, TargetRow) else []
-    assert [row.frame for row in rows[2:]] == ["ned"] * 16 + ["cam"] * 12  # up to 320 ms after the tenth
+    assert [row.frame for row in rows[2:]] == ["ned"] * 11 + ["cam"] * 17  # up to 120 ms after the tenth
     assert off_north_deg(rows[10]) < 0.01
-    assert off_north_deg(rows[17]) == pytest.approx(7 * YAW_DEG_S * FRAME_NS / S, abs=0.01)
-    assert [row.own_age_s for row in rows[17:19]] == [pytest.approx(0.32), None]
+    assert off_north_deg(rows[12]) == pytest.approx(2 * YAW_DEG_S * FRAME_NS / S, abs=0.01)
+    assert [row.own_age_s for row in rows[12:14]] == [pytest.approx(0.12), None]
 
 
 def test_without_own_attitude_a_row_is_by_the_camera_and_a_lost_target_keeps_its_bearing() -> None:
