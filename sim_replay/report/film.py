@@ -24,7 +24,8 @@ def write_video(path: Path, frames: Iterable[Image], fps: float, size_wh: tuple[
     scale = min(1.0, WIDTH_MAX_PX / size_wh[0])
     video_wh = (round(size_wh[0] * scale / 2) * 2, round(size_wh[1] * scale / 2) * 2)
     rate = Fraction(fps).limit_denominator(1001)
-    with av.open(f"file:{path}", mode="w") as container:  # else what precedes a colon would be taken for a protocol
+    # A relative path with a colon would be taken for a URL.
+    with av.open(str(path.absolute()), mode="w") as container:
         stream = cast(av.VideoStream, container.add_stream(CODEC, rate=rate, options=OPTIONS))
         stream.width, stream.height = video_wh
         stream.pix_fmt = "yuv420p"

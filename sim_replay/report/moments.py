@@ -70,13 +70,11 @@ def _moment(sequence: PlayedSequence, match: Match) -> Moment:
 
 
 def film(video: Path) -> tuple[str | None, list[str]]:
-    """The overlay as a data: URL if browsers can play it and it is small enough, else STILLS of it."""
-    capture = cv2.VideoCapture(str(video))
-    codec = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").decode("ascii", "replace")
-    if codec.lower().startswith("vp9") or codec.lower() == "vp09":
-        data = video.read_bytes()
-        if len(data) <= VIDEO_MAX_BYTES:
-            return f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}", []
+    """The overlay as a data: URL if it is small enough, else STILLS of it."""
+    data = video.read_bytes()
+    if len(data) <= VIDEO_MAX_BYTES:
+        return f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}", []
+    capture = cv2.VideoCapture(str(video.absolute()))  # a relative path with a colon would be taken for a URL
     frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     stills = []
     for index in np.linspace(0, max(frames - 1, 0), STILLS).astype(int):

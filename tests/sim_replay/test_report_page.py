@@ -244,9 +244,11 @@ def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_fi
     flown: PlayedSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(moments, "VIDEO_MAX_BYTES", 0)
+    monkeypatch.chdir(tmp_path)
+    out = Path("14:36")  # ffmpeg would take it for a protocol
     silent = Recording(START_NS, UTC_NS, 14550, "tcp/127.0.0.1:7448", 0, {})
-    score, files = write_report(flown, RecordedFlight(flown.scene.folder, MODEL, silent), tmp_path, lambda: None)
-    page = (tmp_path / "report.html").read_text()
+    score, files = write_report(flown, RecordedFlight(flown.scene.folder, MODEL, silent), out, lambda: None)
+    page = (out / "report.html").read_text()
     assert "report.html" in files
     assert score["overall"]["recall"] == 0.0
     assert "<video" not in page
