@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -20,6 +21,7 @@ ANSWER_S = 5.0
 RELOAD_ANSWER_S = 60.0  # the model is loaded and warmed up before the answer
 LINK_S = 10.0
 LOOK_EVERY_S = 0.02
+TIME_OVER = 0.9  # share of the time to answer
 EXIT_REFUSED = 1
 RATE_MIN_HZ, RATE_MAX_HZ = 0.1, 240.0  # the vehicle refuses others
 
@@ -88,29 +90,32 @@ def ask(
         # Of answers of one key, zenoh would otherwise pass on the last one only.
         consolidation=zenoh.ConsolidationMode.NONE,
     )
-    answers, silent = list[dict[str, Any]](), False
+    answers, silent, began_s = list[dict[str, Any]](), False, time.monotonic()
     # Polling, because a blocking wait inside zenoh cannot be interrupted by signals.
     while True:
         try:
             reply = replies.try_recv()
         except zenoh.ZError:  # no further replies
+            # When the time is over, a router may end the query before zenoh tells of it here.
+            silent = silent or time.monotonic() - began_s >= TIME_OVER * timeout_s
             break
         if reply is not None:
             answer = _answer(reply)
             if answer is not None:
                 answers.append(answer)
             else:
-                silent, late = True, f"{uav} does not answer within {timeout_s:.0f} s"
-                why = f"{late}: it may have done it, or it is not for you to command"
+                silent = True
         elif stop.wait(LOOK_EVERY_S):
             why = f"broken off before {uav} answered: it may have done it"
             break
     if len(answers) == 1 and not silent:
         return answers[0]
+    late = f"within {timeout_s:.0f} s: it may have done it"
     if answers:
         said = "; ".join(json.dumps(one.get("done") if one["ok"] is True else one.get("error")) for one in answers)
-        also = f"; another did not within {timeout_s:.0f} s: it may have done it" if silent else ""
-        why = f"{len(answers)} of the vehicles named {uav} answered: {said}{also}"
+        why = f"{len(answers)} of the vehicles named {uav} answered: {said}" + f"; another did not {late}" * silent
+    elif silent:
+        why = f"{uav} does not answer {late}, or it is not for you to command"
     return {"ok": False, "command": name, "error": why}
 
 

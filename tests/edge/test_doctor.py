@@ -31,7 +31,6 @@ from sim_replay.faults.rig import can_mount
 from sim_replay.ports import free_port
 from tests.waiting import until
 
-from . import pictures
 from .conftest import Cli
 from .flying import flying, toml, write_swaying_scene
 from .test_cameras_stream import UdpCamera
@@ -186,7 +185,7 @@ NONE: dict[str, Any] = {"info": {}}
 def test_a_camera_that_the_running_daemon_has_is_not_taken_for_a_broken_one(
     cli: Cli, tmp_path: Path, toy_model: Path
 ) -> None:
-    port, asked_at = pictures.free_port(socket.SOCK_DGRAM), free_port()  # the first is one program's alone to read
+    port, asked_at = free_port(socket.SOCK_DGRAM), free_port()  # the first is one program's alone to read
     intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
     text = (
         f'[camera]\ntype = "stream"\nurl = "udp://127.0.0.1:{port}"\nintrinsics = {intrinsics}\n'

@@ -15,6 +15,7 @@ import pytest
 from edge.config import load_config
 from edge.doctor import _camera, camera_as_told, shortfalls
 from msgs.publish import TopicPublisher
+from sim_replay.ports import free_port
 
 from . import pictures
 from .test_cameras_live import message, router
@@ -22,7 +23,7 @@ from .test_cameras_live import message, router
 
 def test_a_camera_whose_stamps_do_not_advance_has_no_rate(tmp_path: Path) -> None:
     """As of a driver that stamps in whole seconds."""
-    port, over = pictures.free_port(), threading.Event()
+    port, over = free_port(), threading.Event()
     intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
     (tmp_path / "config.toml").write_text(
         '[camera]\ntype = "zenoh"\ntopic = "nose/image/compressed"\n'
