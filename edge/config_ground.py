@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from edge.config_path import ConfigPath
-from msgs.recording import RecordingLimits
+from msgs.recording_store import RecordingLimits
 from msgs.session import TlsFiles, check_endpoint
 from msgs.settings import Section
 

@@ -276,7 +276,7 @@ def _view(options: argparse.Namespace) -> int:
 
 def _record(options: argparse.Namespace) -> int:
     from msgs.ground.record import record
-    from msgs.recording import RecordingLimits
+    from msgs.recording_store import RecordingLimits
 
     limits = RecordingLimits(
         file_bytes_max=round(options.file_mb * 1e6),

@@ -13,7 +13,8 @@ from msgs import topics
 from msgs.ground.errors import InputError
 from msgs.ground.feed import Incoming, linked, listening, session
 from msgs.mcap_file import Publisher
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from msgs.session import TlsFiles
 
 STEM = "ground"

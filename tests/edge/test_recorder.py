@@ -20,7 +20,8 @@ from edge.errors import InputError
 from edge.links.zenoh_link import ZenohLink
 from msgs import recording
 from msgs.client import connect
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
 

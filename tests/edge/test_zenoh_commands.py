@@ -23,7 +23,8 @@ from edge.links.zenoh_link import ZenohLink
 from edge.requests import WAITING_MAX, RequestQueue, SelectTarget, StopTracking, TrackBox
 from msgs.client import connect
 from msgs.ground.command import RATE_MAX_HZ, RATE_MIN_HZ, ask
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from msgs import topics
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 
 ROOM = RecordingLimits(free_bytes_min=0)
 

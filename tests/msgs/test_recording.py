@@ -17,10 +17,11 @@ from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 from rosbags.rosbag2 import Reader
 
-from msgs import recording, topics
+from msgs import mcap_file, recording, topics
 from msgs.definitions import definition
-from msgs.mcap_file import McapFile, finish_unfinished
-from msgs.recording import Recorder, RecordingLimits
+from msgs.mcap_file import McapFile, Publisher, finish_unfinished
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
 from . import make_definitions
@@ -73,7 +74,8 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from msgs import topics
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 recorder = Recorder(Path(sys.argv[1]), "uav1", RecordingLimits(free_bytes_min=0), print)
 recorder.start()
 PERIOD_S = 0.005
@@ -329,3 +331,35 @@ def test_each_file_holds_what_is_told_on_change_alone(tmp_path: Path, monkeypatc
     recorder.stop()
     told = [("/uav1/camera_info", b"narrow"), ("/uav1/target/t0/pose", b"pose")]
     assert [[(topic, data) for topic, _, data, _ in read(path)] for path in sorted(tmp_path.iterdir())] == [told, told]
+
+
+def test_each_file_holds_what_each_of_two_vehicles_of_one_name_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    recorder = Recorder(tmp_path, "ground", ROOM, print, on=False)
+    recorder.start()
+    for session, intrinsics in (("0a", b"wide"), ("0b", b"narrow")):
+        recorder.record(topics.CAMERA_INFO, "uav1", None, intrinsics, 1, Publisher(session, 16 * session))
+    recorder.switch(True)
+    record_some(recorder, [b"pose"])
+    until(lambda: recorder.counters()["recorded"] == 1)
+    recorder.stop()
+    (path,) = tmp_path.iterdir()
+    assert {data for topic, _, data, _ in read(path) if topic == "/uav1/camera_info"} == {b"wide", b"narrow"}
+
+
+def test_more_publishers_than_a_file_can_number_share_a_channel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_file, "CHANNELS_MAX", 3)
+    file = mcap_file.McapFile(tmp_path / "forged.mcap")
+    for number in range(9):
+        forged = Publisher("0a", f"{number:032x}")
+        file.write("uav1/target/t0/pose", topics.POSE.ros_type, bytes([number]), number, number, forged)
+    file.close()
+    assert [data for _, _, data, _ in read(tmp_path / "forged.mcap")] == [bytes([number]) for number in range(9)]
+    with (tmp_path / "forged.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert len(summary.channels) == 4

@@ -11,7 +11,8 @@ import pytest
 from mcap.reader import make_reader
 
 from msgs import recording, topics
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
 DAY_NS = 86_400_000_000_000

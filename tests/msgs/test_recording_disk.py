@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from msgs import recording, topics
-from msgs.recording import Recorder, RecordingLimits
+from msgs.recording import Recorder
+from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
 from .recordings import ROOM, read, record_some

@@ -10,7 +10,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
-from msgs.recording import RecordingLimits, Store
+from msgs.recording_store import RecordingLimits, Store
 
 FILE_BYTES = 25_000
 
@@ -19,11 +19,12 @@ NO_ROOM_FOR_MORE = """
 import json, resource, sys, time
 from pathlib import Path
 from msgs import recording, topics
+from msgs.recording_store import RecordingLimits
 
 recording.FLUSH_S, recording.RETRY_S = 0.02, 0.05
 told = []
 recorder = recording.Recorder(
-    Path(sys.argv[1]), "uav1", recording.RecordingLimits(free_bytes_min=0), lambda _, text: told.append(text)
+    Path(sys.argv[1]), "uav1", RecordingLimits(free_bytes_min=0), lambda _, text: told.append(text)
 )
 recorder.start()
 

@@ -23,7 +23,7 @@ from msgs.ground.feed import Incoming
 from msgs.ground.fleet import Fleet
 from msgs.ground.view.command import ViewOptions, view
 from msgs.ground.view.scene import Scene
-from msgs.mcap_file import McapFile, Publisher
+from msgs.mcap_file import McapFile
 from msgs.publish import Node
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
@@ -308,24 +308,6 @@ def test_what_is_refused_of_a_recording_is_told(
     out = tmp_path / "twice.rrd"
     assert main(["view", str(halves[0]), str(halves[0]), "--max-age", "0.001", "--save", str(out)]) == 0
     assert capsys.readouterr().err.splitlines()[-1] == f"0 poses drawn into {out}, 20 samples refused"
-
-
-def test_of_two_vehicles_of_one_name_one_is_drawn_from_a_recording_too(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The second one's frames are exposed half a period after the first one's."""
-    file, late_ns = McapFile(tmp_path / "both.mcap"), PERIOD_NS // 2
-    first, second = (Publisher(zenoh_session=name, gid=16 * name) for name in ("0a", "0b"))
-    for topic, target, payload, log_ns in samples(10):
-        if topic is topics.POSE:
-            name, pose = topics.topic_name(topic, UAV, target), cdr.PoseWithCovarianceStamped.decode(payload)
-            file.write(name, topic.ros_type, payload, log_ns, log_ns, first)
-            late = dataclasses.replace(pose, stamp_ns=pose.stamp_ns + late_ns).encode()
-            file.write(name, topic.ros_type, late, log_ns + late_ns, log_ns + late_ns, second)
-    file.close()
-    out = tmp_path / "both.rrd"
-    assert main(["view", str(tmp_path / "both.mcap"), "--save", str(out)]) == 0
-    assert capsys.readouterr().err.splitlines()[-1] == f"10 poses drawn into {out}, 10 samples refused"
 
 
 def test_a_recording_is_left_when_told_to_stop_and_what_was_drawn_is_kept(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 import subprocess
 import sys
@@ -13,12 +14,14 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from msgs import cdr, topics
 from msgs.ground.cli import main
 from msgs.ground.errors import InputError
 from msgs.ground.view.saving import saved
+from msgs.mcap_file import McapFile, Publisher
 from sim_replay.ports import free_endpoint
 
-from .flight import record
+from .flight import PERIOD_NS, UAV, record, samples
 
 OLD = b"an older file"
 LIMIT_BYTES = 50_000  # of files: a disk that is full in the middle
@@ -147,3 +150,21 @@ def test_on_a_full_disk_a_sentence_ends_it_and_no_half_file_is_left(flight: Path
     assert "Traceback" not in done.stderr
     assert flight.with_name("out.rrd").read_bytes() == OLD
     assert names(flight.parent) == ["flight.mcap", "out.rrd"]
+
+
+def test_of_two_vehicles_of_one_name_one_is_drawn_from_a_recording_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second one's frames are exposed half a period after the first one's."""
+    file, late_ns = McapFile(tmp_path / "both.mcap"), PERIOD_NS // 2
+    first, second = (Publisher(zenoh_session=name, gid=16 * name) for name in ("0a", "0b"))
+    for topic, target, payload, log_ns in samples(10):
+        if topic is topics.POSE:
+            name, pose = topics.topic_name(topic, UAV, target), cdr.PoseWithCovarianceStamped.decode(payload)
+            file.write(name, topic.ros_type, payload, log_ns, log_ns, first)
+            late = dataclasses.replace(pose, stamp_ns=pose.stamp_ns + late_ns).encode()
+            file.write(name, topic.ros_type, late, log_ns + late_ns, log_ns + late_ns, second)
+    file.close()
+    out = tmp_path / "both.rrd"
+    assert main(["view", str(tmp_path / "both.mcap"), "--save", str(out)]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == f"10 poses drawn into {out}, 10 samples refused"
