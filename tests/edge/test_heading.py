@@ -84,6 +84,20 @@ def test_a_bank_leans_into_its_turn() -> None:
     assert odds(attitude(-30, 0, 80), NORTH, turning_right) < -1.0
 
 
+@pytest.mark.parametrize("other_deg", [-27, 0, 12, 42, 60, 85])
+def test_the_likeliest_bank_is_that_of_a_coordinated_turn(other_deg: float) -> None:
+    """At 25 m/s and 0.2 rad/s, tan(bank) = v w / g = 25 * 0.2 / 9.81: 27 degrees."""
+    turning = flight([0.0, 25.0, 0.0], turn_rate_radps=0.2)
+    assert flown_odds(attitude(27, 0, 90), attitude(other_deg, 0, 90), EXACT, turning) > 0.15
+
+
+@pytest.mark.parametrize("other_deg", [-14, 0, 30])
+def test_the_likeliest_pitch_is_the_climb(other_deg: float) -> None:
+    """6 m/s up at 24 m/s over ground: 14 degrees."""
+    climbing = flight([0.0, 24.0, -6.0])
+    assert flown_odds(attitude(0, 14, 90), attitude(0, other_deg, 90), EXACT, climbing) > 0.5
+
+
 def test_relative_motion_counts_with_the_own_ships_nose() -> None:
     """Flying north behind a target that neither opens nor closes: it flies north too."""
     way = Flight(np.zeros(3), 9.0 * np.eye(3), None, 0.0, NORTH)

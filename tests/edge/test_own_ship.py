@@ -179,11 +179,13 @@ def test_a_writer_and_a_reader_do_not_disturb_each_other() -> None:
 
     reader = threading.Thread(target=read)
     reader.start()
-    for k in range(3000):
-        buffer.add_attitude(k * 10 * MS, [1, 0, 0, 0], np.zeros(3))
-        buffer.add_position(k * 10 * MS, np.zeros(3), np.zeros(3))
-    done.set()
-    reader.join()
+    try:
+        for k in range(3000):
+            buffer.add_attitude(k * 10 * MS, [1, 0, 0, 0], np.zeros(3))
+            buffer.add_position(k * 10 * MS, np.zeros(3), np.zeros(3))
+    finally:
+        done.set()
+        reader.join()
     assert not failures
 
 

@@ -168,7 +168,12 @@ def test_uncertainty_grows_while_coasting() -> None:
 
 @pytest.mark.parametrize(
     ("scores", "least", "most"),
-    [([0.99] * 90, 0.98, 1.0), ([0.95, 0.35] * 45, 0.6, 0.7), ([0.95] * 3 + [0.4] * 87, 0.4, 0.5)],
+    [
+        ([0.99] * 90, 0.98, 1.0),
+        ([0.95, 0.35] * 45, 0.6, 0.7),
+        ([0.95] * 3 + [0.4] * 87, 0.4, 0.5),
+        ([0.9, 0.3, 0.6], 0.599, 0.601),
+    ],
 )
 def test_a_tracks_score_is_that_of_its_recent_frames(scores: list[float], least: float, most: float) -> None:
     tracker = Tracker(4, FORWARD)

@@ -50,6 +50,28 @@ def test_a_velocity_across_a_doubted_stamp_is_forgotten_once_more_after_it() -> 
     assert np.all(np.sqrt(np.diag(track.covariance_ned)[3:5]) > 50.0)
 
 
+def test_a_velocity_that_is_forgotten_leaves_the_place_as_sure_as_it_was() -> None:
+    view = View.of(0, STILL, LOOKING_NORTH)
+    motion = ekf.begin(sight(np.random.default_rng(4), np.array([20.0, -10.0, 200.0]), NORTH_EAST), K, view)
+    flying = replace(motion, v_mps=np.array([3.0, 25.0, 0.0]), turn_rate_radps=0.3)
+    forgotten = ekf.unknown_motion(flying, view)
+    np.testing.assert_allclose(forgotten.t_m, motion.t_m)
+    before, after = ekf.covariance_in_cam(motion, view), ekf.covariance_in_cam(forgotten, view)
+    np.testing.assert_allclose(after, before, rtol=1e-9)
+    in_a_second = ekf.propagate(forgotten, 1_000 * MS)
+    np.testing.assert_allclose(in_a_second.t_m, motion.t_m)
+    assert np.all(np.sqrt(np.diag(in_a_second.P)[:2]) > 50.0)
+
+
+@pytest.mark.parametrize("to", [replace(STILL, origin_epoch=1), replace(STILL, axes_epoch=1)])
+def test_a_turn_from_before_another_origin_or_north_is_not_gone_on_with(to: OwnShip) -> None:
+    old, new = View.of(0, STILL, LOOKING_NORTH), View.of(0, to, LOOKING_NORTH)
+    motion = ekf.begin(sight(np.random.default_rng(5), np.array([20.0, -10.0, 200.0]), NORTH_EAST), K, old)
+    turning = replace(motion, v_mps=np.array([0.0, 25.0, 0.0]), turn_rate_radps=0.6)
+    moved = ekf.reframe(turning, old, new, 0.0)
+    np.testing.assert_allclose(ekf.propagate(moved, 1_000 * MS).t_m, moved.t_m + np.array([0.0, 25.0, 0.0]), atol=1e-9)
+
+
 def own_ship_variances(own_ship: OwnShip) -> np.ndarray:
     """[9] of a target 200 m north: what the own ship's errors do to its place, velocity and attitude."""
     return np.diag(View.of(0, own_ship, LOOKING_NORTH).own_ship_covariance(AHEAD_M, np.zeros(3)))
