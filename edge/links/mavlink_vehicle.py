@@ -45,6 +45,7 @@ class Stream:
     pause_ns: int = RETRY_NS
 
     def measured_hz(self, now_ns: int) -> float:
+        """Rate over RATE_WINDOW_NS."""
         while self.arrivals_ns and now_ns - self.arrivals_ns[0] > RATE_WINDOW_NS:
             self.arrivals_ns.popleft()
         return len(self.arrivals_ns) * 1e9 / RATE_WINDOW_NS
@@ -132,10 +133,6 @@ class Vehicle:
     def arrived(self, message_id: int, now_ns: int) -> None:
         if message_id in self._streams:
             self._streams[message_id].arrivals_ns.append(now_ns)
-
-    def measured_hz(self, message_id: int, now_ns: int) -> float:
-        """Rate of a requested message over RATE_WINDOW_NS."""
-        return self._streams[message_id].measured_hz(now_ns)
 
     def acknowledged(self, accepted: bool) -> None:
         """The answer to the pending request."""

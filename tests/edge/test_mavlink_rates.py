@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 
@@ -79,3 +80,26 @@ def test_what_comes_once_a_second_as_asked_is_not_asked_again_for_its_jitter(lat
         if vehicle.request(now_ms * ms) is not None:
             vehicle.acknowledged(accepted=True)
     assert vehicle.asked_again == 0
+
+
+def test_a_rate_that_is_never_given_is_asked_for_ever_more_rarely_but_for_as_long_as_it_is_not() -> None:
+    """After 3 s, then twice that each time, up to every 30 s."""
+    second = 1_000_000_000
+    vehicle, asked_s = Vehicle(None, {dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0}), []
+    for now_s in range(200):
+        vehicle.heartbeat(SYSTEM_ID, dialect.MAV_AUTOPILOT_PX4, now_s * second)
+        if vehicle.request(now_s * second) is not None:
+            asked_s.append(now_s)
+            vehicle.acknowledged(accepted=False)
+    assert [later - before for before, later in pairwise(asked_s)] == [3, 6, 12, 24, 30, 30, 30, 30, 30]
+
+
+def test_texts_in_parts_go_on_after_more_of_them_than_their_numbers_count() -> None:
+    station = Station(MavlinkSettings(system_id=SYSTEM_ID), OwnShipBuffer(), CAMERA, RequestQueue())
+    numbers = []
+    for _ in range(2**16 + 1):
+        first, second = station.event(dialect.MAV_SEVERITY_WARNING, 51 * "x", 0)
+        assert first.message.id == second.message.id
+        numbers.append(first.message.id)
+    assert (min(numbers), max(numbers)) == (1, 2**16 - 1), "0 is of a text that has no parts"
+    assert all(before != later for before, later in pairwise(numbers))
