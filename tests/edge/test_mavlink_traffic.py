@@ -15,6 +15,11 @@ MOVING = (
     | dialect.ADSB_FLAGS_VALID_VELOCITY
     | dialect.ADSB_FLAGS_VERTICAL_VELOCITY_VALID
 )  # fmt: skip
+ALWAYS = (
+    dialect.ADSB_FLAGS_VALID_COORDS
+    | dialect.ADSB_FLAGS_VALID_ALTITUDE
+    | dialect.ADSB_FLAGS_VALID_CALLSIGN
+)  # fmt: skip
 NOW_NS = 5_000_000_000
 
 
@@ -27,8 +32,9 @@ def test_a_velocity_is_told_once_it_is_known(worst_mps: float, told: bool) -> No
     report = make_report(track, now_ns=NOW_NS)
     follow, traffic = follow_target(report, track), adsb_vehicle(report, track, 0xF00000, NOW_NS)
     assert (follow is not None) is told, "ArduPilot would take the zeros for a velocity"
-    assert (traffic.flags & MOVING) == (MOVING if told else 0)
+    assert traffic.flags == (ALWAYS | MOVING if told else ALWAYS)
     if follow is not None:
         assert follow.est_capabilities & VELOCITY_KNOWN
         assert any(follow.vel)
+        assert not any([*follow.acc, *follow.rates, follow.custom_state]), "none of these is estimated"
     assert (traffic.hor_velocity > 0) is told
