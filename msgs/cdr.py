@@ -1,4 +1,4 @@
-"""The eight ROS 2 interfaces of the topic table: frozen payloads, `encode` and `decode`.
+"""The nine ROS 2 interfaces of the topic table: frozen payloads, `encode` and `decode`.
 
 Stamps are UTC nanoseconds of the exposure. Quaternions are Hamilton, xyzw as ROS writes them. Covariances are
 6×6 over (x, y, z, rot x, rot y, rot z). `decode` trusts nothing and raises PayloadError; `encode` raises
@@ -70,6 +70,28 @@ class Odometry:
         stamp_ns, frame_id = data.header()
         child_frame_id = data.string()
         message = cls(stamp_ns, frame_id, child_frame_id, *data.pose(), data.f64(3), data.f64(3), data.covariance())
+        data.done()
+        return message
+
+
+@dataclass(frozen=True, eq=False)
+class Vector3Stamped:
+    """geometry_msgs/msg/Vector3Stamped: the direction of a target in `cam`, of unit length."""
+
+    stamp_ns: int
+    frame_id: str
+    ray_cam: Array  # [3]
+
+    def encode(self) -> bytes:
+        out = Writer()
+        out.header(self.stamp_ns, self.frame_id)
+        out.f64(_shaped(self.ray_cam, 3))
+        return out.done()
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Vector3Stamped:
+        data = Reader(payload)
+        message = cls(*data.header(), data.f64(3))
         data.done()
         return message
 
@@ -337,6 +359,7 @@ class Log:
 Payload = (
     PoseWithCovarianceStamped
     | Odometry
+    | Vector3Stamped
     | Detection3DArray
     | TFMessage
     | CameraInfo
@@ -348,6 +371,7 @@ Payload = (
 DECODERS: dict[str, Callable[[bytes], Payload]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped.decode,
     "nav_msgs/msg/Odometry": Odometry.decode,
+    "geometry_msgs/msg/Vector3Stamped": Vector3Stamped.decode,
     "vision_msgs/msg/Detection3DArray": Detection3DArray.decode,
     "tf2_msgs/msg/TFMessage": TFMessage.decode,
     "sensor_msgs/msg/CameraInfo": CameraInfo.decode,

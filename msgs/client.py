@@ -16,14 +16,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Generic, TypeVar
 
 import zenoh
 from zenoh import ext, handlers
 
 from msgs import topics
-from msgs.receive import PoseReceiver, TargetPose
+from msgs.receive import PoseReceiver, TargetDirection, TargetPose
 from msgs.session import TlsFiles, check_endpoint, client_config
 from msgs.wire import Refusal
+
+Received = TypeVar("Received")
+Receive = Callable[[str, bytes, bytes, int, str], Received | None]  # as PoseReceiver.receive
 
 FAILURES_MAX = 64  # distinct exception messages that are counted separately
 _opened: list[zenoh.Session] = []  # by `connect`, and not known to be closed
@@ -59,12 +63,14 @@ def _close_sessions() -> None:
             session.close()
 
 
-class PoseSubscription:
-    """Iterates over validated poses; a slow reader loses the oldest. Ends when it or the session is closed."""
+class Subscription(Generic[Received]):
+    """Iterates over validated poses or directions; a slow reader loses the oldest. Ends when it or the session is
+    closed."""
 
-    def __init__(self, subscriber: zenoh.Subscriber, receiver: PoseReceiver) -> None:
+    def __init__(self, subscriber: zenoh.Subscriber, receiver: PoseReceiver, receive: Receive[Received]) -> None:
         self._subscriber = subscriber
         self._receiver = receiver
+        self._receive = receive
         self._closed = False
 
     @property
@@ -77,14 +83,14 @@ class PoseSubscription:
         """Samples refused, by reason."""
         return self._receiver.refused
 
-    def __iter__(self) -> Iterator[TargetPose]:
+    def __iter__(self) -> Iterator[Received]:
         for sample in self._subscriber:
-            pose = _receive(self._receiver, sample)
-            if pose is not None:
-                yield pose
+            one = _received(self._receive, sample)
+            if one is not None:
+                yield one
 
-    def poll(self) -> TargetPose | None:
-        """The oldest buffered pose, without blocking; None if there is none, or this or the session is closed."""
+    def poll(self) -> Received | None:
+        """The oldest buffered one, without blocking; None if there is none, or this or the session is closed."""
         while not self._closed:
             try:
                 sample = self._subscriber.try_recv()
@@ -93,8 +99,8 @@ class PoseSubscription:
                 break
             if sample is None:
                 break
-            if (pose := _receive(self._receiver, sample)) is not None:
-                return pose
+            if (one := _received(self._receive, sample)) is not None:
+                return one
         return None
 
     def close(self) -> None:
@@ -103,7 +109,7 @@ class PoseSubscription:
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()
 
-    def __enter__(self) -> PoseSubscription:
+    def __enter__(self) -> Subscription[Received]:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -118,15 +124,31 @@ def subscribe(
     domain: int = 0,
     max_age_s: float = 1.0,
     depth: int = 8,
-) -> PoseSubscription:
+) -> Subscription[TargetPose]:
     """Subscribe to the poses of all targets of a UAV, or of one (`t0`, …); at most `depth` poses are buffered, the
     oldest are dropped.
 
     Raises ValueError for an invalid name.
     """
     key = topics.subscription_key(topics.POSE, uav, target, domain=domain)
+    receiver = PoseReceiver(uav, domain=domain, max_age_s=max_age_s)
+    return Subscription(session.declare_subscriber(key, handlers.RingChannel(depth)), receiver, receiver.receive)
+
+
+def subscribe_directions(
+    session: zenoh.Session,
+    uav: str,
+    *,
+    target: str | None = None,
+    domain: int = 0,
+    max_age_s: float = 1.0,
+    depth: int = 8,
+) -> Subscription[TargetDirection]:
+    """Subscribe to the directions of targets whose range is not known, of which no pose is sent; as `subscribe`."""
+    key = topics.subscription_key(topics.DIRECTION, uav, target, domain=domain)
+    receiver = PoseReceiver(uav, domain=domain, max_age_s=max_age_s)
     subscriber = session.declare_subscriber(key, handlers.RingChannel(depth))
-    return PoseSubscription(subscriber, PoseReceiver(uav, domain=domain, max_age_s=max_age_s))
+    return Subscription(subscriber, receiver, receiver.receive_direction)
 
 
 class TopicCounts:
@@ -176,7 +198,7 @@ class TopicCounts:
                 return
             topic, target = row
             self._counts[topics.topic_name(topic, self._uav, target)] += 1
-            pose = _receive(self._receiver, sample) if topic is topics.POSE else None
+            pose = _received(self._receiver.receive, sample) if topic is topics.POSE else None
         if pose is None:
             return
         # zenoh would only print an exception.
@@ -223,10 +245,9 @@ def subscribe_all(
     return counts
 
 
-def _receive(receiver: PoseReceiver, sample: zenoh.Sample) -> TargetPose | None:
+def _received(receive: Receive[Received], sample: zenoh.Sample) -> Received | None:
     attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-    sender = sender_of(sample)
-    return receiver.receive(str(sample.key_expr), sample.payload.to_bytes(), attachment, time.time_ns(), sender)
+    return receive(str(sample.key_expr), sample.payload.to_bytes(), attachment, time.time_ns(), sender_of(sample))
 
 
 def sender_of(sample: zenoh.Sample) -> str:

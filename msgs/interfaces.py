@@ -72,6 +72,10 @@ float64 x
 float64 y
 float64 z
 """,
+    "geometry_msgs/Vector3Stamped": """\
+std_msgs/Header header
+geometry_msgs/Vector3 vector
+""",
     "nav_msgs/Odometry": """\
 std_msgs/Header header
 string child_frame_id

@@ -1,20 +1,27 @@
-"""Validating received poses: decodes them, refuses those that are old, repeated, out of order, from a second publisher
-or cannot be a measurement of our camera, and counts refusals by reason."""
+"""Validating received poses and directions: decodes them, refuses those that are old, repeated, out of order, from a
+second publisher or cannot be a measurement of our camera, and counts refusals by reason."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from msgs import topics
-from msgs.cdr import PoseWithCovarianceStamped
+from msgs.cdr import PoseWithCovarianceStamped, Vector3Stamped
 from msgs.geometry import rotation_estimated
-from msgs.wire import PayloadError, Refusal
+from msgs.topics import Topic
+from msgs.wire import Array, PayloadError, Refusal
 
 _NS = 1_000_000_000
 _PUBLISHERS_REMEMBERED = 16
 POSITION_MAX_M = 100_000.0  # of each coordinate and its standard deviation: far beyond what a camera measures
+RAY_TOLERANCE = 1e-3  # of a direction's length, which is one
 _SILENT_NS = _NS  # silence of a publisher after which another is accepted as its successor
+
+_Accepted = TypeVar("_Accepted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +50,20 @@ class TargetPose:
         return (self.arrival_ns - self.pose.stamp_ns) / _NS
 
 
+@dataclass(frozen=True, eq=False)
+class TargetDirection:
+    """An accepted direction: target `target` of `uav` is seen there, at an unknown range."""
+
+    uav: str
+    target: str
+    stamp_ns: int  # UTC of the exposure
+    ray_cam: Array  # [3], unit length, camera to target
+    arrival_ns: int  # UTC of reception
+
+
 @dataclass(frozen=True)
 class _Last:
-    """The newest accepted pose of a target."""
+    """The newest accepted message on a target's topic."""
 
     stamp_ns: int
     arrival_ns: int
@@ -53,7 +71,7 @@ class _Last:
 
 
 class PoseReceiver:
-    """Validates the poses of one UAV's targets and counts refusals by reason.
+    """Validates the poses and directions of one UAV's targets and counts refusals by reason.
 
     A vehicle has one daemon at a time. If two publish under one name, the first one received is accepted until none of
     its poses has been accepted for one second (as after a restart). They are distinguished by their zenoh session
@@ -68,9 +86,9 @@ class PoseReceiver:
         self._domain = domain
         self._max_age_ns = round(max_age_s * _NS)
         self._max_future_ns = round(max_future_s * _NS)
-        self._sequences: dict[tuple[str, bytes], int] = {}
-        self._last: dict[str, _Last] = {}
-        self._sender: tuple[str, int] | None = None  # accepted session, and UTC ns of its last accepted pose
+        self._sequences: dict[tuple[str, str, bytes], int] = {}
+        self._last: dict[tuple[str, str], _Last] = {}
+        self._sender: tuple[str, int] | None = None  # accepted session, and UTC ns of its last accepted message
 
     def believes(self, sender: str, now_ns: int) -> bool:
         """Whether messages of that session, of any topic, belong to the accepted daemon; True for '' (unknown)."""
@@ -81,50 +99,92 @@ class PoseReceiver:
 
     def receive(self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str = "") -> TargetPose | None:
         """The pose in a sample, or None if it is refused. `now_ns` is UTC; `sender` names the zenoh session."""
+
+        def judge() -> TargetPose:
+            target = self._target(topics.POSE, key)
+            sequence, gid = _sent_as(attachment)
+            pose = PoseWithCovarianceStamped.decode(payload)
+            _check_measurable(pose)
+            self._admit(topics.POSE, target, pose.stamp_ns, sequence, gid, now_ns, sender)
+            return TargetPose(self._uav, target, pose, sequence, now_ns)
+
+        return self._judged(judge, now_ns, sender)
+
+    def receive_direction(
+        self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str = ""
+    ) -> TargetDirection | None:
+        """The direction in a sample, or None if it is refused; as `receive`."""
+
+        def judge() -> TargetDirection:
+            target = self._target(topics.DIRECTION, key)
+            sequence, gid = _sent_as(attachment)
+            seen = Vector3Stamped.decode(payload)
+            _check_ray(seen)
+            self._admit(topics.DIRECTION, target, seen.stamp_ns, sequence, gid, now_ns, sender)
+            return TargetDirection(self._uav, target, seen.stamp_ns, seen.ray_cam, now_ns)
+
+        return self._judged(judge, now_ns, sender)
+
+    def _judged(self, judge: Callable[[], _Accepted], now_ns: int, sender: str) -> _Accepted | None:
         try:
-            pose = self._judge(key, payload, attachment, now_ns, sender)
+            accepted = judge()
         except PayloadError as error:
             self.refused[error.reason] += 1
             return None
         if sender:
             self._sender = sender, now_ns
         self.accepted += 1
-        return pose
+        return accepted
 
-    def _judge(self, key: str, payload: bytes, attachment: bytes, now_ns: int, sender: str) -> TargetPose:
+    def _target(self, topic: Topic, key: str) -> str:
         row = topics.parse_key(key, self._uav, domain=self._domain)
-        if row is None or row[0] is not topics.POSE or row[1] is None:
+        if row is None or row[0] is not topic or row[1] is None:
             raise PayloadError(Refusal.TOPIC)
-        target = row[1]
-        parsed = topics.parse_attachment(attachment)
-        if parsed is None:
-            raise PayloadError(Refusal.ATTACHMENT)
-        sequence, _, gid = parsed
-        pose = PoseWithCovarianceStamped.decode(payload)
-        _check_measurable(pose)
-        last = self._last.get(target)
+        return row[1]
+
+    def _admit(
+        self, topic: Topic, target: str, stamp_ns: int, sequence: int, gid: bytes, now_ns: int, sender: str
+    ) -> None:
+        publisher = topic.name, target, gid
+        last = self._last.get((topic.name, target))
         if not self.believes(sender, now_ns):
             raise PayloadError(Refusal.PUBLISHER)
         if last is not None and gid != last.gid and 0 <= now_ns - last.arrival_ns <= _SILENT_NS:
             raise PayloadError(Refusal.PUBLISHER)
-        if sequence <= self._sequences.get((target, gid), 0):
+        if sequence <= self._sequences.get(publisher, 0):
             raise PayloadError(Refusal.SEQUENCE)
-        if pose.stamp_ns - now_ns > self._max_future_ns:
+        if stamp_ns - now_ns > self._max_future_ns:
             raise PayloadError(Refusal.FUTURE)
-        # If the last stamp lies in the future, a clock was set back since: do not refuse all poses until then.
-        overtakes = last is None or pose.stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > self._max_future_ns
-        if now_ns - pose.stamp_ns > self._max_age_ns or not overtakes:
+        # If the last stamp lies in the future, a clock was set back since: do not refuse everything until then.
+        overtakes = last is None or stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > self._max_future_ns
+        if now_ns - stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
-        self._remember(target, gid, sequence)
-        self._last[target] = _Last(pose.stamp_ns, now_ns, gid)
-        return TargetPose(self._uav, target, pose, sequence, now_ns)
+        self._remember(publisher, sequence)
+        self._last[topic.name, target] = _Last(stamp_ns, now_ns, gid)
 
-    def _remember(self, target: str, gid: bytes, sequence: int) -> None:
+    def _remember(self, publisher: tuple[str, str, bytes], sequence: int) -> None:
         # Bounded, newest last, so that a flood of fake publishers cannot exhaust memory.
-        self._sequences.pop((target, gid), None)
-        self._sequences[target, gid] = sequence
+        self._sequences.pop(publisher, None)
+        self._sequences[publisher] = sequence
         while len(self._sequences) > _PUBLISHERS_REMEMBERED:
             del self._sequences[next(iter(self._sequences))]
+
+
+def _sent_as(attachment: bytes) -> tuple[int, bytes]:
+    """Sequence number and publisher."""
+    parsed = topics.parse_attachment(attachment)
+    if parsed is None:
+        raise PayloadError(Refusal.ATTACHMENT)
+    sequence, _, gid = parsed
+    return sequence, gid
+
+
+def _check_ray(seen: Vector3Stamped) -> None:
+    """Raise PayloadError for a vector that is no direction in `cam`."""
+    if seen.frame_id != topics.FRAME_CAMERA:
+        raise PayloadError(Refusal.FRAME)
+    if abs(math.hypot(*seen.ray_cam.tolist()) - 1.0) > RAY_TOLERANCE:
+        raise PayloadError(Refusal.DIRECTION)
 
 
 def _check_measurable(pose: PoseWithCovarianceStamped) -> None:

@@ -167,8 +167,9 @@ def peer_config(
 ) -> zenoh.Config:
     """The daemon's session: opens whether or not anything listens at `connect`, and keeps retrying.
 
-    `pose_rate_max_hz` limits the rate of each target's poses and odometry on quic, tls and udp links, to at most
-    CAP_SLACK times this; the own ship's transforms and the detections, also sent with each frame, are limited further.
+    `pose_rate_max_hz` limits the rate of each target's poses, odometry and directions on quic, tls and udp links, to at
+    most CAP_SLACK times this; the own ship's transforms and the detections, also sent with each frame, are limited
+    further.
     Plain tcp, for tools on board, is not limited. Raises zenoh.ZError for a malformed endpoint.
     """
     config = _config("peer", listen, connect, discovery, tls)
@@ -207,7 +208,7 @@ def _thinned_by_radio(pose_rate_max_hz: float) -> dict[str, Any]:
     }
     # zenoh counts per rule, not per key: in a rule for all targets, the first of each frame would use it up.
     for number in range(topics.TARGETS_MAX):
-        for name in ("pose", "odom"):
+        for name in ("pose", "odom", "direction"):
             rates_hz[f"target/t{number}/{name}"] = CAP_SLACK * pose_rate_max_hz
     rules = [{"key_expr": f"*/*/{name}/**", "freq": rate_hz} for name, rate_hz in rates_hz.items()]
     return {"flows": ["egress"], "messages": ["put"], "link_protocols": ["quic", "tls", "udp"], "rules": rules}

@@ -70,6 +70,12 @@ ODOM = Topic(
     "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     _BEST_EFFORT, _DROP, Priority.REAL_TIME, "frame rate, capped per link", 0, True,
 )  # fmt: skip
+DIRECTION = Topic(
+    "target/{target}/direction",
+    "geometry_msgs/msg/Vector3Stamped",
+    "RIHS01_d4829622288cbb443886e7ea94ea5671a3b1be6bab4ad04224432a65f7d7887a",
+    _BEST_EFFORT, _DROP, Priority.REAL_TIME, "frame rate, capped per link", 0, True,
+)  # fmt: skip
 DETECTIONS = Topic(
     "target/detections",
     "vision_msgs/msg/Detection3DArray",
@@ -107,7 +113,7 @@ EVENTS = Topic(
     _RELIABLE, _DROP, Priority.DATA_HIGH, "on change", 50, True,
 )  # fmt: skip
 
-TOPICS = (POSE, ODOM, DETECTIONS, TF, CAMERA_INFO, IMAGE, DIAGNOSTICS, EVENTS)
+TOPICS = (POSE, ODOM, DIRECTION, DETECTIONS, TF, CAMERA_INFO, IMAGE, DIAGNOSTICS, EVENTS)
 
 
 def check_uav_name(uav: str) -> str:

@@ -42,6 +42,7 @@ class Refusal(Enum):
     FRAME = "frame is not the camera's"
     POSITION = "position, or its standard deviation, is beyond what any camera measures"
     VARIANCE = "a variance of the position is not positive: it is not known"
+    DIRECTION = "direction is not of unit length"
     PUBLISHER = "another publisher of this target was heard within the last second"
 
 

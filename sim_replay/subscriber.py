@@ -23,13 +23,13 @@ from typing import Any
 import zenoh
 
 from msgs import topics
-from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage
+from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage, Vector3Stamped
 from msgs.client import connect, subscribe_all
 from msgs.receive import TargetPose
 from msgs.signals import stop_on_signals
 from msgs.wire import PayloadError
 
-TIMED = (topics.ODOM, topics.DETECTIONS, topics.TF)
+TIMED = (topics.ODOM, topics.DIRECTION, topics.DETECTIONS, topics.TF)
 MAX_AGE_S = 1.0
 _POLL_S = 0.2
 _RETRY_S = 0.1
@@ -74,6 +74,9 @@ def _content(topic: topics.Topic, payload: bytes) -> tuple[int, dict[str, Any]]:
     if topic is topics.ODOM:
         odometry = Odometry.decode(payload)
         return odometry.stamp_ns, {"frame_id": odometry.frame_id, "t_m": odometry.t_ned_target_m.tolist()}
+    if topic is topics.DIRECTION:
+        seen = Vector3Stamped.decode(payload)
+        return seen.stamp_ns, {"ray_cam": seen.ray_cam.tolist()}
     if topic is topics.DETECTIONS:
         array = Detection3DArray.decode(payload)
         return array.stamp_ns, {"targets": [one.id for one in array.detections]}

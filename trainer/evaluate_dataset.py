@@ -17,6 +17,7 @@ from sim_replay.datasets import Dataset, open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation.bop_results import file_answers
 from sim_replay.evaluation.consistency import consistency
+from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.files import write_files
 from sim_replay.evaluation.filtering import filtering
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
@@ -101,6 +102,7 @@ def evaluate_dataset(
         "intervals_95": intervals_95(judged),
         "consistency": consistency(judged),
         "filtering": filtering(judged),
+        "directions": directions(judged),
     }
     return Evaluation(score, name, dataset, judged, dataset.models)
 

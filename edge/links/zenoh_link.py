@@ -26,7 +26,7 @@ from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
-from edge.links.outgoing import NS_PER_MS, sendable
+from edge.links.outgoing import NS_PER_MS, rangeless, sendable
 from edge.links.zenoh_commands import Actions, declare_commands
 from edge.pictures import Picture
 from edge.requests import AskReload, RequestQueue
@@ -272,7 +272,8 @@ class Desk:
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
-        tracks = sendable(report, clock.monotonic_ns(), self._max_age_ms)
+        now_ns = clock.monotonic_ns()
+        tracks = sendable(report, now_ns, self._max_age_ms)
         self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
         max_age_ns = round(self._max_age_ms * NS_PER_MS)
         for track in tracks:
@@ -282,6 +283,9 @@ class Desk:
                 odometry = ros.odometry(track, report.own_ship, stamp_ns)
                 if odometry is not None:
                     self._put(topics.ODOM, odometry, name, until_ns)
+        for track in rangeless(report, now_ns, self._max_age_ms):
+            until_ns = track.measured_ns + max_age_ns
+            self._put(topics.DIRECTION, ros.direction(track, stamp_ns), ros.target_name(track), until_ns)
         until_ns = report.meta.capture_ns + max_age_ns
         self._put(topics.DETECTIONS, ros.detections(tracks, stamp_ns), until_ns=until_ns)
         if report.own_ship is not None:

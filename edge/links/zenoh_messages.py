@@ -33,6 +33,12 @@ def pose(track: Track, stamp_ns: int) -> cdr.PoseWithCovarianceStamped:
     return cdr.PoseWithCovarianceStamped(stamp_ns, topics.FRAME_CAMERA, track.t_cam_target_m, q_xyzw(R), covariance)
 
 
+def direction(track: Track, stamp_ns: int) -> cdr.Vector3Stamped:
+    """Where the target's origin is seen in `cam`, as a unit vector: what is sent while its range is not known."""
+    ray = track.t_cam_target_m / np.linalg.norm(track.t_cam_target_m)
+    return cdr.Vector3Stamped(stamp_ns, topics.FRAME_CAMERA, ray)
+
+
 def odometry(track: Track, own_ship: OwnShip, stamp_ns: int) -> cdr.Odometry | None:
     """The target in `ned`; without own position in base_link_ned, with relative velocity. None: no own attitude."""
     R, t_m, v_mps, P = track.R_ned_target, track.t_ned_target_m, track.v_ned_target_mps, track.covariance_ned

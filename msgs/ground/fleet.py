@@ -2,8 +2,9 @@
 
 Range and closing speed are relative to the camera. Bearing (clockwise from north), elevation and attitude are in NED
 while the vehicle sends its own attitude; otherwise bearing and elevation are measured to the right of and above the
-optical axis. The own attitude arrives after the pose and, over radio, less often: it is predicted for the row that is
-returned at once, and the row that is shown waits for the one of its time.
+optical axis. Of a target whose range is not known, only bearing and elevation are. The own attitude arrives after the
+pose and, over radio, less often: it is predicted for the row that is returned at once, and the row that is shown waits
+for the one of its time.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -21,8 +23,8 @@ from msgs.cdr import DECODERS, Detection3DArray, DiagnosticArray, Log, TFMessage
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.ground.feed import Incoming
 from msgs.ground.own_ship import GAP_NS, OwnShip, OwnShipHistory
-from msgs.receive import PoseReceiver, TargetPose
-from msgs.wire import PayloadError, Refusal
+from msgs.receive import PoseReceiver, TargetDirection, TargetPose
+from msgs.wire import Array, PayloadError, Refusal
 
 CLOSING_WINDOW_NS = 1_500_000_000
 CLOSING_SPAN_NS = 400_000_000
@@ -37,7 +39,8 @@ HEALTH_STALE_NS = 3_000_000_000  # health is sent every second
 SCORE_STALE_NS = 2_000_000_000  # scores come with each frame, at most as often as the poses
 SET_BACK_NS = 500_000_000  # reception times further in the future mean that our clock was set back since
 _KEPT_MAX = 256
-TAKEN = (topics.POSE, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)  # topics that a Fleet evaluates
+# Topics that a Fleet evaluates.
+TAKEN = (topics.POSE, topics.DIRECTION, topics.DETECTIONS, topics.TF, topics.DIAGNOSTICS, topics.EVENTS)
 VEHICLES_MAX = 64  # bounds memory against fake names
 
 
@@ -64,6 +67,24 @@ class TargetRow:
 
 
 @dataclass(frozen=True)
+class DirectionRow:
+    """One target at its latest direction, its range unknown; fields as in TargetRow."""
+
+    uav: str
+    target: str
+    stamp_ns: int
+    heard_ns: int
+    bearing_deg: float
+    elevation_deg: float
+    frame: Literal["ned", "cam"]
+    own_age_s: float | None
+    ray_cam: tuple[float, float, float]  # unit length
+
+
+Row = TargetRow | DirectionRow
+
+
+@dataclass(frozen=True)
 class VehicleRow:
     """One vehicle."""
 
@@ -75,31 +96,32 @@ class VehicleRow:
     event: str
     pose_rate_hz: float
     refused: int
-    targets: tuple[TargetRow, ...]
+    targets: tuple[Row, ...]
 
 
 @dataclass
 class _Target:
-    newest: TargetRow  # with the own attitude known at its reception
+    newest: Row  # with the own attitude known at its reception
     seen_ns: int
-    ranges: deque[tuple[int, float]]  # stamp, m
-    # The newest row whose own attitude has arrived, and later ones that still wait for theirs.
-    settled: TargetRow | None = None
-    waiting: deque[tuple[TargetPose, TargetRow]] = field(default_factory=lambda: deque(maxlen=_KEPT_MAX))
+    ranges: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=_KEPT_MAX))  # stamp, m
+    # The newest row whose own attitude has arrived, and the stamps of later ones that still wait for theirs, each with
+    # what makes the row.
+    settled: Row | None = None
+    waiting: deque[tuple[int, Callable[[OwnShip], Row]]] = field(default_factory=lambda: deque(maxlen=_KEPT_MAX))
 
-    def row(self) -> TargetRow:
+    def row(self) -> Row:
         """The row to show: the newest settled one, unless the vehicle no longer sends its attitude."""
         if self.settled is not None and self.newest.stamp_ns - self.settled.stamp_ns <= GAP_NS:
             return self.settled
         return self.newest
 
     def settle(self, own: OwnShipHistory) -> None:
-        """Recompute the row of the newest pose whose own attitude has arrived."""
+        """Recompute the newest row whose own attitude has arrived."""
         for index in reversed(range(len(self.waiting))):
-            pose, row = self.waiting[index]
-            ship = own.at(pose.stamp_ns)
+            stamp_ns, row_with = self.waiting[index]
+            ship = own.at(stamp_ns)
             if ship is not None:
-                self.settled = target_row(pose, row.closing_mps, ship, row.score)
+                self.settled = row_with(ship)
                 for _ in range(index + 1):
                     self.waiting.popleft()
                 return
@@ -142,18 +164,20 @@ class Fleet:
             if vehicle is not None:
                 vehicle.alive = alive
 
-    def take(self, incoming: Incoming, now_ns: int) -> TargetRow | Log | DiagnosticArray | None:
+    def take(self, incoming: Incoming, now_ns: int) -> Row | Log | DiagnosticArray | None:
         """Process a sample received at `now_ns` (UTC); returns what is new for the operator, or None. Counts malformed
         ones."""
         with self._lock:
             vehicle = self._vehicle(incoming.uav)
             if vehicle is None:
                 return None
+            sample = incoming.key, incoming.payload, incoming.attachment, now_ns, incoming.sender
             if incoming.topic is topics.POSE:
-                pose = vehicle.receiver.receive(
-                    incoming.key, incoming.payload, incoming.attachment, now_ns, incoming.sender
-                )
+                pose = vehicle.receiver.receive(*sample)
                 return None if pose is None else self._take_pose(vehicle, pose)
+            if incoming.topic is topics.DIRECTION:
+                seen = vehicle.receiver.receive_direction(*sample)
+                return None if seen is None else self._take_direction(vehicle, seen)
             if incoming.topic not in TAKEN:
                 return None
             try:
@@ -184,9 +208,7 @@ class Fleet:
         return self._vehicles.get(uav)
 
     def _take_pose(self, vehicle: _Vehicle, pose: TargetPose) -> TargetRow:
-        known = vehicle.targets.get(pose.target)
-        if known is not None and pose.stamp_ns <= known.newest.stamp_ns:
-            known = None  # the vehicle's clock was set back
+        known = _known(vehicle, pose.target, pose.stamp_ns)
         ranges = deque[tuple[int, float]](maxlen=_KEPT_MAX) if known is None else known.ranges
         range_m = float(np.linalg.norm(pose.pose.t_cam_target_m))
         if ranges and not _flown(*ranges[-1], pose.stamp_ns, range_m):
@@ -194,16 +216,19 @@ class Fleet:
         ranges.append((pose.stamp_ns, range_m))
         while ranges[0][0] < pose.stamp_ns - CLOSING_WINDOW_NS:
             ranges.popleft()
-        ship = vehicle.own.near(pose.stamp_ns)
-        row = target_row(pose, closing_mps(ranges), ship, vehicle.score(pose))
+        closing, score = closing_mps(ranges), vehicle.score(pose)
+        row = target_row(pose, closing, vehicle.own.near(pose.stamp_ns), score)
         if known is None:
             known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
-        known.newest, known.seen_ns = row, pose.arrival_ns
-        known.waiting.append((pose, row))
-        while known.waiting[0][1].stamp_ns < pose.stamp_ns - GAP_NS:
-            known.waiting.popleft()
-        known.settle(vehicle.own)
-        vehicle.arrivals_ns.append(pose.arrival_ns)
+        _update(vehicle, known, row, lambda ship: target_row(pose, closing, ship, score))
+        return row
+
+    def _take_direction(self, vehicle: _Vehicle, seen: TargetDirection) -> DirectionRow:
+        row = direction_row(seen, vehicle.own.near(seen.stamp_ns))
+        known = _known(vehicle, seen.target, seen.stamp_ns)
+        if known is None:
+            known = vehicle.targets[seen.target] = _Target(row, seen.arrival_ns)
+        _update(vehicle, known, row, lambda ship: direction_row(seen, ship))
         return row
 
     def _row(self, uav: str, vehicle: _Vehicle, now_ns: int) -> VehicleRow:
@@ -227,6 +252,22 @@ class Fleet:
             sum(vehicle.receiver.refused.values()),
             targets,
         )
+
+
+def _known(vehicle: _Vehicle, target: str, stamp_ns: int) -> _Target | None:
+    """The target as known so far; None if it is new, or the vehicle's clock was set back."""
+    known = vehicle.targets.get(target)
+    return None if known is None or stamp_ns <= known.newest.stamp_ns else known
+
+
+def _update(vehicle: _Vehicle, known: _Target, row: Row, row_with: Callable[[OwnShip], Row]) -> None:
+    """Note a target's newest row; `row_with` makes it with the own attitude of its time."""
+    known.newest, known.seen_ns = row, row.heard_ns
+    known.waiting.append((row.stamp_ns, row_with))
+    while known.waiting[0][0] < row.stamp_ns - GAP_NS:
+        known.waiting.popleft()
+    known.settle(vehicle.own)
+    vehicle.arrivals_ns.append(row.heard_ns)
 
 
 def _note(
@@ -283,16 +324,12 @@ def target_row(pose: TargetPose, closing: float | None, ship: OwnShip | None, sc
     range_m = float(np.linalg.norm(t_m))
     along = t_m / max(range_m, 1e-9)
     attitude: tuple[float, float, float] | None = None
-    if R_ned_cam is None:
-        right, down, ahead = t_m
-    else:
-        ahead, right, down = R_ned_cam @ t_m
+    bearing_deg, elevation_deg, frame, own_age_s = _bearing(t_m, pose.stamp_ns, ship)
     if R_ned_cam is not None and pose.rotation_known:
         R_cam_target = R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
         roll, pitch, yaw = np.degrees(euler_from_R(R_ned_cam @ R_cam_target))
         attitude = (float(roll), float(pitch), float(yaw) % 360.0)
     sigma_rotation_rad = math.sqrt(max(float(np.trace(covariance[3:, 3:])), 0.0) / 3.0)
-    bearing_deg = math.degrees(math.atan2(right, ahead))
     x, y, z, w = map(float, pose.pose.q_cam_target_xyzw)
     return TargetRow(
         uav=pose.uav,
@@ -300,10 +337,10 @@ def target_row(pose: TargetPose, closing: float | None, ship: OwnShip | None, sc
         stamp_ns=pose.stamp_ns,
         heard_ns=pose.arrival_ns,
         range_m=range_m,
-        bearing_deg=bearing_deg if R_ned_cam is None else bearing_deg % 360.0,
-        elevation_deg=math.degrees(math.atan2(-down, math.hypot(right, ahead))),
-        frame="cam" if R_ned_cam is None else "ned",
-        own_age_s=None if ship is None else (pose.stamp_ns - ship.stamp_ns) / 1e9,
+        bearing_deg=bearing_deg,
+        elevation_deg=elevation_deg,
+        frame=frame,
+        own_age_s=own_age_s,
         closing_mps=closing,
         attitude_deg=attitude,
         score=score,
@@ -312,3 +349,25 @@ def target_row(pose: TargetPose, closing: float | None, ship: OwnShip | None, sc
         t_cam_target_m=(float(t_m[0]), float(t_m[1]), float(t_m[2])),
         q_cam_target_xyzw=(x, y, z, w),
     )
+
+
+def direction_row(seen: TargetDirection, ship: OwnShip | None) -> DirectionRow:
+    """Row for a direction; `ship` is None if the own attitude is unknown."""
+    x, y, z = map(float, seen.ray_cam)
+    told = _bearing(seen.ray_cam, seen.stamp_ns, ship)
+    return DirectionRow(seen.uav, seen.target, seen.stamp_ns, seen.arrival_ns, *told, (x, y, z))
+
+
+def _bearing(
+    t_cam_m: Array, stamp_ns: int, ship: OwnShip | None
+) -> tuple[float, float, Literal["ned", "cam"], float | None]:
+    """Bearing and elevation, degrees, of a vector [3] in `cam`; their frame; and the age of the own attitude, s."""
+    if ship is None:
+        right, down, ahead = t_cam_m
+    else:
+        ahead, right, down = ship.R_ned_cam @ t_cam_m
+    bearing_deg = math.degrees(math.atan2(right, ahead))
+    elevation_deg = math.degrees(math.atan2(-down, math.hypot(right, ahead)))
+    if ship is None:
+        return bearing_deg, elevation_deg, "cam", None
+    return bearing_deg % 360.0, elevation_deg, "ned", (stamp_ns - ship.stamp_ns) / 1e9

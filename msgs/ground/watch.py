@@ -19,7 +19,7 @@ from rich.text import Text
 from msgs.cdr import DiagnosticArray, Log
 from msgs.command_line import output
 from msgs.ground.feed import Incoming, linked, listening, session
-from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, Fleet, TargetRow, VehicleRow
+from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, DirectionRow, Fleet, Row, TargetRow, VehicleRow
 from msgs.session import TlsFiles
 
 REFRESH_S = 0.25
@@ -105,7 +105,8 @@ class Fitted:
 def _watch_json(
     options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
 ) -> None:
-    """One JSON object per line: `pose`, `health`, `event`, `vehicle` (present or gone) and `link` (up or down).
+    """One JSON object per line: `pose`, `direction` (range unknown), `health`, `event`, `vehicle` (present or gone) and
+    `link` (up or down).
 
     Raises OutputError if the lines cannot be written, as into a file on a full disk, BrokenPipeError if nobody reads
     them any more.
@@ -129,6 +130,8 @@ def _watch_json(
         match fleet.take(incoming, now_ns):
             case TargetRow() as row:
                 tell(type="pose", age_s=(now_ns - row.stamp_ns) / _NS, **asdict(row))
+            case DirectionRow() as row:
+                tell(type="direction", age_s=(now_ns - row.stamp_ns) / _NS, **asdict(row))
             case DiagnosticArray(stamp_ns=stamp_ns, status=status):
                 one = status[0]
                 tell(
@@ -164,7 +167,8 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int, 
     """The tables at `now_ns` (UTC): one row per target, and one per vehicle; with `one_line`, health and event are cut
     to what fits on one line, and are wrapped otherwise.
 
-    A bearing with a `c` is measured from the optical axis to the right, as the vehicle's attitude is unknown.
+    A bearing with a `c` is measured from the optical axis to the right, as the vehicle's attitude is unknown. A range
+    of `?` is not known: no pose is sent of that target, only its direction.
     """
     link = Text(f"{endpoint}: up" if up else f"{endpoint}: no link", style="green" if up else "bold red")
     fleet = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -203,17 +207,20 @@ def _printable(text: str) -> str:
     return "".join(one if one.isprintable() else " " for one in text)
 
 
-def _cells(row: TargetRow, now_ns: int) -> tuple[str, ...]:
+def _cells(row: Row, now_ns: int) -> tuple[str, ...]:
+    name, age = f"{row.uav}/{row.target}", f"{(now_ns - row.stamp_ns) / _NS:.2f}"
+    bearing = f"{row.bearing_deg:.1f}" + ("" if row.frame == "ned" else "c"), f"{row.elevation_deg:+.1f}"
+    if isinstance(row, DirectionRow):
+        return name, "?", "?", "–", *bearing, "–", "?", "–", age
     roll, pitch, heading = row.attitude_deg or (None, None, None)
     return (
-        f"{row.uav}/{row.target}",
+        name,
         f"{row.range_m:.1f}",
         f"{row.sigma_range_m:.1f}",
         "–" if row.closing_mps is None else f"{row.closing_mps:+.1f}",
-        f"{row.bearing_deg:.1f}" + ("" if row.frame == "ned" else "c"),
-        f"{row.elevation_deg:+.1f}",
+        *bearing,
         "–" if heading is None else f"{heading:.0f}/{pitch:+.0f}/{roll:+.0f}",
         "?" if row.sigma_rotation_deg is None else f"{row.sigma_rotation_deg:.0f}",
         "–" if row.score is None else f"{row.score:.2f}",
-        f"{(now_ns - row.stamp_ns) / _NS:.2f}",
+        age,
     )

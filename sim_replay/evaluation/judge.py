@@ -21,6 +21,7 @@ class Answer:
     poses: tuple[TargetPose, ...]
     time_ms: float | None  # processing time; None: unknown
     measured: tuple[TargetPose, ...] | None = None  # a tracker's inputs for this image; None: no tracker
+    directions: tuple[TargetPose, ...] = ()  # of targets whose range is not known: only where they are seen is told
     surplus: tuple[TargetPose, ...] = ()  # poses beyond the number of aircraft: false, wherever they are
 
 
@@ -36,6 +37,7 @@ class JudgedFrame:
     false_poses: tuple[TargetPose, ...]  # those that belong to no target
     time_ms: float | None
     measured: tuple[Match, ...] = ()  # matches of the tracker's inputs with the same targets; empty without a tracker
+    directions: tuple[Match, ...] = ()  # matches of the directions with the same targets; empty without any
     not_asked: tuple[Truth, ...] = ()  # hidden or unlisted, but present: detecting them is neither right nor wrong
 
 
@@ -108,6 +110,7 @@ def judge_frames(
         truths = truths_of(index, picture, models)
         matches, false_poses = match_poses(truths, answered.poses)
         measured = match_poses(truths, answered.measured)[0] if answered.measured is not None else ()
+        seen = match_poses(truths, answered.directions)[0] if answered.directions else ()
         judged.append(
             JudgedFrame(
                 picture,
@@ -115,6 +118,7 @@ def judge_frames(
                 (*false_poses, *answered.surplus),
                 answered.time_ms,
                 measured=_wanted(measured),
+                directions=_wanted(seen),
                 not_asked=tuple(truth for truth in truths if not truth.wanted),
             )
         )

@@ -58,6 +58,8 @@ def score_table(score: dict[str, Any]) -> Group:
         caption += f"\n{consistency_line(score['consistency'])}"
     if score.get("filtering") is not None:
         caption += f"\n{_filtering(score['filtering'])}"
+    if score.get("directions") is not None:
+        caption += f"\n{_directions(score['directions'])}"
     table = Table("", title=escape(title), caption=caption, title_justify="left", caption_justify="left")
     groups = {"all": overall}
     groups |= {f"{band} m": group for band, group in score["by_range"].items() if group["targets"]}
@@ -104,6 +106,14 @@ def _filtering(found: dict[str, Any]) -> str:
         f"tracker input → output, mean over {found['targets']} targets: "
         f"E_t {translation_m['measured']:.2f} → {translation_m['track']:.2f} m, "
         f"E_r {_text(rotation_deg['measured'], '{:.2f}°')} → {_text(rotation_deg['track'], '{:.2f}°')}"
+    )
+
+
+def _directions(found: dict[str, Any]) -> str:
+    error = found["bearing_error_deg"]
+    return (
+        f"no pose but a direction, the range not being known: {found['targets']} targets, "
+        f"bearing error mean {error['mean']:.3f}°, median {error['median']:.3f}°"
     )
 
 

@@ -23,7 +23,7 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.estimator.upright import up_in_cam
-from edge.links.outgoing import rotation_known, sendable
+from edge.links.outgoing import rangeless, rotation_known, sendable
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
 from msgs.geometry import so3_log
@@ -143,8 +143,13 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
         for shown in current[-1].until(picture.image_id):
             report, estimates, time_ms = _flown(estimator, current[-1], shown)
         told = sendable(report, report.meta.capture_ns, _MAX_AGE_MS)
-        known = [rotation_known(track) for track in told]
-        return Answer(_poses(index, told, known), time_ms, _poses(index, estimates, [True] * len(estimates)))
+        seen = rangeless(report, report.meta.capture_ns, _MAX_AGE_MS)
+        return Answer(
+            _poses(index, told, [rotation_known(track) for track in told]),
+            time_ms,
+            _poses(index, estimates, [True] * len(estimates)),
+            _poses(index, seen, [False] * len(seen)),
+        )
 
     return answer
 

@@ -21,8 +21,9 @@ OWN_UP_M = 300.0  # above the local origin
 METRES_A_DEGREE = 111_195.0
 RANGE_TOLERANCE = 0.02
 LEVEL_TOLERANCE = 1e-2
+RAY_TOLERANCE = 1e-3
 IDLE = dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
-# Messages and topics about a target, by name.
+# Messages and topics about a target of known range, by name.
 KINDS = (
     *("CAMERA_TRACKING_IMAGE_STATUS", "CAMERA_TRACKING_GEO_STATUS", "FOLLOW_TARGET", "ADSB_VEHICLE"),
     *("odom", "detections", "tf"),
@@ -86,6 +87,10 @@ def _zenoh_fault(record: dict[str, Any]) -> str | None:
     if record["topic"] == "tf":
         q_xyzw = record["q_xyzw"].get(topics.FRAME_BODY, (0.0, 0.0, 0.0, 0.0))
         return None if float(np.abs(q_xyzw[3])) >= 1.0 - LEVEL_TOLERANCE else f"an attitude that nobody flew: {q_xyzw}"
+    if record["topic"] == "direction":
+        x, y, z = record["ray_cam"]
+        sane = z > 0.0 and abs(math.hypot(x, y, z) - 1.0) <= RAY_TOLERANCE
+        return None if sane else f"a direction behind the camera, or of another length than 1: {record['ray_cam']}"
     return None
 
 

@@ -29,6 +29,14 @@ FAULT = Condition(HealthState.FAULT, Activity.WAITING)
 ROTATION_UNKNOWN = np.diag([0.09, 0.16, 144.0, 1.1, 1.2, 1.3])  # radians that amount to any attitude
 
 
+def rangeless(track: Track) -> Track:
+    """The same track, its range as good as unknown."""
+    along = track.t_cam_target_m / np.linalg.norm(track.t_cam_target_m)
+    covariance = track.covariance.copy()
+    covariance[:3, :3] = np.eye(3) + 300.0**2 * np.outer(along, along)
+    return replace(track, covariance=covariance)
+
+
 def make_track(now_ns: int, **changed: Any) -> Track:
     """A confirmed, fresh track in both frames; `changed` replaces fields."""
     covariance = np.diag([0.09, 0.16, 144.0, 0.01, 0.02, 0.03])

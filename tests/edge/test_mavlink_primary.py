@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from edge.types import CameraInfo, Track, TrackState
 from msgs.mavlink import FrameReader, MAVLink, dialect
 
 from .mavlink_peer import on_the_wire
-from .reports import OWN_NED_M, R_NED_CAM, SIZE_WH, K, make_report, make_track
+from .reports import OWN_NED_M, R_NED_CAM, SIZE_WH, K, make_report, make_track, rangeless
 
 FRAME_NS = 33_333_333
 FAR_M = np.array([-60.0, 20.0, 420.0])
@@ -65,3 +66,42 @@ def test_another_is_told_when_the_one_told_is_lost_or_withheld_for_long_unless_a
     assert primary.of([again, other], [other], None, WITHHELD_MAX_NS + 4) is other, "its number is another's now"
     assert primary.of([again, other], [again, other], 0, WITHHELD_MAX_NS + 5) is again
     assert primary.of([], [], None, WITHHELD_MAX_NS + 6) is None
+
+
+def test_of_a_target_whose_range_is_not_known_the_box_alone_is_told() -> None:
+    """Neither's at first, then that of the second one, which takes the place of the first."""
+    settings = MavlinkSettings(endpoints=["udpin:127.0.0.1:0"], follow_target=True)
+    station = Station(settings, OwnShipBuffer(), CameraInfo("cam", SIZE_WH, K, 30.0), RequestQueue())
+    autopilot, told = MAVLink(None, srcSystem=1, srcComponent=1), list[tuple[int, Any]]()
+    for frame in range(120):
+        now_ns = 10**12 + frame * FRAME_NS
+        if frame % 30 == 0:
+            station.take(FrameReader(datagram=True).feed(HEARTBEAT.pack(autopilot)), 0, now_ns)
+        one, other = near(now_ns, now_ns), replace(far(now_ns), box_xyxy_px=np.array([100.0, 100.0, 140.0, 120.0]))
+        tracks = (rangeless(one), rangeless(other)) if frame < 60 else (rangeless(one), other)
+        report = make_report(*tracks, now_ns=now_ns)
+        told += [(frame, message) for message in on_the_wire(station.report(report, now_ns))]
+
+    def frames(name: str) -> list[int]:
+        return [frame for frame, message in told if message.get_type() == name]
+
+    boxes = {
+        frame: int(message.point_x * SIZE_WH[0])
+        for frame, message in told
+        if message.get_type() == "CAMERA_TRACKING_IMAGE_STATUS"
+    }
+    assert {boxes[frame] for frame in boxes if frame < 60} == {1060}
+    assert {boxes[frame] for frame in boxes if frame >= 60} == {120}
+    assert min(boxes) < 10
+    for name in ("TARGET_RELATIVE", "CAMERA_TRACKING_GEO_STATUS", "FOLLOW_TARGET"):
+        assert min(frames(name)) >= 60, name
+
+
+def test_who_lost_the_range_of_the_target_told_shows_its_box_and_leads_nobody_to_another() -> None:
+    primary, one, other = Primary(), near(5, 5), far(5)
+    assert primary.of([one, other], [one, other], None, 0) is one
+    assert primary.of([one, other], [other], None, 1) is None
+    assert primary.in_image([one, other], [one], None, 1) is one
+    assert primary.in_image([one, other], [], None, 1) is None
+    assert primary.of([one, other], [], 1, 2) is None, "a person chose the other"
+    assert primary.in_image([one, other], [one, other], 1, 2) is other

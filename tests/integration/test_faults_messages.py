@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from msgs import topics
-from msgs.cdr import Detection3DArray, TFMessage, TransformStamped
+from msgs.cdr import Detection3DArray, TFMessage, TransformStamped, Vector3Stamped
 from msgs.topics import Topic
 from sim_replay.faults.judge import faults_since, message_faults
 from sim_replay.faults.messages import AUTOPILOT, OWN_LAT_LON_ALT, ReceivedMessage, from_mavlink, from_zenoh
@@ -51,12 +52,18 @@ def tf(frame: int, age_ms: int, q_body_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0,
     return sample(topics.TF, TFMessage((own,)).encode(), frame, age_ms)
 
 
+def direction(frame: int, age_ms: float, ray_cam: tuple[float, ...] = (0.6, 0.0, 0.8)) -> ReceivedMessage:
+    told = Vector3Stamped(FRAMES[frame].stamp_ns, topics.FRAME_CAMERA, np.array(ray_cam))
+    return sample(topics.DIRECTION, told.encode(), frame, age_ms)
+
+
 def test_what_is_fresh_and_true_is_no_fault() -> None:
     empty = Detection3DArray(FRAMES[3].stamp_ns, topics.FRAME_CAMERA, ()).encode()
     follow = told(
         "FOLLOW_TARGET", 350 * MS, timestamp=300, lat=round((LAT + 0.002) * 1e7), lon=round(LON * 1e7), alt=ALT_M
     )
     fresh = [geo(350 * MS), box(350 * MS), follow, tf(3, 50), sample(topics.DETECTIONS, empty, 3, 50)]
+    fresh.append(direction(3, 50))
     assert message_faults(fresh, FRAMES) == []
 
 
@@ -66,6 +73,8 @@ def test_what_is_fresh_and_true_is_no_fault() -> None:
         (tf(3, 2_000), "2000 ms after"),
         (tf(25, 20), "frozen"),
         (tf(3, 20, (0.5, 0.5, 0.5, 0.5)), "nobody flew"),
+        (direction(3, 2_000), "2000 ms after"),
+        (direction(3, 20, (0.6, 0.0, -0.8)), "behind the camera"),
         (sample(topics.DETECTIONS, b"\0\1\0\0", 3, 20), "ends before its last field"),
         (geo(4_000 * MS), "no frame had been exposed"),  # nothing but the frozen picture for two seconds
         (box(4_000 * MS), "no frame had been exposed"),

@@ -78,6 +78,7 @@ payloads = st.one_of(
         vectors(3),
         covariances(),
     ),
+    st.builds(cdr.Vector3Stamped, stamps, text, vectors(3)),
     st.builds(cdr.Detection3DArray, stamps, text, st.lists(detections, max_size=3).map(tuple)),
     st.builds(cdr.TFMessage, st.lists(transforms, max_size=3).map(tuple)),
     st.builds(
@@ -157,6 +158,8 @@ def as_ros(m: cdr.Payload) -> Any:
             twist_cov = make("geometry_msgs/msg/TwistWithCovariance", twist, m.covariance_twist.ravel())
             pose = _pose_cov(m.t_ned_target_m, m.q_ned_target_xyzw, m.covariance)
             return make("nav_msgs/msg/Odometry", _header(m), m.child_frame_id, pose, twist_cov)
+        case cdr.Vector3Stamped():
+            return make("geometry_msgs/msg/Vector3Stamped", _header(m), _vector(m.ray_cam))
         case cdr.Detection3DArray():
             return make("vision_msgs/msg/Detection3DArray", _header(m), [_detection(d) for d in m.detections])
         case cdr.TFMessage():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msgs import topics
+from msgs import cdr, topics
 from msgs.receive import PoseReceiver
 from msgs.topics import POSE
 from msgs.wire import Refusal
@@ -20,6 +21,7 @@ from .conftest import pose_now
 NOW_NS, S = 1_700_000_000_000_000_000, 1_000_000_000
 GID, OTHER_GID = bytes(range(16)), bytes(range(1, 17))
 KEY = topics.publication_key(POSE, "uav1", "t0")
+DIRECTION_KEY = topics.publication_key(topics.DIRECTION, "uav1", "t0")
 
 
 def sample(sequence: int, stamp_ns: int, gid: bytes = GID) -> tuple[bytes, bytes]:
@@ -156,3 +158,42 @@ def test_a_clock_that_is_set_back_does_not_keep_poses_out() -> None:
     assert dict(receiver.refused) == {Refusal.SEQUENCE: 1, Refusal.STALE: 1}
     further_ns = back_ns - hour_ns
     assert receiver.receive(KEY, *sample(1, further_ns, OTHER_GID), further_ns)
+
+
+def seen(sequence: int, stamp_ns: int, **changed: Any) -> tuple[bytes, bytes]:
+    ray = cdr.Vector3Stamped(stamp_ns, "camera_optical_frame", np.array([0.6, 0.0, 0.8]))
+    return dataclasses.replace(ray, **changed).encode(), topics.attachment(sequence, NOW_NS, OTHER_GID)
+
+
+def test_directions_and_poses_of_one_target_are_each_taken_in_their_own_order() -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(KEY, *sample(7, NOW_NS), NOW_NS)
+    taken = receiver.receive_direction(DIRECTION_KEY, *seen(1, NOW_NS - 1), NOW_NS)
+    assert taken is not None
+    assert (taken.target, taken.stamp_ns, taken.ray_cam.tolist()) == ("t0", NOW_NS - 1, [0.6, 0.0, 0.8])
+    assert receiver.receive(KEY, *sample(8, NOW_NS + 1), NOW_NS)
+    assert receiver.receive_direction(DIRECTION_KEY, *seen(1, NOW_NS), NOW_NS) is None
+    assert receiver.receive_direction(DIRECTION_KEY, *seen(2, NOW_NS - 2), NOW_NS) is None
+    assert dict(receiver.refused) == {Refusal.SEQUENCE: 1, Refusal.STALE: 1}
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"ray_cam": np.array([0.6, 0.0, 0.9])}, Refusal.DIRECTION),
+        ({"ray_cam": np.zeros(3)}, Refusal.DIRECTION),
+        ({"ray_cam": np.array([0.6, np.nan, 0.8])}, Refusal.NOT_FINITE),
+        ({"frame_id": "base_link_frd"}, Refusal.FRAME),
+    ],
+)
+def test_what_is_no_direction_in_the_camera_s_frame_is_refused(changed: dict[str, Any], reason: Refusal) -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive_direction(DIRECTION_KEY, *seen(1, NOW_NS, **changed), NOW_NS) is None
+    assert dict(receiver.refused) == {reason: 1}
+
+
+def test_a_direction_is_no_pose_and_a_pose_no_direction() -> None:
+    receiver = PoseReceiver("uav1")
+    assert receiver.receive(DIRECTION_KEY, *seen(1, NOW_NS), NOW_NS) is None
+    assert receiver.receive_direction(KEY, *sample(1, NOW_NS), NOW_NS) is None
+    assert dict(receiver.refused) == {Refusal.TOPIC: 2}

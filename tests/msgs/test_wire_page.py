@@ -38,6 +38,7 @@ INTRINSICS = cdr.CameraInfo(
 MESSAGES: list[tuple[topics.Topic, cdr.Payload]] = [
     (topics.POSE, cdr.PoseWithCovarianceStamped(STAMP_NS, "camera_optical_frame", T, Q, P)),
     (topics.ODOM, cdr.Odometry(STAMP_NS, "ned", "target_frd", T, Q, P, T + 1.0, np.zeros(3), 2.0 * P)),
+    (topics.DIRECTION, cdr.Vector3Stamped(STAMP_NS, "camera_optical_frame", T / np.linalg.norm(T))),
     (topics.DETECTIONS, cdr.Detection3DArray(STAMP_NS, "camera_optical_frame", (FOUND, FOUND))),
     (topics.TF, cdr.TFMessage((PLACE, PLACE))),
     (topics.CAMERA_INFO, INTRINSICS),

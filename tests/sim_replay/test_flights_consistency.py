@@ -13,6 +13,7 @@ from edge.tracking import view
 from sim_replay.bop import BopScene
 from sim_replay.datasets import DatasetFrame
 from sim_replay.evaluation.consistency import bounds_95, consistency
+from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.filtering import filtering
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.evaluation.own_ship import OwnShipErrors
@@ -157,6 +158,33 @@ def test_what_a_tracker_was_given_is_held_against_what_it_told_of_the_same_targe
         "rotation_error_deg": {"measured": pytest.approx(20.0), "track": pytest.approx(3.0)},
     }
     assert filtering([frame, *one_side]) is None
+
+
+def test_directions_count_for_targets_without_a_pose_by_their_bearing() -> None:
+    (frame, *_) = flights(1.0)
+    (match,) = frame.matches
+    x, y, z = match.truth.t_cam_target_m
+
+    def seen(off_rad: float, told: bool) -> JudgedFrame:
+        """A direction turned by so much about x, at twice the range; `told`: beside a pose."""
+        turned = Rotation.from_euler("x", off_rad).apply([x, y, z])
+        direction = TargetPose(0, np.eye(3), 2.0 * turned, rotation_known=False)
+        return replace(
+            frame,
+            matches=(Match(match.truth, direction if told else None),),
+            directions=(Match(match.truth, direction),),
+        )
+
+    found = directions([frame, seen(1e-3, False), seen(2e-3, False), seen(6e-3, False), seen(9e-3, True)])
+    across = np.hypot(y, z) / np.linalg.norm([x, y, z])
+    assert found == {
+        "targets": 3,
+        "bearing_error_deg": {
+            "mean": pytest.approx(np.degrees(3e-3 * across), abs=2e-5),
+            "median": pytest.approx(np.degrees(2e-3 * across), abs=2e-5),
+        },
+    }
+    assert directions([frame]) is None
 
 
 def test_own_ship_errors_are_a_flights_own_and_of_the_size_that_the_tracker_allows_for() -> None:

@@ -15,7 +15,7 @@ import rerun as rr
 
 from msgs.cdr import CameraInfo, CompressedImage, DiagnosticArray, DiagnosticStatus
 from msgs.geometry import R_from_q_wxyz, euler_from_R
-from msgs.ground.fleet import TargetRow
+from msgs.ground.fleet import DirectionRow, TargetRow
 from msgs.ground.view.drawing import SIGMAS, box_edges_m, ellipse, ellipsoid, pixel_covariance, posed, project
 from msgs.receive import TargetPose
 from msgs.wire import Array
@@ -50,6 +50,12 @@ def rgb(target: str) -> tuple[int, int, int]:
 def target_paths(uav: str, target: str) -> tuple[str, ...]:
     """Entities of one target's current pose, without its trails and plots."""
     return tuple(f"{uav}/{where}/target/{target}" for where in ("ned", "ned/camera", "map", "zoom"))
+
+
+def clear_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
+    """Remove all of one target but its trails, and interrupt the lines of its plots."""
+    plots = ("range", "range/minus_2_sigma", "range/plus_2_sigma", "closing", *(f"attitude/{what}" for what in _ANGLES))
+    _clear(rec, *target_paths(uav, target), *(plot_path(uav, target, path) for path in plots))
 
 
 def prepare(rec: rr.RecordingStream, uav: str) -> None:
@@ -194,6 +200,29 @@ def _log_zoom(rec: rr.RecordingStream, row: TargetRow, R_cam_target: Array | Non
     sigma = "?" if row.sigma_rotation_deg is None else f"{row.sigma_rotation_deg:.0f}"
     text = f"{row.target}  ±{sigma}°"
     rec.log(f"{where}/label", rr.Points2D([aside + below], colors=[rgb(row.target)], labels=[text], radii=[0.01]))
+
+
+def log_direction(rec: rr.RecordingStream, row: DirectionRow, camera: CameraInfo | None) -> None:
+    """Where a target of unknown range is in the image."""
+    center = None if camera is None else project(RINGS_M[-1] * np.array(row.ray_cam), *_lens(camera))
+    where = f"{row.uav}/ned/camera/target/{row.target}"
+    if center is None:
+        _clear(rec, where)
+        return
+    color = rgb(row.target)
+    rec.log(f"{where}/direction", rr.Points2D([center], colors=[color], radii=[-4.0]))
+    below = [center[0], center[1] + LABEL_BELOW_PX]
+    rec.log(f"{where}/label", rr.Points2D([below], colors=[color], labels=[f"{row.target}  range ?"], radii=[0.0]))
+
+
+def log_direction_placed(rec: rr.RecordingStream, row: DirectionRow, R_ned_cam: Array, t_ned_cam_m: Array) -> None:
+    """The line of sight to a target of unknown range, in space and from above, as far as the outermost ring."""
+    sight_m = RINGS_M[-1] * R_ned_cam @ np.array(row.ray_cam)
+    color, label = rgb(row.target), f"{row.target}  range ?"
+    line = rr.LineStrips3D([[t_ned_cam_m, t_ned_cam_m + sight_m]], colors=[color], labels=[label])
+    rec.log(f"{row.uav}/ned/target/{row.target}/line_of_sight", line)
+    above = rr.LineStrips2D([np.stack([np.zeros(2), _on_map(sight_m)])], colors=[color], labels=[label])
+    rec.log(f"{row.uav}/map/target/{row.target}/line_of_sight", above)
 
 
 def log_placed(

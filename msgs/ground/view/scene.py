@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import rerun as rr
@@ -15,7 +16,7 @@ from msgs import topics
 from msgs.cdr import CameraInfo, CompressedImage, DiagnosticArray, Log, PoseWithCovarianceStamped, TFMessage
 from msgs.geometry import R_from_q_wxyz
 from msgs.ground.feed import Incoming
-from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, VEHICLES_MAX, Fleet, TargetRow
+from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, VEHICLES_MAX, DirectionRow, Fleet, Row, TargetRow
 from msgs.ground.own_ship import GAP_NS, OwnShipHistory
 from msgs.ground.view import entities
 from msgs.ground.view.layout import TIMELINE
@@ -33,11 +34,13 @@ class _Vehicle:
     camera: CameraInfo | None = None
     own: OwnShipHistory = field(default_factory=OwnShipHistory)
     t_own_m: Array = field(default_factory=lambda: np.zeros(3))  # in ned, the last known
-    waiting: deque[tuple[TargetRow, TargetPose]] = field(  # for the own-ship state at their stamps
+    # What waits for the own-ship state of its stamp: drawn by R_ned_cam and t_ned_cam_m.
+    waiting: deque[tuple[int, Callable[[Array, Array], None]]] = field(
         default_factory=lambda: deque(maxlen=_WAITING_MAX)
     )
     seen_ns: dict[str, tuple[int, int]] = field(default_factory=dict)  # stamp and reception time of each drawn target
     prepared: set[str] = field(default_factory=set)  # targets whose plots are named
+    rangeless: set[str] = field(default_factory=set)  # targets of which only the direction is drawn
     health: DiagnosticArray | None = None  # the latest, and its reception time
     health_came_ns: int = 0
     health_silent: bool = False
@@ -71,6 +74,10 @@ class Scene:
             if incoming.topic is topics.POSE:
                 if isinstance(news, TargetRow):
                     self._take_pose(incoming, news, now_ns)
+                return
+            if incoming.topic is topics.DIRECTION:
+                if isinstance(news, DirectionRow):
+                    self._take_direction(news, now_ns)
                 return
             if not believed and incoming.topic is not topics.EVENTS:
                 return
@@ -137,19 +144,42 @@ class Scene:
         vehicle = self._vehicle(incoming.uav)
         if vehicle is None:
             return
-        # Own-ship states of before that time will not arrive any more.
-        self._place(row.uav, vehicle, row.stamp_ns - GAP_NS)
         message = PoseWithCovarianceStamped.decode(incoming.payload)
         pose = TargetPose(row.uav, row.target, message, 0, now_ns)
-        self._at(row.stamp_ns)
+        self._begin(vehicle, row, now_ns, rangeless=False)
         entities.log_seen(self._rec, row, pose, vehicle.camera, self._size_m)
         entities.log_plots(self._rec, row, pose.age_s)
         if row.target not in vehicle.prepared:
             vehicle.prepared.add(row.target)
             entities.prepare_target(self._rec, row.uav, row.target)
-        vehicle.waiting.append((row, pose))
-        vehicle.seen_ns[row.target] = row.stamp_ns, now_ns
+
+        def place(R_ned_cam: Array, t_ned_cam_m: Array) -> None:
+            entities.log_placed(self._rec, row, pose, R_ned_cam, t_ned_cam_m, self._size_m)
+
         self.drawn += 1
+        self._place_soon(vehicle, row, place)
+
+    def _take_direction(self, row: DirectionRow, now_ns: int) -> None:
+        vehicle = self._vehicle(row.uav)
+        if vehicle is None:
+            return
+        self._begin(vehicle, row, now_ns, rangeless=True)
+        entities.log_direction(self._rec, row, vehicle.camera)
+        self._place_soon(vehicle, row, partial(entities.log_direction_placed, self._rec, row))
+
+    def _begin(self, vehicle: _Vehicle, row: Row, now_ns: int, *, rangeless: bool) -> None:
+        """Begin to draw a target at the row's time. If its range was known before and is not now, or the other way
+        round, what was drawn of it is removed."""
+        # Own-ship states of before that time will not arrive any more.
+        self._place(row.uav, vehicle, row.stamp_ns - GAP_NS)
+        self._at(row.stamp_ns)
+        if rangeless != (row.target in vehicle.rangeless):
+            entities.clear_target(self._rec, row.uav, row.target)
+            vehicle.rangeless ^= {row.target}
+        vehicle.seen_ns[row.target] = row.stamp_ns, now_ns
+
+    def _place_soon(self, vehicle: _Vehicle, row: Row, place: Callable[[Array, Array], None]) -> None:
+        vehicle.waiting.append((row.stamp_ns, place))
         if vehicle.own.at(row.stamp_ns) is not None:
             self._place(row.uav, vehicle, row.stamp_ns)
 
@@ -189,20 +219,20 @@ class Scene:
         self._place(uav, vehicle, ship.stamp_ns)
 
     def _place(self, uav: str, vehicle: _Vehicle, until_ns: int | None) -> None:
-        """Draw waiting poses up to `until_ns` in space: their own-ship state has arrived, or will not."""
+        """Draw what waits, up to `until_ns`, in space: its own-ship state has arrived, or will not."""
         for _ in range(len(vehicle.waiting)):
-            row, pose = vehicle.waiting.popleft()
-            if until_ns is not None and row.stamp_ns > until_ns:
-                vehicle.waiting.append((row, pose))
+            stamp_ns, place = vehicle.waiting.popleft()
+            if until_ns is not None and stamp_ns > until_ns:
+                vehicle.waiting.append((stamp_ns, place))
                 continue
-            self._at(row.stamp_ns)
-            ship = vehicle.own.near(row.stamp_ns)
+            self._at(stamp_ns)
+            ship = vehicle.own.near(stamp_ns)
             if ship is None and not vehicle.told_no_attitude:
                 entities.log_event(self._rec, uav, 30, "own attitude unknown: drawn as if level and looking north")
                 here_m = vehicle.t_own_m
                 entities.log_ship(self._rec, uav, np.eye(3), here_m, _R_NED_CAM_UNKNOWN, here_m)
             vehicle.told_no_attitude = ship is None
-            R_ned_cam, t_ned_cam_m = (
-                (_R_NED_CAM_UNKNOWN, vehicle.t_own_m) if ship is None else (ship.R_ned_cam, ship.t_ned_cam_m)
-            )
-            entities.log_placed(self._rec, row, pose, R_ned_cam, t_ned_cam_m, self._size_m)
+            if ship is None:
+                place(_R_NED_CAM_UNKNOWN, vehicle.t_own_m)
+            else:
+                place(ship.R_ned_cam, ship.t_ned_cam_m)

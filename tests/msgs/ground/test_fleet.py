@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from msgs import cdr, topics
 from msgs.ground.feed import Incoming
-from msgs.ground.fleet import Fleet, TargetRow
+from msgs.ground.fleet import DirectionRow, Fleet, TargetRow
 from msgs.topics import Topic
 
 from ..conftest import pose_now
@@ -245,3 +245,30 @@ def test_of_two_daemons_of_one_name_one_tells_targets_attitude_and_health() -> N
     assert row.refused == 60 * 4
     (after,) = [pose(now_ns + 2 * S, 900, 450.0)]
     assert fleet.take(dataclasses.replace(after, sender="b"), now_ns + 2 * S) is not None, "the first is silent"
+
+
+def test_a_target_whose_range_is_no_longer_known_keeps_its_bearing_alone() -> None:
+    """In the turning vehicle's ned: for ten frames poses, for ten directions, then poses again."""
+    fleet, rows = Fleet(), list[TargetRow | DirectionRow]()
+    for number in range(1, 31):
+        stamp_ns = NOW_NS + number * FRAME_NS
+        told = list(turning_frame(stamp_ns, number, own=True))
+        if 10 < number <= 20:
+            pose_of = cdr.PoseWithCovarianceStamped.decode(told[0].payload)
+            ray = pose_of.t_cam_target_m / np.linalg.norm(pose_of.t_cam_target_m)
+            seen = cdr.Vector3Stamped(stamp_ns, topics.FRAME_CAMERA, ray)
+            told[0] = incoming(topics.DIRECTION, seen, number, OTHER_GID, "t0")
+        for one in told:
+            fleet.take(one, stamp_ns)
+        (vehicle,) = fleet.rows(stamp_ns)
+        (row,) = vehicle.targets
+        assert row.stamp_ns == stamp_ns
+        rows.append(row)
+    assert [isinstance(row, DirectionRow) for row in rows] == [False] * 10 + [True] * 10 + [False] * 10
+    for row in rows:
+        assert (row.frame, row.own_age_s) == ("ned", 0.0)
+        assert abs((row.bearing_deg + 180.0) % 360.0 - 180.0) < 1e-6
+        assert row.elevation_deg == pytest.approx(0.0, abs=1e-6)
+    last = rows[-1]
+    assert isinstance(last, TargetRow)
+    assert last.closing_mps == pytest.approx(0.0, abs=1e-6)

@@ -203,6 +203,37 @@ def test_of_a_target_whose_rotation_is_not_known_the_place_alone_is_drawn(tmp_pa
     assert labels == ["t0  ±8°"] * 10 + ["t0  ±?°"] * 10 + ["t0  ±8°"] * 10
 
 
+def test_of_a_target_whose_range_is_not_known_the_line_of_sight_alone_is_drawn(tmp_path: Path) -> None:
+    """Known for ten frames, not for ten, and then again."""
+    file = McapFile(tmp_path / "direction.mcap")
+    for topic, target, payload, log_ns in samples(30):
+        if topic is topics.POSE and 10 <= (log_ns - START_NS) // PERIOD_NS < 20:
+            pose = cdr.PoseWithCovarianceStamped.decode(payload)
+            ray = pose.t_cam_target_m / np.linalg.norm(pose.t_cam_target_m)
+            topic, payload = topics.DIRECTION, cdr.Vector3Stamped(pose.stamp_ns, pose.frame_id, ray).encode()
+        file.write(topics.topic_name(topic, UAV, target), topic.ros_type, payload, log_ns, log_ns)
+    file.close()
+    path = tmp_path / "direction.rrd"
+    assert main(["view", str(tmp_path / "direction.mcap"), "--save", str(path)]) == 0
+    stamps = stamps_ns(30)
+    for entity in ("ned/target/t0/place", "ned/target/t0/body", "ned/camera/target/t0/box", "map/target/t0/place"):
+        drawn = [stamp_ns for stamp_ns, row in rows(path, entity) if not clears(row)]
+        assert drawn == stamps[:10] + stamps[20:], entity
+    for where in ("ned/target/t0", "ned/camera/target/t0", "map/target/t0", "plots/range/t0"):
+        assert [stamp_ns for stamp_ns, row in rows(path, where) if clears(row)] == [stamps[10], stamps[20]], where
+    for entity in ("map/target/t0/line_of_sight", "ned/camera/target/t0/direction"):
+        assert [stamp_ns for stamp_ns, row in rows(path, entity) if not clears(row)] == stamps[10:20], entity
+    labels = [text(row, "labels") for _, row in rows(path, "ned/camera/target/t0/label") if not clears(row)]
+    assert labels[10:20] == ["t0  range ?"] * 10
+    stamp_ns, row = next(one for one in rows(path, "ned/target/t0/line_of_sight") if one[0] == stamps[10])
+    own_m, target_m = places_m(stamp_ns)
+    camera_m = own_m + attitude(stamp_ns).apply(T_BODY_CAM_M)
+    start, end = component(row, "strips").reshape(2, 3)
+    towards = (target_m - camera_m) / np.linalg.norm(target_m - camera_m)
+    np.testing.assert_allclose(start, camera_m, atol=1e-3)
+    np.testing.assert_allclose((end - start) / np.linalg.norm(end - start), towards, atol=1e-5)
+
+
 def clears(row: dict[str, object]) -> bool:
     return any("Clear:" in name and value is not None for name, value in row.items())
 

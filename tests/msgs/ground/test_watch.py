@@ -116,6 +116,8 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
 
         def tell() -> None:
             uav1.tell()
+            ray = cdr.Vector3Stamped(time.time_ns(), "camera_optical_frame", np.array([0.6, 0.0, 0.8]))
+            uav1.put(topics.DIRECTION, ray, "t1")
             uav2.tell()
             uav1.tell_health()
 
@@ -126,7 +128,8 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
 
         def complete() -> bool:
             heard = {one["uav"] for one in full()}
-            return heard == {"uav1", "uav2"} and bool(lines.objects("health")) and bool(lines.objects("event"))
+            others = all(lines.objects(kind) for kind in ("health", "event", "direction"))
+            return heard == {"uav1", "uav2"} and others
 
         until(complete, tell)
         last = full()[-1]
@@ -140,6 +143,11 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
         assert (last["score"], last["frame"]) == (0.83, "ned")
         assert last["sigma_rotation_deg"] == pytest.approx(np.degrees(0.1))
         assert 0.0 <= last["age_s"] < 2.0  # type: ignore[operator]
+        seen = next(one for one in lines.objects("direction") if one["frame"] == "ned")
+        ahead, right, down = (R_NED_BODY * R_BODY_CAM).apply([0.6, 0.0, 0.8])
+        assert (seen["uav"], seen["target"], seen["ray_cam"]) == ("uav1", "t1", [0.6, 0.0, 0.8])
+        assert seen["bearing_deg"] == pytest.approx(np.degrees(np.arctan2(right, ahead)) % 360)
+        assert seen["elevation_deg"] == pytest.approx(np.degrees(np.arcsin(-down)))
         assert lines.objects("health")[0]["values"] == {"dropped": "3"}
         assert [one["event"] for one in lines.objects("event")] == ["tracking"]
         assert {(one["uav"], one["alive"]) for one in lines.objects("vehicle")} == {("uav1", True), ("uav2", True)}
@@ -298,6 +306,19 @@ def test_a_target_is_dim_by_when_it_was_heard_whatever_the_vehicle_s_clock_says(
     tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS - 3 * S // 2), NOW_NS, "t0")
     assert DIM not in line(fleet, NOW_NS + S // 2, "uav1/t0")
     assert DIM in line(fleet, NOW_NS + 2 * S, "uav1/t0")
+
+
+def test_of_a_target_whose_range_is_not_known_the_table_shows_where_it_is_seen() -> None:
+    fleet = Fleet()
+    tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS - S // 10), NOW_NS, "t0")
+    for target in ("t0", "t1"):
+        ray = cdr.Vector3Stamped(NOW_NS - S // 20, "camera_optical_frame", np.array([0.48, 0.6, 0.64]))
+        tell(fleet, topics.DIRECTION, ray, NOW_NS, target)
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table(fleet.rows(NOW_NS), True, "tcp/127.0.0.1:7447", NOW_NS))
+    assert isinstance(console.file, io.StringIO)
+    shown = [line.split() for line in console.file.getvalue().splitlines() if "uav1/t" in line]
+    assert shown == [[f"uav1/{name}", "?", "?", "–", "36.9c", "-36.9", "–", "?", "–", "0.05"] for name in ("t0", "t1")]
 
 
 @pytest.mark.parametrize("columns", [40, 60, 80])
