@@ -131,15 +131,17 @@ class OwnShipBuffer:
     def clear(self, *, same_axes: bool = False, same_autopilot: bool = False) -> None:
         """Discard all samples: the autopilot or its estimator was reset, and its local origin with it.
 
-        `same_axes`: attitudes keep their meaning. Otherwise north, or the gimbal's zero, may have changed.
+        `same_axes`: attitudes keep their meaning and are kept: without one for a frame, the targets' velocities would
+        be lost. Otherwise north, or the gimbal's zero, may have changed.
         `same_autopilot`: it sends the same kinds of position as before.
         """
         with self._lock:
             self._in_local_ned = self._in_local_ned and same_autopilot
             self._origin_epoch += 1
-            self._axes_epoch += not same_axes
-            self._attitudes.clear()
-            self._gimbals.clear()
+            if not same_axes:
+                self._axes_epoch += 1
+                self._attitudes.clear()
+                self._gimbals.clear()
             self._positions.clear()
             self._global = None
 

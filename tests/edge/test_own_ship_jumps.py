@@ -97,6 +97,22 @@ def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump
     assert own.t_ned_body_m is not None, "the position is taken again"
 
 
+def test_a_reset_of_the_own_position_costs_neither_an_attitude_nor_a_target_s_velocity() -> None:
+    autopilot, rng, tracker = Autopilot(), np.random.default_rng(0), Tracker(4, MountSettings().mount())
+    for k_ms in range(5000):
+        t_ned_m = V_NED_MPS * k_ms / 1000 + np.array([40.0 * (k_ms > 4000), 0.0, -300.0])
+        autopilot.turn(k_ms, t_ned_m, V_NED_MPS)
+        if k_ms % 33 == 30:
+            capture_ns = BEGIN_NS + (k_ms - 15) * MS
+            own = autopilot.own_ship.at(capture_ns)
+            (track,) = tracker.update(capture_ns, [seen(rng)], own, K, SIZE_WH)
+            if k_ms > 3900:
+                assert own is not None, f"no attitude at {k_ms} ms"
+                assert track.covariance_ned is not None
+                assert np.sqrt(np.trace(track.covariance_ned[3:6, 3:6])) < 8.0, f"no velocity at {k_ms} ms"
+    assert autopilot.station.counters["position_jumps"] == 1
+
+
 @pytest.mark.parametrize(("speed_mps", "turn_radps"), [(25.0, 0.3), (60.0, 0.8), (15.0, 3.0)])
 def test_hard_flying_is_no_jump(speed_mps: float, turn_radps: float) -> None:
     autopilot, rng = Autopilot(), np.random.default_rng(1)
