@@ -68,9 +68,11 @@ class TlsFiles:
         except ssl.SSLError as error:
             raise ValueError(f"{self.root_ca} holds no certificate in PEM") from error
         try:
-            context.load_cert_chain(self.certificate, self.private_key)
+            # Without any password, OpenSSL would ask for one at the terminal.
+            context.load_cert_chain(self.certificate, self.private_key, password=b"")
         except ssl.SSLError as error:
-            raise ValueError(f"{self.private_key} is not the PEM key of {self.certificate}") from error
+            said = f"{self.private_key} is not the PEM key of {self.certificate}, or is encrypted"
+            raise ValueError(said) from error
 
     def doubt(self) -> str | None:
         """Why peers may refuse files that pass `check`, as a sentence: issued by another CA, or not valid today.

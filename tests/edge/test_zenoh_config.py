@@ -9,6 +9,12 @@ from pathlib import Path
 
 import pytest
 import zenoh
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
 
 from edge.config import load_config
 from edge.errors import InputError
@@ -42,6 +48,12 @@ def other_key(folder: Path) -> None:
     (folder / "uav1.key").write_bytes((folder / "ground.key").read_bytes())
 
 
+def encrypted_key(folder: Path) -> None:
+    path = folder / "uav1.key"
+    key, encryption = load_pem_private_key(path.read_bytes(), None), BestAvailableEncryption(b"secret")
+    path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption))
+
+
 def open_key(folder: Path) -> None:
     (folder / "uav1.key").chmod(0o644)
 
@@ -73,6 +85,7 @@ def test_a_fault_is_told_with_file_line_and_key(tmp_path: Path, text: str, sente
     ("spoil", "sentence"),
     [
         (other_key, "uav1.key is not the PEM key of"),
+        (encrypted_key, "uav1.pem, or is encrypted"),
         (open_key, "uav1.key is open to other users; chmod 600 it"),
         (no_certificate, "uav1.pem cannot be read: No such file"),
     ],
