@@ -10,6 +10,7 @@ import ipaddress
 import os
 import re
 from collections.abc import Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -48,8 +49,7 @@ def init_authority(folder: Path, days: int = 3650) -> tuple[Path, Path]:
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
-    _write_new(key_path, _pem(key), mode=0o600)
-    _write_new(certificate_path, builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    _write_both(key_path, key, certificate_path, builder.sign(key, hashes.SHA256()))
     return certificate_path, key_path
 
 
@@ -78,9 +78,7 @@ def issue(folder: Path, identity: str, hosts: Sequence[str] = (), days: int = 82
             critical=False,
         )
     )
-    signed = builder.sign(authority_key, hashes.SHA256())
-    _write_new(files.private_key, _pem(key), mode=0o600)
-    _write_new(files.certificate, signed.public_bytes(serialization.Encoding.PEM))
+    _write_both(files.private_key, key, files.certificate, builder.sign(authority_key, hashes.SHA256()))
     return files
 
 
@@ -165,11 +163,23 @@ def _require_new(*paths: Path) -> None:
             raise InputError(f"{path}: already exists; move it away first, so that no key is lost")
 
 
-def _write_new(path: Path, data: bytes, mode: int = 0o644) -> None:
+def _write_both(
+    key_path: Path, key: ec.EllipticCurvePrivateKey, certificate_path: Path, certificate: x509.Certificate
+) -> None:
+    """Both files or, as on a full disk, neither: what is left behind would keep the next attempt from writing."""
+    with ExitStack() as unfinished:
+        _write_new(key_path, _pem(key), 0o600, unfinished)
+        _write_new(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644, unfinished)
+        unfinished.pop_all()
+
+
+def _write_new(path: Path, data: bytes, mode: int, unfinished: ExitStack) -> None:
     """Create the file with its mode: a key must not be readable to others even for a moment."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        unfinished.callback(path.unlink)
+        with open(descriptor, "wb") as file:
             file.write(data)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import resource
 import ssl
 import stat
 import subprocess
@@ -104,6 +105,20 @@ def test_nothing_is_overwritten_and_bad_names_are_refused(tmp_path: Path) -> Non
     with pytest.raises(InputError, match="valid for 1 to"):
         issue(tmp_path, "uav2", days=0)
     assert not (tmp_path / "uav2.key").exists()
+
+
+@pytest.mark.parametrize("room_bytes", [100, 300])  # less than a key, less than a certificate
+def test_a_full_disk_leaves_nothing_that_keeps_the_next_attempt_from_writing(tmp_path: Path, room_bytes: int) -> None:
+    init_authority(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, hard))
+    try:
+        with pytest.raises(InputError, match="cannot be written: File too large"):
+            issue(tmp_path, "uav1")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ca.key", "ca.pem"]
+    issue(tmp_path, "uav1").check()
 
 
 def test_the_list_says_until_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
