@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
+import resource
 import select
 import socket
 import struct
@@ -17,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from edge import clock
 from edge.config import MavlinkSettings
 from edge.links.errors import LinkError
 from edge.links.mavlink_endpoints import NetworkEndpoint, SerialEndpoint, parse_endpoint
@@ -305,6 +307,30 @@ def test_callers_that_leave_beside_one_that_floods_do_not_end_the_link() -> None
         until(lambda: len(server.filenos()) == 2, flood, what="the end of one")
 
 
+def test_a_caller_for_whom_no_descriptor_is_left_wakes_nobody_until_the_next_tick() -> None:
+    server = TcpServer(NetworkEndpoint("tcpin", "127.0.0.1", 0, "tcpin:127.0.0.1:0"))
+
+    def readable() -> bool:
+        poll = select.poll()
+        for fileno in server.filenos():
+            poll.register(fileno, select.POLLIN)
+        return bool(poll.poll(0))
+
+    with contextlib.closing(server), socket.create_connection(("127.0.0.1", server.port)):
+        until(readable, what="the caller")
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+        try:
+            assert server.receive() is None
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert not readable()
+        server.tick(0)
+        assert readable(), "it is tried again"
+        server.receive()
+        assert len(server.filenos()) == 2, "it is accepted"
+
+
 def test_a_connection_that_ends_while_it_is_written_to_does_not_end_the_link() -> None:
     with contextlib.closing(listening()) as server:
         port = server.getsockname()[1]
@@ -316,6 +342,21 @@ def test_a_connection_that_ends_while_it_is_written_to_does_not_end_the_link() -
             accepted.close()  # a reset, not an end
             until(lambda: not client.filenos(), lambda: client.send(b"pose", ()), what="the reset")
             assert client.filenos() == ()
+
+
+def test_in_lock_step_a_lost_server_is_called_again_by_the_stepped_time() -> None:
+    with contextlib.closing(listening()) as server, contextlib.ExitStack() as stepping:
+        stepping.callback(clock.run_freely)
+        clock.step_to(1)  # long before the time of the host
+        port = server.getsockname()[1]
+        client = stepping.enter_context(
+            contextlib.closing(TcpClient(NetworkEndpoint("tcpout", "127.0.0.1", port, f"tcpout:127.0.0.1:{port}")))
+        )
+        until(client.filenos, lambda: client.tick(clock.monotonic_ns()), what="the connection")
+        server.accept()[0].close()
+        until(lambda: not client.filenos(), client.receive, what="its end")
+        clock.step_to(1 + FIRST_WAIT_NS)
+        until(client.filenos, lambda: client.tick(clock.monotonic_ns()), what="the connection again")
 
 
 def test_an_endpoint_that_fails_silences_neither_the_others_nor_the_heartbeat(

@@ -6,7 +6,6 @@ import errno
 import logging
 import os
 import termios
-import time
 from collections.abc import Sequence
 
 import serial
@@ -114,7 +113,7 @@ class SerialPort:
         self._port.close()
         self._port = None
         self._outbox.close()
-        self._backoff = self._backoff.failed(time.monotonic_ns())
+        self._backoff = self._backoff.failed(clock.monotonic_ns())
 
 
 def _tell_silence_from_absence(fileno: int) -> None:

@@ -6,7 +6,6 @@ import errno
 import logging
 import socket
 import struct
-import time
 from collections import Counter
 from collections.abc import Sequence
 
@@ -148,7 +147,7 @@ class TcpClient:
 
     def receive(self) -> Received | None:
         received = self._connection.receive() if self._connection is not None else None
-        self._part_if_closed(time.monotonic_ns())
+        self._part_if_closed(clock.monotonic_ns())
         return received
 
     def send(self, data: bytes, peer: Address, *, yields: bool = False) -> bool:
@@ -231,6 +230,7 @@ class TcpServer:
         self.endpoint = endpoint.text
         self._callers: dict[Address, Connection] = {}
         self._heeded: Address | None = None
+        self._accepts = True  # False until the next tick, if the process has no file descriptor left
         self._dropped = 0  # by connections that were closed
         family, address = resolve(endpoint, socket.SOCK_STREAM)[0]
         with opening(endpoint, family, socket.SOCK_STREAM) as self._socket:
@@ -245,9 +245,12 @@ class TcpServer:
         return local_port(self._socket)
 
     def filenos(self) -> Sequence[int]:
-        return (self._socket.fileno(), *(caller.fileno() for caller in self._callers.values() if caller.open))
+        # A caller that cannot be accepted stays pending: polled for, it would wake the link without end.
+        listening = (self._socket.fileno(),) if self._accepts else ()
+        return (*listening, *(caller.fileno() for caller in self._callers.values() if caller.open))
 
     def tick(self, now_ns: int) -> None:
+        self._accepts = True
         for caller in self._callers.values():
             caller.flush()
         self._forget_closed()
@@ -284,8 +287,9 @@ class TcpServer:
     def _accept(self) -> None:
         try:
             connected, address = self._socket.accept()
-        except OSError:
-            return  # no connection, or it is closed again
+        except OSError as error:  # no connection, or it is closed again
+            self._accepts = error.errno not in (errno.EMFILE, errno.ENFILE)
+            return
         if len(self._callers) >= CALLERS_MAX:
             self._callers.pop(self._spare()).close()
         self._callers[address] = Connection(connected, address)
