@@ -55,11 +55,9 @@ class Tracker:
 
     max_targets: int
     mount: Mount
-    out_of_order: int = 0  # frames dropped
     not_finite: int = 0  # estimates dropped
     _targets: list[Target] = field(default_factory=list)
     _view: View | None = None  # the camera in the last frame
-    _tracks: tuple[Track, ...] = ()
     _motion_doubted: bool = False
     _doubles: Doubles = field(default_factory=Doubles)
     _wanted: Estimate | None = None  # of the next update, to become a target before all others
@@ -103,7 +101,7 @@ class Tracker:
             self._wanted = wanted
 
     def is_late(self, capture_ns: int) -> bool:
-        """Whether a frame is not later than the last one and so cannot be used."""
+        """Whether a frame is not later than the last one and so cannot be used: the tracks are of a later time."""
         return self._view is not None and capture_ns <= self._view.time_ns
 
     def update(
@@ -117,15 +115,11 @@ class Tracker:
         chosen_id: int | None = None,
         doubtful_below: float = 0.0,
     ) -> tuple[Track, ...]:
-        """Update with the estimates of the frame taken at `capture_ns`; returns all tracks, by track_id.
+        """Update with the estimates of the frame taken at `capture_ns`, not `is_late`; returns all tracks, by track_id.
 
         `chosen_id`: the target that the operator selected. `doubtful_below`: a target of a lower score gives way, if
         there is no free slot, to an estimate that is not below.
-        A frame not later than the last one is dropped and counted; the tracks stay unchanged.
         """
-        if self.is_late(capture_ns):
-            self.out_of_order += 1
-            return self._tracks
         view = View.of(capture_ns, own_ship, self.mount, self._view)
         # Before association: after a gap a prediction is so uncertain that any detection would fit it.
         self._targets = self._within_reach(capture_ns)
@@ -153,8 +147,7 @@ class Tracker:
             self._forget_motion()
             self._motion_doubted = False
         self._targets.sort(key=lambda t: t.track_id)
-        self._tracks = tuple(_track(target, target.motion, target.attitude, view, lens) for target in self._targets)
-        return self._tracks
+        return tuple(_track(target, target.motion, target.attitude, view, lens) for target in self._targets)
 
     def _within_reach(self, time_ns: int) -> list[Target]:
         """Targets detected recently enough to be distinguished from others."""

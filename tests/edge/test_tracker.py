@@ -189,16 +189,6 @@ def test_one_false_detection_never_becomes_a_track() -> None:
     assert tracks == ()
 
 
-def test_a_frame_from_the_past_changes_nothing() -> None:
-    tracker = Tracker(4, FORWARD)
-    history = list(flight(12, frames=20))
-    for now in history:
-        tracks = update(tracker, now, "ned")
-    again = update(tracker, history[10], "ned")
-    assert again is tracks
-    assert tracker.out_of_order == 1
-
-
 @pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
 @settings(max_examples=20, deadline=None)
 @given(steps_ns=st.lists(st.sampled_from([1, 40, 20_000, 900_000, 1_000_000, 33_333_333]), min_size=30, max_size=60))
