@@ -24,10 +24,12 @@ from zenoh import ext, handlers
 from msgs import topics
 from msgs.receive import PoseReceiver, TargetDirection, TargetPose
 from msgs.session import TlsFiles, check_endpoint, client_config
+from msgs.topics import Topic
 from msgs.wire import Refusal
 
 Received = TypeVar("Received")
 Receive = Callable[[str, bytes, bytes, int, str], Received | None]  # as PoseReceiver.receive
+Subscriber = zenoh.Subscriber | ext.AdvancedSubscriber
 
 FAILURES_MAX = 64  # distinct exception messages that are counted separately
 _opened: list[zenoh.Session] = []  # by `connect`, and not known to be closed
@@ -162,7 +164,7 @@ class TopicCounts:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._failures: Counter[str] = Counter()
-        self._subscribers: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
+        self._subscribers: list[Subscriber] = []
 
     def counts(self) -> dict[str, int]:
         """Samples received by topic, e.g. `uav1/target/t0/pose`; refused poses are counted too."""
@@ -214,16 +216,9 @@ class TopicCounts:
         # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
         handler = handlers.Callback(self._on_sample, indirect=False)
         for topic in topics.TOPICS:
-            if topic is topics.IMAGE:
-                continue
-            key = topics.subscription_key(topic, self._uav, domain=self._domain)
-            if not topic.cache:
-                self._subscribers.append(session.declare_subscriber(key, handler))
-                continue
-            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
-            recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-            advanced = ext.declare_advanced_subscriber(session, key, handler, history=history, recovery=recovery)
-            self._subscribers.append(advanced)
+            if topic is not topics.IMAGE:
+                key = topics.subscription_key(topic, self._uav, domain=self._domain)
+                self._subscribers.append(declare(session, topic, key, handler))
 
 
 def subscribe_all(
@@ -243,6 +238,15 @@ def subscribe_all(
     counts = TopicCounts(uav, domain, max_age_s, on_pose)
     counts._declare(session)
     return counts
+
+
+def declare(session: zenoh.Session, topic: Topic, key: str, handler: handlers.Callback) -> Subscriber:
+    """A zenoh subscriber to `key`; if the topic is cached, it gets the history first, and what was lost again."""
+    if not topic.cache:
+        return session.declare_subscriber(key, handler)
+    history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
+    recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+    return ext.declare_advanced_subscriber(session, key, handler, history=history, recovery=recovery)
 
 
 def _received(receive: Receive[Received], sample: zenoh.Sample) -> Received | None:

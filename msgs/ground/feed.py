@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
 import zenoh
-from zenoh import ext, handlers
+from zenoh import handlers
 
 from msgs import topics
-from msgs.client import connect, sender_of
+from msgs.client import connect, declare, sender_of
 from msgs.ground.errors import InputError
 from msgs.session import CALLING, SECURE, TlsFiles, check_endpoint
 from msgs.topics import Topic
@@ -130,16 +130,11 @@ def listening(
 
     # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
     handler = handlers.Callback(sample, indirect=False)
-    declared: list[zenoh.Subscriber | ext.AdvancedSubscriber] = []
-    for uav in dict.fromkeys(uavs or ("*",)):
-        for topic in wanted:
-            key = topics.subscription_key(topic, uav, domain=domain)
-            if not topic.cache:
-                declared.append(opened.declare_subscriber(key, handler))
-                continue
-            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=topic.cache)
-            recovery = ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-            declared.append(ext.declare_advanced_subscriber(opened, key, handler, history=history, recovery=recovery))
+    declared = [
+        declare(opened, topic, topics.subscription_key(topic, uav, domain=domain), handler)
+        for uav in dict.fromkeys(uavs or ("*",))
+        for topic in wanted
+    ]
     tokens = opened.liveliness().declare_subscriber(ALIVE, handlers.Callback(alive, indirect=False), history=True)
     try:
         yield
