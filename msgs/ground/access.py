@@ -6,25 +6,30 @@ matches a key chunk that begins with `@`, so such keys of zenoh and ROS are list
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from msgs.settings import Section
 
 _LOOKS = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
 _GIVES = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
 
 
-@dataclass(frozen=True)
-class Access:
-    """Common names by role. `loopback_reads`: clients on this machine may read over plain TCP, without certificate."""
-
-    vehicles: Sequence[str]
-    readers: Sequence[str] = ()
-    operators: Sequence[str] = ()
-    loopback_reads: bool = False
+CommonName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,62}$")]
+VehicleName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
-def access_control(access: Access, domain: int) -> dict[str, Any]:
+class AccessSettings(Section):
+    """Common names by role."""
+
+    vehicles: list[VehicleName] = Field(default_factory=list, description="write below their own name, nowhere else")
+    operators: list[CommonName] = Field(default_factory=list, description="read everything and command")
+    readers: list[CommonName] = Field(default_factory=list, description="read everything")
+    loopback_reads: bool = Field(default=False, description="tcp from this machine reads without a certificate")
+
+
+def access_control(access: AccessSettings, domain: int) -> dict[str, Any]:
     """The router's `access_control` section."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
@@ -44,7 +49,7 @@ def access_control(access: Access, domain: int) -> dict[str, Any]:
     commands = _rule("operator commands", "ingress", ["query"], ["uavpose/@v1/*/cmd/**"])
     readers: list[dict[str, Any]] = []
     if access.readers:
-        readers.append({"id": "readers", "cert_common_names": list(access.readers)})
+        readers.append({"id": "readers", "cert_common_names": access.readers})
     if access.loopback_reads:
         readers.append({"id": "this machine", "interfaces": ["lo"], "link_protocols": ["tcp"]})
     if readers:
@@ -52,7 +57,7 @@ def access_control(access: Access, domain: int) -> dict[str, Any]:
         rules.extend([looks, gets])
         policies.append({"subjects": [one["id"] for one in readers], "rules": [looks["id"], gets["id"]]})
     if access.operators:
-        operator = {"id": "operators", "cert_common_names": list(access.operators)}
+        operator = {"id": "operators", "cert_common_names": access.operators}
         theirs = [{**rule, "id": f"operator: {rule['id']}"} for rule in (looks, gets)]
         allow(operator, *theirs, commands)
     return {

@@ -20,32 +20,21 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
 
 import zenoh
 from pydantic import Field, model_validator
 
-from msgs.ground.access import Access, access_control
+from msgs.ground.access import AccessSettings, access_control
 from msgs.ground.errors import InputError
 from msgs.ground.feed import ALIVE, alive_uav
 from msgs.session import TlsFiles, check_endpoint, router_config
 from msgs.settings import Section, WrittenPath, load_settings
-
-CommonName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,62}$")]
-VehicleName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
 class TlsSettings(Section):
     root_ca: WrittenPath = Field(description="the authority that signed every certificate, PEM")
     certificate: WrittenPath = Field(description="the router's, PEM")
     private_key: WrittenPath = Field(description="the router's, PEM, mode 0600")
-
-
-class AccessSettings(Section):
-    vehicles: list[VehicleName] = Field(default_factory=list, description="write below their own name, nowhere else")
-    operators: list[CommonName] = Field(default_factory=list, description="read everything and command")
-    readers: list[CommonName] = Field(default_factory=list, description="read everything")
-    loopback_reads: bool = Field(default=False, description="tcp from this machine reads without a certificate")
 
 
 class RouterSettings(Section):
@@ -82,7 +71,7 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
         raise InputError(f"[tls] {error}") from error
     rules = None
     if settings.access is not None:
-        rules = access_control(Access(**settings.access.model_dump()), settings.domain)
+        rules = access_control(settings.access, settings.domain)
     try:
         session = zenoh.open(router_config(settings.listen, tls=tls, access_control=rules))
     except zenoh.ZError as error:
