@@ -12,11 +12,12 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from typing import Any, Protocol
+from typing import Any
 
 from edge.links.mavlink_endpoints import plain_host
 from edge.links.mavlink_packing import Letter, Packer
 from edge.links.mavlink_receive import Receiver
+from edge.links.mavlink_recognition import Recognition
 from edge.links.mavlink_table import RATE_LIMITS_HZ
 from edge.links.mavlink_vehicle import LOST_NS
 from edge.links.transports.medium import Address, Received, Transport
@@ -27,27 +28,11 @@ log = logging.getLogger(__name__)
 AUTOPILOT_HEARTBEAT = re.compile(rb"\xfd.[\x00\x01].{3}\x01\x00{3}|\xfe\x09.{2}\x01\x00", re.DOTALL)
 
 
-class Judge(Protocol):
-    """Decides which autopilot is ours (`Recognition`)."""
-
-    def authentic(self, messages: list[Any]) -> list[Any]:
-        """The messages without those that are not signed as required."""
-
-    def introduces(self, message: Any, now_ns: int) -> bool:
-        """Whether it is a heartbeat for which its sender is accepted if there is no peer; another's is remembered."""
-
-    def displaces(self, message: Any, now_ns: int) -> bool:
-        """Whether it is a heartbeat for which its sender replaces the accepted peer."""
-
-    def is_stranger(self, message: Any) -> bool:
-        """Whether it is of another aircraft, for which no peer is accepted."""
-
-
 class Endpoint:
     """Passes incoming messages that `judge` accepts, and packs outgoing ones."""
 
     def __init__(
-        self, transport: Transport, allowed_hosts: list[str], refused: Counter[str], judge: Judge, packer: Packer
+        self, transport: Transport, allowed_hosts: list[str], refused: Counter[str], judge: Recognition, packer: Packer
     ) -> None:
         self.transport = transport
         self._allowed_hosts = allowed_hosts
