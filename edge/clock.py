@@ -7,7 +7,7 @@ watchdog, timeouts for the end of a thread) use the host's clock.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 UTC_PERIOD_NS = 1_000_000_000
 UTC_SET_NS = 1_000_000  # a smaller step of UTC is found by the next measurement
@@ -56,9 +56,8 @@ class UtcClock:
     """Converts monotonic time to UTC and back, by an offset measured every second and as soon as UTC was stepped or the
     machine was suspended. Use from one thread."""
 
-    uncertainty_ns: int = 0  # of the last measurement: half the time between the two readings around it
     _offset_ns: int = 0
-    _measured_ns: int | None = field(default=None)
+    _measured_ns: int | None = None
 
     def utc_ns(self, at_monotonic_ns: int) -> int:
         return at_monotonic_ns + self._offset()
@@ -85,8 +84,7 @@ class UtcClock:
         for _ in range(5):
             before_ns, now_utc_ns, after_ns = monotonic_ns(), utc_ns(), monotonic_ns()
             readings.append((after_ns - before_ns, now_utc_ns - (before_ns + after_ns) // 2))
-        spread_ns, self._offset_ns = min(readings)
-        self.uncertainty_ns = spread_ns // 2
+        _, self._offset_ns = min(readings)
 
 
 class SleepWatch:

@@ -21,7 +21,6 @@ from edge.estimator.decode import lies_on
 from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.estimator.upright import up_in_cam
-from edge.health import HealthSnapshot
 from edge.memory import MemoryKeeper
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
@@ -69,7 +68,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
             capture.start(outlets.settle)
             pipeline.fly(stop)
     # The links have stopped, so their counters are final.
-    log.info("stopped: %s", pipeline.snapshot().line())
+    log.info("stopped: %s", pipeline.supervisor.snapshot().line())
     return 0
 
 
@@ -128,9 +127,6 @@ class Pipeline:
                     self._warn_of_model()
                 self.supervisor.turn()
                 self._take_reload()
-
-    def snapshot(self) -> HealthSnapshot:
-        return self.supervisor.snapshot()
 
     def _counters(self) -> dict[str, int]:
         searched = Counter(self.search.counters())
@@ -256,10 +252,8 @@ class Pipeline:
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
     ) -> Report:
-        model, chosen_id, lens = self._estimator.model, self._by_hand.chosen_id, frame.distortion
-        report = Report(
-            frame.meta, frame.K, size_wh, tracks, own_ship, model.sha256, chosen_id, lens, model.doubtful_below
-        )
+        chosen_id, doubtful_below = self._by_hand.chosen_id, self._estimator.model.doubtful_below
+        report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, chosen_id, frame.distortion, doubtful_below)
         self._outlets.publish(report)
         self._outlets.show(frame)
         return report
@@ -275,8 +269,8 @@ class Pipeline:
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
         self._acquire_every_n = new.file.config.estimator.acquire_every_n
         self.supervisor.apply(new.file.config.health)
-        log.info("%s", new.said)
-        self._outlets.event(logging.INFO, new.said)
+        log.info("%s", new.outcome.said)
+        self._outlets.event(logging.INFO, new.outcome.said)
         if replaced:
             self._warned = ()
             self._warn_of_model()

@@ -192,9 +192,9 @@ def judge(
 class Health:
     """Collects data from the loop; `assess` and `snapshot` evaluate them."""
 
-    def __init__(self, wants_attitude: bool, no_frame_ns: int = NO_FRAME_NS) -> None:
+    def __init__(self, wants_attitude: bool) -> None:
         self._wants_attitude = wants_attitude
-        self.no_frame_ns = no_frame_ns
+        self.no_frame_ns = NO_FRAME_NS
         self.faults: tuple[Reason, ...] = ()  # found elsewhere, reported as reasons while present
         self._stages_ns: dict[str, deque[int]] = {}
         self._recent: deque[tuple[int, int, int]] = deque()  # done ns, number, total ns

@@ -35,18 +35,13 @@ class Outlets:
         mavlink: MavlinkLink | None,
         recorder: Recorder | None = None,
         pictures: Pictures | None = None,
-        board: StatusBoard | None = None,
     ) -> None:
         self._zenoh = zenoh
         self._mavlink = mavlink
         self._recorder = recorder
         self._pictures = pictures
-        self._board = board
 
     def publish(self, report: Report) -> None:
-        if self._board is not None:
-            # The true size may not be known earlier, for example over zenoh, and may change in flight.
-            self._board.image_size_wh = report.image_size_wh
         if self._mavlink is not None:
             self._mavlink.publish(report)
         if self._zenoh is not None:
@@ -165,7 +160,7 @@ def start_outlets(
             mavlink = MavlinkLink(config.mavlink, own_ship, board.camera, requests, signing)
             cleanup.callback(mavlink.stop)
             mavlink.start()
-    outlets = Outlets(zenoh, mavlink, recorder, pictures, board)
+    outlets = Outlets(zenoh, mavlink, recorder, pictures)
     if recorder is not None:
         recorder.start()
     if config.health.prometheus_port is not None:

@@ -41,11 +41,6 @@ class Reloaded:
     estimator: Estimator  # warmed up
     outcome: ReloadOutcome
 
-    @property
-    def said(self) -> str:
-        """A sentence for the operator."""
-        return self.outcome.said
-
 
 def load_configured(file: ConfigFile) -> Model:
     """The configured model, run once at each size. Raises InputError that names the key."""

@@ -73,6 +73,8 @@ class Supervisor:
         if not self._flew:
             self._flew = True
             log.info("first frame done, %.0f ms after its exposure", stages_ns["total"] / 1e6)
+        # The true size may not be known earlier, for example over zenoh, and may change in flight.
+        self._board.image_size_wh = report.image_size_wh
         tracks = tuple(track for track in report.tracks if probable(track, report))
         self._health.frame_done(
             report.meta.sequence, stages_ns, tracks, report.own_ship is not None, clock.monotonic_ns()

@@ -124,7 +124,6 @@ class Report:
     image_size_wh: tuple[int, int]
     tracks: tuple[Track, ...]
     own_ship: OwnShip | None  # at meta.capture_ns; None: no attitude, tracks are in `cam` only
-    model_sha256: str
     chosen_id: int | None = None  # track_id of the target that the operator selected
     distortion: tuple[float, ...] = ()  # of the frame's lens, as in Frame
     doubtful_below: float = PROBABLE_SCORE  # score of a track; 0 if the model's scores are no probabilities

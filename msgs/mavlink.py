@@ -162,11 +162,6 @@ def target_relative(
     )
 
 
-def pack_target_relative(mav: Any, **pose: Any) -> bytes:
-    """`target_relative` of a pose as one MAVLink 2 packet. Raises ValueError as both functions do."""
-    return pack(mav, target_relative(**pose))
-
-
 def _floats(field: str, values: Sequence[float], count: int) -> tuple[float, ...]:
     if len(values) != count:
         raise ValueError(f"TARGET_RELATIVE.{field} takes {count} numbers, not {len(values)}")

@@ -19,6 +19,7 @@ _NS = 1_000_000_000
 _PUBLISHERS_REMEMBERED = 16
 POSITION_MAX_M = 100_000.0  # of each coordinate and its standard deviation: far beyond what a camera measures
 RAY_TOLERANCE = 1e-3  # of a direction's length, which is one
+_FUTURE_MAX_NS = _NS // 2  # how far the sender's clock may be ahead of ours
 _SILENT_NS = _NS  # silence of a publisher after which another is accepted as its successor
 
 _Accepted = TypeVar("_Accepted")
@@ -76,16 +77,15 @@ class PoseReceiver:
     A vehicle has one daemon at a time. If two publish under one name, the first one received is accepted until none of
     its poses has been accepted for one second (as after a restart). They are distinguished by their zenoh session
     (`sender`) or, where that is unknown, by the publisher gid of each target.
-    Ages compare the sender's clock with ours: `max_age_s` and `max_future_s` must allow for their offset.
+    Ages compare the sender's clock with ours: `max_age_s` must allow for their offset.
     """
 
-    def __init__(self, uav: str, *, domain: int = 0, max_age_s: float = 1.0, max_future_s: float = 0.5) -> None:
+    def __init__(self, uav: str, *, domain: int = 0, max_age_s: float = 1.0) -> None:
         self.accepted = 0
         self.refused: Counter[Refusal] = Counter()
         self._uav = topics.check_uav_name(uav)
         self._domain = domain
         self._max_age_ns = round(max_age_s * _NS)
-        self._max_future_ns = round(max_future_s * _NS)
         self._sequences: dict[tuple[str, str, bytes], int] = {}
         self._last: dict[tuple[str, str], _Last] = {}
         self._sender: tuple[str, int] | None = None  # accepted session, and UTC ns of its last accepted message
@@ -153,10 +153,10 @@ class PoseReceiver:
             raise PayloadError(Refusal.PUBLISHER)
         if sequence <= self._sequences.get(publisher, 0):
             raise PayloadError(Refusal.SEQUENCE)
-        if stamp_ns - now_ns > self._max_future_ns:
+        if stamp_ns - now_ns > _FUTURE_MAX_NS:
             raise PayloadError(Refusal.FUTURE)
         # If the last stamp lies in the future, a clock was set back since: do not refuse everything until then.
-        overtakes = last is None or stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > self._max_future_ns
+        overtakes = last is None or stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > _FUTURE_MAX_NS
         if now_ns - stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
         self._remember(publisher, sequence)

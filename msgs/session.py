@@ -1,7 +1,7 @@
 """zenoh session settings: the UAV is a peer, the ground station a router, its tools are clients.
 
-Discovery is off unless requested, timestamps are on (cached topics need them), and the lease is short enough that an
-outage is detected within seconds.
+Discovery is off, timestamps are on (cached topics need them), and the lease is short enough that an outage is detected
+within seconds.
 """
 
 from __future__ import annotations
@@ -163,7 +163,6 @@ def peer_config(
     listen: Sequence[str],
     connect: Sequence[str],
     *,
-    discovery: bool = False,
     tls: TlsFiles | None = None,
     pose_rate_max_hz: float | None = None,
 ) -> zenoh.Config:
@@ -174,7 +173,7 @@ def peer_config(
     further.
     Plain tcp, for tools on board, is not limited. Raises zenoh.ZError for a malformed endpoint.
     """
-    config = _config("peer", listen, connect, discovery, tls)
+    config = _config("peer", listen, connect, tls)
     _insert(config, "connect/timeout_ms", -1)
     _insert(config, "connect/exit_on_failure", False)
     retry = {"period_init_ms": RETRY_PERIOD_MS, "period_max_ms": RETRY_PERIOD_MAX_MS, "period_increase_factor": 2}
@@ -190,7 +189,7 @@ def router_config(
 ) -> zenoh.Config:
     """The ground station's session, to which UAVs and tools connect; `access_control` is zenoh's section of that
     name."""
-    config = _config("router", listen, [], False, tls)
+    config = _config("router", listen, [], tls)
     if access_control is not None:
         _insert(config, "access_control", access_control)
     return config
@@ -199,7 +198,7 @@ def router_config(
 def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zenoh.Config:
     """A tool's session. Opening it raises zenoh.ZError if no endpoint answers: immediately if nothing listens there,
     over QUIC after QUIC_OPEN_TIMEOUT_MS."""
-    return _config("client", [], connect, False, tls)
+    return _config("client", [], connect, tls)
 
 
 def _thinned_by_radio(pose_rate_max_hz: float) -> dict[str, Any]:
@@ -236,17 +235,15 @@ def _no_pictures_by_radio() -> dict[str, Any]:
     }
 
 
-def _config(
-    mode: str, listen: Sequence[str], connect: Sequence[str], discovery: bool, tls: TlsFiles | None
-) -> zenoh.Config:
+def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsFiles | None) -> zenoh.Config:
     listen, connect = [with_datagrams(one) for one in listen], [with_datagrams(one) for one in connect]
     config = zenoh.Config()
     _insert(config, "mode", mode)
     # An empty list instead of this table would keep zenoh's default of listening on all interfaces.
     _insert(config, "listen/endpoints", {"router": listen, "peer": listen, "client": []})
     _insert(config, "connect/endpoints", connect)
-    _insert(config, "scouting/multicast/enabled", discovery)
-    _insert(config, "scouting/gossip/enabled", discovery)
+    _insert(config, "scouting/multicast/enabled", False)
+    _insert(config, "scouting/gossip/enabled", False)
     _insert(config, "timestamping/enabled", True)
     _insert(config, "transport/link/tx/lease", LEASE_MS)
     _insert(config, "transport/link/tx/queue/size/real_time", POSE_BATCHES)

@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from edge.cameras.reconnect import LinkState, Reconnect
+from edge.cameras.reconnect import Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
 from edge.cameras.watch import FrameWatch
 from edge.errors import InputError
@@ -64,10 +64,6 @@ class Capture:
             if frame is None and self._end is not None:
                 raise self._end
             return frame
-
-    @property
-    def streaming(self) -> bool:
-        return self._link.state is LinkState.STREAMING
 
     def counters(self) -> dict[str, int]:
         """captured; dropped, at the source (if it numbers its frames) or replaced by a newer one before being taken;

@@ -26,34 +26,33 @@ class ComputerStatus:
 class ComputerReader:
     """Loads are averages between two readings. Raises OSError or ValueError if Linux does not provide the data."""
 
-    def __init__(self, proc: Path = PROC, thermal: Path = THERMAL) -> None:
-        self._proc = proc
-        self._thermal = thermal
+    def __init__(self) -> None:
         self._jiffies: dict[str, tuple[int, int]] = {}  # by core: busy, all
 
     def read(self) -> ComputerStatus:
-        jiffies = _jiffies((self._proc / "stat").read_text())
+        jiffies = _jiffies((PROC / "stat").read_text())
         loads = {name: _percent(self._jiffies[name], now) for name, now in jiffies.items() if name in self._jiffies}
         self._jiffies = jiffies
-        memory_kib = dict(_memory_lines((self._proc / "meminfo").read_text()))
-        uptime_s = float((self._proc / "uptime").read_text().split()[0])
+        memory_kib = dict(_memory_lines((PROC / "meminfo").read_text()))
+        uptime_s = float((PROC / "uptime").read_text().split()[0])
         return ComputerStatus(
             round(uptime_s * 1000),
             tuple(load for name, load in loads.items() if name != "cpu"),
             loads.get("cpu"),
             (memory_kib["MemTotal"] - memory_kib["MemAvailable"]) // 1024,
             memory_kib["MemTotal"] // 1024,
-            tuple(self._temperatures()),
+            tuple(_temperatures_degc()),
         )
 
-    def _temperatures(self) -> list[int]:
-        found = []
-        for zone in sorted(self._thermal.glob("thermal_zone*/temp"))[:TEMPERATURES_MAX]:
-            try:
-                found.append(max(min(round(int(zone.read_text()) / 1000), UNKNOWN_INT8 - 1), -128))
-            except (OSError, ValueError):
-                continue  # an inactive thermal zone
-        return found
+
+def _temperatures_degc() -> list[int]:
+    found = []
+    for zone in sorted(THERMAL.glob("thermal_zone*/temp"))[:TEMPERATURES_MAX]:
+        try:
+            found.append(max(min(round(int(zone.read_text()) / 1000), UNKNOWN_INT8 - 1), -128))
+        except (OSError, ValueError):
+            continue  # an inactive thermal zone
+    return found
 
 
 def onboard_computer_status(status: ComputerStatus, utc_us: int) -> Any:

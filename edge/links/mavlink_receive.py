@@ -24,7 +24,6 @@ from msgs.mavlink import FrameReader, dialect
 
 DATAGRAM_MAX = 8192  # bytes; longer ones carry no telemetry
 RATE_MAX_HZ = 2000
-MAGIC = (0xFD, 0xFE)  # MAVLink 2 and 1
 QUATERNION_TOLERANCE = 1e-2
 # Physical limits for aircraft: finite but absurd values would pass through the filter into our output.
 TURN_RATE_MAX_RADPS = 50.0

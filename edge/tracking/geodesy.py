@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edge.types import Array
-
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
 ORIGIN_ROUNDS = 2  # iterations; error below a millimetre at 100 km
@@ -40,11 +38,3 @@ def origin_of_ned(point_deg_m: tuple[float, float, float], t_ned_m: ArrayLike) -
         lat, lon, alt = (o + p - q for o, p, q in zip(origin, point_deg_m, there, strict=True))
         origin = lat, (lon + 180.0) % 360.0 - 180.0, alt
     return origin
-
-
-def ned_from_lat_lon_alt(origin_deg_m: tuple[float, float, float], point_deg_m: tuple[float, float, float]) -> Array:
-    """A point's offset [3] in the north-east-down axes at the origin: the inverse of lat_lon_alt_from_ned."""
-    per_lat, per_lon = radii_m(origin_deg_m[0], origin_deg_m[2])
-    d_lon = (point_deg_m[1] - origin_deg_m[1] + 180.0) % 360.0 - 180.0
-    d_lat = point_deg_m[0] - origin_deg_m[0]
-    return np.array([np.deg2rad(d_lat) * per_lat, np.deg2rad(d_lon) * per_lon, origin_deg_m[2] - point_deg_m[2]])

@@ -169,7 +169,7 @@ def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[
         capture_ns, estimates, own_ship, shown.K, size_wh, doubtful_below=model.doubtful_below
     )
     time_ms = (time.monotonic_ns() - started_ns) * 1e-6
-    report = Report(frame.meta, shown.K, size_wh, tracks, own_ship, model.sha256, doubtful_below=model.doubtful_below)
+    report = Report(frame.meta, shown.K, size_wh, tracks, own_ship, doubtful_below=model.doubtful_below)
     return report, estimates, time_ms
 
 

@@ -72,7 +72,7 @@ def report(sequence: int, targets: int, uav_number: int = 0) -> Report:
         )
         for number in range(targets)
     )
-    return Report(FrameMeta(sequence, now_ns, now_ns), _K, (1920, 1080), tracks, own, "0" * 64)
+    return Report(FrameMeta(sequence, now_ns, now_ns), _K, (1920, 1080), tracks, own)
 
 
 def snapshot(tracks: int, fps: float) -> HealthSnapshot:

@@ -62,4 +62,4 @@ def make_track(now_ns: int, **changed: Any) -> Track:
 def make_report(*tracks: Track, sequence: int = 1, now_ns: int | None = None, own_ship: bool = True) -> Report:
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
     own = OwnShip(now_ns, np.eye(3), OWN_NED_M, np.array([20.0, 0.0, 0.0]), ORIGIN) if own_ship else None
-    return Report(FrameMeta(sequence, now_ns, now_ns), K, SIZE_WH, tracks, own, "0" * 64)
+    return Report(FrameMeta(sequence, now_ns, now_ns), K, SIZE_WH, tracks, own)

@@ -39,7 +39,6 @@ def test_being_held_up_between_two_readings_falsifies_no_stamp(
         utc_clock = UtcClock()
         at_ns = now_ns + age_ns
         assert abs(utc_clock.monotonic_ns(at_ns + UTC_AHEAD_NS) - at_ns) <= 2 * READING_NS
-        assert utc_clock.uncertainty_ns <= READING_NS
         assert utc_clock.monotonic_ns(utc_clock.utc_ns(at_ns)) == at_ns
 
 
@@ -71,7 +70,6 @@ def test_being_held_up_is_not_taken_for_utc_that_is_set(monkeypatch: pytest.Monk
     told_ns = utc_clock.utc_ns(0)
     held_up_ns = 150_000_000
     assert utc_clock.utc_ns(0) == told_ns
-    assert utc_clock.uncertainty_ns <= READING_NS
 
 
 def test_the_hosts_clocks_agree_with_themselves() -> None:

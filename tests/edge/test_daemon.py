@@ -314,5 +314,5 @@ def test_a_frame_that_is_not_later_than_the_last_is_counted_and_its_pose_not_sen
     stamps_ns = [report.meta.capture_ns for report in outlets.reports]
     assert len(stamps_ns) >= 2
     assert np.all(np.diff(stamps_ns) > 0)
-    counters = pipeline.snapshot().counters
+    counters = pipeline.supervisor.snapshot().counters
     assert 5 < counters["out_of_order"] <= counters["captured"] - len(stamps_ns)

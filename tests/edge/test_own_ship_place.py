@@ -7,10 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.tracking.geodesy import lat_lon_alt_from_ned, ned_from_lat_lon_alt
+from edge.tracking.geodesy import lat_lon_alt_from_ned, radii_m
 from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import Array
 
 MS = 1_000_000
+
+
+def ned_from_lat_lon_alt(origin_deg_m: tuple[float, float, float], point_deg_m: tuple[float, float, float]) -> Array:
+    """A point's offset [3] in the north-east-down axes at the origin: the inverse of lat_lon_alt_from_ned."""
+    per_lat, per_lon = radii_m(origin_deg_m[0], origin_deg_m[2])
+    d_lon = (point_deg_m[1] - origin_deg_m[1] + 180.0) % 360.0 - 180.0
+    d_lat = point_deg_m[0] - origin_deg_m[0]
+    return np.array([np.deg2rad(d_lat) * per_lat, np.deg2rad(d_lon) * per_lon, origin_deg_m[2] - point_deg_m[2]])
 
 
 def test_of_frequent_positions_some_may_be_lost() -> None:

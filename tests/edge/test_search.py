@@ -375,4 +375,4 @@ def test_the_diagnostics_count_searches(pipeline: tuple[Pipeline, Ear, RequestQu
     gated.gate.set()
     for index in range(12):
         loop._process(frame(index, HELD))
-    until(lambda: loop.snapshot().counters["searches"] >= 1)
+    until(lambda: loop.supervisor.snapshot().counters["searches"] >= 1)

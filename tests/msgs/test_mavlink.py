@@ -41,6 +41,10 @@ POSE: dict[str, Any] = {
 }
 
 
+def packed_pose(mav: Any, **pose: Any) -> bytes:
+    return mavlink.pack(mav, mavlink.target_relative(**pose))
+
+
 def crc16_mcrf4xx(data: bytes) -> int:
     """The checksum of the MAVLink guide, bit by bit."""
     crc = 0xFFFF
@@ -88,7 +92,7 @@ def test_upstream_s_generator_takes_the_dialect(tmp_path: Path, root: str) -> No
         check=False,
     )
     assert made.returncode == 0, made.stdout + made.stderr
-    packed = mavlink.pack_target_relative(mavlink.MAVLink(None, srcSystem=1, srcComponent=191), **POSE)
+    packed = packed_pose(mavlink.MAVLink(None, srcSystem=1, srcComponent=191), **POSE)
     fields = ["timestamp", "id", "frame", "x", "z", "pos_std", "yaw_std", "q_target", "q_sensor", "type"]
     read = subprocess.run(
         [sys.executable, "-c", READ, packed.hex(), *fields], cwd=tmp_path, capture_output=True, text=True, check=True
@@ -122,7 +126,7 @@ def test_mavsdk_decodes_target_relative_field_by_field(ground: tuple[Mavsdk, int
         direct.load_custom_xml(mavlink.DIALECT_XML.read_text())
         direct.subscribe_message("TARGET_RELATIVE", lambda message, _: (messages.append(message), decoded.set()))
         while not decoded.wait(0.05):
-            sender.sendto(mavlink.pack_target_relative(mav, **POSE), ("127.0.0.1", port))
+            sender.sendto(packed_pose(mav, **POSE), ("127.0.0.1", port))
     assert (messages[0].system_id, messages[0].component_id) == (1, 191)
     fields = json.loads(messages[0].fields_json)
     assert fields == {
@@ -151,7 +155,7 @@ def test_our_parser_reads_back_what_was_packed(utc_us: int, target_id: int, t: t
     q = np.random.default_rng(seed).normal(size=4)
     q = (q / np.linalg.norm(q)).astype(np.float32)
     pose = POSE | {"utc_us": utc_us, "target_id": target_id, "t_cam_target_m": t, "q_cam_target_wxyz": q}
-    packet = mavlink.pack_target_relative(mavlink.MAVLink(None, 7, 191), **pose)
+    packet = packed_pose(mavlink.MAVLink(None, 7, 191), **pose)
     (message,) = mavlink.MAVLink(None).parse_buffer(packet)
     assert (message.timestamp, message.id, (message.x, message.y, message.z)) == (utc_us, target_id, t)
     assert np.array_equal(message.q_target, q)
@@ -176,12 +180,12 @@ def test_our_parser_reads_back_what_was_packed(utc_us: int, target_id: int, t: t
 def test_what_is_no_pose_is_never_packed(change: dict[str, Any]) -> None:
     mav = mavlink.MAVLink(None, 1, 191)
     with pytest.raises(ValueError, match="TARGET_RELATIVE"):
-        mavlink.pack_target_relative(mav, **(POSE | change))
+        packed_pose(mav, **(POSE | change))
     assert mav.seq == 0
 
 
 def test_unknown_own_attitude_is_the_zero_quaternion() -> None:
-    packet = mavlink.pack_target_relative(mavlink.MAVLink(None, 1, 191), **(POSE | {"q_ned_cam_wxyz": None}))
+    packet = packed_pose(mavlink.MAVLink(None, 1, 191), **(POSE | {"q_ned_cam_wxyz": None}))
     (message,) = mavlink.MAVLink(None).parse_buffer(packet)
     assert message.q_sensor == [0.0, 0.0, 0.0, 0.0]
 

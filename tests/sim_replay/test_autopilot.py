@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from msgs.mavlink import MAVLink, dialect, pack, pack_target_relative
+from msgs.mavlink import MAVLink, dialect, pack, target_relative
 from sim_replay.autopilot import COMPONENT_ID, SYSTEM_ID
 from sim_replay.telemetry import COLUMNS, Telemetry, TelemetryError, read_telemetry, write_telemetry
 from tests.waiting import runs, until
@@ -163,8 +163,7 @@ def test_it_sets_intervals_with_an_acknowledgement_and_denies_what_it_lacks(daem
 
 def test_it_records_valid_target_poses_and_refuses_the_rest_by_reason(daemon: Daemon) -> None:
     def target(utc_us: int) -> bytes:
-        return pack_target_relative(
-            daemon.mav,
+        pose = target_relative(
             utc_us=utc_us,
             target_id=0,
             t_cam_target_m=(1.0, 2.0, 300.0),
@@ -173,6 +172,7 @@ def test_it_records_valid_target_poses_and_refuses_the_rest_by_reason(daemon: Da
             q_cam_target_wxyz=(1.0, 0.0, 0.0, 0.0),
             q_ned_cam_wxyz=None,
         )
+        return pack(daemon.mav, pose)
 
     daemon.first("HEARTBEAT")
     for utc_us in (1_000_000, 2_000_000, 2_000_000):
