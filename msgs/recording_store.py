@@ -43,7 +43,8 @@ class Store:
         self._stem = stem
         self._limits = limits
         self._tell = tell
-        self._name = re.compile(rf"{re.escape(stem)}_(\d{{6,}})_.*\.mcap")
+        # Down to the last letter: files of a vehicle called `<stem>_000001` are not ours.
+        self._name = re.compile(rf"{re.escape(stem)}_(\d{{6,}})_\d{{8}}T\d{{6}}Z\.mcap")
 
     def files(self) -> list[Path]:
         """This recorder's files, oldest first."""

@@ -57,6 +57,13 @@ def test_the_newest_recording_counts_towards_what_all_may_take(tmp_path: Path) -
     assert told == [f"old recordings removed to make room: 1, up to {files[0].name}"]
 
 
+def test_recordings_of_a_vehicle_whose_name_goes_on_like_ours_are_not_ours_to_remove(tmp_path: Path) -> None:
+    theirs = tmp_path / "uav1_000001_000000_20260101T000000Z.mcap"
+    theirs.write_bytes(bytes(FILE_BYTES))
+    Store(tmp_path, "uav1", RecordingLimits(total_bytes_max=1000, free_bytes_min=0), lambda *_: None).make_room()
+    assert theirs.exists()
+
+
 def test_a_disk_with_room_for_the_first_bytes_alone_is_told_once_and_leaves_no_empty_files(tmp_path: Path) -> None:
     command = [sys.executable, "-c", NO_ROOM_FOR_MORE, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)
