@@ -49,7 +49,8 @@ class PictureLink(Protocol):
 
 
 class Rate:
-    """When the next picture is due, by the frames' times; counted from the last due time, so that the rate is met."""
+    """When the next one is due; counted from the last due time, so that the mean rate is met although frames come at
+    other times."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = round(1e9 / hz) if hz > 0 else None

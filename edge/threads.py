@@ -12,7 +12,7 @@ YIELDS = 10  # niceness of the threads that search whole frames, relative to the
 
 @dataclass(frozen=True)
 class ThreadRow:
-    name: str  # of the threading.Thread
+    name: str  # of the threading.Thread, or its beginning
     does: str
     never_waits_for: str
     watched: bool = False  # once started it runs until the end: its absence is a fault

@@ -121,7 +121,7 @@ class Recorder:
                     self._changed.notify()
 
     def switch(self, on: bool) -> None:
-        """Start a new file, or end the current one; returns immediately."""
+        """Begin to record, or end the current file; returns immediately."""
         with self._changed:
             self._wanted = on
             self._woken = True

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 import threading
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ from edge.links import zenoh_messages as ros
 from edge.links.errors import LinkError
 from edge.links.outgoing import NS_PER_MS, rangeless, sendable
 from edge.links.zenoh_commands import Actions, declare_commands
-from edge.pictures import Picture
+from edge.pictures import Picture, Rate
 from edge.requests import AskReload, RequestQueue
 from edge.types import Mount, Report
 from msgs import topics
@@ -258,8 +258,7 @@ class Desk:
         self._clock = UtcClock()
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
         self._intrinsics: tuple[bytes, tuple[int, int], tuple[float, ...]] | None = None
-        self._pose_period_s = 0.0
-        self._pose_due_s: dict[tuple[str, str | None], float] = {}
+        self._pose_rates: defaultdict[tuple[str, str | None], Rate] | None = None  # None: no limit
         shared = (topics.DETECTIONS, topics.TF, topics.CAMERA_INFO, topics.DIAGNOSTICS, topics.EVENTS)
         if node is not None:
             for topic in shared:
@@ -268,7 +267,7 @@ class Desk:
     def set_pose_rate(self, max_hz: float | None) -> None:
         """Limit the rate of poses and odometry; None: no limit. Recordings are not limited. May be called from any
         thread."""
-        self._pose_period_s = 0.0 if max_hz is None else 1.0 / max_hz
+        self._pose_rates = None if max_hz is None else defaultdict(partial(Rate, max_hz))
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
@@ -328,17 +327,8 @@ class Desk:
             self.counted[f"sent_{topic.name.rpartition('/')[2]}"] += 1
 
     def _due(self, topic: Topic, target: str | None) -> bool:
-        if not topic.per_target or self._pose_period_s == 0.0:
-            return True
-        now_s = clock.monotonic_ns() / 1e9
-        # At most one current period ahead, in case a lower rate was set before.
-        due_s = min(self._pose_due_s.get((topic.name, target), 0.0), now_s + self._pose_period_s)
-        if now_s < due_s:
-            self._pose_due_s[topic.name, target] = due_s
-            return False
-        # Counted from the due time, not from now, so that the mean rate is met although frames arrive at other times.
-        self._pose_due_s[topic.name, target] = max(due_s, now_s - self._pose_period_s) + self._pose_period_s
-        return True
+        rates = self._pose_rates
+        return rates is None or not topic.per_target or rates[topic.name, target].due(clock.monotonic_ns())
 
     def _publisher(self, node: Node, topic: Topic, target: str | None) -> TopicPublisher:
         key = (topic.name, target)
