@@ -138,8 +138,8 @@ class Reloader:
         self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
     ) -> Reloaded | None:
         """To be called in every iteration of the loop: start a requested reload, return a finished one. Never waits."""
-        ready, self._ready = self._ready, None
-        if ready is not None:
+        if (ready := self._ready) is not None:  # only then is it emptied: the thread may be filling it just now
+            self._ready = None
             self._taken.set()
             return ready
         if self._asked and self._thread is None:
