@@ -139,7 +139,10 @@ class ZenohLink:
     def wants_picture(self) -> bool:
         """Whether pictures have a subscriber now."""
         publisher = self._picture_publisher
-        return publisher is not None and publisher.matching()
+        try:
+            return publisher is not None and publisher.matching()
+        except zenoh.ZError:  # the worker has ended, which must not end the loop too
+            return False
 
     def records_picture(self) -> bool:
         """Whether a recording is in progress."""

@@ -98,6 +98,16 @@ def test_who_looks_sees_the_picture_with_the_stamp_of_its_poses_and_nothing_is_s
     assert stamps[-1] - stamps[0] >= (len(stamps) - 2) * 100_000_000
 
 
+def test_a_link_that_has_ended_wants_no_pictures_and_does_not_end_who_asks() -> None:
+    endpoint = free_endpoint()
+    link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
+    link.start()
+    with connect(endpoint) as session, session.declare_subscriber("0/uav1/image/**"):
+        until(link.wants_picture, what="the viewer")
+        link.stop()
+        assert not link.wants_picture()
+
+
 def test_a_picture_that_is_too_large_for_the_wire_is_sent_worse_or_counted() -> None:
     endpoint = free_endpoint()
     link = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
