@@ -35,7 +35,7 @@ class Budget:
 
 def report(flight: Flight, fps: float, period_s: float, minutes: float) -> dict[str, Any]:
     """JSON's types; milliseconds, 10^6 bytes, seconds; null where there is no data."""
-    latency = mavlink_latency_ms(flight, period_s)
+    latency = mavlink_latency_ms(flight, fps, period_s)
     stages = stage_latency_ms([record["values"] for record in flight.diagnostics], fps)
     counters = last_counters(flight)
     memory = memory_mb(flight)
@@ -84,13 +84,15 @@ def _budget(name: str, limit: float, value: float | None, unit: str) -> Budget:
     return Budget(name, limit, value, unit, None if value is None else value <= limit)
 
 
-def mavlink_latency_ms(flight: Flight, period_s: float) -> dict[str, dict[str, float]]:
+def mavlink_latency_ms(flight: Flight, fps: float, period_s: float) -> dict[str, dict[str, float]]:
     """From exposure to arrival at the autopilot: `all`, and `steady` without SETTLE_S after each restart."""
-    captures_ns = [record["capture_utc_us"] * 1000 - flight.utc_minus_monotonic_ns for record in flight.targets]
-    pairs = zip(captures_ns, flight.targets, strict=True)
-    since_s = [((capture_ns - flight.start_at_ns) * 1e-9) % period_s for capture_ns in captures_ns]
-    ms = [(record["received_ns"] - capture_ns) * 1e-6 for capture_ns, record in pairs]
-    steady = [value for value, since in zip(ms, since_s, strict=True) if since >= SETTLE_S]
+    exposures_utc_ns = [record["capture_utc_us"] * 1000 for record in flight.targets]
+    ms = [
+        (record["received_ns"] - (utc_ns - flight.utc_minus_monotonic_ns)) * 1e-6
+        for record, utc_ns in zip(flight.targets, exposures_utc_ns, strict=True)
+    ]
+    frames = _frames(flight, exposures_utc_ns, fps)
+    steady = [value for value, frame in zip(ms, frames, strict=True) if _is_steady(frame, fps, period_s)]
     return {"all": _percentiles(ms), "steady": _percentiles(steady)}
 
 
@@ -130,7 +132,9 @@ def _frames(flight: Flight, exposures_utc_ns: Iterable[int], fps: float) -> Iter
 
 
 def _is_steady(frame: int, fps: float, period_s: float) -> bool:
-    return frame / fps % period_s >= SETTLE_S
+    # In frames: as a time, the first of a round may seem to be just before it, by a rounding error or as stamps are of
+    # whole microseconds.
+    return frame % round(period_s * fps) / fps >= SETTLE_S
 
 
 def stage_latency_ms(diagnostics: Sequence[dict[str, str]], fps: float) -> dict[str, dict[str, float]]:

@@ -73,10 +73,24 @@ def run(cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_what_is_found_anew_after_each_round_is_no_steady_tracking() -> None:
     flight = heard([0.5, 2.0, 4.9, 5.2, 7.0], [80.0, 10.0, 12.0, 90.0, 11.0])
-    latency = mavlink_latency_ms(flight, PERIOD_S)
+    latency = mavlink_latency_ms(flight, 30.0, PERIOD_S)
     assert latency["steady"]["p50"] == pytest.approx(11.0, abs=1e-3)
     assert latency["steady"]["p99"] < 12.01
     assert latency["all"]["p99"] > 80.0
+
+
+def test_the_first_frame_of_a_round_is_no_steady_tracking_however_its_time_is_rounded() -> None:
+    for fps, frames in ((30.0, 150), (30.0, 96), (29.97, 150)):
+        period_s = frames / fps
+        rounds = range(1, 120)
+        captures_s = [(turn * frames + k) / fps for turn in rounds for k in (0, frames // 2)]
+        flight = heard(captures_s, [90.0, 10.0] * len(rounds))
+        for record in flight.targets:
+            record["capture_utc_us"] -= 1  # of whole microseconds, by the daemon's own offset of UTC
+        assert mavlink_latency_ms(flight, fps, period_s)["steady"]["p99"] < 10.01
+        flight.poses_utc_ns = poses_at((k for k in range(120 * frames) if k % frames), fps)
+        flight.diagnostics = [{"values": {"dropped": "119", "captured": str(120 * frames)}}]
+        assert report(flight, fps, period_s, 10.0)["dropped_tracking"] == 0
 
 
 def test_stages_are_of_windows_that_do_not_overlap() -> None:
