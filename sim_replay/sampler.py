@@ -1,14 +1,7 @@
-"""Training data: windows rendered on demand, each a pure function of (seed, index, size), with exact labels.
-
-    python -m sim_replay.sampler --size 128 --count 256
-
-measures how many windows per second this machine renders.
-"""
+"""Training data: windows rendered on demand, each a pure function of (seed, index, size), with exact labels."""
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Sequence
 
 import cv2
@@ -19,15 +12,13 @@ from sim_replay.airframes import AIRFRAMES, airframe_of
 from sim_replay.airframes.invented import FLEET_ALONE, Invention
 from sim_replay.render.distractors import add_decoy, add_distractors
 from sim_replay.render.flown import NONE_FLOWN, FlownShare
-from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px, render_frame
+from sim_replay.render.frame import MASK_COVERAGE_MIN, Box, is_inside, mask_extents_px, outline_px
 from sim_replay.render.placing import VISIBLE_SHARE_MIN, Window, crop_K, draw_window
 from sim_replay.render.projection import extents_px
 from sim_replay.render.renderer import Rendered, Renderer
 from sim_replay.render.scene import Camera, Target
 from sim_replay.render.sensor import exposed, sensor_from
 from sim_replay.sample import AcquireView, SampleBatch
-
-__all__ = ["WindowSampler", "render_frame"]
 
 TILES = (4, 4)
 
@@ -163,23 +154,3 @@ class WindowSampler:
         out["image_bgr"][k], out["K"][k] = image, camera.K
         if window.visible_share * clear >= VISIBLE_SHARE_MIN:
             _write_target(out, k, window, camera, coverage >= MASK_COVERAGE_MIN, noc, hidden=clear < 1.0)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures and prints windows per second."""
-    parser = argparse.ArgumentParser(description="Measure how fast training windows are rendered on this machine.")
-    parser.add_argument("--size", type=int, default=128, help="side of a window, pixels (default %(default)s)")
-    parser.add_argument("--count", type=int, default=256, help="windows to render (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    sampler = WindowSampler(options.seed, options.size)
-    sampler.batch(0, TILES[0] * TILES[1])
-    start = time.perf_counter()
-    batch = sampler.batch(0, options.count)
-    rate = options.count / (time.perf_counter() - start)
-    print(f"{rate:.0f} windows/s at {options.size} px, {batch.present.mean():.0%} with a target")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -30,6 +30,7 @@ from trainer.pixel_quads import take_quads
 from trainer.tally import Tally, windows_in
 
 OPSET = 17
+THREADS = 2
 ORT_WARNING, ORT_ERROR = 2, 3  # severities of its log; the first is its default
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
 # Soft-argmax, ray, sampling, depth and rotation remain in float, and so does the last layer of each head.
@@ -174,12 +175,12 @@ def read_contract(path: Path) -> ModelContract:
         raise ConfigError(f"{path}: {METADATA_KEY}: {error}") from None
 
 
-def open_session(path: Path, threads: int = 2) -> ort.InferenceSession:
+def open_session(path: Path) -> ort.InferenceSession:
     """An ONNX Runtime session on the CPU. Raises ConfigError if the file is no model."""
     if not path.is_file():
         raise ConfigError(f"{path}: no such model file")
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = THREADS
     options.log_severity_level = ORT_ERROR
     try:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

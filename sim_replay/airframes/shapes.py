@@ -202,9 +202,7 @@ def propeller_disc(centre_m: ArrayLike, radius_m: float) -> Mesh:
     return Mesh(vertices.astype(np.float32), normals, part, faces.astype(np.int32))
 
 
-def propeller(
-    hub_m: ArrayLike, radius_m: float, spinner_m: float, pusher: bool = False, spinner: Part = Part.METAL
-) -> Mesh:
+def propeller(hub_m: ArrayLike, radius_m: float, spinner_m: float, pusher: bool = False) -> Mesh:
     """Disc and spinner of a turning propeller; the spinner is `spinner_m` long and points ahead, or aft if a pusher."""
     hub = np.asarray(hub_m, dtype=np.float64)
     radius = max(0.6 * spinner_m, 0.1 * radius_m)
@@ -213,7 +211,7 @@ def propeller(
     stations = [(way * spinner_m * along, 2 * radius * r, 2 * radius * r, 0.0) for along, r in profile]
     if pusher:
         stations.reverse()
-    cone = fuselage(stations, 2.0, spinner, rings=5, points=10)
+    cone = fuselage(stations, 2.0, Part.METAL, rings=5, points=10)
     return merge([moved(cone, hub), propeller_disc(hub, radius_m)])
 
 
@@ -236,19 +234,17 @@ def tricycle(
     )
 
 
-def store(centre_m: ArrayLike, length_m: float, width_m: float, rack_z_m: float, fins: bool = True) -> Mesh:
-    """A finned store or a drop tank under a pylon that reaches up to z = rack_z_m, on one side."""
+def store(centre_m: ArrayLike, length_m: float, width_m: float, rack_z_m: float) -> Mesh:
+    """A finned store under a pylon that reaches up to z = rack_z_m, on one side."""
     x, y, z = np.asarray(centre_m, dtype=np.float64)
     shape = [(0.5, 0.08), (0.47, 0.5), (0.38, 0.95), (-0.3, 1.0), (-0.5, 0.6)]
-    if not fins:
-        shape = [(0.5, 0.05), (0.4, 0.55), (0.2, 0.95), (-0.1, 1.0), (-0.35, 0.6), (-0.5, 0.08)]
     stations = [(x + length_m * along, width_m * r, width_m * r, z) for along, r in shape]
     parts = [fuselage(stations, 2.0, Part.SENSOR, y, rings=7, points=8)]
     foot = (x + 0.2 * length_m, y, z - 0.4 * width_m, 0.42 * length_m)
     parts.append(
         lifting_surface([foot, (x + 0.25 * length_m, y, rack_z_m, 0.5 * length_m)], "0010", points=SMALL_POINTS)
     )
-    for side, up in ((1, 1), (1, -1), (-1, 1), (-1, -1)) if fins else ():
+    for side, up in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         root = (x - 0.32 * length_m, y + 0.2 * side * width_m, z + 0.2 * up * width_m, 0.17 * length_m)
         tip = (x - 0.4 * length_m, y + 0.75 * side * width_m, z + 0.75 * up * width_m, 0.1 * length_m)
         parts.append(lifting_surface([root, tip], "0008", Part.SENSOR, points=SMALL_POINTS))
@@ -293,10 +289,3 @@ def stopped_rotor(hub_m: ArrayLike, radius_m: float, turn_rad: float) -> Mesh:
     wide, high = 0.12 * radius_m, 0.16 * radius_m
     motor = fuselage([(wide, wide, high, 0.0), (-wide, wide, high, 0.0)], 3.0, Part.METAL, rings=2, points=8)
     return merge([loft(rings, Part.TYRE), moved(motor, hub + np.array([0.0, 0.0, 0.5 * high]))])
-
-
-def flat_plate(outline_m: ArrayLike, thickness_m: float, part: Part) -> Mesh:
-    """A level plate [P, 3] of convex outline, `thickness_m` thick."""
-    outline = np.asarray(outline_m, dtype=np.float64)
-    half = np.array([0.0, 0.0, 0.5 * thickness_m])
-    return loft(np.stack([outline - half, outline + half]), part)

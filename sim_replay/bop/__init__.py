@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from sim_replay.bop.layout import find_root, find_scenes, names_split, read_scene
 from sim_replay.bop.model_frame import MODEL_FRAME_FILE, ModelFrame, ModelFrames, read_model_frames
-from sim_replay.bop.models import Model, ModelInfo, object_names, read_models, read_models_info
+from sim_replay.bop.models import Model, object_names, read_models
 from sim_replay.bop.ply import read_ply_vertices_m, write_ply
 from sim_replay.bop.records import DISTORTION_KEY, BopError, BopFrame, BopTarget, Distortion
 from sim_replay.bop.scene import BopScene
@@ -24,7 +24,6 @@ __all__ = [
     "Model",
     "ModelFrame",
     "ModelFrames",
-    "ModelInfo",
     "SceneWriter",
     "find_root",
     "find_scenes",
@@ -32,7 +31,6 @@ __all__ = [
     "object_names",
     "read_model_frames",
     "read_models",
-    "read_models_info",
     "read_ply_vertices_m",
     "read_scene",
     "write_camera",

@@ -19,25 +19,6 @@ from sim_replay.bop.records import MM_PER_M, Array, BopError
 _CHUNK = 2048
 
 
-@dataclass(frozen=True)
-class ModelInfo:
-    """Size of a model, metres, in its own frame."""
-
-    diameter_m: float
-    low_m: tuple[float, float, float]
-    size_m: tuple[float, float, float]
-
-
-def read_models_info(folder: Path) -> dict[int, ModelInfo]:
-    """Read models_info.json in `folder`, by object id. Raises BopError."""
-    path = folder / "models_info.json"
-    out = {}
-    for key, entry in load_object(path).items():
-        low, size = _box(path, key, entry)
-        out[number_key(path, key)] = ModelInfo(_metres(path, key, entry, "diameter"), low, size)
-    return out
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """One object. Its vertices are read on first use."""
@@ -117,7 +98,9 @@ def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame
     diameter_m = _metres(path, key, entry, "diameter") if "diameter" in known or ply is None else None
     corners = None
     if all(f"{kind}_{axis}" in known for kind in ("min", "size") for axis in "xyz"):
-        low, size = (np.array(values) for values in _box(path, key, entry))
+        low, size = (
+            np.array([_metres(path, key, entry, f"{kind}_{axis}") for axis in "xyz"]) for kind in ("min", "size")
+        )
         corners = frame.points_in_body(_corners(low, size))
     if ply is not None and (diameter_m is None or corners is None):
         vertices = Model(0.0, ply=ply, frame=frame).vertices_m
@@ -159,11 +142,6 @@ def _corners(low: Array, size: Array) -> Array:
 
 def _metres(path: Path, key: str, entry: Any, name: str) -> float:
     return float(matrix(path, key, entry, name, ())) / MM_PER_M
-
-
-def _box(path: Path, key: str, entry: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    low, size = ([_metres(path, key, entry, f"{kind}_{axis}") for axis in "xyz"] for kind in ("min", "size"))
-    return _triple(np.array(low)), _triple(np.array(size))
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

@@ -40,12 +40,12 @@ class UdpRelay:
     autopilot sent.
     """
 
-    def __init__(self, daemon: Address, seed: int = 0) -> None:
+    def __init__(self, daemon: Address) -> None:
         self.state = LinkState()
         self.tape: deque[bytes] = deque(maxlen=_TAPE_DATAGRAMS)
         self._daemon = daemon
         self._autopilot: Address | None = None
-        self._chance = random.Random(seed)
+        self._chance = random.Random(0)
         self._front = _bound(socket.SOCK_DGRAM)
         self._back = _bound(socket.SOCK_DGRAM)
         self._late: list[tuple[float, int, bool, bytes]] = []  # due, tie-break, to the daemon, data
@@ -125,10 +125,10 @@ class TcpRelay:
     A cut holds the bytes back, as a radio does: both ends see silence, not a closed connection.
     """
 
-    def __init__(self, upstream: Address, seed: int = 0) -> None:
+    def __init__(self, upstream: Address) -> None:
         self.state = LinkState()
         self._upstream = upstream
-        self._chance = random.Random(seed)
+        self._chance = random.Random(0)
         self._stopping = threading.Event()
         self._server = _bound(socket.SOCK_STREAM)
         self._server.listen()

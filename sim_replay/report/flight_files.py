@@ -33,11 +33,6 @@ class RecordedFlight:
     speed: float = 1.0  # factor on the sequence's own frame rate
 
 
-def is_flight(folder: Path) -> bool:
-    """Whether `folder` contains the files of a replay."""
-    return (folder / FLIGHT_JSON).is_file()
-
-
 def remove_flight(folder: Path) -> None:
     """Remove the files of an earlier replay, so that they are not taken for those of the one that begins now."""
     for name in WRITTEN:

@@ -87,7 +87,7 @@ def film(video: Path) -> tuple[str | None, list[str]]:
     return None, stills
 
 
-def jpeg_url(image_bgr: Image, quality: int = 86) -> str:
+def jpeg_url(image_bgr: Image) -> str:
     """The image [H, W, 3] as a data: URL."""
-    _, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, 86])
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"

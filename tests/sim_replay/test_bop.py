@@ -19,8 +19,9 @@ from sim_replay.bop import (
     BopError,
     BopFrame,
     BopTarget,
+    ModelFrames,
     SceneWriter,
-    read_models_info,
+    read_models,
     read_ply_vertices_m,
     read_scene,
     write_models,
@@ -139,12 +140,12 @@ def test_models_come_back_in_metres(tmp_path: Path) -> None:
     points = np.random.default_rng(3).normal(size=(300, 3)) * [4.0, 6.0, 1.0]
     single = points.astype(np.float32)
     mesh = Mesh(single, single, np.zeros(300, np.uint8), np.array([[0, 1, 2]], np.int32))
-    write_models(tmp_path, {2: mesh})
-    np.testing.assert_allclose(read_ply_vertices_m(tmp_path / "obj_000002.ply"), points, atol=1e-5)
-    info = read_models_info(tmp_path)[2]
-    assert info.diameter_m == pytest.approx(pdist(mesh.vertices_m.astype(float)).max(), abs=1e-6)
-    np.testing.assert_allclose(info.size_m, np.ptp(points, axis=0), atol=1e-5)
-    raw = json.loads((tmp_path / "models_info.json").read_text())["2"]
+    write_models(tmp_path / "models", {2: mesh})
+    np.testing.assert_allclose(read_ply_vertices_m(tmp_path / "models" / "obj_000002.ply"), points, atol=1e-5)
+    model = read_models(tmp_path, ModelFrames())[2]
+    assert model.diameter_m == pytest.approx(pdist(mesh.vertices_m.astype(float)).max(), abs=1e-6)
+    np.testing.assert_allclose(model.size_m, np.ptp(points, axis=0), atol=1e-5)
+    raw = json.loads((tmp_path / "models" / "models_info.json").read_text())["2"]
     assert raw["size_y"] == pytest.approx(1000.0 * np.ptp(points[:, 1]), abs=1e-2)
 
 

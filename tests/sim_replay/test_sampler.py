@@ -24,7 +24,7 @@ from sim_replay.render.placing import (
 )  # fmt: skip
 from sim_replay.render.projection import extents_px
 from sim_replay.sample import SampleBatch
-from sim_replay.sampler import WindowSampler, main
+from sim_replay.sampler import WindowSampler
 
 SIZE = 96
 
@@ -211,8 +211,3 @@ def test_a_whole_frame_differs_from_the_next_by_noise_and_exposure_alone() -> No
     difference = a.image_bgr.astype(np.int16) - b.image_bgr
     assert 0.0 < np.abs(difference).mean() < 12
     assert abs(difference.mean()) < 3
-
-
-def test_the_bench_prints_a_rate(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--size", "48", "--count", "16"]) == 0
-    assert int(capsys.readouterr().out.split()[0]) > 0

@@ -10,7 +10,7 @@ import pytest
 
 import sim_replay
 from msgs.geometry import R_from_q_wxyz, euler_from_R, rotation_angle, so3_log
-from sim_replay.bop import BopScene, read_models_info, read_scene
+from sim_replay.bop import BopScene, ModelFrames, read_models, read_scene
 from sim_replay.render.frame import render_frame
 from sim_replay.sequence import FPS, SENSOR, scenes
 from sim_replay.telemetry import Telemetry, read_telemetry
@@ -45,7 +45,9 @@ def test_it_is_small_and_whole(scene: BopScene) -> None:
     assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) <= 7.5e6
     assert scene.image_bgr(scene.frames[0]).shape == (1080, 1920, 3)
     assert all(scene.image_path(frame).is_file() for frame in scene.frames)
-    assert read_models_info(FOLDER / "models")[scene.frames[0].targets[0].object_id].size_m[1] == pytest.approx(12.0)
+    size_m = read_models(FOLDER, ModelFrames())[scene.frames[0].targets[0].object_id].size_m
+    assert size_m is not None
+    assert size_m[1] == pytest.approx(12.0)
 
 
 def test_the_target_opens_from_150_m_to_beyond_300_m_in_full_view(scene: BopScene) -> None:
