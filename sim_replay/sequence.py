@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from msgs.geometry import R_from_euler, q_wxyz_from_R, so3_log
 from sim_replay.airframes import AIRFRAMES, airframe_id
-from sim_replay.bop import BopFrame, BopTarget, SceneWriter, write_camera, write_models
-from sim_replay.render.frame import RenderedFrame, render_frame
-from sim_replay.render.scene import Camera, Environment, Scene, Target, environment_from_seed
+from sim_replay.bop import SceneWriter, write_camera, write_models
+from sim_replay.render.frame import render_frame
+from sim_replay.render.records import bop_frame, bop_target
+from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
 from sim_replay.render.sensor import Sensor
 from sim_replay.telemetry import Telemetry, write_telemetry
 
@@ -141,48 +142,48 @@ def target_flight(seed: int) -> Flight:
     )
 
 
-def scenes(seed: int) -> list[Scene]:
-    """The frames' scenes, exposed at k / FPS seconds."""
-    t_s = np.arange(FRAMES) / FPS
-    own, target = own_flight(seed).states(t_s), target_flight(seed).states(t_s)
-    K = np.array([[FOCAL_PX, 0, (WIDTH_PX - 1) / 2], [0, FOCAL_PX, (HEIGHT_PX - 1) / 2], [0, 0, 1]])
-    environment: Environment = environment_from_seed(seed)
-    out = []
-    for k in range(FRAMES):
-        R_ned_own, t_ned_own_m = own[0][k], own[1][k]
-        camera = Camera(K, WIDTH_PX, HEIGHT_PX, R_ned_own @ R_BODY_CAM, t_ned_own_m + R_ned_own @ T_BODY_CAM_M)
-        seen = Target(airframe_id(AIRFRAME), LIVERY_SEED, target[0][k], target[1][k])
-        out.append(Scene(camera, (seen,), environment, sensor_seed=seed, frame_index=k))
-    return out
+@dataclass(frozen=True)
+class Filmed:
+    """A sequence to be filmed by a camera fixed to the own ship: K / `fps` seconds after the start, frame K."""
+
+    frames: int
+    fps: float
+    size_wh_px: tuple[int, int]  # of a sensor with one size of pixels, cut smaller
+    seed: int  # light, ground and noise
+    own: Flight
+    targets: tuple[tuple[str, int, Flight], ...]  # airframe, seed of its livery
+
+    def scenes(self) -> list[Scene]:
+        """The frames' scenes."""
+        t_s = np.arange(self.frames) / self.fps
+        width, height = self.size_wh_px
+        K = np.array([[FOCAL_PX, 0, (width - 1) / 2], [0, FOCAL_PX, (height - 1) / 2], [0, 0, 1]])
+        R_ned_own, t_ned_own_m, _ = self.own.states(t_s)
+        flown = [(airframe_id(name), livery, *flight.states(t_s)[:2]) for name, livery, flight in self.targets]
+        environment = environment_from_seed(self.seed)
+        out = []
+        for k in range(self.frames):
+            place = t_ned_own_m[k] + R_ned_own[k] @ T_BODY_CAM_M
+            camera = Camera(K, width, height, R_ned_own[k] @ R_BODY_CAM, place)
+            targets = tuple(Target(airframe, livery, R[k], t_m[k]) for airframe, livery, R, t_m in flown)
+            out.append(Scene(camera, targets, environment, sensor_seed=self.seed, frame_index=k))
+        return out
+
+    def telemetry(self) -> Telemetry:
+        """The own ship's state at 50 Hz, from LEAD_S before the first frame to LEAD_S after the last."""
+        rows = round((self.frames / self.fps + 2 * LEAD_S) * TELEMETRY_HZ) + 1
+        t_ns = np.round((np.arange(rows) / TELEMETRY_HZ - LEAD_S) * 1e9).astype(np.int64)
+        t_s = t_ns.astype(np.float64) * 1e-9
+        R_ned_body, position, velocity = self.own.states(t_s)
+        place = np.array([lat_lon_alt_from_ned(ORIGIN_DEG_M, p) for p in position])
+        rates = self.own.rates_body_radps(t_s)
+        return Telemetry(t_ns, np.hstack([q_wxyz_from_R(R_ned_body), rates, position, velocity, place]))
 
 
-def telemetry(seed: int) -> Telemetry:
-    """The own ship's state at 50 Hz, from LEAD_S before the first frame to LEAD_S after the last."""
-    flight = own_flight(seed)
-    rows = round((FRAMES / FPS + 2 * LEAD_S) * TELEMETRY_HZ) + 1
-    t_ns = np.round((np.arange(rows) / TELEMETRY_HZ - LEAD_S) * 1e9).astype(np.int64)
-    t_s = t_ns.astype(np.float64) * 1e-9
-    R_ned_body, position, velocity = flight.states(t_s)
-    place = np.array([lat_lon_alt_from_ned(ORIGIN_DEG_M, p) for p in position])
-    values = np.hstack([q_wxyz_from_R(R_ned_body), flight.rates_body_radps(t_s), position, velocity, place])
-    return Telemetry(t_ns, values)
-
-
-def bop_frame(scene: Scene, rendered: RenderedFrame, object_id: int) -> BopFrame:
-    """The BOP record of a rendered frame whose only target is an object of that id."""
-    camera, seen = scene.camera, rendered.targets[0]
-    R_cam_ned = camera.R_ned_cam.T
-    R_cam_target, t_cam_target_m = scene.targets[0].pose_in(camera)
-    target = BopTarget(
-        object_id,
-        R_cam_target,
-        t_cam_target_m,
-        box_visible_xyxy_px=None if seen.box_visible_xyxy_px is None else np.asarray(seen.box_visible_xyxy_px),
-        box_whole_xyxy_px=None if seen.box_whole_xyxy_px is None else np.asarray(seen.box_whole_xyxy_px),
-        visible_px=seen.visible_px,
-        whole_px=seen.whole_px,
-    )
-    return BopFrame(scene.frame_index, camera.K, (target,), R_cam_ned, -R_cam_ned @ camera.t_ned_cam_m)
+def crossing(seed: int) -> Filmed:
+    """The bundled sequence."""
+    target = (AIRFRAME, LIVERY_SEED, target_flight(seed))
+    return Filmed(FRAMES, FPS, (WIDTH_PX, HEIGHT_PX), seed, own_flight(seed), (target,))
 
 
 def _sequence_toml(seed: int, command: str) -> str:
@@ -206,20 +207,19 @@ def _sequence_toml(seed: int, command: str) -> str:
     )
 
 
-def generate(folder: Path, seed: int, jpeg_quality: int, command: str) -> None:
-    """Write the whole sequence into `folder`."""
-    shown = scenes(seed)
-    object_id = airframe_id(AIRFRAME) + 1
+def write_scene(folder: Path, filmed: Filmed, jpeg_quality: int) -> None:
+    """Render a sequence into `folder`: everything but sequence.toml. What lies behind the camera is not listed."""
+    names = {airframe_id(name) + 1: name for name, _, _ in filmed.targets}
+    shown = filmed.scenes()
     with SceneWriter(folder, jpeg_quality) as writer:
         for scene in shown:
             rendered = render_frame(scene, SENSOR)
-            writer.add(
-                bop_frame(scene, rendered, object_id), rendered.image_bgr, [t.mask_visib for t in rendered.targets]
-            )
-    write_models(folder / "models", {object_id: AIRFRAMES[object_id - 1].mesh()}, {object_id: AIRFRAME})
-    write_camera(folder / "camera.json", shown[0].camera.K, WIDTH_PX, HEIGHT_PX)
-    write_telemetry(folder / "telemetry.csv", telemetry(seed))
-    (folder / "sequence.toml").write_text(_sequence_toml(seed, command), encoding="utf-8")
+            ahead = [(t, s) for t, s in zip(scene.targets, rendered.targets, strict=True) if s.box_whole_xyxy_px]
+            targets = tuple(bop_target(target, scene.camera, seen) for target, seen in ahead)
+            writer.add(bop_frame(scene, targets), rendered.image_bgr, [seen.mask_visib for _, seen in ahead])
+    write_models(folder / "models", {number: AIRFRAMES[number - 1].mesh() for number in names}, names)
+    write_camera(folder / "camera.json", shown[0].camera.K, *filmed.size_wh_px)
+    write_telemetry(folder / "telemetry.csv", filmed.telemetry())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -230,9 +230,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jpeg-quality", type=int, default=84, metavar="Q", help="1 to 100 (default %(default)s)")
     options = parser.parse_args(arguments)
     given = sys.argv[1:] if arguments is None else list(arguments)
-    generate(
-        options.out, options.seed, options.jpeg_quality, shlex.join(["python", "-m", "sim_replay.sequence", *given])
-    )
+    write_scene(options.out, crossing(options.seed), options.jpeg_quality)
+    command = shlex.join(["python", "-m", "sim_replay.sequence", *given])
+    (options.out / "sequence.toml").write_text(_sequence_toml(options.seed, command), encoding="utf-8")
     return 0
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim_replay.airframes import airframe_id
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import Preset
-from sim_replay.bop import BopFrame, BopTarget
+from sim_replay.bop import BopTarget
 from sim_replay.flight import Encounter, EncounterPlan, fly_encounter
 from sim_replay.render.frame import outline_px
 from sim_replay.render.projection import extents_px, project_px, solid_vertices_m
@@ -160,17 +160,3 @@ def outline_labels(scene: Scene) -> tuple[BopTarget, ...]:
             pose = target.pose_in(camera)
             out.append(BopTarget(target.airframe_id + 1, *pose, np.concatenate([low, high]), whole))
     return tuple(out)
-
-
-def bop_frame(scene: Scene, targets: tuple[BopTarget, ...]) -> BopFrame:
-    """The BOP record of a frame; the scene's world is local NED."""
-    camera = scene.camera
-    R_cam_ned = camera.R_ned_cam.T
-    return BopFrame(
-        scene.frame_index,
-        camera.K,
-        targets,
-        R_cam_ned,
-        -R_cam_ned @ camera.t_ned_cam_m,
-        distortion=camera.distortion,
-    )

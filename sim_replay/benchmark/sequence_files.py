@@ -7,20 +7,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from msgs.geometry import Array
 from msgs.settings import toml_value
 from sim_replay.benchmark.crew import Stopped, Tell
 from sim_replay.benchmark.exposure import metered
-from sim_replay.benchmark.filming import Film, bop_frame, fly, outline_labels
+from sim_replay.benchmark.filming import Film, fly, outline_labels
 from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import Preset
 from sim_replay.benchmark.scene_store import SceneStore, is_finished
 from sim_replay.benchmark.video import through_h264
-from sim_replay.bop import BopTarget, write_camera
+from sim_replay.bop import write_camera
 from sim_replay.flight.encounter import ORIGIN_DEG_M
 from sim_replay.render.frame import render_frame
+from sim_replay.render.records import bop_frame, bop_target
 from sim_replay.telemetry import write_telemetry
 
 
@@ -104,27 +103,10 @@ def add_frame(store: SceneStore, film: Film, number: int, labels_only: bool) -> 
         store.add(bop_frame(scene, outline_labels(scene)), None)
         return
     drawn = render_frame(scene, film.sensor)
-    targets, visible, whole = [], [], []
-    for target, seen in zip(scene.targets, drawn.targets, strict=True):
-        if seen.visible_px == 0:
-            continue
-        targets.append(
-            BopTarget(
-                target.airframe_id + 1,
-                *target.pose_in(scene.camera),
-                box_visible_xyxy_px=_box(seen.box_visible_xyxy_px),
-                box_whole_xyxy_px=_box(seen.box_whole_xyxy_px),
-                visible_px=seen.visible_px,
-                whole_px=seen.whole_px,
-            )
-        )
-        visible.append(seen.mask_visib)
-        whole.append(seen.mask)
-    store.add(bop_frame(scene, tuple(targets)), drawn.image_bgr, visible, whole)
-
-
-def _box(box_xyxy_px: tuple[float, float, float, float] | None) -> Array | None:
-    return None if box_xyxy_px is None else np.asarray(box_xyxy_px, dtype=np.float64)
+    shown = [(target, seen) for target, seen in zip(scene.targets, drawn.targets, strict=True) if seen.visible_px]
+    targets = tuple(bop_target(target, scene.camera, seen) for target, seen in shown)
+    visible, whole = [seen.mask_visib for _, seen in shown], [seen.mask for _, seen in shown]
+    store.add(bop_frame(scene, targets), drawn.image_bgr, visible, whole)
 
 
 def _matrix_rows(matrix: Array) -> str:

@@ -12,7 +12,7 @@ import sim_replay
 from msgs.geometry import R_from_q_wxyz, euler_from_R, rotation_angle, so3_log
 from sim_replay.bop import BopScene, ModelFrames, read_models, read_scene
 from sim_replay.render.frame import render_frame
-from sim_replay.sequence import FPS, SENSOR, scenes
+from sim_replay.sequence import FPS, SENSOR, crossing
 from sim_replay.telemetry import Telemetry, read_telemetry
 
 FOLDER = Path(sim_replay.__file__).parent / "data" / "crossing"
@@ -107,7 +107,7 @@ def test_the_target_flies_coordinated_turns(scene: BopScene) -> None:
 
 
 def test_the_seed_makes_the_same_pictures(scene: BopScene) -> None:
-    rendered = render_frame(scenes(SETTINGS["seed"])[77], SENSOR)
+    rendered = render_frame(crossing(SETTINGS["seed"]).scenes()[77], SENSOR)
     stored = scene.image_bgr(scene.frames[77])
     assert np.abs(rendered.image_bgr.astype(np.int16) - stored).mean() < 2.0
     mask = scene.mask(scene.frames[77], 0)
