@@ -7,13 +7,14 @@ from pathlib import Path
 
 from msgs.settings import toml_value
 from sim_replay.ground_truth import PlayedSequence
+from sim_replay.ports import LOOPBACK
 
+UAV = "uav1"
 EVERY_IMAGE_HZ = 240.0  # the largest; at the sequence's own rate, an exposure rounded down to a nanosecond is too early
 
 
 def sequence_config(
     sequence: PlayedSequence,
-    uav: str,
     model: Path | None,
     zenoh_endpoint: str,
     mavlink_port: int,
@@ -31,7 +32,7 @@ def sequence_config(
         to_px4: Also send TARGET_RELATIVE to PX4, which takes it for a landing target.
     """
     tables: dict[str, dict[str, object]] = {
-        "vehicle": {"name": uav},
+        "vehicle": {"name": UAV},
         "camera": {
             "type": "sequence",
             "mount": sequence.camera_mount,
@@ -45,7 +46,7 @@ def sequence_config(
         },
         "model": {} if model is None else {"path": str(model.resolve())},
         "zenoh": {"listen": [zenoh_endpoint]},
-        "mavlink": {"endpoints": [f"udpin:127.0.0.1:{mavlink_port}"]},
+        "mavlink": {"endpoints": [f"udpin:{LOOPBACK}:{mavlink_port}"]},
     }
     if to_px4:
         tables["mavlink"]["target_relative_to_px4"] = True

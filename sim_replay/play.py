@@ -25,10 +25,10 @@ from typing import Any
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.bad_link import LinkFaults
-from sim_replay.daemon_config import sequence_config
+from sim_replay.daemon_config import UAV, sequence_config
 from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
-from sim_replay.ports import free_port
+from sim_replay.ports import LOOPBACK, free_endpoint, free_port
 
 LEADS_S = (5.0, 15.0, 45.0)  # until frame 0, for the daemon to become ready; too slow: the next value is tried
 READY_MARGIN_NS = 100_000_000
@@ -87,7 +87,6 @@ class PlaySettings:
     sequence: PlayedSequence
     out: Path
     model: Path | None = None  # None: the model shipped with the daemon
-    uav: str = "uav1"
     record: bool = False  # into out/recordings, by the daemon
     firmware: str = "ardupilot"  # one of sim_replay.autopilot.FIRMWARES
     link: LinkFaults = field(default_factory=LinkFaults)  # between daemon and autopilot
@@ -111,12 +110,10 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
     """One run with frame 0 `lead_s` from now; None if the daemon became ready too late."""
     start_at_ns = time.monotonic_ns() + round(lead_s * 1e9)
     utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
-    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    recording = Recording(start_at_ns, utc_minus_monotonic_ns, free_port(socket.SOCK_DGRAM), endpoint)
+    recording = Recording(start_at_ns, utc_minus_monotonic_ns, free_port(socket.SOCK_DGRAM), free_endpoint())
     config = settings.out / "config.toml"
     text = sequence_config(
         settings.sequence,
-        settings.uav,
         settings.model,
         recording.zenoh_endpoint,
         recording.mavlink_port,
@@ -221,7 +218,7 @@ def _wait_until_ready(
 def _peers(settings: PlaySettings, recording: Recording, lead_s: float) -> dict[str, list[str]]:
     """Arguments of each peer; the subscriber waits up to `lead_s` for the daemon to appear."""
     telemetry = str(settings.sequence.telemetry_csv)
-    address = f"127.0.0.1:{recording.mavlink_port}"
+    address = f"{LOOPBACK}:{recording.mavlink_port}"
     start = str(recording.start_at_ns - settings.sequence.frame0_ns)
     autopilot = ["--telemetry", telemetry, "--endpoint", address, "--start-at-ns", start]
     autopilot += ["--firmware", settings.firmware, *settings.link.arguments()]
@@ -232,7 +229,7 @@ def _peers(settings: PlaySettings, recording: Recording, lead_s: float) -> dict[
         autopilot += ["--gimbal", str(gimbal_csv)]
     return {
         "autopilot": autopilot,
-        "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", settings.uav, "--wait-s", str(lead_s)],
+        "subscriber": ["--connect", recording.zenoh_endpoint, "--uav", UAV, "--wait-s", str(lead_s)],
     }
 
 

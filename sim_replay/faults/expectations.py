@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass, field
 from functools import singledispatch
 
+from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER
 from sim_replay.faults.rig import Rig
 from sim_replay.faults.timeline import (
     ExpectCounter,
@@ -17,7 +18,6 @@ from sim_replay.faults.timeline import (
     ExpectState,
     ExpectStill,
 )
-from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 POSES_ENOUGH = 3
 NS = 1_000_000_000

@@ -12,8 +12,8 @@ import numpy as np
 
 from edge.config import R_BODY_CAM_FORWARD
 from msgs.geometry import q_wxyz_from_R
-from sim_replay.faults.messages import ReceivedMessage
-from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose, Witness
+from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER, ReceivedMessage
+from sim_replay.faults.witness import ExposedFrame, ReceivedPose, Witness
 
 # The daemon's own limits on a measurement's age, and what a loaded host may add from that check until it arrives.
 AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}

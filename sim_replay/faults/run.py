@@ -16,9 +16,9 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.actions import act
 from sim_replay.faults.expectations import Seen, Since, Unmet, expect
 from sim_replay.faults.judge import ages_ms, violations
+from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER
 from sim_replay.faults.rig import Rig, RigSettings, can_mount
 from sim_replay.faults.timeline import ExpectExit, ExpectPoses, Signal, Start, Step, Timeline, load_timeline
-from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 TIMELINES = Path(__file__).parent / "timelines"
 EXIT_UNMET = 1

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from edge.clock import UtcClock
-from sim_replay.faults.messages import AUTOPILOT as AUTOPILOT
-from sim_replay.faults.messages import SUBSCRIBER as SUBSCRIBER
-from sim_replay.faults.messages import ReceivedMessage, from_mavlink, from_zenoh
+from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER, ReceivedMessage, from_mavlink, from_zenoh
 
 NEVER_NS = 2**63
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK
 
 STEP_TIMEOUT_S = 120.0
 _POLL_S = 0.2
@@ -16,14 +17,14 @@ class Control:
     """One line per step; each waits for the daemon's answer."""
 
     def __init__(self) -> None:
-        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._listening = socket.create_server((LOOPBACK, 0))
         self._daemon: socket.socket | None = None
         self._unread = b""
 
     @property
     def address(self) -> str:
         """HOST:PORT for the daemon's `[camera] lockstep`."""
-        return f"127.0.0.1:{self._listening.getsockname()[1]}"
+        return f"{LOOPBACK}:{self._listening.getsockname()[1]}"
 
     def wait_until_ready(self, alive: Callable[[], bool]) -> None:
         """Wait until the daemon has connected and warmed up. Raises PlayError if it ends first or takes too long."""

@@ -21,6 +21,7 @@ from msgs.receive import PoseReceiver, TargetPose
 from sim_replay.autopilot import Autopilot
 from sim_replay.mavlink_record import message_record
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK
 from sim_replay.subscriber import pose_record
 
 Record = dict[str, Any]
@@ -48,7 +49,7 @@ class MavlinkPeer:
         self._parser = MAVLink(None)
         self._parser.robust_parsing = True
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(("127.0.0.1", port))
+        self._socket.connect((LOOPBACK, port))
         self._socket.setblocking(False)
 
     def next_due_ns(self) -> int | None:

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
-from sim_replay.daemon_config import sequence_config
+from sim_replay.daemon_config import UAV, sequence_config
 from sim_replay.faults.processes import Process
 from sim_replay.gimbal import looped as looped_gimbal
 from sim_replay.ground_truth import PlayedSequence
@@ -26,12 +26,11 @@ from sim_replay.lockstep.control import Control
 from sim_replay.lockstep.peers import MavlinkPeer, Record, Subscriber
 from sim_replay.pipeline.flight import looped
 from sim_replay.play import MESSAGES_JSONL, PlayError, Recording
-from sim_replay.ports import free_port
+from sim_replay.ports import free_endpoint, free_port
 from sim_replay.telemetry import read_telemetry
 
 BASE_NS = 1_000_000_000_000  # the stepped clock where the telemetry's is 0: later than the autopilot's boot
 LEAD_NS = 1_000_000_000  # of telemetry before the first frame
-UAV = "uav1"
 ENDING_S = 3.0  # from disconnecting to the daemon's end
 POSES_JSONL = "poses.jsonl"
 
@@ -87,10 +86,10 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
     with ExitStack() as cleanup:
         folder = Path(cleanup.enter_context(TemporaryDirectory(prefix="uavpose-lockstep-")))
         control = cleanup.enter_context(closing(Control()))
-        mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), free_endpoint()
         config = folder / "config.toml"
         camera = {"lockstep": control.address}
-        text = sequence_config(settings.sequence, UAV, settings.model, endpoint, mavlink_port, camera)
+        text = sequence_config(settings.sequence, settings.model, endpoint, mavlink_port, camera)
         config.write_text(text, encoding="utf-8")
         command: list[str | Path] = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
         daemon = Process(command, lambda line, _: said.append(line))

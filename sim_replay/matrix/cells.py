@@ -7,10 +7,10 @@ from pathlib import Path
 
 from edge.estimator.model import Model
 from sim_replay.faults.judge import ages_ms, violations
+from sim_replay.faults.messages import AUTOPILOT
 from sim_replay.faults.rig import Rig, RigSettings
 from sim_replay.faults.run import play_timeline
 from sim_replay.faults.timeline import Timeline
-from sim_replay.faults.witness import AUTOPILOT
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.offline import method_of

@@ -18,17 +18,16 @@ import numpy as np
 
 from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
-from sim_replay.daemon_config import sequence_config
+from sim_replay.daemon_config import UAV, sequence_config
 from sim_replay.faults.processes import Process
 from sim_replay.ground_truth import PlayedSequence
+from sim_replay.pace import sped_up
 from sim_replay.pipeline.usage import Usage, usage_of
 from sim_replay.play import LEADS_S, READY_MARGIN_NS, PlayError
-from sim_replay.ports import LOOPBACK, free_port
+from sim_replay.ports import LOOPBACK, free_endpoint, free_port
 from sim_replay.telemetry import FLOWN_CSV, Telemetry, read_telemetry, write_telemetry
 
-UAV = "uav1"
 SAMPLE_S = 1.0
-RATES_AND_VELOCITIES = [4, 5, 6, 10, 11, 12]  # columns of Telemetry.values
 
 
 @dataclass(frozen=True)
@@ -110,13 +109,6 @@ def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
     raise PlayError(f"the daemon was not ready within {LEADS_S[-1]:.0f} s; see {settings.out / 'daemon.log'}")
 
 
-def sped_up(telemetry: Telemetry, frame0_ns: int, factor: float) -> Telemetry:
-    """The same path flown `factor` times as fast; the exposure time of the first frame is unchanged."""
-    values = telemetry.values.copy()
-    values[:, RATES_AND_VELOCITIES] *= factor
-    return Telemetry(frame0_ns + np.round((telemetry.t_ns - frame0_ns) / factor).astype(np.int64), values)
-
-
 def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -> Telemetry:
     """The part that belongs to the frames, repeated; t_ns is 0 at the exposure of the first frame."""
     t_ns = telemetry.t_ns - frame0_ns
@@ -134,18 +126,16 @@ def _attempt(
     """One flight with frame 0 `lead_s` from now; None if the daemon became ready too late."""
     now_ns = time.monotonic_ns()
     flight = Flight(now_ns, now_ns + round(lead_s * 1e9), time.time_ns() - now_ns)
-    mavlink_port, zenoh_port = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), free_endpoint()
     config = settings.out / "config.toml"
-    endpoint, camera = f"tcp/{LOOPBACK}:{zenoh_port}", {"start_at_ns": flight.start_at_ns, "loop": True}
-    text = sequence_config(
-        replace(settings.sequence, fps=settings.fps), UAV, settings.model, endpoint, mavlink_port, camera
-    )
-    config.write_text(text, encoding="utf-8")
+    camera = {"start_at_ns": flight.start_at_ns, "loop": True}
+    sequence = replace(settings.sequence, fps=settings.fps)
+    config.write_text(sequence_config(sequence, settings.model, endpoint, mavlink_port, camera), encoding="utf-8")
     command = Path(sys.executable).parent / "uavpose-edge"
     log = settings.out / "daemon.log"
     with ExitStack() as cleanup:
         cleanup.callback(lambda: log.write_text("".join(f"{line}\n" for line in flight.said), encoding="utf-8"))
-        peers = _peers(flight, telemetry_csv, mavlink_port, zenoh_port)
+        peers = _peers(flight, telemetry_csv, mavlink_port, endpoint)
         for peer in peers:
             cleanup.callback(peer.end)
         daemon = Process([command, "run", "--config", config], flight.hear_daemon, flight.hear_end)
@@ -196,9 +186,9 @@ def _check_all_run(flight: Flight, daemon: Process, peers: Sequence[Process]) ->
             raise PlayError(f"{'the daemon' if process is daemon else 'a peer'} ended with exit code {code}: {last}")
 
 
-def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, zenoh_port: int) -> tuple[Process, ...]:
+def _peers(flight: Flight, telemetry_csv: Path, mavlink_port: int, endpoint: str) -> tuple[Process, ...]:
     python = [sys.executable, "-m"]
     autopilot = [*python, "sim_replay.autopilot", "--telemetry", str(telemetry_csv)]
     autopilot += ["--endpoint", f"{LOOPBACK}:{mavlink_port}", "--start-at-ns", str(flight.start_at_ns)]
-    subscriber = [*python, "sim_replay.subscriber", "--connect", f"tcp/{LOOPBACK}:{zenoh_port}", "--uav", UAV]
+    subscriber = [*python, "sim_replay.subscriber", "--connect", endpoint, "--uav", UAV]
     return tuple(Process(command, flight.hear_peer, flight.hear_end) for command in (autopilot, subscriber))

@@ -19,6 +19,7 @@ from msgs.client import connect, subscribe
 from msgs.ground.feed import Incoming, listening
 from msgs.ground.fleet import TAKEN, Fleet, TargetRow
 from sim_replay.play import PlayError
+from sim_replay.ports import LOOPBACK
 from sim_replay.radio.channel import Channel
 from sim_replay.radio.relay import RadioRelay
 from sim_replay.radio.rig import SOCKET_KINDS, START_S, Transport, Vehicle, ground
@@ -102,7 +103,7 @@ def play(plan: Plan) -> Outcome:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="uavpose-radio-")))
         router = stack.enter_context(ground(folder, plan.transport, [UAV]))
-        upstream = ("127.0.0.1", router.port)
+        upstream = (LOOPBACK, router.port)
         relay = stack.enter_context(RadioRelay(upstream, plan.channel, SOCKET_KINDS[plan.transport], plan.seed))
         session = stack.enter_context(connect(router.loopback))
         refused = stack.enter_context(_taking(plan, session, ledger))

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from sim_replay.faults.judge import faults_since, violations
-from sim_replay.faults.messages import KINDS
+from sim_replay.faults.messages import AUTOPILOT, KINDS, SUBSCRIBER
 from sim_replay.faults.rig import Rig, RigSettings, can_mount
 from sim_replay.faults.run import TIMELINES, Outcome, play_timeline
 from sim_replay.faults.timeline import load_timeline
-from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER
 
 WORD_S = 5.0
 SHORT = {"mavlink-cut", "flood"}  # the same as mavlink-cut-30s and flood-10mb, and less of it

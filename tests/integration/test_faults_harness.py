@@ -21,10 +21,11 @@ from edge.errors import InputError
 from msgs.mavlink import FrameReader, MAVLink, dialect
 from sim_replay.faults import hostile, run
 from sim_replay.faults.judge import pose_faults
+from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER
 from sim_replay.faults.relay import LinkState, TcpRelay, UdpRelay, message_id
 from sim_replay.faults.rig import SERVING, Rig, RigSettings
 from sim_replay.faults.timeline import Start, Who, load_timeline
-from sim_replay.faults.witness import AUTOPILOT, SUBSCRIBER, ExposedFrame, ReceivedPose
+from sim_replay.faults.witness import ExposedFrame, ReceivedPose
 from sim_replay.ports import LOOPBACK
 
 MS = 1_000_000

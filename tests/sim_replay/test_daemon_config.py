@@ -24,15 +24,13 @@ def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     sequence = replace(bundled, scene=replace(bundled.scene, folder=folder))
     path = tmp_path / "config.toml"
     camera = {"start_at_ns": 12, "loop": True}
-    path.write_text(
-        sequence_config(sequence, "uav7", folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera), encoding="utf-8"
-    )
+    path.write_text(sequence_config(sequence, folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera), encoding="utf-8")
     config = load_config(path).config
     assert isinstance(config.camera, SequenceCamera)
     assert (config.camera.path, config.camera.fps) == (folder, sequence.fps)
     assert (config.camera.start_at_ns, config.camera.loop) == (12, True)
     assert config.model.path == folder / "a.onnx"
-    assert (config.vehicle.name, config.zenoh.listen) == ("uav7", ["tcp/127.0.0.1:7001"])
+    assert (config.vehicle.name, config.zenoh.listen) == ("uav1", ["tcp/127.0.0.1:7001"])
     assert config.mavlink.endpoints == ["udpin:127.0.0.1:14001"]
     np.testing.assert_allclose(config.mount.mount().R_body_cam, sequence.mount.R_body_cam, atol=1e-9)
     np.testing.assert_allclose(config.mount.mount().t_body_cam_m, sequence.mount.t_body_cam_m)
@@ -41,6 +39,6 @@ def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize("fps", [10.0, 15.0, 24.0, 30.0, 60.0, 120.0])
 def test_every_image_of_a_sequence_is_recorded(fps: float, tmp_path: Path) -> None:
     sequence, path = replace(read_sequence(BUNDLED_SEQUENCE), fps=fps), tmp_path / "config.toml"
-    path.write_text(sequence_config(sequence, "uav1", None, "tcp/127.0.0.1:7001", 14001, {}, tmp_path))
+    path.write_text(sequence_config(sequence, None, "tcp/127.0.0.1:7001", 14001, {}, tmp_path))
     limit = Rate(load_config(path).config.recorder.image_max_hz)
     assert all(limit.due(round(frame * 1e9 / fps)) for frame in range(300))

@@ -18,8 +18,9 @@ from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
+from sim_replay.pace import sped_up
 from sim_replay.pipeline import flight as pipeline_flight
-from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped, sped_up
+from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped
 from sim_replay.pipeline.report import (
     WINDOW_FRAMES,
     cpu,
