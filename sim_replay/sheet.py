@@ -112,10 +112,8 @@ def sheet_image(airframes: Sequence[Airframe], livery_seed: int = 0) -> Image:
 def sheet(airframes: Sequence[Airframe], out: Path, livery_seed: int = 0) -> None:
     """Draw the airframes and write them as one JPEG of at most 400 kB.
 
-    Raises InputError if `out` is not the name of a JPEG or its folder is missing.
+    Raises InputError if its folder is missing.
     """
-    if out.suffix.lower() not in (".jpg", ".jpeg"):
-        raise InputError(f"--out {out}: a sheet is a JPEG; its name must end in .jpg")
     if not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     image = sheet_image(airframes, livery_seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import tempfile
 import time
@@ -112,8 +113,8 @@ def _run_all(kind: Kind, seconds: float, workers: int) -> Sequence[Measured]:
 def run(seconds: float, workers: int | None, as_json: bool) -> int:
     """Measure and print. Exit codes: 0 measured, 1 a worker failed. Raises InputError."""
     chosen = available_cores() if workers is None else workers
-    if seconds <= 0 or chosen < 1:
-        raise InputError("--seconds and --workers: must be above 0")
+    if not 0 < seconds < math.inf or chosen < 1:
+        raise InputError("--seconds and --workers: must be above 0 and finite")
     try:
         found = bench(seconds, chosen)
     except CrewError as error:

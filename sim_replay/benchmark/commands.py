@@ -128,6 +128,10 @@ def _sheet(commands: Any) -> None:
 
 
 def _run_sheet(args: argparse.Namespace) -> int:
+    if args.out.suffix.lower() not in (".jpg", ".jpeg"):
+        raise InputError(f"--out {args.out}: a sheet is a JPEG; its name must end in .jpg")
+    if args.dataset is not None and args.airframe:
+        raise InputError("--airframe: not with --dataset, whose frames show what they show")
     if args.dataset is not None:
         from sim_replay.benchmark.contact_sheet import run as run_contact_sheet
 

@@ -31,7 +31,7 @@ def test_bench_names_the_machine_and_counts_what_it_drew(capsys: pytest.CaptureF
     assert found["windows_per_second"]["together"] > found["frames_per_second"]["together"]
 
 
-@pytest.mark.parametrize("words", [["--workers", "0"], ["--seconds", "0"]])
+@pytest.mark.parametrize("words", [["--workers", "0"], ["--seconds", "0"], ["--seconds", "nan"], ["--seconds", "inf"]])
 def test_bench_refuses_to_measure_nothing(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *words]) == 2
     assert "must be above 0" in capsys.readouterr().err

@@ -67,6 +67,8 @@ def test_an_invented_aircraft_is_drawn_by_its_name(tmp_path: Path) -> None:
     [
         (["--airframe", "zeppelin", "--out", "a.jpg"], r"--airframe: .*'zeppelin'.*male_v_tail"),
         (["--out", "a.tiff"], r"--out a\.tiff: .*\.jpg"),
+        (["--out", "a.png", "--dataset", "flown"], r"--out a\.png: .*\.jpg"),
+        (["--out", "a.jpg", "--dataset", "flown", "--airframe", "glider"], "--airframe: not with --dataset"),
         (["--out", "/nowhere/at/all/a.jpg"], r"--out .*no folder /nowhere/at/all"),
     ],
 )
