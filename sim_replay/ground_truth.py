@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
 from msgs.geometry import Array
-from sim_replay.bop import BopFrame, Distortion, Model, read_scene
+from sim_replay.bop import Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
 from sim_replay.evaluation.judge import is_seen
@@ -97,7 +96,6 @@ def read_scene_truth(folder: Path) -> SceneTruth:
     models, frames = dataset.models, scene.pictured
     truths = []
     for index, picture in enumerate(dataset.pictured_frames()):
-        seen: Counter[int] = Counter()
         for target in picture.targets:
             if target.object_id not in models:
                 raise InputError(
@@ -106,8 +104,7 @@ def read_scene_truth(folder: Path) -> SceneTruth:
                 )
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
-            truths.append(Truth(index, R, t_m, *known, instance=seen[target.object_id], visible=is_seen(target)))
-            seen[target.object_id] += 1
+            truths.append(Truth(index, R, t_m, *known, visible=is_seen(target)))
     return SceneTruth(
         folder,
         [scene.image_path(frame) for frame in frames],
@@ -115,16 +112,9 @@ def read_scene_truth(folder: Path) -> SceneTruth:
         truths,
         {object_id: extents_of(model) for object_id, model in models.items()},
         [frame.distortion for frame in frames],
-        [_camera_world(frame) for frame in frames],
+        [frame.camera_in_world for frame in frames],
         all(frame.truth_known for frame in frames),
     )
-
-
-def _camera_world(frame: BopFrame) -> tuple[Array, Array] | None:
-    if frame.R_cam_world is None or frame.t_cam_world_m is None:
-        return None
-    R_world_cam = frame.R_cam_world.T
-    return R_world_cam, -R_world_cam @ frame.t_cam_world_m
 
 
 def extents_of(model: Model) -> Extents:

@@ -9,7 +9,8 @@ from functools import cache
 import numpy as np
 
 from sim_replay.airframes import light_aircraft, propeller_uavs, small_uavs, turbine_aircraft
-from sim_replay.airframes.mesh import Mesh, diameter_m, scaled
+from sim_replay.airframes.mesh import Mesh, scaled
+from sim_replay.bop.models import largest_distance
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def _mesh(airframe: Airframe) -> Mesh:
 
 @cache
 def _diameter_m(airframe: Airframe) -> float:
-    return diameter_m(airframe.mesh())
+    return largest_distance(airframe.mesh().vertices_m.astype(np.float64))
 
 
 AIRFRAMES: tuple[Airframe, ...] = (

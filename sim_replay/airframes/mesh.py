@@ -77,18 +77,6 @@ def both_sides(*meshes: Mesh) -> Mesh:
     return merge([*meshes, *(mirrored(mesh) for mesh in meshes)])
 
 
-def diameter_m(mesh: Mesh) -> float:
-    """Largest distance between two vertices (BOP's `diameter`), metres."""
-    points = np.unique(mesh.vertices_m.astype(np.float64), axis=0)
-    radius = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    # Any known distance is a lower bound on how far out either end of the largest one is.
-    reached = np.linalg.norm(points - points[np.argmax(radius)], axis=1).max()
-    points = points[radius >= reached - radius.max() - 1e-9]
-    squared = np.sum(points**2, axis=1)
-    distance2 = squared[:, None] + squared[None, :] - 2.0 * points @ points.T
-    return float(np.sqrt(distance2.max()))
-
-
 def built(vertices: Array, faces: NDArray[np.int64], face_part: Part | Parts) -> Mesh:
     """A mesh with normals smoothed by area, its faces turned outward by the sign of the enclosed volume.
 

@@ -44,3 +44,11 @@ class BopFrame:
     t_cam_world_m: Array | None = None  # [3]
     distortion: Distortion | None = None  # None: a pinhole camera
     truth_known: bool = True  # False: no file states its content, so it may show targets even if none is listed
+
+    @property
+    def camera_in_world(self) -> tuple[Array, Array] | None:
+        """R_world_cam [3, 3] and t_world_cam_m [3]; None: unknown."""
+        if self.R_cam_world is None or self.t_cam_world_m is None:
+            return None
+        R_world_cam = self.R_cam_world.T
+        return R_world_cam, -R_world_cam @ self.t_cam_world_m

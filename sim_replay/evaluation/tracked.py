@@ -88,7 +88,7 @@ class _Sequence:
     def own_ship(self, image_id: int) -> OwnShip | None:
         """The camera as a vehicle of its own: its body axes are the camera's, the mount is the identity."""
         k, frame = self.places[image_id]
-        place = _place(frame)
+        place = frame.camera_in_world
         if not self.in_ned or place is None:
             return None
         R_ned_cam, t_ned_cam_m = place
@@ -101,7 +101,7 @@ class _Sequence:
     def _rates(self, k: int) -> tuple[Array, Array]:
         """Angular rate [3], rad/s, and velocity [3], m/s, both in ned, between the frames before and after the k-th."""
         first, last = max(k - 1, 0), min(k + 1, len(self.places) - 1)
-        before, after = _place(self.scene.frames[first]), _place(self.scene.frames[last])
+        before, after = (self.scene.frames[index].camera_in_world for index in (first, last))
         if before is None or after is None or first == last:
             return np.zeros(3), np.zeros(3)
         dt_s = (self.frames[last] - self.frames[first]) / self.fps
@@ -117,13 +117,6 @@ def _by_number(image_ids: Sequence[int]) -> list[int]:
     apart = [after - before for before, after in pairwise(image_ids)]
     frame = sorted(apart)[len(apart) // 4] if apart else 1
     return list(accumulate((max(1, round(gap / frame)) for gap in apart), initial=0))
-
-
-def _place(frame: BopFrame) -> tuple[Array, Array] | None:
-    """R_ned_cam [3, 3] and t_ned_cam_m [3]; None if the file does not state them."""
-    if frame.R_cam_world is None or frame.t_cam_world_m is None:
-        return None
-    return frame.R_cam_world.T, -frame.R_cam_world.T @ frame.t_cam_world_m
 
 
 def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:

@@ -14,7 +14,7 @@ from scipy.spatial.distance import pdist
 
 from sim_replay.airframes import AIRFRAMES, Airframe, Part, airframe_id
 from sim_replay.airframes.livery import livery_from_seed
-from sim_replay.airframes.mesh import Mesh, diameter_m
+from sim_replay.airframes.mesh import Mesh
 from sim_replay.airframes.shapes import Patch, ellipsoid, fuselage, lifting_surface
 from sim_replay.bop import read_ply_vertices_m, write_models
 
@@ -153,7 +153,7 @@ def test_solids_have_the_volume_that_geometry_gives_them() -> None:
     # A NACA four-digit section encloses 0.685 t c^2 (Abbott & von Doenhoff's thickness polynomial, integrated).
     plank = lifting_surface([(0.0, 0.0, 0.0, 1.0), (0.0, 3.0, 0.0, 1.0)], "0012")
     assert _signed_volume(plank) == pytest.approx(0.685 * 0.12 * 3.0, rel=0.06)
-    assert diameter_m(plank) == pytest.approx(np.hypot(1.0, 3.0), rel=0.01)
+    assert pdist(plank.vertices_m).max() == pytest.approx(np.hypot(1.0, 3.0), rel=0.01)
 
 
 def test_an_unknown_name_is_answered_with_those_there_are() -> None:
