@@ -156,7 +156,7 @@ def longest_silence_s(
     views_s = [(span[0] / fps, (span[-1] + 1) / fps) for span in spans]
     bounds = [*arrivals, max([arrivals[-1], *(stop for _, stop in views_s)])]
     silences = [min(after, stop) - max(before, start) for before, after in pairwise(bounds) for start, stop in views_s]
-    return round(float(max(silences, default=0.0)), 4)
+    return round(float(max([0.0, *silences])), 4)  # below 0 where the view ended before the first pose arrived
 
 
 def tracks(matches: Sequence[Match], false_poses: Sequence[TargetPose]) -> dict[str, dict[str, Any]]:

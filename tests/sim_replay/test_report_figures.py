@@ -183,6 +183,7 @@ def test_silence_counts_only_while_a_target_is_to_be_seen() -> None:
     unbroken = matches("00000") + matches("00000", first_frame=15)
     assert longest_silence_s(unbroken, [(m.truth.frame, 20.0) for m in unbroken], FPS) == pytest.approx(0.1, abs=0.005)
     assert longest_silence_s(seen, [], FPS) is None
+    assert longest_silence_s(matches("-0"), [(1, 150.0)], FPS) == 0.0  # arrived when the target was out of view again
 
 
 def test_tracks_tell_what_they_followed_and_what_was_false() -> None:
