@@ -113,7 +113,7 @@ def read_beside(paths: Sequence[Path]) -> list[dict[str, Any]]:
         try:
             score = json.loads(path.read_text(encoding="utf-8"))
             _pictures(score), _called(score["method"])
-        except (OSError, ValueError, LookupError, TypeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ConfigError(f"{path}: is not a metrics.json from evaluate: {error}") from error
         beside.append(score)
     return beside

@@ -82,7 +82,7 @@ def read_flight(folder: Path) -> RecordedFlight:
         ) from error
     except KeyError as error:
         raise InputError(f"{path}: {error.args[0]!r} is missing") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: not as expected: {error}") from error
     _read_received(folder / RECEIVED_JSONL, recording)
     return RecordedFlight(sequence, model, recording, speed)
@@ -112,7 +112,10 @@ def _check(record: Record, recording: Recording) -> None:
     latency_ms = float(record["age_ms"]) if record["event"] == "pose" else latency_ms_of(record, recording)
     if pose.t_cam_target_m.shape != (3,) or pose.R_cam_target.shape != (3, 3):
         raise ValueError("its pose is not three metres and a quaternion")
-    if pose.covariance is not None and pose.covariance.shape != (6, 6):
-        raise ValueError("its covariance is not a 6×6 matrix")
+    if pose.covariance is not None:
+        if pose.covariance.shape != (6, 6):
+            raise ValueError("its covariance is not a 6×6 matrix")
+        if not (np.isfinite(pose.covariance).all() and pose.covariance.diagonal().min() >= 0.0):
+            raise ValueError("its covariance is not finite, or a variance is negative")
     if not np.isfinite([*pose.t_cam_target_m, latency_ms, float(recording.capture_ns(record))]).all():
         raise ValueError("a number is not finite")

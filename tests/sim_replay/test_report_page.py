@@ -283,9 +283,13 @@ def test_a_flight_that_is_none_or_is_damaged_is_named(
     spoiled = tmp_path / "spoiled"
     spoiled.mkdir()
     (spoiled / "flight.json").write_text('{"sequence": "x"}')
+    endless = tmp_path / "endless"
+    endless.mkdir()
+    (endless / "flight.json").write_text('{"start_at_ns": Infinity}')
     for arguments, named in (
         ([tmp_path / "nowhere"], "nowhere/flight.json"),
         ([spoiled], "'start_at_ns' is missing"),
+        ([endless], "endless/flight.json: not as expected"),
         ([flight], "received.jsonl: line 1"),
         ([], "FLIGHT"),
         ([flight, "--dataset", tmp_path], "FLIGHT"),

@@ -55,6 +55,8 @@ def test_a_pose_that_is_one_is_taken(flight: Path) -> None:
         ({"t_cam_target_m": [1.0, 2.0]}, "its pose is not three metres and a quaternion"),
         ({"t_cam_target_m": [0.0, 0.0, float("inf")]}, "a number is not finite"),
         ({"covariance": [[1.0]]}, "its covariance is not a 6×6 matrix"),
+        ({"covariance": [[float("nan")] * 6] * 6}, "its covariance is not finite, or a variance is negative"),
+        ({"covariance": [[-1.0] * 6] * 6}, "its covariance is not finite, or a variance is negative"),
     ],
 )
 def test_a_pose_that_is_none_is_told_with_its_line(flight: Path, change: dict[str, Any], words: str) -> None:

@@ -144,7 +144,7 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_pat
     for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
         with pytest.raises(ConfigError, match="other images"):
             refuse_other_pictures([unlike], [CROSSING])
-    for text in ("no json", "{}", "[]"):
+    for text in ("no json", "{}", "[]", json.dumps({**other, "method": "other_crossing-all.csv"})):
         path.write_text(text)
         with pytest.raises(ConfigError, match=str(path)):
             read_beside([path])
