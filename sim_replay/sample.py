@@ -27,5 +27,5 @@ class SampleBatch:
     box_xyxy_px: NDArray[np.float32]  # [N, 4], of the visible mask, clipped to the image
     mask: NDArray[np.bool_]  # [N, H, W], visible target pixels
     noc: NDArray[np.float16]  # [N, H, W, 3], body-frame surface point / model diameter; zeros off the mask
-    airframe_id: NDArray[np.int32]  # [N], index into sim_replay.airframes.AIRFRAMES, -1 without a target
+    airframe_id: NDArray[np.int32]  # [N], as sim_replay.airframes.airframe_of takes it, -1 without a target
     diameter_m: NDArray[np.float32]  # [N], largest distance between two model points

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs import topics
 from msgs.client import connect
-from msgs.ground.feed import Incoming, listening
-from msgs.ground.fleet import TAKEN, Fleet, TargetRow
+from msgs.ground.feed import listening
+from msgs.ground.fleet import TAKEN, Fleet
 from sim_replay.play import PlayError
 from sim_replay.radio.rig import START_S, Transport, Vehicle, ground
-from sim_replay.radio.trial import CLOCK_TOLERANCE_S, DRAIN_S, Ledger
+from sim_replay.radio.trial import CLOCK_TOLERANCE_S, DRAIN_S, Ledger, taker
+
+MAX_AGE_S = 1.0  # of a pose that is shown
 
 
 @dataclass(frozen=True)
@@ -40,26 +41,16 @@ class FleetOutcome:
     processor_share: float  # of one core: router and watcher together
 
 
-def fly_fleet(
-    vehicles: int, seconds: float, fps: float = 20.0, transport: Transport = "quic", max_age_s: float = 1.0
-) -> FleetOutcome:
+def fly_fleet(vehicles: int, seconds: float, fps: float = 20.0, transport: Transport = "quic") -> FleetOutcome:
     """Start this many vehicles as processes and watch them all. Raises PlayError if nothing is received from one."""
     uavs = [f"uav{number}" for number in range(1, vehicles + 1)]
     ledgers = {uav: Ledger() for uav in uavs}
-    fleet = Fleet(max_age_s=max_age_s)
-
-    def take(incoming: Incoming) -> None:
-        now_ns = time.time_ns()
-        shown = fleet.take(incoming, now_ns)
-        attachment = topics.parse_attachment(incoming.attachment)
-        if isinstance(shown, TargetRow) and attachment is not None:
-            ledgers[shown.uav].show(shown.range_m, attachment[0], now_ns)
-
+    fleet = Fleet(max_age_s=MAX_AGE_S)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="uavpose-fleet-")))
         router = stack.enter_context(ground(folder, transport, uavs))
         session = stack.enter_context(connect(router.loopback))
-        stack.enter_context(listening(session, (), 0, take, fleet.alive, TAKEN))
+        stack.enter_context(listening(session, (), 0, taker(fleet, ledgers), fleet.alive, TAKEN))
         flying = [Vehicle(uav, router.endpoint(router.port), router.keys[uav], fps) for uav in uavs]
         for vehicle in flying:
             stack.callback(vehicle.close)
@@ -77,17 +68,17 @@ def fly_fleet(
         sent = {vehicle.uav: vehicle.end()["sent_pose"] for vehicle in flying}
         threading.Event().wait(DRAIN_S)
         refused = sum(row.refused for row in fleet.rows(time.time_ns()))
-    return _outcome(ledgers, sent, (fps, seconds, max_age_s, transport), refused, share)
+    return _outcome(ledgers, sent, (fps, seconds, transport), refused, share)
 
 
 def _outcome(
     ledgers: dict[str, Ledger],
     sent: dict[str, int],
-    plan: tuple[float, float, float, Transport],
+    plan: tuple[float, float, Transport],
     refused: int,
     share: float,
 ) -> FleetOutcome:
-    fps, seconds, max_age_s, transport = plan
+    fps, seconds, transport = plan
     offered = {uav: ledger.offered(sent[uav]) for uav, ledger in ledgers.items()}
     shown = {uav: len(ledger.rows) for uav, ledger in ledgers.items()}
     rows = [row for ledger in ledgers.values() for row in ledger.rows]
@@ -106,6 +97,6 @@ def _outcome(
         age_p99_s=p99_s,
         age_max_s=float(ages_s.max()),
         refused=refused,
-        late_shown=int((ages_s > max_age_s + CLOCK_TOLERANCE_S).sum()),
+        late_shown=int((ages_s > MAX_AGE_S + CLOCK_TOLERANCE_S).sum()),
         processor_share=share,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,16 +164,21 @@ def _as_program(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[
 @contextmanager
 def _as_watch(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[Callable[[], int]]:
     fleet = Fleet(max_age_s=plan.max_age_s)
+    with listening(session, [UAV], 0, taker(fleet, {UAV: ledger}), fleet.alive, TAKEN):
+        yield lambda: sum(row.refused for row in fleet.rows(time.time_ns()))
+
+
+def taker(fleet: Fleet, ledgers: Mapping[str, Ledger]) -> Callable[[Incoming], None]:
+    """Takes what arrives into the fleet, and each pose that it shows then into its vehicle's ledger."""
 
     def take(incoming: Incoming) -> None:
         now_ns = time.time_ns()
         shown = fleet.take(incoming, now_ns)
         attachment = topics.parse_attachment(incoming.attachment)
         if isinstance(shown, TargetRow) and attachment is not None:
-            ledger.show(shown.range_m, attachment[0], now_ns)
+            ledgers[shown.uav].show(shown.range_m, attachment[0], now_ns)
 
-    with listening(session, [UAV], 0, take, fleet.alive, TAKEN):
-        yield lambda: sum(row.refused for row in fleet.rows(time.time_ns()))
+    return take
 
 
 def outcome_of(

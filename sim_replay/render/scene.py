@@ -41,7 +41,7 @@ def rays_ned(pixels: Array, camera: Camera) -> Array:
 class Target:
     """An aircraft in the scene."""
 
-    airframe_id: int  # index into AIRFRAMES
+    airframe_id: int  # as sim_replay.airframes.airframe_of takes it
     livery_seed: int
     R_ned_body: Array  # [3, 3]
     t_ned_body_m: Array  # [3]
