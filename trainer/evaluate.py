@@ -192,17 +192,13 @@ def sigma_shortfall(a: Predictions, b: Predictions, present: NDArray[np.bool_]) 
 
 def difference(a: Predictions, b: Predictions, present: NDArray[np.bool_]) -> dict[str, float]:
     """Differences of two predictors on the same windows: medians and 95th percentiles over those with a target."""
-    rotation_deg = metrics.rotation_error_deg(a.R_cam_target, b.R_cam_target)[present]
-    depth_rel = np.abs(a.t_cam_target_m[present, 2] / b.t_cam_target_m[present, 2] - 1.0)
-    center_px = np.linalg.norm(a.center_px - b.center_px, axis=-1)[present]
-    sigma_rel = np.abs(a.sigma[present] / b.sigma[present] - 1.0)
-    score = np.abs(a.score - b.score)
+    a, b = (Predictions(*(value[present] for value in one)) for one in (a, b))
     values = {
-        "rotation_deg": rotation_deg,
-        "depth_rel": depth_rel,
-        "center_px": center_px,
-        "sigma_rel": sigma_rel,
-        "score": score,
+        "rotation_deg": metrics.rotation_error_deg(a.R_cam_target, b.R_cam_target),
+        "depth_rel": np.abs(a.t_cam_target_m[:, 2] / b.t_cam_target_m[:, 2] - 1.0),
+        "center_px": np.linalg.norm(a.center_px - b.center_px, axis=-1),
+        "sigma_rel": np.abs(a.sigma / b.sigma - 1.0),
+        "score": np.abs(a.score - b.score),
     }
     return {
         f"{name}_{label}": float(np.percentile(value, percentile))

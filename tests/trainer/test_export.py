@@ -22,6 +22,7 @@ from trainer.evaluate import (
     Predictions,
     choose_threshold,
     constant_guess,
+    difference,
     measure,
     predict_all,
     sigma_shortfall,
@@ -204,6 +205,15 @@ def test_a_contract_that_contradicts_how_the_network_was_trained_is_refused(expo
 def test_an_answer_that_is_no_number_is_refused() -> None:
     assert Strayed(float("nan")).refusal(ANY) is not None
     assert Strayed(1.0, 1.0, -3.0, -4.0).refusal(Tolerance()) is None
+
+
+def test_files_are_compared_on_windows_with_a_target_only() -> None:
+    px, R = np.zeros((4, 2), np.float32), np.repeat(np.eye(3, dtype=np.float32)[None], 4, 0)
+    one = Predictions(np.full(4, 0.5, np.float32), px, px, px, R[:, 2], R, np.ones((4, 6), np.float32))
+    other = one._replace(score=np.array([0.5, 0.5, 0.9, 0.9], np.float32))
+    present = np.array([True, True, False, False])
+    assert set(difference(one, other, present).values()) == {0.0}
+    assert difference(one, other, ~present)["score_median"] == pytest.approx(0.4)
 
 
 def test_sigmas_that_are_told_too_small_are_found_whichever_of_the_six() -> None:
