@@ -82,13 +82,13 @@ def _refine(arguments: argparse.Namespace) -> None:
     from trainer.refine import RefinePlan, refine
 
     plan = RefinePlan(
-        arguments.seed,
-        arguments.windows,
-        arguments.epochs,
-        arguments.strangers,
-        tuple(arguments.dataset),
-        arguments.dataset_share,
-        arguments.split,
+        seed=arguments.seed,
+        windows=arguments.windows,
+        epochs=arguments.epochs,
+        strangers=arguments.strangers,
+        datasets=tuple(arguments.dataset),
+        split=arguments.split,
+        dataset_share=arguments.dataset_share,
     )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")

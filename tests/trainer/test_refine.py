@@ -18,6 +18,7 @@ from sim_replay.airframes.invented import draw_invented
 from sim_replay.sample import SampleBatch
 from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
+from trainer.cli import main
 from trainer.config import ConfigError, DataConfig
 from trainer.equations import heatmap_peaks
 from trainer.losses import pose_residual
@@ -160,6 +161,20 @@ def test_a_test_split_is_refined_on_only_if_named(tmp_path: Path) -> None:
         refine_on(run, tmp_path / "other", "val")
     refine_on(run, tmp_path / "other", "train")
     refine_on(run, tmp_path / "other" / "test")
+
+
+def test_the_command_takes_the_split_and_the_share_of_its_datasets(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own"
+    write_splits(own, "train", "val")
+    asked = f"refine --checkpoint {run_on(tmp_path / 'run', own)} --out {tmp_path / 'out'} --seed 11 --dataset {own}"
+    for more, told in (
+        ("--dataset-share 0.3", "the network was trained on it; give another, or another --split"),
+        ("--dataset-share 0.3 --split test", "no split 'test'; it has train, val"),
+    ):
+        assert main(f"{asked} {more}".split()) == 2
+        assert capsys.readouterr().err == f"uavpose-trainer: --dataset {own}: {told}\n"
 
 
 def test_windows_are_cut_from_the_split_that_is_named(tmp_path: Path) -> None:
