@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from edge.estimator.lens import Lens, lens_of
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
-from sim_replay.bop.fields import integer, load_json
 from sim_replay.bop.layout import TARGETS_FILE, dataset_of
 from sim_replay.bop.models import models_folder
 from sim_replay.bop.scene import Image, Mask, header_size_wh, picture_size_wh, read_picture_bgr
+from sim_replay.bop.target_list import Wanted, chosen_of, read_targets
+from sim_replay.label_fit import Labelled, lie_beside_their_boxes, told_of_places, told_of_sizes
 
 Array = NDArray[np.float64]
-Wanted = dict[tuple[int, int], Counter[int]]  # by scene and image id: how many instances of each object
 _MASKS_LOOKED_AT = 200  # masks that are read to estimate diameters if there are neither models nor boxes
 _log = logging.getLogger(__name__)
 
@@ -124,7 +124,7 @@ class Dataset:
                         passed_over += 1
                         continue
                     met.add(key)
-                    indices = _chosen(frame.targets, wanted[key])
+                    indices = chosen_of(frame.targets, wanted[key])
                 yield self._frame(scene, frame, indices)
         if passed_over and not met:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
@@ -148,20 +148,26 @@ class Dataset:
     def labelled_frames(self) -> list[DatasetFrame]:
         """The frames() with known ground truth: some datasets do not publish that of their test splits.
 
-        Raises BopError, also if it is known for none.
+        Warns of labels that do not fit each other. Raises BopError, also if the ground truth is known for none.
         """
         frames = list(self.frames())
-        labelled = [frame for frame in frames if frame.truth_known]
-        if frames and not labelled:
+        known = [frame for frame in frames if frame.truth_known]
+        if frames and not known:
             raise BopError(f"{self.root}: no scene_gt.json (or KEY.gt.json) tells what its pictures show")
-        if len(labelled) < len(frames):
-            _log.warning("%s: what %d pictures show is not told", self.root, len(frames) - len(labelled))
-        return labelled
+        told = "%s: %d pictures count nowhere: no scene_gt.json (or KEY.gt.json) tells what they show"
+        for folder, number in Counter(frame.scene.folder for frame in frames if not frame.truth_known).items():
+            _log.warning(told, folder, number)
+        labelled = _labelled(known)
+        diameters_m = {object_id: model.diameter_m for object_id, model in self.models.items()}
+        for misfit in (told_of_places(labelled), told_of_sizes(labelled, diameters_m)):
+            if misfit is not None:
+                _log.warning("%s: %s", self.root, misfit)
+        return known
 
     def boxed_frames(self) -> list[DatasetFrame]:
         """The labelled_frames(), each target with a visible box or known to be invisible.
 
-        Raises BopError, also for a target of unknown visibility.
+        Raises BopError, also for a target of unknown visibility, and if most targets lie beside their boxes.
         """
         frames = self.labelled_frames()
         for frame in frames:
@@ -171,11 +177,15 @@ class Dataset:
                         f"{frame.scene.folder}: nothing tells where picture {frame.image_id} shows its target of "
                         f"obj_id {target.object_id}: give scene_gt_info.json, masks, or a model with a mesh or a box"
                     )
+        if lie_beside_their_boxes(_labelled(frames)):
+            raise BopError(
+                f"{self.root}: most poses project beside their boxes: nothing can be learnt from such labels"
+            )
         return frames
 
     @cached_property
     def _wanted(self) -> Wanted | None:
-        return _read_targets(self.root / TARGETS_FILE)
+        return read_targets(self.root / TARGETS_FILE)
 
     def _frame(self, scene: BopScene, frame: BopFrame, indices: Sequence[int]) -> DatasetFrame:
         path = scene.image_path(frame)
@@ -235,32 +245,9 @@ def _is_test(scene: BopScene) -> bool:
     return scene.split is not None and scene.split.startswith("test")
 
 
-def _read_targets(path: Path) -> Wanted | None:
-    """test_targets_bop19.json; None if the dataset has none. Raises BopError."""
-    if not path.is_file():
-        return None
-    entries = load_json(path)
-    if not isinstance(entries, list):
-        raise BopError(f"{path} does not hold a list of targets")
-    wanted: Wanted = {}
-    for number, entry in enumerate(entries):
-        scene_id, image_id, object_id = (
-            integer(path, f"entry {number}", entry, name) for name in ("scene_id", "im_id", "obj_id")
-        )
-        count = integer(path, f"entry {number}", entry, "inst_count") if "inst_count" in entry else 1
-        wanted.setdefault((scene_id, image_id), Counter())[object_id] += count
-    return wanted
-
-
-def _chosen(targets: Sequence[BopTarget], wanted: Counter[int]) -> list[int]:
-    """Indices of the wanted instances of each object; if there are too many, the most visible ones."""
-    by_visible = sorted(range(len(targets)), key=lambda index: -(targets[index].visible_px or 0))
-    left, chosen = wanted.copy(), []
-    for index in by_visible:
-        if left[targets[index].object_id] > 0:
-            left[targets[index].object_id] -= 1
-            chosen.append(index)
-    return sorted(chosen)
+def _labelled(frames: Sequence[DatasetFrame]) -> list[Labelled]:
+    every = ((frame, target) for frame in frames for target in frame.targets)
+    return [Labelled(target, frame.K, frame.distortion, frame.scene.folder) for frame, target in every]
 
 
 def _unseen(target: BopTarget) -> bool:

@@ -21,6 +21,7 @@ from msgs.settings import read_toml
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, find_scenes, object_names
 from sim_replay.bop.fields import integer, load_object
 from sim_replay.evaluation.judge import is_seen
+from sim_replay.label_fit import Labelled, lies_beside_its_box
 
 RANGE_EDGES_M = tuple(range(100, 501, 50))
 # FW-UAV6DPose according to the paper's dataset section. It prints 7,725 training images; its total requires 8,425.
@@ -47,6 +48,7 @@ class _Counts:
     range_m: list[float] = field(default_factory=list)
     focal_px: list[float] = field(default_factory=list)  # one per scene
     box_share: list[float] = field(default_factory=list)
+    beside_box: list[bool] = field(default_factory=list)
     visible_fraction: list[float] = field(default_factory=list)
     below_camera: list[bool] = field(default_factory=list)  # where the world is known to be local NED
     distorted: int = 0  # scenes
@@ -85,6 +87,8 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
     flown = _toml(scene.folder / "sequence.toml")
     for frame in frames:
         _take_frame(counts, split, frame, size[0] * size[1], names, in_ned=bool(flown))
+        fits = (lies_beside_its_box(Labelled(t, frame.K, frame.distortion, scene.folder)) for t in frame.targets)
+        counts.beside_box += [beside for beside in fits if beside is not None]
     if flown.get("airframe") and "flight_seed" in flown:
         seed = flown["flight_seed"]
         if not isinstance(seed, int):
@@ -161,6 +165,7 @@ def _summary(counts: _Counts) -> dict[str, Any]:
         "range_m": _spread(counts.range_m),
         "range_histogram_m": dict(zip(edges, (int(n) for n in histogram), strict=True)),
         "box_share": _spread(counts.box_share),
+        "beside_box_share": float(np.mean(counts.beside_box)) if counts.beside_box else None,
         "focal_px": _spread(counts.focal_px),
         "distorted_sequences": counts.distorted,
         "targets_per_frame": {str(n): counts.targets_in_frame[n] for n in sorted(counts.targets_in_frame)},
@@ -203,6 +208,8 @@ def _rows(s: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     if b := s["box_share"]:
         spread = f"(5th to 95th percentile: {100 * b['p5']:.2f}–{100 * b['p95']:.2f} %)"
         yield "visible box / image area, mean", f"{100 * b['mean']:.3f} % {spread}", PAPER["box_share"]
+    if s["beside_box_share"] is not None:
+        yield "poses that project beside their box", f"{100 * s['beside_box_share']:.1f} %", "not given"
     if f := s["focal_px"]:
         yield "focal length", f"{f['min']:.0f}–{f['max']:.0f} px, median {f['median']:.0f}", "not given"
     yield "sequences with distortion", str(s["distorted_sequences"]), "not given"
