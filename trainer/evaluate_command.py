@@ -91,6 +91,7 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from sim_replay.evaluation.axes import told_of_axes
     from sim_replay.evaluation.table import score_table, table_console
     from trainer.config import ConfigError, refuse_no_folder
     from trainer.evaluate_dataset import DatasetRequest, OwnShipTold, evaluate_dataset
@@ -121,6 +122,8 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
         print(json.dumps(evaluation.score, indent=2, allow_nan=False))
     else:
         table_console().print(score_table(evaluation.score))
+    for told in told_of_axes(evaluation.judged):
+        errors.print(told, markup=False, highlight=False, soft_wrap=True)
     names = [path.name for path in files if not path.name.startswith("sequence_")]
     drawn = f"{len(files) - len(names)} sequence_*.png"
     written = f"written to {arguments.out}: {', '.join([*names, drawn])}"

@@ -14,8 +14,8 @@ from sim_replay import metrics
 from sim_replay.bop import Model
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.ground_truth import extents_of
-from sim_replay.overlay import ESTIMATE_BGR, TRUTH_BGR, Extents, draw_pose, project, window_camera
-from sim_replay.score import Match
+from sim_replay.overlay import ESTIMATE_BGR, TRUTH_BGR, Color, Extents, draw_pose, project, window_camera
+from sim_replay.score import Match, TargetPose
 
 Image = NDArray[np.uint8]
 
@@ -26,6 +26,7 @@ _TILE_PX = 420
 _CAPTION_PX = 54
 _VIEW_SCALE = 2.6  # side of the cut-out over the target's projected box
 _VIEW_MIN_PX = 96
+_UP_LENGTHS = 0.3  # length of the line that leads up, over the target's own
 
 
 def badness(match: Match) -> float:
@@ -83,7 +84,10 @@ def _tile(frame: JudgedFrame, match: Match, models: Mapping[int, Model]) -> Imag
 
 
 def close_up(image_bgr: Image, K: Array, match: Match, extents: Extents, side_px: int) -> Image:
-    """The target's surroundings enlarged to [side_px, side_px, 3], with true and estimated box."""
+    """The target's surroundings enlarged to [side_px, side_px, 3], with true and estimated box.
+
+    Beside the nose's arrow, a line leads up from each, like a fin: axes that are turned about the nose show by it.
+    """
     truth, estimate = match.truth, match.estimate
     corners = project(extents.corners_m() @ truth.R_cam_target.T + truth.t_cam_target_m, K)
     low, high = (np.zeros(2), np.array(image_bgr.shape[1::-1])) if corners is None else (corners.min(0), corners.max(0))
@@ -92,10 +96,20 @@ def close_up(image_bgr: Image, K: Array, match: Match, extents: Extents, side_px
     view = _cut(image_bgr, left, top, side)
     inset = np.asarray(cv2.resize(view, (side_px, side_px), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     K_view = window_camera(K, (left, top), side_px / side)
-    draw_pose(inset, K_view, truth, extents, TRUTH_BGR, 2)
-    if estimate is not None:
-        draw_pose(inset, K_view, estimate, extents, ESTIMATE_BGR, 1)
+    for pose, color, thickness in ((truth, TRUTH_BGR, 2), (estimate, ESTIMATE_BGR, 1)):
+        if pose is not None:
+            draw_pose(inset, K_view, pose, extents, color, thickness)
+            _draw_up(inset, K_view, pose, extents, color, thickness)
     return inset
+
+
+def _draw_up(canvas: Image, K: Array, pose: TargetPose, extents: Extents, color: Color, thickness: int) -> None:
+    """A line from the target's origin, up in its own axes, in place; nothing for a pose of unknown rotation."""
+    tip_m = [0.0, 0.0, min(extents.min_m[2], 0.0) - _UP_LENGTHS * extents.size_m[0]]
+    ends_px = project(np.array([np.zeros(3), tip_m]) @ pose.R_cam_target.T + pose.t_cam_target_m, K)
+    if ends_px is not None and pose.rotation_known and np.abs(ends_px).max() < 1e5:
+        start, end = ((int(u), int(v)) for u, v in np.round(ends_px))
+        cv2.line(canvas, start, end, color, thickness + 1, cv2.LINE_AA)
 
 
 def _cut(image_bgr: Image, left: int, top: int, side: int) -> Image:
