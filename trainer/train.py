@@ -25,12 +25,11 @@ OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to 
 
 
 @contextlib.contextmanager
-def stop_on_signals() -> Iterator[list[int]]:
-    """A list that SIGTERM and SIGINT append to, so that the loop ends between two steps."""
-    received: list[int] = []
-    previous = {s: signal.signal(s, lambda number, _: received.append(number)) for s in (signal.SIGTERM, signal.SIGINT)}
+def kept_for_later(received: list[int], *signals: signal.Signals) -> Iterator[None]:
+    """Signals are only appended to a list, so that the loop ends between two steps."""
+    previous = {s: signal.signal(s, lambda number, _: received.append(number)) for s in signals}
     try:
-        yield received
+        yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -98,8 +97,12 @@ def run_training(
             before, now = (one.progress(trainer.samples, plan.used_before_s) for one in (earlier, plan))
             if now < before:
                 loop.note(f"with the new plan the schedule goes back from {before:.0%} to {now:.0%}")
-            with stop_on_signals() as stopped:
-                loop.run(stopped, max_steps)
+            stopped: list[int] = []
+            # Only a second Ctrl-C ends the last validation: who starts a run may send it SIGTERM as well.
+            with kept_for_later(stopped, signal.SIGTERM):
+                with kept_for_later(stopped, signal.SIGINT):
+                    loop.run(stopped, max_steps)
+                loop.finish()
     return trainer
 
 
@@ -134,27 +137,37 @@ class _Loop:
             self.log.note(text)
 
     def run(self, stopped: list[int], max_steps: int | None) -> None:
+        """Train and save a checkpoint."""
         last_step = None if max_steps is None else self.trainer.steps + max_steps
-        reason = "planned number of samples reached"
+        reason, goes_on = "planned number of samples reached", "--resume --samples N"
         worth_saving = True
         try:
             self.size_px = size_at(self.config.schedule, self.progress())  # a resumed run may already be complete
             while (progress := self.progress()) < 1.0:
                 size_px = size_at(self.config.schedule, progress)
                 if self._train_at(size_px, stopped, last_step):
-                    reason = "stopped before the planned number of samples"
+                    reason, goes_on = "stopped before the planned number of samples", "--resume"
                     break
             if self.plan.budget_s and self.used_s() >= self.plan.budget_s:
-                reason = "time budget used up"
+                reason, goes_on = "time budget used up", "--resume --budget-minutes M"
         except Diverged:
             worth_saving = False
             raise ConfigError(self._divergence()) from None
         finally:
             if self.trainer.steps > 0 and worth_saving:  # a run that failed before its first step cannot be resumed
                 self.save()
-        self.validate(self.size_px)
-        self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples; resume with --resume")
-        if self.log is not None:
+        how = f"; {goes_on} continues" if self.trainer.steps > 0 else ""
+        self.note(f"{reason}: {self.trainer.steps} steps, {self.trainer.samples} samples{how}")
+
+    def finish(self) -> None:
+        """Validate once more and close the log."""
+        if self.log is None:
+            return
+        try:
+            if self.trainer.steps > 0 and not self._is_validated(self.size_px):
+                self.note("last validation (Ctrl-C skips it)")
+                self.validate(self.size_px)
+        finally:
             self.log.close()
 
     def _divergence(self) -> str:
@@ -196,9 +209,12 @@ class _Loop:
         if trainer.steps % self.config.run.log_every_steps == 0:
             self.log.report(trainer.steps, trainer.samples, progress, trainer.optimizer.param_groups[-1]["lr"])
 
+    def _is_validated(self, size_px: int) -> bool:
+        return self.validated == (self.trainer.samples, size_px)
+
     def validate(self, size_px: int) -> None:
         """Evaluate the averaged network on held-out windows of this size, rendered once; log metrics and examples."""
-        if self.log is None or self.validated == (self.trainer.samples, size_px):
+        if self.log is None or self._is_validated(size_px):
             return
         self.validated = (self.trainer.samples, size_px)
         if size_px not in self.held_out:

@@ -114,5 +114,27 @@ def test_a_run_whose_whole_group_is_told_to_stop_ends_as_one_that_was_asked_to(t
             process.kill()
     assert process.returncode == 0
     assert "stopped before the planned number of samples" in said
+    assert ("; --resume continues" in said) == (tmp_path / "run" / "resume.pt").exists()
     if renderer == "rendering":  # else it may have been stopped before it had learnt anything
         assert (tmp_path / "run" / "resume.pt").exists()
+
+
+def test_a_second_ctrl_c_ends_the_last_validation_of_a_run_that_is_saved(tmp_path: Path) -> None:
+    """As torchrun does, SIGTERM follows the first; windows to validate on are never rendered here."""
+    endless = SLOW.format(tests=str(Path(tiny.__file__).parent)).replace("0.5", "1000 if self.seed == 4 else 0")
+    (tmp_path / "slow.py").write_text(endless)
+    command = [sys.executable, str(tmp_path / "slow.py"), str(tmp_path / "run")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            next(line for line in process.stdout if line.startswith("step"))
+            process.send_signal(signal.SIGINT)
+            assert any("; --resume continues" in line for line in process.stdout)
+            assert next(process.stdout) == "last validation (Ctrl-C skips it)\n"
+            assert (tmp_path / "run" / "resume.pt").exists()
+            process.send_signal(signal.SIGTERM)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert said.rstrip().endswith("KeyboardInterrupt")  # SIGTERM would have left no traceback
