@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.bop import BopError, BopTarget
+from sim_replay.bop.scene import refuse_broken
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.sample import AcquireView, SampleBatch
 from trainer.config import Z_RANGE_M, ConfigError
@@ -64,6 +65,18 @@ class DatasetSampler:
     def scene_folders(self) -> set[Path]:
         """Folders of the scenes, without links."""
         return {frame.scene.folder.resolve() for frame in self._frames}
+
+    def refuse_broken_pictures(self) -> None:
+        """Raises ConfigError, naming the first of the images that are none or are truncated."""
+        broken: list[str] = []
+        for frame in self._frames:
+            try:
+                refuse_broken(frame.image_path)
+            except BopError as error:
+                broken.append(str(error))
+        if broken:
+            others = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
+            raise ConfigError(broken[0] + others)
 
     @property
     def depths_m(self) -> Array:

@@ -105,6 +105,7 @@ def refuse_unreadable(config: DataConfig) -> None:
                 opened = DatasetSampler(
                     source.path, split, config.seed, size_px, config.acquire_share, config.acquire_view
                 )
+                opened.refuse_broken_pictures()
                 show_targets[purpose].append(opened.shows_targets)
                 scenes[purpose] |= opened.scene_folders
     if both := scenes["train"] & scenes["validate"]:

@@ -27,7 +27,7 @@ def find_scenes(path: Path) -> tuple[BopScene, ...]:
     Raises BopError if there is none, or two of one split have the same number.
     """
     if not path.is_dir():
-        raise BopError(f"{path} is not a folder")
+        raise BopError(f"{path} is not a folder" + ("" if path.is_absolute() else f" in {Path.cwd()}"))
     try:
         scenes = [scene for folder in _walk(path, _DEEPEST) for scene in _scenes_of(folder)]
     except OSError as error:

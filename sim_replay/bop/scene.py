@@ -24,6 +24,7 @@ Mask = NDArray[np.bool_]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later one is used if a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
+_TAIL_BYTES = 512  # of a JPEG, where its end marker is, unless something follows it
 SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _log = logging.getLogger(__name__)
 
@@ -215,6 +216,21 @@ def _pixels(path: Path, flags: int) -> NDArray[Any]:
     if pixels is None:
         raise BopError(f"{path} is not a readable picture")
     return pixels
+
+
+def refuse_broken(path: Path) -> None:
+    """Raises BopError for a file that is no picture or a truncated JPEG; reads little of most others."""
+    if header_size_wh(path) is None or not _ends_as_it_should(path):
+        read_picture_bgr(path)
+
+
+def _ends_as_it_should(path: Path) -> bool:
+    """False for a JPEG without an end marker near its end: the whole file tells whether it is truncated."""
+    with path.open("rb") as file:
+        if file.read(2) != b"\xff\xd8":
+            return True
+        file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
+        return b"\xff\xd9" in file.read()
 
 
 def _is_torn_jpeg(coded: bytes) -> bool:

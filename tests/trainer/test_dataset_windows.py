@@ -244,6 +244,27 @@ def test_a_wrong_validation_split_is_told_before_the_first_step(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_a_broken_image_is_told_before_the_first_step(dataset: Path, tmp_path: Path, split: str) -> None:
+    """It would end the run whenever it is drawn, at night; one of the validation split at the first validation."""
+    root = tmp_path / "own"
+    for name in ("train", "val"):
+        shutil.copytree(dataset / "train", root / name)
+    source = f'[[data.datasets]]\npath = "{root}"\nshare = 0.5\nvalidation_split = "val"\n[schedule]'
+    data = parse_config(tiny.TOML.replace("[schedule]", source), "own.toml").data
+    refuse_unreadable(data)
+    first, second, *_ = sorted((root / split / "000003" / "rgb").iterdir())
+    with first.open("ab") as file:
+        file.write(b"something that a camera appends" * 1000)
+    refuse_unreadable(data)
+    second.write_bytes(second.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match=rf"{second} is cut short.*gray$"):
+        refuse_unreadable(data)
+    first.write_bytes(b"")
+    with pytest.raises(ConfigError, match=rf"{first} is not a readable picture \(and 1 more such pictures\)"):
+        refuse_unreadable(data)
+
+
 def test_the_examples_of_the_page_on_datasets_are_configurations() -> None:
     page = (Path(__file__).parents[2] / "docs" / "datasets.md").read_text()
     examples = re.findall(r"```toml\n(\[\[data\.datasets\]\].*?)```", page, re.DOTALL)
