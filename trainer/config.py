@@ -26,11 +26,12 @@ class RenderingError(RuntimeError):
 
 
 def made_folder(path: Path) -> Path:
-    """Create the folder if it does not exist, and return it. Raises ConfigError if it cannot be created."""
+    """Create the folder if it does not exist, and return it. Raises ConfigError if it cannot be created or written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+    refuse_no_folder(path)
     return path
 
 
@@ -40,7 +41,7 @@ def refuse_no_folder(path: Path) -> None:
     if not there.is_dir():
         raise ConfigError(f"{path}: cannot be made a folder: {there} is a file")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"{path}: cannot be made a folder: {there} is not yours to write to")
+        raise ConfigError(f"{path}: cannot be written: {there} is read-only, or belongs to another user")
 
 
 class ModelConfig(Section):

@@ -135,7 +135,7 @@ def _on_windows(arguments: argparse.Namespace) -> None:
     from rich.progress import Progress
 
     from sim_replay.offline import SHIPPED_MODEL
-    from trainer.config import ConfigError, made_folder
+    from trainer.config import ConfigError, made_folder, refuse_no_folder
     from trainer.evaluate import null_where_unknown
     from trainer.held_out import Request, evaluate_file
 
@@ -147,6 +147,7 @@ def _on_windows(arguments: argparse.Namespace) -> None:
             )
     if arguments.score_min is not None:
         raise ConfigError("--score-min: cannot be combined with --windows, which uses the thresholds of the file")
+    refuse_no_folder(arguments.out)
     model = arguments.model or SHIPPED_MODEL
     request = Request(model, arguments.windows, arguments.seed, arguments.stage, arguments.size)
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:

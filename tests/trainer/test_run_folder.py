@@ -263,6 +263,15 @@ def test_a_folder_that_cannot_be_is_named(tmp_path: Path, capsys: pytest.Capture
     assert capsys.readouterr().err.count(f"uavpose-trainer: {out}: cannot be made a folder: Not a directory\n") == 2
 
 
+def test_a_folder_that_nobody_may_write_to_is_named_before_anything_is_rendered(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (["export", "--checkpoint", str(run)], ["evaluate", "--model", str(run), "--windows", "16"]):
+        assert main([*command, "--out", "/proc/self"]) == 2
+        told = "uavpose-trainer: /proc/self: cannot be written: /proc/self is read-only, or belongs to another user\n"
+        assert capsys.readouterr() == ("", told)
+
+
 def test_ctrl_c_where_nothing_is_to_be_kept_ends_without_a_traceback(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
