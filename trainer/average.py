@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import torch
 
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, load_model, write_atomic
 from trainer.config import ConfigError, made_folder
+
+_log = logging.getLogger(__name__)
 
 
 def average(runs: Sequence[Path], out: Path) -> Path:
@@ -25,6 +28,12 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     for run, config in zip(runs, configs, strict=True):
         if config.model.deployed() != configs[-1].model.deployed():
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
+    known = {(source.path.resolve(), source.split) for source in configs[-1].data.datasets}
+    for run, config in zip(runs, configs, strict=True):
+        for source in config.data.datasets:
+            if (source.path.resolve(), source.split) not in known:
+                told = "%s: was trained on %s (%s), of which the mean, with the last run's configuration, knows nothing"
+                _log.warning(told, run, source.path, source.split)
     last, every = contents[-1], [content["weights"] for content in contents]
     weights = {
         # Training-only heads may be missing in some runs; they are averaged over the others.

@@ -249,7 +249,7 @@ def told(head: RefinementHead, kept: Kept, first: int) -> str:
     nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
     left = (residual[:, RANGE] + correction).abs()
     words = [f"NLL {nll:.3f}"]
-    for name, of in (("fleet", ~strange), ("generated aircraft", strange)):
+    for name, of in (("fleet and datasets", ~strange), ("generated aircraft", strange)):
         if of.any():
             before, after = residual[of, RANGE].abs().mean(), left[of].mean()
             scale = torch.exp(log_sigma[of, RANGE]).median()

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from msgs.contract import ModelContract
 from trainer.config import ConfigError
 
+if TYPE_CHECKING:
+    from sim_replay.datasets import Dataset
+
+_log = logging.getLogger(__name__)
 # A false target costs more than a target found a few frames later, so the threshold for a new one is high; a target
 # being tracked is given up only at a low probability.
 ACQUIRE_PROBABILITY_MIN, TRACK_PROBABILITY_MIN = 0.7, 0.3
@@ -74,6 +80,8 @@ def calibrate_file(
         raise ConfigError(f"{path}: its folder is not writable")
     try:
         datasets = [open_dataset(folder, split) for folder in folders]
+        for dataset in datasets:
+            _warn_of_training_images(dataset, contract)
         of_each = [dataset.boxed_frames() for dataset in datasets]
         pictures = [picture for frames in of_each for picture in frames]
         on_start(len(pictures))
@@ -107,3 +115,13 @@ def calibrate_file(
     contract = contract.model_copy(update=changes | {"metrics": metrics, "training": training})
     write_contract(path, contract)
     return contract
+
+
+def _warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
+    """By name, as a model file knows no folders: a network is too sure of images that it was trained on."""
+    splits = sorted({scene.split for scene in dataset.scenes if scene.split is not None})
+    for split in splits:
+        # Training on `train` takes in `train_pbr`.
+        if any(f"{dataset.name}, split {name}: " in contract.data for name in (split, split.partition("_")[0])):
+            told = "%s: the model was trained on split %s of a dataset of this name; if it is this one, calibrated "
+            _log.warning(told + "scores promise too much: give another --split, such as val", dataset.root, split)

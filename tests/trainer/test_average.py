@@ -45,6 +45,18 @@ def test_training_only_heads_that_one_run_lacks_are_the_other_s(tmp_path: Path) 
     assert all(torch.equal(mean[name], kept[name]) for name in only_training)
 
 
+def test_images_that_only_an_earlier_run_was_trained_on_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The mean's file would not tell of them, and `refine` would take windows from them."""
+    own = tiny.TOML.replace("[schedule]", '[[data.datasets]]\npath = "/data/hawks"\nshare = 0.5\n[schedule]')
+    rendered, hawks = write_run(tmp_path / "a", 1), write_run(tmp_path / "b", 2, own)
+    average([rendered, hawks], tmp_path / "mean")
+    assert caplog.text == ""
+    average([hawks, rendered], tmp_path / "other")
+    assert f"{hawks}: was trained on /data/hawks (train), of which the mean, with the last run's" in caplog.text
+
+
 def test_a_run_that_may_go_on_keeps_its_own_weights(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, seed) for seed, name in enumerate("ab", start=1)]
     write_atomic(runs[1] / "resume.pt", {})

@@ -163,6 +163,22 @@ def test_a_calibrated_file_tells_targets_from_what_fooled_it(
     assert sum(len(frame.false_poses) for frame in judged) <= 2
 
 
+def test_images_that_the_model_was_trained_on_are_warned_of(
+    tmp_path: Path, dark_spot_model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for split in ("train_pbr", "val"):
+        write_scene(tmp_path / "dataset" / split / "000000", spots=24, specks=24)
+    model = tmp_path / "model.onnx"
+    shutil.copy(dark_spot_model, model)
+    trained_on = "dataset, split train: 50%; rendered windows: 50%, of them 20% without a target"
+    write_contract(model, read_contract(model).model_copy(update={"data": trained_on}))
+    command = ["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]
+    assert main([*command, "--split", "val"]) == 0
+    assert caplog.text == ""
+    assert main(command) == 0
+    assert f"{tmp_path / 'dataset'}: the model was trained on split train_pbr of a dataset of this name" in caplog.text
+
+
 def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_spot_model: Path) -> None:
     K, lens = np.array([[FOCAL_PX, 0, CX_PX], [0, FOCAL_PX, CY_PX], [0, 0, 1]]), (-1.0, 0.0, 0.0, 0.0, 0.0)
     scene = tmp_path / "dataset" / "val" / "000000"
