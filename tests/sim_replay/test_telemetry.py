@@ -15,6 +15,11 @@ def rows() -> list[str]:
     return [",".join(COLUMNS), *(f"{k * 20_000_000},{still}" for k in range(4))]
 
 
+def test_the_page_on_replay_has_every_column() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "replay.md").read_text()
+    assert [name for name in COLUMNS if f"`{name}`" not in page] == []
+
+
 def write(path: Path, lines: list[str], encoding: str = "utf-8") -> Path:
     path.write_text("\n".join(lines) + "\n", encoding=encoding)
     return path
