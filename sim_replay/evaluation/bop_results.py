@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1, though not every dataset does
 UNKNOWN_TIME_S = -1.0
 _ROTATION_TOLERANCE = 0.02
+_UNITS_REL = 100.0  # no method is off by so much, but metres for millimetres are
 _LARGEST = 1e15  # beyond it, squares and sums exceed what JSON can represent
 
 Array = NDArray[np.float64]
@@ -99,6 +100,7 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
     known = {(scene.scene_id, frame.image_id) for scene in dataset.scenes for frame in scene.frames}
     if by_picture and not known & by_picture.keys():
         raise InputError(f"{path}: none of its scene_id and im_id is a picture of {dataset.name}")
+    _warn_of_other_units(path, by_picture, dataset)
 
     def answer(index: int, picture: DatasetFrame) -> Answer:
         rows = by_picture.get((picture.scene_id, picture.image_id), [])
@@ -113,6 +115,17 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
         )
 
     return answer
+
+
+def _warn_of_other_units(
+    path: Path, by_picture: Mapping[tuple[int, int], Sequence[ResultRow]], dataset: Dataset
+) -> None:
+    told_m = [np.linalg.norm(row.t_cam_model_m) for rows in by_picture.values() for row in rows]
+    targets = (target for scene in dataset.scenes for frame in scene.frames for target in frame.targets)
+    true_m = [np.linalg.norm(target.t_cam_target_m) for target in targets]
+    if told_m and true_m and not 1 / _UNITS_REL < np.median(told_m) / np.median(true_m) < _UNITS_REL:
+        distances = f"its poses lie {np.median(told_m):.3g} m from the camera, the targets {np.median(true_m):.3g} m"
+        _log.warning("%s: %s (medians): t is in millimetres", path, distances)
 
 
 def _best(rows: Sequence[ResultRow], there: Sequence[int]) -> set[int]:

@@ -82,6 +82,19 @@ def test_who_names_no_object_or_another_one_fills_what_is_left_by_score(root: Pa
     assert len(frames[0].false_poses) == 1
 
 
+def test_poses_in_metres_are_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = results(root.parent, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)])
+    file_answers(path, open_dataset(root))
+    assert caplog.text == ""
+    path.write_text(
+        path.read_text().replace(f"{1e3 * LEFT} 0 200000", f"{LEFT} 0 200").replace("5000.0 0 200000", "5 0 200")
+    )
+    file_answers(path, open_dataset(root))
+    assert (
+        f"{path}: its poses lie 0.2 m from the camera, the targets 200 m (medians): t is in millimetres" in caplog.text
+    )
+
+
 def test_a_false_pose_is_not_written_as_one_of_an_object_that_a_dataset_numbers_0(root: Path) -> None:
     """Read again, the surest pose would have taken the place of a right one."""
     for path in (root / "test" / "000000" / "scene_gt.json", root / "models" / "models_info.json"):
