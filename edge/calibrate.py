@@ -77,9 +77,10 @@ def calibrate(source: Path, board: BoardSettings, coefficients: Coefficients) ->
     if size_wh is None or boards == 0:
         raise InputError(f"{source}: no image shows the whole board as described by --pattern and --squares")
     if len(views) < VIEWS_MIN:
+        rarely = "keep all of it in the image, check --squares, and " if 2 * boards < pictures else ""
         raise InputError(
             f"{source}: {boards} of {pictures} images show the board, but only {len(views)} views of it differ; "
-            f"{VIEWS_MIN} are needed: move and tilt the board more"
+            f"{VIEWS_MIN} are needed: {rarely}move and tilt the board more"
         )
     found = calibration_of(spread(views), size_wh, coefficients, boards, pictures)
     if isinstance(found, str):

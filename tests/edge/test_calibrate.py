@@ -150,7 +150,12 @@ def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path
     still = film(tmp_path / "still", "charuco", poses(0.5, 1.0)[:2] * 3)
     done = cli("calibrate", still)
     assert done.returncode == 2
-    assert "6 of 6 images show the board, but only 2 views of it differ" in done.stderr
+    told = "images show the board, but only 2 views of it differ; 8 are needed:"
+    assert f"6 of 6 {told} move and tilt the board more\n" in done.stderr
+    for index in range(6, 14):
+        cv2.imwrite(str(still / f"{index}.png"), np.full(SIZE_WH[::-1], 120, np.uint8))
+    done = cli("calibrate", still)
+    assert f"6 of 14 {told} keep all of it in the image, check --squares, and move" in done.stderr
     assert not (tmp_path / "camera.yaml").exists()
 
 
