@@ -168,7 +168,10 @@ class Station:
         self.counters["tracks_withheld"] += len(report.tracks) - len(tracks)
         first = self._primary.of(report.tracks, tracks, report.chosen_id, now_ns)
         self._sight = Sight(report, tracks, first, now_ns)
-        seen = self._seen(report, first, now_ns) if self._schedule.due(IMAGE_STATUS, 0, now_ns) else None
+        shown = first or self._primary.in_image(
+            report.tracks, rangeless(report, now_ns, self._settings.max_age_ms), report.chosen_id, now_ns
+        )
+        seen = words.image_status(report, shown) if self._schedule.due(IMAGE_STATUS, 0, now_ns) else None
         if self.vehicle.contact is not Contact.HEARD:
             return [self._image_status(seen)] if seen is not None else []
         out = [self._target_relative(report, track) for track in tracks if self._wants_target_relative(track, now_ns)]
@@ -179,13 +182,6 @@ class Station:
         if place is not None:
             out.append(self._letter(place, camera=True, unknown=words.GEO_STATUS_UNKNOWN))
         return out + self._traffic(report, tracks, first, now_ns)
-
-    def _seen(self, report: Report, first: Track | None, now_ns: int) -> Any:
-        """The image status: that of `first`, or of a target of which no more than its place in the image is known."""
-        if first is None:
-            unknown = rangeless(report, now_ns, self._settings.max_age_ms)
-            first = self._primary.in_image(report.tracks, unknown, report.chosen_id, now_ns)
-        return words.image_status(report, first)
 
     def event(self, severity: int, text: str, now_ns: int, of_state: bool = False) -> list[Letter]:
         """STATUSTEXT for the operator; `severity` is a MAV_SEVERITY. Warnings and errors are always sent; lesser ones

@@ -105,3 +105,26 @@ def test_who_lost_the_range_of_the_target_told_shows_its_box_and_leads_nobody_to
     assert primary.in_image([one, other], [], None, 1) is None
     assert primary.of([one, other], [], 1, 2) is None, "a person chose the other"
     assert primary.in_image([one, other], [one, other], 1, 2) is other
+
+
+def test_who_has_no_range_of_two_targets_shows_the_box_of_one_and_the_same() -> None:
+    """Although in every third frame it is the other one alone that is detected; then the other alone has a range."""
+    primary, one, other, shown = Primary(), near(5, 5), far(5), []
+    for frame in range(300):
+        now_ns = frame * FRAME_NS
+        first = replace(one, state=TrackState.COASTING) if frame % 3 == 1 else one
+        ranged = [other] if 150 <= frame < 160 else []
+        told = primary.of([first, other], ranged, None, now_ns)
+        assert told is (other if ranged else None)
+        box = told or primary.in_image([first, other], [first, other], None, now_ns)
+        assert box is not None
+        shown.append(box.track_id)
+    assert shown == [one.track_id] * 150 + [other.track_id] * 150
+
+
+def test_a_box_shown_without_a_range_is_not_replaced_by_another_until_it_is_withheld_for_long() -> None:
+    primary, one, other = Primary(), near(5, 5), far(5)
+    assert primary.in_image([one, other], [one, other], None, 0) is one
+    assert primary.in_image([one, other], [other], None, WITHHELD_MAX_NS) is None
+    assert primary.in_image([one, other], [other], None, WITHHELD_MAX_NS + 1) is other
+    assert primary.in_image([one, other], [one, other], None, WITHHELD_MAX_NS + 2) is other, "nor back"
