@@ -16,7 +16,7 @@ from msgs.topics import Topic
 from msgs.wire import Array, PayloadError, Refusal
 
 _NS = 1_000_000_000
-_PUBLISHERS_REMEMBERED = 16
+_PUBLISHERS_REMEMBERED = 32  # of one target's poses or directions, each
 POSITION_MAX_M = 100_000.0  # of each coordinate and its standard deviation: far beyond what a camera measures
 RAY_TOLERANCE = 1e-3  # of a direction's length, which is one
 _FUTURE_MAX_NS = _NS // 2  # how far the sender's clock may be ahead of ours
@@ -66,7 +66,6 @@ class TargetDirection:
 class _Last:
     """The newest accepted message on a target's topic."""
 
-    stamp_ns: int
     arrival_ns: int
     gid: bytes  # of its publisher
 
@@ -88,6 +87,7 @@ class PoseReceiver:
         self._max_age_ns = round(max_age_s * _NS)
         self._sequences: dict[tuple[str, str, bytes], int] = {}
         self._last: dict[tuple[str, str], _Last] = {}
+        self._newest_ns: dict[str, int] = {}  # by target: stamp of the newest accepted pose or direction
         self._sender: tuple[str, int] | None = None  # accepted session, and UTC ns of its last accepted message
 
     def believes(self, sender: str, now_ns: int) -> bool:
@@ -155,12 +155,14 @@ class PoseReceiver:
             raise PayloadError(Refusal.SEQUENCE)
         if stamp_ns - now_ns > _FUTURE_MAX_NS:
             raise PayloadError(Refusal.FUTURE)
+        newest_ns = self._newest_ns.get(target)
         # If the last stamp lies in the future, a clock was set back since: do not refuse everything until then.
-        overtakes = last is None or stamp_ns > last.stamp_ns or last.stamp_ns - now_ns > _FUTURE_MAX_NS
+        overtakes = newest_ns is None or stamp_ns > newest_ns or newest_ns - now_ns > _FUTURE_MAX_NS
         if now_ns - stamp_ns > self._max_age_ns or not overtakes:
             raise PayloadError(Refusal.STALE)
         self._remember(publisher, sequence)
-        self._last[topic.name, target] = _Last(stamp_ns, now_ns, gid)
+        self._last[topic.name, target] = _Last(now_ns, gid)
+        self._newest_ns[target] = stamp_ns
 
     def _remember(self, publisher: tuple[str, str, bytes], sequence: int) -> None:
         # Bounded, newest last, so that a flood of fake publishers cannot exhaust memory.
