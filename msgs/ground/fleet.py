@@ -221,6 +221,7 @@ class Fleet:
         if known is None:
             known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
         _update(vehicle, known, row, lambda ship: target_row(pose, closing, ship, score))
+        vehicle.arrivals_ns.append(pose.arrival_ns)
         return row
 
     def _take_direction(self, vehicle: _Vehicle, seen: TargetDirection) -> DirectionRow:
@@ -267,7 +268,6 @@ def _update(vehicle: _Vehicle, known: _Target, row: Row, row_with: Callable[[Own
     while known.waiting[0][0] < row.stamp_ns - GAP_NS:
         known.waiting.popleft()
     known.settle(vehicle.own)
-    vehicle.arrivals_ns.append(row.heard_ns)
 
 
 def _note(

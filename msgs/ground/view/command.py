@@ -68,7 +68,8 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
         scene.finish()
     into = f" into {options.save}" if options.save is not None else ""
     refused = sum(one.refused for one in fleet.rows(time.time_ns()))
-    say(f"{scene.drawn} poses drawn{into}" + (f", {refused} samples refused" if refused else ""))
+    what = f"{scene.drawn} poses" + (f" and {scene.directions_drawn} directions" if scene.directions_drawn else "")
+    say(f"{what} drawn{into}" + (f", {refused} samples refused" if refused else ""))
     return 0
 
 

@@ -54,7 +54,8 @@ def target_paths(uav: str, target: str) -> tuple[str, ...]:
 
 def clear_target(rec: rr.RecordingStream, uav: str, target: str) -> None:
     """Remove all of one target but its trails, and interrupt the lines of its plots."""
-    plots = ("range", "range/minus_2_sigma", "range/plus_2_sigma", "closing", *(f"attitude/{what}" for what in _ANGLES))
+    ranges = ("range", "range/minus_2_sigma", "range/plus_2_sigma", "closing")
+    plots = (*ranges, "score", "age", *(f"attitude/{what}" for what in _ANGLES))
     _clear(rec, *target_paths(uav, target), *(plot_path(uav, target, path) for path in plots))
 
 

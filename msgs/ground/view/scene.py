@@ -59,6 +59,7 @@ class Scene:
         on_vehicles: Callable[[Sequence[str]], None],
     ) -> None:
         self.drawn = 0  # poses
+        self.directions_drawn = 0
         self._rec = rec
         self._fleet = fleet
         self._size_m = tuple(size_m)
@@ -165,6 +166,7 @@ class Scene:
             return
         self._begin(vehicle, row, now_ns, rangeless=True)
         entities.log_direction(self._rec, row, vehicle.camera)
+        self.directions_drawn += 1
         self._place_soon(vehicle, row, partial(entities.log_direction_placed, self._rec, row))
 
     def _begin(self, vehicle: _Vehicle, row: Row, now_ns: int, *, rangeless: bool) -> None:

@@ -263,6 +263,7 @@ def test_a_target_whose_range_is_no_longer_known_keeps_its_bearing_alone() -> No
         (vehicle,) = fleet.rows(stamp_ns)
         (row,) = vehicle.targets
         assert row.stamp_ns == stamp_ns
+        assert vehicle.pose_rate_hz * 3.0 == pytest.approx(number if number <= 10 else max(10, number - 10))
         rows.append(row)
     assert [isinstance(row, DirectionRow) for row in rows] == [False] * 10 + [True] * 10 + [False] * 10
     for row in rows:
