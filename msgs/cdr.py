@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from msgs.wire import Array, Reader, Writer
@@ -59,9 +58,9 @@ class Odometry:
         out.header(self.stamp_ns, self.frame_id)
         out.string(self.child_frame_id)
         _put_pose(out, self.t_ned_target_m, self.q_ned_target_xyzw, self.covariance)
-        out.f64(_shaped(self.v_target_mps, 3))
-        out.f64(_shaped(self.omega_target_radps, 3))
-        out.f64(_shaped(self.covariance_twist, 6, 6))
+        out.f64(self.v_target_mps, 3)
+        out.f64(self.omega_target_radps, 3)
+        out.f64(self.covariance_twist, 6, 6)
         return out.done()
 
     @classmethod
@@ -85,7 +84,7 @@ class Vector3Stamped:
     def encode(self) -> bytes:
         out = Writer()
         out.header(self.stamp_ns, self.frame_id)
-        out.f64(_shaped(self.ray_cam, 3))
+        out.f64(self.ray_cam, 3)
         return out.done()
 
     @classmethod
@@ -139,9 +138,9 @@ class Detection3DArray:
                 out.string(one.class_id)
                 out.f64(one.score)
                 _put_pose(out, one.t_cam_target_m, one.q_cam_target_xyzw, one.covariance)
-            out.f64(_shaped(detection.t_cam_box_m, 3))
-            out.f64(_shaped(detection.q_cam_box_xyzw, 4))
-            out.f64(_shaped(detection.size_m, 3))
+            out.f64(detection.t_cam_box_m, 3)
+            out.f64(detection.q_cam_box_xyzw, 4)
+            out.f64(detection.size_m, 3)
             out.string(detection.id)
         return out.done()
 
@@ -178,8 +177,8 @@ class TFMessage:
         for one in self.transforms:
             out.header(one.stamp_ns, one.frame_id)
             out.string(one.child_frame_id)
-            out.f64(_shaped(one.t_frame_child_m, 3))
-            out.f64(_shaped(one.q_frame_child_xyzw, 4))
+            out.f64(one.t_frame_child_m, 3)
+            out.f64(one.q_frame_child_xyzw, 4)
         return out.done()
 
     @classmethod
@@ -228,9 +227,9 @@ class CameraInfo:
         out.u32(self.height_px, self.width_px)
         out.string(self.distortion_model)
         out.f64_sequence(self.distortion)
-        out.f64(_shaped(self.K, 3, 3))
-        out.f64(_shaped(self.R, 3, 3))
-        out.f64(_shaped(self.P, 3, 4))
+        out.f64(self.K, 3, 3)
+        out.f64(self.R, 3, 3)
+        out.f64(self.P, 3, 4)
         roi = self.roi
         out.u32(self.binning_x, self.binning_y, roi.x_offset_px, roi.y_offset_px, roi.height_px, roi.width_px)
         out.u8(roi.do_rectify)
@@ -381,17 +380,10 @@ DECODERS: dict[str, Callable[[bytes], Payload]] = {
 }
 
 
-def _shaped(values: ArrayLike, *shape: int) -> Array:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"an array of shape {array.shape} where {shape} belongs")
-    return array
-
-
 def _put_pose(out: Writer, t_m: ArrayLike, q_xyzw: ArrayLike, covariance: ArrayLike) -> None:
-    out.f64(_shaped(t_m, 3))
-    out.f64(_shaped(q_xyzw, 4))
-    out.f64(_shaped(covariance, 6, 6))
+    out.f64(t_m, 3)
+    out.f64(q_xyzw, 4)
+    out.f64(covariance, 6, 6)
 
 
 def _take_detection(data: Reader) -> Detection3D:

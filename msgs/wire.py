@@ -70,16 +70,20 @@ class Writer:
         self._align(4)
         self._out += struct.pack(f"<{len(values)}I", *values)
 
-    def f64(self, values: ArrayLike) -> None:
-        """Float64 array of any shape, row-major, without a length."""
+    def f64(self, values: ArrayLike, *shape: int) -> None:
+        """Float64 array of that shape (none: one number), row-major, without a length. Raises ValueError for another
+        shape."""
+        array = np.asarray(values, dtype="<f8")
+        if array.shape != shape:
+            raise ValueError(f"an array of shape {array.shape} where {shape} belongs")
         self._align(8)
-        self._out += np.ascontiguousarray(values, dtype="<f8").tobytes()
+        self._out += array.tobytes()
 
     def f64_sequence(self, values: ArrayLike) -> None:
-        flat = np.ascontiguousarray(values, dtype="<f8").ravel()
+        flat = np.asarray(values, dtype="<f8").ravel()
         self.u32(flat.size)
         if flat.size:
-            self.f64(flat)
+            self.f64(flat, flat.size)
 
     def bytes_sequence(self, data: bytes) -> None:
         self.u32(len(data))
