@@ -52,8 +52,8 @@ class ZenohSettings(Section):
         default=None,
         ge=0.1,
         le=240,
-        description="maximum rate of each target's poses and odometry on tls/ and quic/ links; best a whole fraction "
-        "of the frame rate, which is then delivered; default: unlimited",
+        description="maximum rate of each target's poses, odometry and directions on tls/ and quic/ links; best a "
+        "whole fraction of the frame rate, which is then delivered; default: unlimited",
     )
     image_max_hz: RateOrNone = Field(
         default=1.0,

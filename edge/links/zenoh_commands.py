@@ -7,7 +7,7 @@
 | `stop`   | `{}`                              | drop all targets                                                 |
 | `record` | `{"on": true}` or `{"on": false}` | begin a recording, or end it                                     |
 | `reload` | `{}`                              | read the configuration and the model again; answered when it is done |
-| `rate`   | `{"max_hz": 10}` or `{"max_hz": null}` | send poses and odometry no more often; null: every one      |
+| `rate`   | `{"max_hz": 10}` or `{"max_hz": null}` | send poses, odometry, directions no more often; null: every one |
 
 The answer is `{"ok": true, "command": ..., "done": ...}` or `{"ok": false, "command": ..., "error": "a sentence"}`.
 """

@@ -268,15 +268,16 @@ class Desk:
                 self._publisher(node, topic, None)
 
     def set_pose_rate(self, max_hz: float | None) -> None:
-        """Limit the rate of poses and odometry; None: no limit. Recordings are not limited. May be called from any
-        thread."""
+        """Limit the rate of each target's poses, odometry and directions; None: no limit. Recordings are not limited.
+        May be called from any thread."""
         self._pose_rates = None if max_hz is None else defaultdict(partial(Rate, max_hz))
 
     def put_report(self, report: Report) -> None:
         stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
         now_ns = clock.monotonic_ns()
         tracks = sendable(report, now_ns, self._max_age_ms)
-        self.counted["tracks_withheld"] += len(report.tracks) - len(tracks)
+        unranged = rangeless(report, now_ns, self._max_age_ms)
+        self.counted["tracks_withheld"] += len(report.tracks) - len(tracks) - len(unranged)
         max_age_ns = round(self._max_age_ms * NS_PER_MS)
         for track in tracks:
             name, until_ns = ros.target_name(track), track.measured_ns + max_age_ns
@@ -285,7 +286,7 @@ class Desk:
                 odometry = ros.odometry(track, report.own_ship, stamp_ns)
                 if odometry is not None:
                     self._put(topics.ODOM, odometry, name, until_ns)
-        for track in rangeless(report, now_ns, self._max_age_ms):
+        for track in unranged:
             until_ns = track.measured_ns + max_age_ns
             self._put(topics.DIRECTION, ros.direction(track, stamp_ns), ros.target_name(track), until_ns)
         until_ns = report.meta.capture_ns + max_age_ns

@@ -23,7 +23,7 @@ from edge.links.errors import LinkError
 from edge.links.zenoh_link import ZenohLink
 from edge.types import Mount, TrackState
 from msgs import topics
-from msgs.client import connect, subscribe, subscribe_all, subscribe_directions
+from msgs.client import connect, subscribe, subscribe_all
 from msgs.session import router_config
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
@@ -38,7 +38,6 @@ from .reports import (
     TRACKING,
     V_NED_MPS,
     K,
-    rangeless,
 )
 from .reports import make_report as report
 from .reports import make_track as track
@@ -172,33 +171,6 @@ def test_tentative_stale_broken_and_unsure_tracks_never_leave() -> None:
     assert poses == {"uav1/target/t7/pose", "uav1/target/t7/odom"}
 
 
-def test_of_a_target_whose_range_is_not_known_the_direction_alone_is_told() -> None:
-    endpoint = free_endpoint()
-    with linked(endpoint) as link, connect(endpoint) as session:
-        samples = Samples(session)
-
-        def publish() -> None:
-            now_ns = time.monotonic_ns()
-            anywhere = np.diag([5.0**2, 1.0, 250.0**2, 1.0, 1.0, 1.0])
-            link.publish(
-                report(
-                    rangeless(track(now_ns, track_id=0)),
-                    track(now_ns, track_id=1, covariance=anywhere),
-                    rangeless(track(now_ns, track_id=2, state=TrackState.TENTATIVE)),
-                    track(now_ns, track_id=3),
-                )
-            )
-
-        samples.wait("uav1/target/t0/direction", "uav1/target/t3/pose", "uav1/target/detections", each=publish)
-        seen = samples.newest["uav1/target/t0/direction"]
-        of_targets = {name for name in samples.newest if "/target/t" in name}
-        (only,) = samples.newest["uav1/target/detections"].detections
-    assert seen.header.frame_id == "camera_optical_frame"
-    np.testing.assert_allclose(vector(seen.vector), T_CAM_TARGET_M / np.linalg.norm(T_CAM_TARGET_M))
-    assert of_targets == {"uav1/target/t0/direction", "uav1/target/t3/pose", "uav1/target/t3/odom"}
-    assert only.id == "t3"
-
-
 def test_a_report_that_waited_too_long_is_withheld_when_it_is_sent() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link:
@@ -237,21 +209,6 @@ def test_the_typed_client_takes_every_pose_it_gets() -> None:
         # However long it took: its age is from its exposure to its receipt, give or take the clocks' relation.
         assert began_ns - 5_000_000 < pose.stamp_ns < taken_ns + 5_000_000
         assert -0.005 < pose.age_s < (taken_ns - pose.stamp_ns) * 1e-9 + 0.005
-
-
-def test_the_typed_client_takes_every_direction_it_gets() -> None:
-    endpoint = free_endpoint()
-    with linked(endpoint) as link, connect(endpoint) as session, subscribe_directions(session, "uav1") as seen:
-        taken = []
-
-        def publish() -> None:
-            link.publish(report(rangeless(track(time.monotonic_ns()))))
-            taken.extend(iter(seen.poll, None))
-
-        until(lambda: len(taken) >= 5, publish, what="directions")
-        assert not seen.refused
-    assert {one.target for one in taken} == {"t0"}
-    np.testing.assert_allclose(taken[0].ray_cam, T_CAM_TARGET_M / np.linalg.norm(T_CAM_TARGET_M))
 
 
 def test_who_joins_late_gets_intrinsics_and_events_from_the_cache() -> None:

@@ -88,9 +88,10 @@ def identities(tmp_path: Path) -> Sequence[session.TlsFiles]:
     return _identity(folders[0], "ground", ours), _identity(folders[0], "uav1", ours), trusting
 
 
+@pytest.mark.parametrize("topic", [topics.POSE, topics.DIRECTION], ids=["pose", "direction"])
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
-def test_only_who_holds_our_certificate_gets_in_and_poses_are_thinned_there(
-    identities: Sequence[session.TlsFiles], protocol: str
+def test_only_who_holds_our_certificate_gets_in_and_what_is_told_of_targets_is_thinned_there(
+    identities: Sequence[session.TlsFiles], protocol: str, topic: topics.Topic
 ) -> None:
     ground, uav, stranger = identities
     secure = free_endpoint().replace("tcp/", f"{protocol}/")
@@ -105,8 +106,8 @@ def test_only_who_holds_our_certificate_gets_in_and_poses_are_thinned_there(
         on_board = stack.enter_context(client.connect(plain))
         for name, place in (("ground", router), ("on board", on_board)):
             handler = zenoh.handlers.Callback(lambda _, name=name: received.update([name]), indirect=False)
-            place.declare_subscriber(topics.subscription_key(topics.POSE, "uav1"), handler)
-        publisher = stack.enter_context(Node(daemon, "uav1")).publisher(topics.POSE, "t0")
+            place.declare_subscriber(topics.subscription_key(topic, "uav1"), handler)
+        publisher = stack.enter_context(Node(daemon, "uav1")).publisher(topic, "t0")
         until(lambda: len(received) == 2, lambda: publisher.put(pose_now().encode()))
         received.clear()
         started = time.monotonic()
