@@ -164,13 +164,14 @@ def summary_table(score: dict[str, Any]) -> Table:
     table = Table("metric", "value", title=f"score of {score['sequence']}", title_justify="left")
     rows = {
         "frames / poses received": f"{overall['frames']} / {score['poses']}",
+        "directions received, range not known": _text(_directions(score["zenoh_received"]), "{:d}"),
         "recall": _text(overall["recall"], "{:.1%}"),
         "rotation error, mean / median": _pair(overall["rotation_error_deg"], "{:.2f}°"),
         "translation error, mean / median": _pair(overall["translation_error_m"], "{:.2f} m"),
         "relative depth error, mean": _text(overall["depth_error_rel"]["mean"], "{:.2%}"),
         "Pose@10°/5 %": _text(overall["pose_10deg_5pct"], "{:.1%}"),
         "capture to MAVLink, p50 / p95 / p99": _percentiles(score["latency_ms"]),
-        "withheld by MAVLink, unconfirmed or too old": _text(score["latency_ms"]["tracks_withheld"], "{:d}"),
+        "withheld by MAVLink, too unsure or too old": _text(score["latency_ms"]["tracks_withheld"], "{:d}"),
         "poses that match no target": _text(overall["false_poses"], "{:d}"),
         "frames dropped": _text(score["dropped_frames"], "{:d}"),
     }
@@ -178,6 +179,11 @@ def summary_table(score: dict[str, Any]) -> Table:
     for row in rows.items():
         table.add_row(*row)
     return table
+
+
+def _directions(received: dict[str, int]) -> int | None:
+    """Of the samples received by topic; None where the topics were not counted, as in lock-step."""
+    return sum(count for topic, count in received.items() if topic.endswith("/direction")) if received else None
 
 
 def _pair(values: dict[str, float | None], form: str) -> str:

@@ -154,8 +154,8 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
 
 
 def _latency_ms(recording: Recording) -> dict[str, float | None]:
-    """Capture to MAVLink. `tracks_withheld` were not sent over MAVLink (not confirmed yet, or too old), so the
-    percentiles do not include them. All null in lock-step.
+    """Capture to MAVLink. `tracks_withheld` were not sent over MAVLink (not confirmed yet, too unsure or too old),
+    so the percentiles do not include them. All null in lock-step.
     """
     if recording.in_lockstep:
         return {**latency_statistics([]), "tracks_withheld": None}

@@ -11,8 +11,9 @@ from sim_replay.evaluation.judge import JudgedFrame
 
 
 def directions(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
-    """{"targets", "bearing_error_deg": {"mean", "median"}} over the targets without a pose but with a direction; None
-    where there are none, and thus without a tracker."""
+    """{"targets", "bearing_error_deg": {"mean", "median"}, "false"} over the targets without a pose but with a
+    direction, the errors None if there are none, and the directions that belong to no target; None without any
+    direction, and thus without a tracker."""
     errors = [
         seen.bearing_error_deg
         for frame in judged
@@ -20,10 +21,8 @@ def directions(judged: Sequence[JudgedFrame]) -> dict[str, Any] | None:
         for seen, told in zip(frame.directions, frame.matches, strict=True)
         if seen.estimate is not None and told.estimate is None
     ]
-    if not errors:
+    false = sum(len(frame.false_directions) for frame in judged)
+    if not errors and not false:
         return None
-    mean, median = np.mean(np.array(errors, float)), np.median(np.array(errors, float))
-    return {
-        "targets": len(errors),
-        "bearing_error_deg": {"mean": round(float(mean), 5), "median": round(float(median), 5)},
-    }
+    mean, median = (round(float(of(np.array(errors, float))), 5) if errors else None for of in (np.mean, np.median))
+    return {"targets": len(errors), "bearing_error_deg": {"mean": mean, "median": median}, "false": false}

@@ -38,6 +38,7 @@ class JudgedFrame:
     time_ms: float | None
     measured: tuple[Match, ...] = ()  # matches of the tracker's inputs with the same targets; empty without a tracker
     directions: tuple[Match, ...] = ()  # matches of the directions with the same targets; empty without any
+    false_directions: tuple[TargetPose, ...] = ()  # those that belong to no target
     not_asked: tuple[Truth, ...] = ()  # hidden or unlisted, but present: detecting them is neither right nor wrong
 
 
@@ -110,7 +111,7 @@ def judge_frames(
         truths = truths_of(index, picture, models)
         matches, false_poses = match_poses(truths, answered.poses)
         measured = match_poses(truths, answered.measured)[0] if answered.measured is not None else ()
-        seen = match_poses(truths, answered.directions)[0] if answered.directions else ()
+        seen, false_directions = match_poses(truths, answered.directions) if answered.directions else ((), ())
         judged.append(
             JudgedFrame(
                 picture,
@@ -119,6 +120,7 @@ def judge_frames(
                 answered.time_ms,
                 measured=_wanted(measured),
                 directions=_wanted(seen),
+                false_directions=tuple(false_directions),
                 not_asked=tuple(truth for truth in truths if not truth.wanted),
             )
         )

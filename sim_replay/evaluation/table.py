@@ -112,8 +112,9 @@ def _filtering(found: dict[str, Any]) -> str:
 def _directions(found: dict[str, Any]) -> str:
     error = found["bearing_error_deg"]
     return (
-        f"no pose but a direction, the range not being known: {found['targets']} targets, "
-        f"bearing error mean {error['mean']:.3f}°, median {error['median']:.3f}°"
+        f"no pose but a direction, the range not being known: {found['targets']} targets, bearing error "
+        f"mean {_text(error['mean'], '{:.3f}°')}, median {_text(error['median'], '{:.3f}°')}; "
+        f"directions without a target: {found['false']}"
     )
 
 

@@ -183,6 +183,7 @@ def test_directions_count_for_targets_without_a_pose_by_their_bearing() -> None:
             "mean": pytest.approx(np.degrees(3e-3 * across), abs=2e-5),
             "median": pytest.approx(np.degrees(2e-3 * across), abs=2e-5),
         },
+        "false": 0,
     }
     assert directions([frame]) is None
 

@@ -141,7 +141,18 @@ def test_what_mavlink_withheld_is_told_beside_its_latency(flown: PlayedSequence)
     console = Console(width=100)
     with console.capture() as shown:
         console.print(summary_table(score))
-    assert re.search(r"withheld by MAVLink, unconfirmed or too old +│ 7 ", shown.get())
+    assert re.search(r"withheld by MAVLink, too unsure or too old +│ 7 ", shown.get())
+
+
+def test_directions_received_are_told_beside_the_poses(flown: PlayedSequence) -> None:
+    received = {"uav1/target/t0/pose": 2, "uav1/target/t0/direction": 4, "uav1/target/t1/direction": 1}
+    for counts, told in ((received, "5"), ({}, "–")):
+        made = replace(recording(flown, {0, 2}), zenoh={"received": counts})
+        score = score_json(flown, judge(flown, made), MODEL)
+        console = Console(width=100)
+        with console.capture() as shown:
+            console.print(summary_table(score))
+        assert re.search(rf"directions received, range not known +│ {told} ", shown.get())
 
 
 def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:

@@ -18,6 +18,7 @@ from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, write_results
+from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
@@ -199,6 +200,28 @@ def test_a_pose_of_a_listed_aircraft_that_is_entirely_occluded_is_neither_right_
             overall = score_of(dataset, {}, frames)["overall"]
             assert (overall["targets"], overall["recall"], overall["false_poses"]) == (1, 1.0, false_poses)
             assert overall["false_positives_per_1000"] == false_alarms
+
+
+def test_directions_without_a_target_are_false_wherever_they_are_told(root: Path) -> None:
+    """One to each target's side, one where there is a target, and one in a picture without any."""
+
+    def answer(index: int, picture: DatasetFrame) -> Answer:
+        nearer = [LEFT / 2, 0.0, 100.0]
+        seen_m = [[-20.0, 0.0, 200.0], [20.0, 0.0, 200.0], nearer] if index == 0 else [[0.0, 0.0, 50.0]]
+        return Answer((), None, directions=tuple(TargetPose(index, np.eye(3), np.array(t_m)) for t_m in seen_m))
+
+    dataset = open_dataset(root)
+    frames = judge_frames(dataset.labelled_frames(), dataset.models, answer)
+    found = directions(frames)
+    assert found == {"targets": 1, "bearing_error_deg": {"mean": 0.0, "median": 0.0}, "false": 3}
+    unseen = directions(frames[1:])
+    assert unseen == {"targets": 0, "bearing_error_deg": {"mean": None, "median": None}, "false": 1}
+    console = Console(file=io.StringIO(), width=130)
+    for told in (found, unseen):
+        console.print(score_table(score_of(dataset, {"file": "m.onnx"}, frames) | {"directions": told}))
+    shown = " ".join(console.file.getvalue().split())
+    assert "1 targets, bearing error mean 0.000°, median 0.000°; directions without a target: 3" in shown
+    assert "0 targets, bearing error mean –, median –; directions without a target: 1" in shown
 
 
 def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
