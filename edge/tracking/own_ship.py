@@ -17,8 +17,9 @@ from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
 ATTITUDE_GAP_MAX_NS = 500_000_000  # no interpolation between samples further apart
-# How long an attitude is extrapolated with its rates: enough for a link that delays messages. If they usually come more
-# rarely, they are not used at all: rather none than for some frames only.
+# How long an attitude is extrapolated with its rates beyond the time when the next one is usually due: enough for a
+# link that delays messages, or loses one. If they usually come more rarely than this, they are not used at all: rather
+# none than for some frames only.
 ATTITUDE_AHEAD_MAX_NS = 150_000_000
 USUAL_OF = 5  # samples that give the usual interval: a single lost or late one does not change it
 ANGULAR_ACCELERATION_STD_RADPS2 = 1.5  # of a fixed-wing aircraft that begins or ends a turn
@@ -146,7 +147,8 @@ class OwnShipBuffer:
             self._global = None
 
     def at(self, time_ns: int) -> OwnShip | None:
-        """The own ship at a time: slerp between samples, extrapolation with body rates for at most 150 ms.
+        """The own ship at a time: slerp between samples, extrapolation with body rates until 150 ms after the next one
+        was due.
 
         None without an attitude for that time (also of the gimbal, if any). Position and velocity are None if no
         position is available for it; the ned origin is then the own ship itself.
@@ -229,7 +231,7 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     if _too_rare(samples):
         return None
     if after == len(samples):
-        if time_ns - a.time_ns > ATTITUDE_AHEAD_MAX_NS:
+        if time_ns - a.time_ns > ATTITUDE_AHEAD_MAX_NS + _usual_gap_ns(samples):
             return None
         return a.R_ned_body @ so3_exp(a.rates_body_radps * ((time_ns - a.time_ns) / NS_PER_S))
     b = samples[after]
@@ -269,19 +271,23 @@ def _usual_gaps_ns(samples: deque) -> list[int]:
     return sorted(b - a for a, b in pairwise(times))
 
 
-def _too_rare(samples: deque[_Attitude] | deque[_Gimbal]) -> bool:
-    """Whether samples usually lie further apart than the last one may be extrapolated."""
+def _usual_gap_ns(samples: deque) -> int:
+    """The median interval between the last few samples; 0 for a single one."""
     gaps_ns = _usual_gaps_ns(samples)
-    return bool(gaps_ns) and gaps_ns[len(gaps_ns) // 2] > ATTITUDE_AHEAD_MAX_NS
+    return gaps_ns[len(gaps_ns) // 2] if gaps_ns else 0
+
+
+def _too_rare(samples: deque[_Attitude] | deque[_Gimbal]) -> bool:
+    """Whether samples usually lie too far apart to be used."""
+    return _usual_gap_ns(samples) > ATTITUDE_AHEAD_MAX_NS
 
 
 def _goes_on(samples: deque[_Position], time_ns: int) -> bool:
     """Whether positions still arrive, even if too rarely to be used themselves."""
     if not samples:
         return False
-    gaps_ns = _usual_gaps_ns(samples)
-    usual_ns = gaps_ns[len(gaps_ns) // 2] if gaps_ns else 0
-    return time_ns - samples[-1].time_ns <= min(max(usual_ns * 3 // 2, POSITION_AHEAD_MAX_NS), POSITION_GAP_MAX_NS)
+    due_ns = _usual_gap_ns(samples) * 3 // 2
+    return time_ns - samples[-1].time_ns <= min(max(due_ns, POSITION_AHEAD_MAX_NS), POSITION_GAP_MAX_NS)
 
 
 def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Array | None:
