@@ -179,8 +179,11 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except BrokenPipeError:
         raise  # the reader of the output has closed it: not a failure, and `launch` exits as usual for that
-    except (PlayError, OSError) as error:
+    except PlayError as error:
         print(error, file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{error.filename}: {error.strerror}" if error.filename else error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

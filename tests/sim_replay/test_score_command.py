@@ -65,3 +65,10 @@ def test_a_pose_that_is_none_is_told_with_its_line(flight: Path, change: dict[st
     with pytest.raises(InputError) as error:
         read_flight(flight)
     assert str(error.value) == f"{flight / RECEIVED_JSONL}: line 2 is not a record of a peer: {words}"
+
+
+def test_where_a_flight_cannot_be_written_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    taken = tmp_path / "taken"
+    taken.touch()
+    assert main(["demo", "--out", str(taken)]) == 1
+    assert capsys.readouterr().err.strip() == f"{taken}/flight.json: Not a directory"
