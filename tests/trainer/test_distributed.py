@@ -18,16 +18,18 @@ from trainer.train import run_training
 
 STEPS = 3
 TEXT = tiny.TOML.replace(", { from_progress = 0.7, size_px = 96 }", "").replace("samples = 16\nw", "samples = 64\nw")
+# Its rendering processes import it too, and need no torch.
 WORKER = """
 import os, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 import synthetic_sampler
-from trainer.checkpoint import weights_sha256
-from trainer.config import parse_config
-from trainer.train import run_training
 
 if __name__ == "__main__":
+    from trainer.checkpoint import weights_sha256
+    from trainer.config import parse_config
+    from trainer.train import run_training
+
     out, text, steps, begin = Path(sys.argv[1]), Path(sys.argv[2]).read_text(), int(sys.argv[3]), sys.argv[4]
     trainer = run_training(
         parse_config(text, "tiny.toml"), text, out,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from odd_samplers import GOOD_SAMPLES, SpoiltSampler
 from synthetic_sampler import PlateSampler, opener
 
-from sim_replay.sample import SampleBatch
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
@@ -22,18 +21,7 @@ from trainer.evaluate import predict_all, torch_predictor
 from trainer.pictures import example_sheet
 from trainer.train import run_training
 
-GOOD_SAMPLES = 8
 WILD = tiny.TOML.replace("warmup_samples = 8", "warmup_samples = 0\nlr = 1e12\nlr_final = 1e12")
-
-
-class SpoiltSampler(PlateSampler):
-    """From GOOD_SAMPLES on a position is no number."""
-
-    def batch(self, first_index: int, count: int) -> SampleBatch:
-        made = super().batch(first_index, count)
-        if first_index < GOOD_SAMPLES:
-            return made
-        return replace(made, t_cam_target_m=np.full_like(made.t_cam_target_m, np.nan))
 
 
 def spoilt(seed: int, size_px: int) -> Callable[[], SpoiltSampler]:
@@ -48,7 +36,7 @@ def test_what_was_saved_before_stays_and_is_named(tmp_path: Path) -> None:
     config = parse_config(tiny.TOML, "tiny.toml")
     run_training(config, tiny.TOML, tmp_path, open_sampler=spoilt, max_steps=2)
     saved = digests(tmp_path)
-    with pytest.raises(ConfigError, match=r"after 8 samples: .*--start-from .*weights\.pt"):
+    with pytest.raises(ConfigError, match=rf"after {GOOD_SAMPLES} samples: .*--start-from .*weights\.pt"):
         run_training(config, tiny.TOML, tmp_path, open_sampler=spoilt, resume=True)
     assert digests(tmp_path) == saved
 

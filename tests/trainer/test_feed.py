@@ -12,14 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from odd_samplers import Broken, Telling
 from synthetic_sampler import PlateSampler
 
-from sim_replay.sample import SampleBatch
 from tests.waiting import until
 from trainer.config import RenderingError
 from trainer.data import Feed, training_batch
-
-LARGE_PX = 256  # a batch of such pictures is far more than a pipe holds
 
 
 def rendered_pids(parent: int | None = None) -> set[int]:
@@ -37,19 +35,6 @@ def test_batches_come_in_order_whoever_renders_them() -> None:
     assert not rendered_pids()
 
 
-class Telling(PlateSampler):
-    """Says, by a file, that it was asked for its third batch."""
-
-    def __init__(self, told: Path) -> None:
-        super().__init__(5, LARGE_PX)
-        self.told = told
-
-    def batch(self, first_index: int, count: int) -> SampleBatch:
-        if first_index >= 2 * count:
-            self.told.touch()
-        return super().batch(first_index, count)
-
-
 @pytest.mark.timeout(60)
 def test_a_renderer_that_is_killed_in_the_middle_of_a_batch_is_told(tmp_path: Path) -> None:
     """The third is rendered once the first is on its way through the pipe, which holds a part, and the second waits."""
@@ -61,13 +46,6 @@ def test_a_renderer_that_is_killed_in_the_middle_of_a_batch_is_told(tmp_path: Pa
             feed.next()
 
 
-class Broken(PlateSampler):
-    def batch(self, first_index: int, count: int) -> SampleBatch:
-        if first_index:
-            raise ZeroDivisionError("no such aircraft")
-        return super().batch(first_index, count)
-
-
 def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
     with Feed(partial(Broken, 5, 64), 4, 0) as feed:
         assert len(feed.next().present) == 4
@@ -75,14 +53,13 @@ def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
             feed.next()
 
 
+# Its rendering processes import it too, and need no torch.
 SLOW = """
 import sys, time
 from functools import partial
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-import tiny
 from synthetic_sampler import PlateSampler
-from trainer.train import run_training
 
 class Slow(PlateSampler):
     def batch(self, first_index, count):
@@ -90,6 +67,9 @@ class Slow(PlateSampler):
         return super().batch(first_index, count)
 
 if __name__ == "__main__":
+    import tiny
+    from trainer.train import run_training
+
     toml = tiny.TOML.replace("samples = 16\\nwarmup", "samples = 100000\\nwarmup")
     config = tiny.parse_config(toml, "tiny.toml")
     run_training(config, toml, Path(sys.argv[1]), open_sampler=lambda seed, size: partial(Slow, seed, size))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable
 from functools import partial
@@ -12,10 +11,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from synthetic_sampler import PlateSampler
+from odd_samplers import Filling, NoTargets
 
 from sim_replay.airframes.invented import draw_invented
-from sim_replay.sample import SampleBatch
 from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.cli import main
@@ -27,22 +25,6 @@ from trainer.refinement import Evidence, RefinementHead, answer_count
 from trainer.sources import refinement_sampler
 
 PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
-
-
-class Filling(PlateSampler):
-    """Boxes as large as the picture, so that an untrained network's peak lies in them; every third is a stranger."""
-
-    def batch(self, first_index: int, count: int) -> SampleBatch:
-        batch = super().batch(first_index, count)
-        box = np.tile(np.array([0, 0, self.size_px, self.size_px], np.float32), (count, 1))
-        strange = np.where((first_index + np.arange(count)) % 3 == 0, fleet_size() + 5, batch.airframe_id)
-        return dataclasses.replace(batch, box_xyxy_px=box, airframe_id=strange.astype(np.int32))
-
-
-class NoTargets(PlateSampler):
-    def batch(self, first_index: int, count: int) -> SampleBatch:
-        batch = super().batch(first_index, count)
-        return dataclasses.replace(batch, present=batch.present & False)
 
 
 def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], Filling]:
