@@ -11,6 +11,7 @@ import multiprocessing as mp
 import os
 import queue
 import signal
+import sys
 import threading
 import traceback
 import weakref
@@ -85,10 +86,8 @@ def _pooled(dense: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(dense, tiles_wh, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _serve(
-    open_sampler: Callable[[], Sampler], batch_size: int, first: int, stride: int, prefetch: int, out: Connection
-) -> None:
-    """Body of a rendering process: renders batches first, first + stride, ... until the trainer is gone."""
+def _serve(open_sampler: Callable[[], Sampler], batch_size: int, starts: range, prefetch: int, out: Connection) -> None:
+    """Body of a rendering process: renders the batches that begin at `starts`, or until the trainer is gone."""
     # The trainer terminates it: a signal to the whole process group must not end it before the trainer has saved.
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
@@ -102,11 +101,9 @@ def _serve(
     try:
         os.nice(1)
         sampler = open_sampler()
-        start = first
-        while True:
+        for start in starts:
             drawn = sampler.batch(start, batch_size)
             made.put(training_batch(drawn) if isinstance(drawn, SampleBatch) else drawn)
-            start += stride
     except ConfigError as error:
         made.put(error)
     except Exception:
@@ -143,8 +140,12 @@ class Feed:
         prefetch: int = 4,
         rank: int = 0,
         ranks: int = 1,
+        batches: int | None = None,
     ) -> None:
-        """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ..., those of one training process."""
+        """Of the consecutive batches this feed delivers `rank`, rank + `ranks`, ..., those of one training process.
+
+        With `batches`, no more than so many are rendered; by default the stream has no end.
+        """
         context = mp.get_context("spawn")
         self._turn = 0
         # Receives the next batch while the trainer computes.
@@ -158,7 +159,10 @@ class Feed:
         for worker in range(workers):
             reader, writer = context.Pipe(duplex=False)
             first = first_index + (worker * ranks + rank) * batch_size
-            arguments = (open_sampler, batch_size, first, workers * ranks * batch_size, prefetch, writer)
+            stride = workers * ranks * batch_size
+            end = sys.maxsize if batches is None else first_index + batches * batch_size
+            starts = range(first, end, stride)
+            arguments = (open_sampler, batch_size, starts, prefetch, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
             # Blocked until the process ignores them itself, after seconds of imports.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
@@ -208,15 +212,16 @@ class Feed:
 
 
 def render_once(
-    open_sampler: Callable[[], Sampler], count: int, chunk: int = 16, rendered: Callable[[int], None] | None = None
+    open_sampler: Callable[[], Sampler], samples: int, chunk: int = 16, rendered: Callable[[int], None] | None = None
 ) -> list[TrainingBatch]:
-    """Samples 0..count-1 (rounded up to whole chunks) from a separate renderer, as a list in memory.
+    """Samples 0..samples-1 (rounded up to whole chunks) from a separate renderer, as a list in memory.
 
     `rendered` is called with the number of samples after each chunk.
     """
+    chunks = (samples + chunk - 1) // chunk
     batches = []
-    with Feed(open_sampler, chunk, 0) as feed:
-        for index in range((count + chunk - 1) // chunk):
+    with Feed(open_sampler, chunk, 0, batches=chunks) as feed:
+        for index in range(chunks):
             batches.append(feed.next())
             if rendered is not None:
                 rendered((index + 1) * chunk)

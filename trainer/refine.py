@@ -165,9 +165,11 @@ def look(
     handle = model.head_refine.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     found: list[Tensor] = []  # the kept rows; allocated when the first batch gives their shapes
     count = 0
+    starts = range(0, windows, RENDERED_AT_ONCE)
+    workers, prefetch = config.data.workers, config.data.prefetch
     try:
-        with Feed(opener, RENDERED_AT_ONCE, 0, config.data.workers, config.data.prefetch) as feed, torch.no_grad():
-            for done in range(0, windows, RENDERED_AT_ONCE):
+        with Feed(opener, RENDERED_AT_ONCE, 0, workers, prefetch, batches=len(starts)) as feed, torch.no_grad():
+            for done in starts:
                 seen.clear()
                 part = _found(model, config, feed.next(), seen)
                 columns = [*part.evidence, part.residual, part.strange]

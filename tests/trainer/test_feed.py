@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from odd_samplers import Broken, Telling
+from odd_samplers import LARGE_PX, Broken, Telling
 from synthetic_sampler import PlateSampler
 
 from tests.waiting import until
@@ -44,6 +44,15 @@ def test_a_renderer_that_is_killed_in_the_middle_of_a_batch_is_told(tmp_path: Pa
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(RenderingError, match="renderer-0 ended with exit code -9"):
             feed.next()
+
+
+def test_of_a_known_number_of_batches_no_more_is_rendered(tmp_path: Path) -> None:
+    alone = PlateSampler(5, LARGE_PX)
+    with Feed(partial(Telling, tmp_path / "told"), 4, 0, prefetch=4, batches=2) as feed:
+        for first in (0, 4):
+            assert np.array_equal(feed.next().image_bgr, training_batch(alone.batch(first, 4)).image_bgr)
+        until(lambda: not rendered_pids(), what="the renderer's end")
+    assert not (tmp_path / "told").exists()
 
 
 def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
