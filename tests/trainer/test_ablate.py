@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from functools import partial
 from pathlib import Path
@@ -28,6 +29,19 @@ def open_view(data: DataConfig, seed: int, size_px: int) -> partial:
 
 def silent(_: str) -> None:
     pass
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("measured")
+    ablate(tiny.config(), [FULL], SCALE, out, silent, open_view)
+    return out
+
+
+@pytest.fixture
+def full(measured: Path, tmp_path: Path) -> Path:
+    """A folder in which the variant `full` has been trained and measured."""
+    return Path(shutil.copytree(measured, tmp_path / "runs"))
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.name)
@@ -85,21 +99,20 @@ def test_rows_are_trained_once_and_stand_in_one_table(tmp_path: Path) -> None:
         ablate(tiny.config(), [FULL], Scale(12, 64, 16), tmp_path, said.append, open_view)
 
 
-def test_rows_of_other_variants_stay_where_one_is_added(tmp_path: Path) -> None:
+def test_rows_of_other_variants_stay_where_one_is_added(full: Path) -> None:
     said: list[str] = []
-    full = ablate(tiny.config(), [FULL], SCALE, tmp_path, said.append, open_view)
-    both = ablate(tiny.config(), chosen(["direct-depth"]), SCALE, tmp_path, said.append, open_view)
+    before = json.loads((full / "ablation.json").read_text())
+    both = ablate(tiny.config(), chosen(["direct-depth"]), SCALE, full, said.append, open_view)
     assert list(both["rows"]) == ["full", "direct-depth"]
-    assert both["rows"]["full"] == full["rows"]["full"]
-    assert json.loads((tmp_path / "ablation.json").read_text()) == both
-    more = ablate(tiny.config(), [FULL], Scale(8, 64, 32), tmp_path, said.append, open_view)
+    assert both["rows"]["full"] == before["rows"]["full"]
+    assert json.loads((full / "ablation.json").read_text()) == both
+    more = ablate(tiny.config(), [FULL], Scale(8, 64, 32), full, said.append, open_view)
     assert (list(more["rows"]), more["windows"]) == (["full"], 32)
     assert said[-1] == "direct-depth: its row is dropped: it was measured on 16 windows"
 
 
-def test_rows_of_another_scale_seed_or_configuration_are_not_mixed_in(tmp_path: Path) -> None:
-    ablate(tiny.config(), [FULL], SCALE, tmp_path, silent, open_view)
-    before = (tmp_path / "ablation.json").read_text()
+def test_rows_of_another_scale_seed_or_configuration_are_not_mixed_in(full: Path) -> None:
+    before = (full / "ablation.json").read_text()
     added = chosen(["direct-depth"])
     other_seed = parse_config(tiny.TOML.replace("seed = 3", "seed = 5", 1), "other seed")
     other_batches = parse_config(tiny.TOML.replace("batch_size = 4", "batch_size = 2"), "other batches")
@@ -113,11 +126,11 @@ def test_rows_of_another_scale_seed_or_configuration_are_not_mixed_in(tmp_path: 
         (other_batches, SCALE, "full: contains a run of another configuration"),
     ):
         with pytest.raises(ConfigError, match=told):
-            ablate(config, added, scale, tmp_path, silent, open_view)
-    assert (tmp_path / "ablation.json").read_text() == before
-    (tmp_path / "ablation.json").write_text(before[:20])
+            ablate(config, added, scale, full, silent, open_view)
+    assert (full / "ablation.json").read_text() == before
+    (full / "ablation.json").write_text(before[:20])
     with pytest.raises(ConfigError, match=r"ablation\.json: not a result of `ablate`"):
-        ablate(tiny.config(), added, SCALE, tmp_path, silent, open_view)
+        ablate(tiny.config(), added, SCALE, full, silent, open_view)
 
 
 def test_an_interrupted_variant_has_no_row_and_the_next_call_goes_on(tmp_path: Path) -> None:
@@ -153,8 +166,8 @@ def test_the_table_says_how_many_windows_were_measured_and_not_how_many_were_ask
     assert "16 held-out windows" in (tmp_path / "table.md").read_text()
 
 
-def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(tmp_path: Path) -> None:
-    result = ablate(tiny.config(), [FULL], SCALE, tmp_path, lambda _: None, open_view)
+def test_a_figure_that_was_not_measured_is_a_dash_in_the_table(measured: Path) -> None:
+    result = json.loads((measured / "ablation.json").read_text())
     result["rows"]["full"]["bearing_median_deg"] = None
     assert "| – | `" in table(result)
 
@@ -164,12 +177,13 @@ def test_an_unknown_variant_is_named_with_those_there_are() -> None:
         chosen(["no-such"])
 
 
-def test_as_json_standard_output_holds_the_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_as_json_standard_output_holds_the_result_alone(
+    full: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command measures it alone."""
     (tmp_path / "tiny.toml").write_text(tiny.TOML)
-    ablate(tiny.config(), [FULL], SCALE, tmp_path / "runs", lambda _: None, open_view)  # the command measures it alone
-    capsys.readouterr()
     options = ["--samples", "8", "--size", "64", "--windows", "16", "--variants", "full", "--json"]
-    assert main(["ablate", "--config", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "runs"), *options]) == 0
+    assert main(["ablate", "--config", str(tmp_path / "tiny.toml"), "--out", str(full), *options]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out) == json.loads((tmp_path / "runs" / "ablation.json").read_text())
+    assert json.loads(out) == json.loads((full / "ablation.json").read_text())
     assert "full: all of it" in err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -144,6 +145,22 @@ def windows(seed: int, size_px: int) -> TrainingBatch:
     return training_batch(open_view(seed, size_px, 0.0)().batch(0, 16))
 
 
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return Views([windows(1, 64)], [windows(2, 96)])
+
+
+def measured(path: Path, views: Views) -> Measured:
+    predict = onnx_predictor(path)
+    return Measured(predict_all(predict, views.track), predict_all(predict, views.acquire))
+
+
+@pytest.fixture(scope="module")
+def strayed(exported: Exported, views: Views) -> Strayed:
+    int8, floats = measured(exported.int8, views), measured(exported.fp32, views)
+    return comparison_table(views, "INT8 vs. FP32", int8, floats, (0.5, 0.5))[1]
+
+
 @pytest.mark.parametrize(
     ("tolerance", "told"),
     [
@@ -154,14 +171,14 @@ def windows(seed: int, size_px: int) -> TrainingBatch:
         (ANY._replace(recall_points=-1.0), r"recall is 0 points worse .* --tolerance-recall -1"),
     ],
 )
-def test_an_int8_file_that_strays_is_not_written(
-    exported: Exported, tmp_path: Path, tolerance: Tolerance, told: str
-) -> None:
-    views = Views([windows(1, 64)], [windows(2, 96)])
-    predict = onnx_predictor(exported.fp32)
-    floats = Measured(predict_all(predict, views.track), predict_all(predict, views.acquire))
-    destination = tmp_path / "strays.onnx"
-    with pytest.raises(ConfigError, match=rf"strays\.onnx: not written: {told}"):
+def test_int8_that_strays_is_refused_by_what_it_strays_in(strayed: Strayed, tolerance: Tolerance, told: str) -> None:
+    assert strayed.refusal(ANY) is None
+    assert re.match(told, str(strayed.refusal(tolerance)))
+
+
+def test_an_int8_file_that_is_refused_is_not_written(exported: Exported, views: Views, tmp_path: Path) -> None:
+    floats, destination = measured(exported.fp32, views), tmp_path / "strays.onnx"
+    with pytest.raises(ConfigError, match=r"strays\.onnx: not written: median rotation differs .* --tolerance 0"):
         write_int8(
             exported.fp32,
             destination,
@@ -169,7 +186,7 @@ def test_an_int8_file_that_strays_is_not_written(
             views,
             views,
             floats,
-            tolerance,
+            ANY._replace(rotation_deg=0.0),
             exported.said.append,
         )
     assert list(tmp_path.iterdir()) == []

@@ -16,6 +16,8 @@ from edge.estimator.model import Peaks
 from edge.estimator.window import PixelMap
 from msgs.contract import OUTPUT_NAMES
 from trainer.checkpoint import save_weights
+from trainer.cli import main
+from trainer.export import export_unmeasured
 from trainer.graph import open_session, read_contract
 
 
@@ -53,8 +55,7 @@ def test_a_network_is_written_to_be_timed_and_not_flown(tmp_path: Path, config: 
 
 def test_targets_of_a_file_that_nobody_measured_are_of_no_untrained_size(tmp_path: Path, config: Path) -> None:
     """A checkpoint is evaluated through such a file: its estimates are told as the network has them."""
-    assert export("--untrained", config, "--out", tmp_path).returncode == 0
-    contract = read_contract(tmp_path / "tiny-unmeasured-fp32.onnx")
+    contract = read_contract(export_unmeasured(config, tmp_path, untrained=True))
     size_wh = (640, 480)
     K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
     shown = Shown(PixelMap((1.0, 1.0), (0.0, 0.0)), K, size_wh, size_wh)
@@ -73,10 +74,11 @@ def test_targets_of_a_file_that_nobody_measured_are_of_no_untrained_size(tmp_pat
         assert np.sqrt(estimate.covariance[2, 2]) == pytest.approx(0.05 * 300.0, rel=1e-3)
 
 
-def test_a_configuration_that_is_wrong_is_named(tmp_path: Path, config: Path) -> None:
+def test_a_configuration_that_is_wrong_is_named(
+    tmp_path: Path, config: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config.write_text(tiny.TOML.replace('backbone = "repvit_small"', 'backbone = "vgg"'))
-    done = export("--untrained", config, "--out", tmp_path / "models")
-    assert done.returncode == 2
-    assert "tiny.toml" in done.stderr
-    assert "backbone" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert main(["export", "--untrained", str(config), "--out", str(tmp_path / "models")]) == 2
+    said = capsys.readouterr().err
+    assert "tiny.toml" in said
+    assert "backbone" in said

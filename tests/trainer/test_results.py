@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -106,8 +107,13 @@ def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
     assert windows in card
 
 
-def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
-    scores = measure([None], [CROSSING], lambda _: None)
+@pytest.fixture(scope="module")
+def scores() -> list[dict[str, Any]]:
+    """Of the shipped model on the bundled scene."""
+    return measure([None], [CROSSING], lambda _: None)
+
+
+def test_the_page_has_a_row_for_each_score_and_one_of_the_paper(scores: list[dict[str, Any]]) -> None:
     assert [score["mode"] for score in scores] == ["frames", "track"]
     text = page(scores, "the command", "Trained on much.")
     rows = [line for line in text.splitlines() if line.startswith("| crossing")]
@@ -121,8 +127,9 @@ def test_the_page_has_a_row_for_each_score_and_one_of_the_paper() -> None:
     assert all(words in text and words in shown for words in (EXPLANATION, CURVES))
 
 
-def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(tmp_path: Path) -> None:
-    scores = measure([None], [CROSSING], lambda _: None)
+def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(
+    scores: list[dict[str, Any]], tmp_path: Path
+) -> None:
     other = {**scores[0], "method": {"file": "other_crossing-all.csv", "precision": None}}
     path = tmp_path / "metrics.json"
     path.write_text(json.dumps(other))

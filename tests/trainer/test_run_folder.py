@@ -28,6 +28,8 @@ from trainer.runlog import RunLog, commit_of
 from trainer.train import run_training
 from trainer.trainer import Trainer
 
+# The command and the same with --resume; of two processes each would import torch.
+TWICE = "import sys; from trainer.cli import main; print(main(sys.argv[1:]), main([*sys.argv[1:], '--resume']))"
 LONG = tiny.TOML.replace("samples = 16\nw", "samples = 1000000\nw")
 
 
@@ -106,18 +108,19 @@ def test_a_second_run_in_the_folder_is_refused_while_the_first_is_at_work(tmp_pa
     """Their curves would be told as one, and the weights be of whichever saved last."""
     out, other = tmp_path / "run", tmp_path / "other.toml"
     other.write_text(tiny.TOML.replace("seed = 3", "seed = 7"))
-    refused: list[tuple[int, str]] = []
+    tries: list[subprocess.CompletedProcess[str]] = []
 
     def opener(seed: int, size_px: int) -> object:
-        command = [sys.executable, "-m", "trainer.cli", "train", "--config", str(other), "--out", str(out)]
-        for more in ([], ["--resume"]) if not refused else ():
-            done = subprocess.run([*command, *more], capture_output=True, text=True, check=False, timeout=200)
-            refused.append((done.returncode, done.stderr))
+        if not tries:
+            command = [sys.executable, "-c", TWICE, "train", "--config", str(other), "--out", str(out)]
+            tries.append(subprocess.run(command, capture_output=True, text=True, check=False, timeout=200))
         return synthetic_sampler.opener(seed, size_px)
 
     config = parse_config(tiny.TOML, "tiny.toml")
     run_training(config, tiny.TOML, out, open_sampler=opener, max_steps=1)
-    assert refused == [(2, f"uavpose-trainer: {out}: is in use by another run; give another --out\n")] * 2
+    (tried,) = tries
+    assert tried.stdout.split() == ["2", "2"]
+    assert tried.stderr == 2 * f"uavpose-trainer: {out}: is in use by another run; give another --out\n"
     assert (out / "config.toml").read_text() == tiny.TOML
     assert [start["seed"] for start in json.loads((out / "run.json").read_text())["starts"]] == [3]
     assert train(out, resume=True).samples == 16

@@ -61,16 +61,21 @@ def exported(folder: Path, text: str) -> ModelContract:
     return contracts[1]
 
 
-@pytest.mark.parametrize(("told", "range_m"), [("", (69.0, 91.0)), ("trained_range_m = [60.0, 95.0]\n", (60.0, 95.0))])
-def test_the_contract_tells_what_was_trained_on_and_not_what_was_measured_on(
-    tmp_path: Path, told: str, range_m: tuple[float, float]
-) -> None:
+def test_the_contract_tells_what_was_trained_on_and_not_what_was_measured_on(tmp_path: Path) -> None:
     """The daemon widens its covariances beyond it: a network that saw 70 to 90 m knows nothing of 400."""
     discs(tmp_path / "own" / "train" / "000001", 1500.0, (69.5, 80.0, 90.5))
     discs(tmp_path / "own" / "val" / "000002", 150_000.0, (400.0, 450.0))
-    contract = exported(tmp_path, on_dataset(tmp_path / "own", told))
-    assert contract.trained_range_m == range_m
+    contract = exported(tmp_path, on_dataset(tmp_path / "own"))
+    assert contract.trained_range_m == (69.0, 91.0)
     assert contract.trained_focal_px[1] < 15_000.0
+
+
+def test_a_range_that_the_configuration_tells_is_the_contracts(tmp_path: Path) -> None:
+    discs(tmp_path / "own" / "train" / "000001", 1500.0, (69.5, 80.0, 90.5))
+    config = parse_config(on_dataset(tmp_path / "own", "trained_range_m = [60.0, 95.0]\n"), "own.toml")
+    rendered = training_batch(PlateSampler(5, 64).batch(0, 8))
+    contract = make_contract(config, {}, "0" * 64, Views([rendered], [rendered]), (0.3, 0.3))
+    assert contract.trained_range_m == (60.0, 95.0)
 
 
 def test_a_dataset_of_a_small_share_adds_all_the_depths_of_its_labels(tmp_path: Path) -> None:
