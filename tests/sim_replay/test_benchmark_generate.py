@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -48,7 +47,8 @@ jpeg_quality = [80, 90]
 [[compression]]
 h264_kbps = [400, 400]
 """
-PROGRAM = (sys.executable, "-m", "sim_replay.cli", "generate")
+# Workers import what was started anew: of `python -m sim_replay.cli` all, of the command little.
+PROGRAM = (str(Path(sys.executable).parent / "uavpose-replay"), "generate")
 SCENES = ("train/000000", "train/000001", "test/000002")
 WITHIN_S = 150.0  # a dataset is drawn in software, by a machine that may be busy
 
@@ -60,8 +60,8 @@ def preset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _generate(preset: Path, out: Path, *more: str, program: Sequence[str] = PROGRAM) -> int:
-    words = [*program, "--preset", str(preset), "--out", str(out), "--seed", "3", *more]
+def _generate(preset: Path, out: Path, *more: str) -> int:
+    words = [*PROGRAM, "--preset", str(preset), "--out", str(out), "--seed", "3", *more]
     return subprocess.run(words, stderr=subprocess.DEVNULL, timeout=200).returncode
 
 
