@@ -73,6 +73,22 @@ def as_it_was(flown: Path, toy_model: Path, tmp_path_factory: pytest.TempPathFac
     return poses_of(out)
 
 
+@pytest.fixture(scope="module")
+def flight(flown: Path, toy_model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a flight in real time left behind, with its recording."""
+    out = tmp_path_factory.mktemp("flight")
+    played = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", out)
+    assert played.returncode == 0, played.stderr
+    assert "not scored: no ground truth" in played.stdout.replace("\n", " ")
+    return out
+
+
+@pytest.fixture(scope="module")
+def recorded(flight: Path) -> Path:
+    (path,) = (flight / "recordings").glob("*.mcap")
+    return path
+
+
 def test_a_video_with_telemetry_flies_as_its_pictures_do(
     flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -102,18 +118,14 @@ def test_a_video_with_telemetry_flies_as_its_pictures_do(
 
 
 def test_the_daemons_own_recording_flies_again(
-    flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
+    flight: Path, recorded: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
 ) -> None:
-    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
-    assert recorded.returncode == 0, recorded.stderr
-    assert "not scored: no ground truth" in recorded.stdout.replace("\n", " ")
-    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
-    with path.open("rb") as file:
+    with recorded.open("rb") as file:
         kept = make_reader(file).iter_messages("/uav1/image/compressed")
         pictures = [CompressedImage.decode(message.data).data for _, _, message in kept]
     assert len(pictures) > FRAMES // 2
 
-    again = replay("play", "--lockstep", "--sequence", path, "--model", toy_model, "--out", tmp_path / "again")
+    again = replay("play", "--lockstep", "--sequence", recorded, "--model", toy_model, "--out", tmp_path / "again")
     assert again.returncode == 0, again.stderr
     sequence = read_sequence(tmp_path / "again/sequence")
     assert sequence.fps == pytest.approx(FPS, rel=0.02)
@@ -131,7 +143,8 @@ def test_the_daemons_own_recording_flies_again(
     _attitude_as_flown(read_telemetry(tmp_path / "again/sequence/telemetry.csv"))
 
     # What a flight leaves behind is known by name, but for what was recorded and unpacked.
-    for folder, left in (("first", ["recordings"]), ("again", ["sequence"])):
+    shutil.copytree(flight, tmp_path / "flight")
+    for folder, left in (("flight", ["recordings"]), ("again", ["sequence"])):
         remove_flight(tmp_path / folder)
         assert [one.name for one in (tmp_path / folder).iterdir()] == left
 
@@ -156,14 +169,12 @@ def copied(path: Path, cut: Path, keep: Callable[[str, Message], bool]) -> Path:
     return cut
 
 
-def test_pictures_from_before_the_first_attitude_are_left_out(flown: Path, toy_model: Path, tmp_path: Path) -> None:
-    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
-    assert recorded.returncode == 0, recorded.stderr
-    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
-    with path.open("rb") as file:
+def test_pictures_from_before_the_first_attitude_are_left_out(recorded: Path, tmp_path: Path) -> None:
+    with recorded.open("rb") as file:
         kept = [message for _, _, message in make_reader(file).iter_messages("/uav1/image/compressed")]
     from_ns = kept[10].log_time
-    cut = copied(path, tmp_path / "cut.mcap", lambda topic, one: one.log_time >= from_ns or not topic.endswith("/tf"))
+    told = lambda topic, one: one.log_time >= from_ns or not topic.endswith("/tf")  # noqa: E731
+    cut = copied(recorded, tmp_path / "cut.mcap", told)
     sequence = open_sequence(cut, tmp_path / "again", Console(quiet=True))
     first = [CompressedImage.decode(message.data).data for message in kept].index(sequence.scene.images[0].read_bytes())
     assert 8 <= first <= 12
@@ -172,17 +183,14 @@ def test_pictures_from_before_the_first_attitude_are_left_out(flown: Path, toy_m
 
 
 def test_what_was_not_recorded_is_a_dropped_frame_and_no_picture_shown_again(
-    flown: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
+    recorded: Path, toy_model: Path, as_it_was: dict[int, dict[str, Any]], tmp_path: Path
 ) -> None:
-    recorded = replay("play", "--record", "--sequence", flown, "--model", toy_model, "--out", tmp_path / "first")
-    assert recorded.returncode == 0, recorded.stderr
-    (path,) = (tmp_path / "first/recordings").glob("*.mcap")
     gap = range(15, 21)  # by the scene's numbers
 
     def keep(topic: str, message: Message) -> bool:
         return not topic.endswith("/image/compressed") or frame_of(CompressedImage.decode(message.data).data) not in gap
 
-    cut = copied(path, tmp_path / "cut.mcap", keep)
+    cut = copied(recorded, tmp_path / "cut.mcap", keep)
     again = replay("play", "--lockstep", "--step", "--sequence", cut, "--model", toy_model, "--out", tmp_path / "again")
     assert again.returncode == 0, again.stderr
     sequence = read_sequence(tmp_path / "again/sequence")
@@ -220,7 +228,7 @@ def write_film(folder: Path, picture: Path, frames: int, row_s: float = 0.02) ->
 def test_a_video_whose_unpacking_was_stopped_is_unpacked_anew(
     number: signal.Signals, flown: Path, tmp_path: Path
 ) -> None:
-    frames, out = 1000, tmp_path / "out"
+    frames, out = 400, tmp_path / "out"
     path = write_film(tmp_path, flown / "rgb/000000.png", frames)
     command = [BIN / "uavpose-replay", "play", "--sequence", path, "--out", out]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
