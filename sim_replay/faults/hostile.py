@@ -13,6 +13,8 @@ from msgs.mavlink import MAVLink, dialect
 VEHICLE = 1
 STRANGE_SYSTEM = 42
 DATAGRAM_MAX = 1200
+FRAMES_IN_DATAGRAM = (1, 2, 4, 8, 16)
+SEQUENCE_NUMBERS = 256
 _BOOT_MS = 5_000
 
 
@@ -24,24 +26,34 @@ def random_datagrams(chance: random.Random) -> Iterator[bytes]:
 
 
 def hostile_datagrams() -> Iterator[bytes]:
-    """Valid checksums: telemetry of another system or component, NaN, infinities, no rotations, absurd positions."""
+    """Valid checksums: telemetry of another system or component, NaN, infinities, no rotations, absurd positions.
+
+    One frame in a datagram, or several, as autopilots send them too.
+    """
+    frames = itertools.cycle(hostile_frames())
+    for count in itertools.cycle(FRAMES_IN_DATAGRAM):
+        yield b"".join(itertools.islice(frames, count))
+
+
+def hostile_frames() -> list[bytes]:
+    """The frames of `hostile_datagrams`, as many as it takes until each sender's sequence numbers begin again."""
     vehicle = MAVLink(None, srcSystem=VEHICLE, srcComponent=1)
     strangers = (
         MAVLink(None, srcSystem=STRANGE_SYSTEM, srcComponent=1),
         MAVLink(None, srcSystem=VEHICLE, srcComponent=66),
         MAVLink(None, srcSystem=255, srcComponent=190),
     )
-    while True:
-        for message in _absurd():
-            yield _packed(vehicle, message)
-        for stranger, message in itertools.product(strangers, _upside_down()):
-            yield _packed(stranger, message)
+    frames = []
+    for _ in range(SEQUENCE_NUMBERS):
+        frames += [_packed(vehicle, message) for message in _absurd()]
+        frames += [_packed(stranger, message) for stranger, message in itertools.product(strangers, _upside_down())]
+    return frames
 
 
 def _packed(mav: Any, message: Any) -> bytes:
     """Packed by pymavlink: our own encoder rejects non-finite values."""
     packed = bytes(message.pack(mav))
-    mav.seq = (mav.seq + 1) % 256
+    mav.seq = (mav.seq + 1) % SEQUENCE_NUMBERS
     return packed
 
 
