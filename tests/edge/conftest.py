@@ -12,6 +12,7 @@ import pytest
 
 from edge import clock
 
+from .flying import write_swaying_scene
 from .toy_model import write_toy_model
 from .toy_scene import write_scene
 
@@ -26,6 +27,12 @@ def toy_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scenes") / "000001", frames=40)
+
+
+@pytest.fixture(scope="session")
+def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene in which the toy model never loses its target."""
+    return write_swaying_scene(tmp_path_factory.mktemp("scenes") / "000001")
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from sim_replay.ports import free_port
 from tests.waiting import until
 
 from .conftest import Cli
-from .flying import flying, toml, write_swaying_scene
+from .flying import flying, toml
 from .test_cameras_stream import UdpCamera
 
 
@@ -48,10 +48,9 @@ def findings(cli: Cli, tmp_path: Path, text: str) -> tuple[int, dict[str, dict[s
     return done.returncode, {finding["what"]: finding for finding in answer["findings"]}
 
 
-def test_a_machine_that_can_fly_is_told_so(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
-    scene = write_swaying_scene(tmp_path / "000001")
+def test_a_machine_that_can_fly_is_told_so(cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path) -> None:
     more = f'[recorder]\nenabled = true\nfolder = "{tmp_path}"\nfree_min_mb = 1\n'
-    code, found = findings(cli, tmp_path, toml(scene, toy_model, free_port(), more))
+    code, found = findings(cli, tmp_path, toml(swaying, toy_model, free_port(), more))
     assert [f for f in found.values() if f["verdict"] == "wrong"] == []
     assert code == 0
     assert set(found) >= {"processor", "cores", "clock", "disk", "camera", "model", "zenoh"}
@@ -81,11 +80,10 @@ def test_each_fault_is_found_at_once_with_what_to_do(cli: Cli, tmp_path: Path) -
 
 
 def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
-    cli: Cli, tmp_path: Path, toy_model: Path
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
 ) -> None:
-    scene = write_swaying_scene(tmp_path / "000001")
     with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as scraped:
-        text = toml(scene, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
+        text = toml(swaying, toy_model, taken.getsockname()[1]).partition("[mavlink]")[0]
         text += '[mavlink]\nendpoints = ["udpin:127.0.0.1:0", "tcpout:autopilot.invalid:5760"]\n'
         text += f"[health]\nprometheus_port = {scraped.getsockname()[1]}\n"
         code, found = findings(cli, tmp_path, text)
@@ -103,9 +101,9 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
     [("ground..local", "host 'ground..local' cannot be resolved"), ("192.0.2.1", "Cannot assign requested address")],
 )
 def test_an_address_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_another_holds(
-    cli: Cli, tmp_path: Path, toy_model: Path, host: str, said: str
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path, host: str, said: str
 ) -> None:
-    text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
+    text = toml(swaying, toy_model, free_port()).partition("[mavlink]")[0]
     text = text.replace("127.0.0.1", "192.0.2.1") + f'[mavlink]\nendpoints = ["udpin:{host}:14550"]\n'
     code, found = findings(cli, tmp_path, text)
     assert code == 1
@@ -116,9 +114,9 @@ def test_an_address_that_is_none_of_ours_is_not_taken_for_an_endpoint_that_anoth
 
 
 def test_a_serial_port_that_another_program_holds_is_not_taken_for_a_silent_autopilot(
-    cli: Cli, tmp_path: Path, toy_model: Path
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
 ) -> None:
-    text = toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()).partition("[mavlink]")[0]
+    text = toml(swaying, toy_model, free_port()).partition("[mavlink]")[0]
     held, port = pty.openpty()
     with serial.Serial(os.ttyname(port), exclusive=True):
         code, found = findings(cli, tmp_path, text + f'[mavlink]\nendpoints = ["serial:{os.ttyname(port)}:57600"]\n')
@@ -168,10 +166,9 @@ def test_a_disk_without_room_is_wrong(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_only_the_ground_s_command_would_write_to_is_looked_at_too(
-    cli: Cli, tmp_path: Path, toy_model: Path
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
 ) -> None:
-    scene = write_swaying_scene(tmp_path / "000001")
-    text = toml(scene, toy_model, free_port(), '[recorder]\nfolder = "/proc/none"\n')
+    text = toml(swaying, toy_model, free_port(), '[recorder]\nfolder = "/proc/none"\n')
     code, found = findings(cli, tmp_path, text)
     assert (code, found["disk"]["verdict"]) == (0, "poor")
     assert "requested by the ground" in found["disk"]["says"]
@@ -210,10 +207,12 @@ def test_a_camera_that_the_running_daemon_has_is_not_taken_for_a_broken_one(
     assert "running (process " in found["daemon"]["says"]
 
 
-def test_what_the_running_daemon_says_of_its_links_is_taken(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
-    scene, asked_at = write_swaying_scene(tmp_path / "000001"), free_port()
+def test_what_the_running_daemon_says_of_its_links_is_taken(
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
+) -> None:
+    asked_at = free_port()
     links = f'endpoints = ["udpin:127.0.0.1:0", "serial:{tmp_path}/none:57600"]\n'
-    text = toml(scene, toy_model, asked_at).replace("enabled = false\n", links)
+    text = toml(swaying, toy_model, asked_at).replace("enabled = false\n", links)
     assert links in text
 
     def lacks_attitude() -> bool:
@@ -228,8 +227,8 @@ def test_what_the_running_daemon_says_of_its_links_is_taken(cli: Cli, tmp_path: 
     assert "autopilot" in found["daemon"]["advice"]
 
 
-def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model: Path) -> None:
-    (tmp_path / "config.toml").write_text(toml(write_swaying_scene(tmp_path / "000001"), toy_model, free_port()))
+def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
+    (tmp_path / "config.toml").write_text(toml(swaying, toy_model, free_port()))
     file = load_config(tmp_path / "config.toml")
     info = CameraInfo("nose", (320, 180), np.eye(3), None)
     running = StatusBoard(file, load_configured(file), info).info()

@@ -41,7 +41,7 @@ from msgs.client import connect
 from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .flying import flying, toml, write_swaying_scene
+from .flying import flying, toml
 from .toy_scene import K
 
 STICKS_LATER = """
@@ -73,8 +73,10 @@ def test_a_camera_that_never_gave_a_frame_is_a_fault_once_it_has_had_its_time() 
     assert health.assess(6 + FIRST_FRAME_NS).state is HealthState.INIT, "as the settings have it"
 
 
-def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path: Path, toy_model: Path) -> None:
-    scene, words, over = write_swaying_scene(tmp_path / "000001"), list[str](), threading.Event()
+def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(
+    tmp_path: Path, toy_model: Path, swaying: Path
+) -> None:
+    words, over = list[str](), threading.Event()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(0.1)
@@ -88,7 +90,7 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path:
         manager.start()
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
         port, heard = free_port(), list[str]()
-        text = toml(scene, toy_model, port, "[health]\nloop_stuck_s = 5.0\n")
+        text = toml(swaying, toy_model, port, "[health]\nloop_stuck_s = 5.0\n")
         try:
             with (
                 flying(tmp_path, text, environment, program=("-c", STICKS_LATER)) as flight,
@@ -114,13 +116,12 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(tmp_path:
     assert words[-1] != "WATCHDOG=1"
 
 
-def test_a_daemon_told_to_stop_tells_systemd(tmp_path: Path, toy_model: Path) -> None:
-    scene = write_swaying_scene(tmp_path / "000001")
+def test_a_daemon_told_to_stop_tells_systemd(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind("\0uavpose-" + tmp_path.name)
         systemd.settimeout(20.0)
         environment = {"NOTIFY_SOCKET": "@uavpose-" + tmp_path.name}
-        with flying(tmp_path, toml(scene, toy_model, free_port()), environment) as flight:
+        with flying(tmp_path, toml(swaying, toy_model, free_port()), environment) as flight:
             flight.process.terminate()
             word = ""
             while word != "STOPPING=1":

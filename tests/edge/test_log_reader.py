@@ -15,15 +15,15 @@ from msgs.client import connect
 from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .flying import flying, toml, write_swaying_scene
+from .flying import flying, toml
 
 RELOADS = 25  # each is two lines of the log and more, of which forty fill the pipe
 
 
-def test_a_log_that_nobody_reads_keeps_the_daemon_from_nothing(tmp_path: Path, toy_model: Path) -> None:
-    scene, port = write_swaying_scene(tmp_path / "000001"), free_port()
+def test_a_log_that_nobody_reads_keeps_the_daemon_from_nothing(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
+    port = free_port()
     with (
-        flying(tmp_path, toml(scene, toy_model, port)) as flight,
+        flying(tmp_path, toml(swaying, toy_model, port)) as flight,
         connect(f"tcp/127.0.0.1:{port}") as ground,
     ):
         assert flight.process.stderr is not None
@@ -39,10 +39,10 @@ def test_a_log_that_nobody_reads_keeps_the_daemon_from_nothing(tmp_path: Path, t
         assert flight.process.wait(timeout=60) == 0
 
 
-def test_a_flood_of_commands_fills_no_log(tmp_path: Path, toy_model: Path) -> None:
-    scene, port = write_swaying_scene(tmp_path / "000001"), free_port()
+def test_a_flood_of_commands_fills_no_log(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
+    port = free_port()
     with (
-        flying(tmp_path, toml(scene, toy_model, port)) as flight,
+        flying(tmp_path, toml(swaying, toy_model, port)) as flight,
         connect(f"tcp/127.0.0.1:{port}") as ground,
     ):
         began = time.monotonic()

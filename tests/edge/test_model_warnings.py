@@ -26,7 +26,7 @@ from msgs.client import connect, subscribe
 from sim_replay.ports import free_port
 
 from .conftest import Cli
-from .flying import flying, toml, write_swaying_scene
+from .flying import flying, toml
 from .toy_model import write_toy_model
 
 # `uavpose-edge` with an ONNX Runtime that has a GPU, which the CPU stands in for until the file BROKEN is there.
@@ -73,11 +73,6 @@ sys.exit(main())
 @pytest.fixture
 def calibrated(tmp_path: Path) -> Path:
     return write_toy_model(tmp_path / "calibrated.onnx", track_score={"offset": 0.1})
-
-
-@pytest.fixture
-def swaying(tmp_path: Path) -> Path:
-    return write_swaying_scene(tmp_path / "000001")
 
 
 def on_the_gpu(text: str) -> str:

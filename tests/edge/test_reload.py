@@ -35,13 +35,8 @@ from sim_replay.ports import free_port
 from tests.certificates import redate
 from tests.waiting import until
 
-from .flying import Flight, flying, toml, write_swaying_scene
+from .flying import Flight, flying, toml
 from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
-
-
-@pytest.fixture(scope="module")
-def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_swaying_scene(tmp_path_factory.mktemp("scenes") / "000001")
 
 
 @pytest.fixture

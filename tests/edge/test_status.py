@@ -31,7 +31,7 @@ from sim_replay.ports import free_port
 from tests.waiting import until
 
 from .conftest import Cli
-from .flying import Flight, flying, toml, write_swaying_scene
+from .flying import Flight, flying, toml
 
 SAMPLE = re.compile(r'^[a-z_]+(\{[a-z0-9_]+="[^"]*"(,[a-z0-9_]+="[^"]*")*\})? [-+0-9.e]+$')
 
@@ -47,10 +47,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def daemon(folder: Path, toy_model: Path, ports: tuple[int, int]) -> Iterator[Flight]:
-    scene = write_swaying_scene(folder / "000001")
+def daemon(folder: Path, toy_model: Path, swaying: Path, ports: tuple[int, int]) -> Iterator[Flight]:
     more = f'[health]\nprometheus_port = {ports[1]}\n[vehicle]\nname = "kestrel"\n'
-    with flying(folder, toml(scene, toy_model, ports[0], more)) as flight:
+    with flying(folder, toml(swaying, toy_model, ports[0], more)) as flight:
         yield flight
 
 
