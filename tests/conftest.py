@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 from collections.abc import Callable, Generator
 
@@ -13,6 +14,8 @@ settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
 # A shell that runs the tests in the background has Ctrl-C ignored, and all that is started here would ignore it too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# Images for containers often forbid bytecode: then each of the hundreds of processes compiles what it imports anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 RECOVERY = "recovery"  # the user property in which a test leaves a line for the closing report
 
