@@ -190,6 +190,7 @@ def router_config(
     """The ground station's session, to which UAVs and tools connect; `access_control` is zenoh's section of that
     name."""
     config = _config("router", listen, [], tls)
+    _insert(config, "scouting/delay", 0)  # it looks for nobody, and otherwise opens half a second later
     if access_control is not None:
         _insert(config, "access_control", access_control)
     return config

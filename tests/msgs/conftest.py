@@ -13,6 +13,7 @@ import zenoh
 
 from msgs import cdr, session
 from sim_replay.ports import free_endpoint
+from tests.waiting import until
 
 
 def pose_now(z_m: float = 300.0, age_s: float = 0.0) -> cdr.PoseWithCovarianceStamped:
@@ -35,5 +36,8 @@ def network() -> Iterator[Network]:
     endpoint = free_endpoint()
     with ExitStack() as stack:
         router = stack.enter_context(zenoh.open(session.router_config([endpoint])))
-        daemon = stack.enter_context(zenoh.open(session.peer_config([free_endpoint()], [endpoint])))
+        config = session.peer_config([free_endpoint()], [endpoint])
+        config.insert_json5("scouting/delay", "0")  # zenoh waits as long although they are connected at once
+        daemon = stack.enter_context(zenoh.open(config))
+        until(lambda: list(daemon.info.routers_zid()), what="the daemon's connection to the router")
         yield Network(endpoint, daemon, router)
