@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import tomllib
 from collections import Counter
 from pathlib import Path
@@ -87,18 +88,28 @@ def test_every_photograph_is_used_and_half_of_the_sequences_use_none(count: int)
     assert max(used.values()) < 2 * min(used.values())
 
 
-@pytest.fixture
-def made(tmp_path: Path) -> list[str]:
-    """The words that made a dataset of two photographs offered, ready to be said again."""
-    (tmp_path / "mine.toml").write_text(PRESET)
-    photographs = tmp_path / "photographs"
-    photographs.mkdir()
+def words_in(folder: Path) -> list[str]:
+    words = ["generate", "--preset", str(folder / "mine.toml"), "--out", str(folder / "data"), "--labels-only"]
+    return [*words, "--workers", "1", "--backdrops", str(folder / "photographs")]
+
+
+@pytest.fixture(scope="module")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a dataset, for which two photographs were offered."""
+    folder = tmp_path_factory.mktemp("once")
+    (folder / "mine.toml").write_text(PRESET)
+    (folder / "photographs").mkdir()
     for name in ("lake", "meadow"):
-        cv2.imwrite(str(photographs / f"{name}.png"), np.full((32, 64, 3), 90, np.uint8))
-    words = ["generate", "--preset", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "data"), "--labels-only"]
-    words += ["--workers", "1", "--backdrops", str(photographs)]
-    assert main(words) == 0
-    return [*words, "--resume"]
+        cv2.imwrite(str(folder / "photographs" / f"{name}.png"), np.full((32, 64, 3), 90, np.uint8))
+    assert main(words_in(folder)) == 0
+    return folder
+
+
+@pytest.fixture
+def made(once: Path, tmp_path: Path) -> list[str]:
+    """The words that make such a dataset, which is there, go on."""
+    shutil.copytree(once, tmp_path, dirs_exist_ok=True)
+    return [*words_in(tmp_path), "--resume"]
 
 
 def test_the_same_recipe_goes_on(made: list[str]) -> None:
