@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from typing import Generic, TypeVar
 
 import zenoh
@@ -154,12 +155,20 @@ def subscribe_directions(
 
 
 class TopicCounts:
-    """Counts the samples of every topic of one UAV and validates its poses; created by `subscribe_all`."""
+    """Counts the samples of every topic of one UAV, validates its poses and directions; made by `subscribe_all`."""
 
-    def __init__(self, uav: str, domain: int, max_age_s: float, on_pose: Callable[[TargetPose], None]) -> None:
+    def __init__(
+        self,
+        uav: str,
+        domain: int,
+        max_age_s: float,
+        on_pose: Callable[[TargetPose], None],
+        on_direction: Callable[[TargetDirection], None],
+    ) -> None:
         self._uav = uav
         self._domain = domain
         self._on_pose = on_pose
+        self._on_direction = on_direction
         self._receiver = PoseReceiver(uav, domain=domain, max_age_s=max_age_s)
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
@@ -167,18 +176,18 @@ class TopicCounts:
         self._subscribers: list[Subscriber] = []
 
     def counts(self) -> dict[str, int]:
-        """Samples received by topic, e.g. `uav1/target/t0/pose`; refused poses are counted too."""
+        """Samples received by topic, e.g. `uav1/target/t0/pose`; refused ones are counted too."""
         with self._lock:
             return dict(self._counts)
 
     def refused(self) -> dict[Refusal, int]:
-        """Poses refused, by reason."""
+        """Poses and directions refused, by reason."""
         with self._lock:
             return dict(self._receiver.refused)
 
     def failures(self) -> dict[str, int]:
-        """Number of exceptions raised by `on_pose`, which interrupt nothing: by message, or by type alone once there
-        are FAILURES_MAX different messages."""
+        """Number of exceptions raised by the callbacks, which interrupt nothing: by message, or by type alone once
+        there are FAILURES_MAX different messages."""
         with self._lock:
             return dict(self._failures)
 
@@ -200,17 +209,25 @@ class TopicCounts:
                 return
             topic, target = row
             self._counts[topics.topic_name(topic, self._uav, target)] += 1
-            pose = _received(self._receiver.receive, sample) if topic is topics.POSE else None
-        if pose is None:
+            tell = self._accepted(topic, sample)
+        if tell is None:
             return
         # zenoh would only print an exception.
         try:
-            self._on_pose(pose)
+            tell()
         except Exception as error:
             with self._lock:
                 text = f"{type(error).__name__}: {error}"
                 crowded = len(self._failures) >= FAILURES_MAX and text not in self._failures
                 self._failures[type(error).__name__ if crowded else text] += 1
+
+    def _accepted(self, topic: Topic, sample: zenoh.Sample) -> Callable[[], None] | None:
+        """What passes an accepted pose or direction on; None for a refused one and for other topics."""
+        if topic is topics.POSE and (pose := _received(self._receiver.receive, sample)) is not None:
+            return partial(self._on_pose, pose)
+        if topic is topics.DIRECTION and (seen := _received(self._receiver.receive_direction, sample)) is not None:
+            return partial(self._on_direction, seen)
+        return None
 
     def _declare(self, session: zenoh.Session) -> None:
         # An indirect callback would run in a Python thread that keeps the process alive while the session is open.
@@ -225,6 +242,7 @@ def subscribe_all(
     session: zenoh.Session,
     uav: str,
     on_pose: Callable[[TargetPose], None] = lambda _: None,
+    on_direction: Callable[[TargetDirection], None] = lambda _: None,
     *,
     domain: int = 0,
     max_age_s: float = 1.0,
@@ -232,10 +250,10 @@ def subscribe_all(
     """Subscribe to every topic of one UAV except images, which the daemon encodes only while somebody subscribes;
     cached topics deliver their history first.
 
-    `on_pose` is called with each validated pose on zenoh's receiving thread and must return quickly. Close the result,
-    or use it as a context.
+    `on_pose` is called with each validated pose, `on_direction` with each validated direction, on zenoh's receiving
+    thread; both must return quickly. Close the result, or use it as a context.
     """
-    counts = TopicCounts(uav, domain, max_age_s, on_pose)
+    counts = TopicCounts(uav, domain, max_age_s, on_pose, on_direction)
     counts._declare(session)
     return counts
 

@@ -61,6 +61,11 @@ class TargetDirection:
     ray_cam: Array  # [3], unit length, camera to target
     arrival_ns: int  # UTC of reception
 
+    @property
+    def age_s(self) -> float:
+        """As a pose's."""
+        return (self.arrival_ns - self.stamp_ns) / _NS
+
 
 @dataclass(frozen=True)
 class _Last:

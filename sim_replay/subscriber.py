@@ -2,9 +2,9 @@
 
     python -m sim_replay.subscriber --connect tcp/127.0.0.1:7448 --uav uav1
 
-Prints one JSON object per line: `ready`, each valid `pose`, each `diagnostics`, with --all each `sample` of the other
-topics with a timestamp, and a `summary` of samples by topic and refusals by reason when it is told to stop (SIGTERM,
-SIGINT) or its parent process ends.
+Prints one JSON object per line: `ready`, each valid `pose` and `direction`, each `diagnostics`, with --all each
+`sample`, valid or not, of the topics with a timestamp other than poses, and a `summary` of samples by topic and
+refusals by reason when it is told to stop (SIGTERM, SIGINT) or its parent process ends.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import zenoh
 from msgs import topics
 from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage, Vector3Stamped
 from msgs.client import connect, subscribe_all
-from msgs.receive import TargetPose
+from msgs.receive import TargetDirection, TargetPose
 from msgs.signals import stop_on_signals
 from msgs.wire import PayloadError
 
@@ -47,6 +47,17 @@ def pose_record(pose: TargetPose) -> dict[str, Any]:
         "rotation_known": pose.rotation_known,
         "q_cam_target_wxyz": [w, x, y, z],
         "covariance": pose.pose.covariance.tolist(),
+    }
+
+
+def direction_record(seen: TargetDirection) -> dict[str, Any]:
+    """The `direction` line of an accepted direction."""
+    return {
+        "event": "direction",
+        "target": seen.target,
+        "capture_utc_ns": seen.stamp_ns,
+        "age_ms": round(seen.age_s * 1e3, 3),
+        "ray_cam": seen.ray_cam.tolist(),
     }
 
 
@@ -113,7 +124,13 @@ def _listen(
     def on_sample(topic: topics.Topic, sample: zenoh.Sample) -> None:
         records.put(sample_record(topic, sample.payload.to_bytes(), time.time_ns()))
 
-    counts = subscribe_all(session, uav, lambda pose: records.put(pose_record(pose)), max_age_s=max_age_s)
+    counts = subscribe_all(
+        session,
+        uav,
+        lambda pose: records.put(pose_record(pose)),
+        lambda seen: records.put(direction_record(seen)),
+        max_age_s=max_age_s,
+    )
     takers: list[tuple[topics.Topic, Callable[[zenoh.Sample], None]]] = [(topics.DIAGNOSTICS, on_diagnostics)]
     if everything:
         takers += [(topic, functools.partial(on_sample, topic)) for topic in TIMED]
@@ -149,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--wait-s", type=float, default=30.0, help="how long the daemon may take to appear")
     parser.add_argument("--all", action="store_true", help="print a line for odometry, detections and transforms too")
     parser.add_argument(
-        "--max-age-s", type=float, default=MAX_AGE_S, help="poses that come later than this are refused (%(default)s)"
+        "--max-age-s", type=float, default=MAX_AGE_S, help="what comes later than this is refused (%(default)s)"
     )
     args = parser.parse_args(argv)
     stop = stop_on_signals()

@@ -124,5 +124,5 @@ class Witness:
             self.state, self.counted_ns = record["message"], time.time_ns()
         elif event == "summary":
             self.summaries.append((name, record))
-        else:
+        elif event != "direction":  # a `sample` tells it as well
             self.complaints.append(f"{name}: {line}")

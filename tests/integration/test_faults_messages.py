@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -10,11 +11,12 @@ import pytest
 
 from msgs import topics
 from msgs.cdr import Detection3DArray, TFMessage, TransformStamped, Vector3Stamped
+from msgs.receive import TargetDirection
 from msgs.topics import Topic
 from sim_replay.faults.judge import faults_since, message_faults
 from sim_replay.faults.messages import AUTOPILOT, OWN_LAT_LON_ALT, ReceivedMessage, from_mavlink, from_zenoh
 from sim_replay.faults.witness import ExposedFrame, Witness
-from sim_replay.subscriber import sample_record
+from sim_replay.subscriber import direction_record, sample_record
 
 MS = 1_000_000
 T0 = 1_700_000_000_000_000_000
@@ -87,6 +89,13 @@ def test_what_is_fresh_and_true_is_no_fault() -> None:
 def test_what_is_stale_or_untrue_is_found(message: ReceivedMessage, words: str) -> None:
     (fault,) = message_faults([geo(350 * MS), message], FRAMES)
     assert words in fault
+
+
+def test_a_direction_is_told_twice_and_no_complaint() -> None:
+    seen = TargetDirection("uav1", "t0", FRAMES[3].stamp_ns, np.array([0.6, 0.0, 0.8]), FRAMES[4].stamp_ns)
+    witness = Witness()
+    witness.hear("subscriber", json.dumps(direction_record(seen)))
+    assert (witness.complaints, witness.poses, witness.messages) == ([], [], [])
 
 
 def test_a_camera_that_says_it_tracks_nothing_tells_of_no_target() -> None:

@@ -1,14 +1,23 @@
-"""The subscriber before its daemon is there."""
+"""The subscriber before its daemon is there, and what it prints of a target whose range is not known."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
+import zenoh
+
+from msgs import session, topics
+from msgs.cdr import Vector3Stamped
+from msgs.publish import Node
+from sim_replay.ports import free_endpoint
 from tests.waiting import runs, until
 
 PATIENCE_S = 3600.0
@@ -53,3 +62,30 @@ def test_it_ends_with_a_player_that_is_killed_while_it_waits_for_a_daemon() -> N
                 process.kill()
                 if runs(pid):
                     os.kill(pid, signal.SIGKILL)
+
+
+def test_it_prints_the_directions_that_are_valid_and_counts_the_others() -> None:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "sim_replay.subscriber", "--connect", endpoint, "--max-age-s", str(PATIENCE_S)]
+    ray_cam = np.array([0.6, 0.0, 0.8])
+    with zenoh.open(session.peer_config([endpoint], [])) as daemon, Node(daemon, "uav1") as node:
+        publisher = node.publisher(topics.DIRECTION, "t2")
+        reached = daemon.declare_publisher(publisher.key)
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            try:
+                assert process.stdout is not None
+                assert json.loads(process.stdout.readline()) == {"event": "ready"}
+                until(lambda: reached.matching_status.matching, what="the subscription")
+                sent_ns = time.time_ns()
+                for length in (2.0, 1.0):
+                    publisher.put(Vector3Stamped(sent_ns, topics.FRAME_CAMERA, length * ray_cam).encode())
+                seen = json.loads(process.stdout.readline())
+                process.terminate()
+                said, _ = process.communicate(timeout=60)
+            finally:
+                process.kill()
+    assert seen.pop("age_ms") >= 0.0
+    assert seen == {"event": "direction", "target": "t2", "capture_utc_ns": sent_ns, "ray_cam": ray_cam.tolist()}
+    summary = json.loads(said)
+    assert summary["received"] == {"uav1/target/t2/direction": 2}
+    assert summary["refused"] == {"DIRECTION": 1}
