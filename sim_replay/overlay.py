@@ -25,6 +25,7 @@ _PANEL_BGR: Color = (28, 24, 20)
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 _SUBPIXEL_BITS = 4
 _PLACE_PX = 12  # size of a cross, per pixel of line width
+_RING_PX = 28  # radius around a target of unknown range, in a picture of 1080 rows
 _INSET_SCALE = 2.2  # window side over the target's longer projected side
 
 
@@ -50,6 +51,7 @@ class FrameView:
     extents: Extents | None  # of that target
     latency_ms: float | None
     others: tuple[tuple[Match, Extents], ...] = ()  # the frame's other targets
+    directions: tuple[TargetPose, ...] = ()  # targets of unknown range: only their directions mean anything
 
 
 def project(points_cam_m: ArrayLike, K: Array) -> Array | None:
@@ -105,7 +107,7 @@ class Overlay:
         canvas = image_bgr.copy()
         view = self._views[index]
         inset = self._inset(view, image_bgr)
-        self._draw_poses(canvas, view, view.K, self._px(2))
+        self._draw_targets(canvas, view, view.K, self._px(2))
         if inset is not None:
             top, left = self._px(32), self._inset_left
             canvas[top : top + self._inset_px, left : left + self._inset_px] = inset
@@ -124,13 +126,27 @@ class Overlay:
         inside = [c for c in centers if c is not None and c[0, 0] > 0.7 * self._width and c[0, 1] < 0.55 * self._height]
         return len(inside) > 0.1 * max(len(centers), 1)
 
-    def _draw_poses(self, canvas: Image, view: FrameView, K: Array, thickness: int) -> None:
-        if view.match is None or view.extents is None:
-            return
-        for match, extents in ((view.match, view.extents), *view.others):
+    def _draw_targets(self, canvas: Image, view: FrameView, K: Array, thickness: int) -> None:
+        first = () if view.match is None or view.extents is None else ((view.match, view.extents),)
+        for match, extents in (*first, *view.others):
             draw_pose(canvas, K, match.truth, extents, TRUTH_BGR, thickness + self._px(1))
             if match.estimate is not None:
                 draw_pose(canvas, K, match.estimate, extents, ESTIMATE_BGR, thickness)
+        for seen in view.directions:
+            self._draw_direction(canvas, K, seen, thickness)
+
+    def _draw_direction(self, canvas: Image, K: Array, seen: TargetPose, thickness: int) -> None:
+        """A ring with the target's name below it; nothing if it is seen behind the camera."""
+        place_px = project(seen.t_cam_target_m[None], K)
+        if place_px is None or np.abs(place_px).max() > 1e5:
+            return
+        u, v = (int(c) for c in np.round(place_px[0]))
+        radius = self._px(_RING_PX)
+        cv2.circle(canvas, (u, v), radius, ESTIMATE_BGR, thickness, cv2.LINE_AA)
+        label, size = f"{seen.track} range ?", self._px(26)
+        _, _, width, _ = cv2.getTextSize((self._width, self._height), label, (0, 0), self._font, size, 500)
+        below = (u - width // 2, v + radius + size)
+        cv2.putText(canvas, label, below, ESTIMATE_BGR, self._font, size, 500)
 
     def _inset(self, view: FrameView, image_bgr: Image) -> Image | None:
         """The target's surroundings enlarged, with boxes drawn at the inset's own resolution."""
@@ -146,7 +162,7 @@ class Overlay:
         left, top = (int(c) for c in np.clip(np.round((low + high - side) / 2.0), 0, limits))
         crop = image_bgr[top : top + side, left : left + side]
         inset = np.asarray(cv2.resize(crop, (self._inset_px,) * 2, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
-        self._draw_poses(inset, view, window_camera(view.K, (left, top), self._inset_px / side), self._px(2))
+        self._draw_targets(inset, view, window_camera(view.K, (left, top), self._inset_px / side), self._px(2))
         return inset
 
     def _text(self, canvas: Image, text: str, left: float, base: float, size: float, color: Color) -> None:

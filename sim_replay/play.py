@@ -57,13 +57,19 @@ class Recording:
     daemon_counters: dict[str, int] = field(default_factory=dict)  # the daemon's own, as logged when it stopped
     poses: list[Record] = field(default_factory=list)  # sim_replay.subscriber's `pose`
     targets: list[Record] = field(default_factory=list)  # sim_replay.autopilot's `target_relative`
+    directions: list[Record] = field(default_factory=list)  # its `direction`
     diagnostics: list[Record] = field(default_factory=list)
     mavlink: Record = field(default_factory=dict)  # the autopilot's `summary`
     zenoh: Record = field(default_factory=dict)  # the subscriber's `summary`
 
     def take(self, name: str, record: Record) -> None:
         """Store one record printed by a peer."""
-        lists = {"pose": self.poses, "target_relative": self.targets, "diagnostics": self.diagnostics}
+        lists = {
+            "pose": self.poses,
+            "direction": self.directions,
+            "target_relative": self.targets,
+            "diagnostics": self.diagnostics,
+        }
         if record["event"] in lists:
             lists[record["event"]].append(record)
         elif record["event"] == "summary":
@@ -75,7 +81,7 @@ class Recording:
         return not self.zenoh_endpoint
 
     def capture_ns(self, record: Record) -> int:
-        """Exposure time, monotonic, of a pose or target record."""
+        """Exposure time, monotonic, of a pose, direction or target record."""
         utc_ns = record["capture_utc_ns"] if "capture_utc_ns" in record else record["capture_utc_us"] * 1000
         return int(utc_ns) - self.utc_minus_monotonic_ns
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +14,19 @@ from sim_replay.ground_truth import PlayedSequence, SceneTruth
 from sim_replay.overlay import Extents, FrameView
 from sim_replay.play import Record, Recording
 from sim_replay.report.peer import peer_figures, percentiles
-from sim_replay.score import Match, TargetPose, Truth, frame_of, latency_statistics, match_poses, statistics
+from sim_replay.score import (
+    Match,
+    TargetPose,
+    Truth,
+    direction_statistics,
+    frame_of,
+    latency_statistics,
+    match_poses,
+    statistics,
+)
 
 PEERS = ("subscriber", "autopilot")
+FAR_M = 1e4  # range that stands for an unknown one: further than any target is large, so that it is matched by bearing
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +45,7 @@ class Result:
 
     subscriber: PeerResult
     autopilot: PeerResult
+    directions: PeerResult  # what the subscriber was told of targets whose range is not known; see `direction_of`
     recording: Recording
 
     @property
@@ -62,6 +73,12 @@ def pose_of(record: Record, frame: int) -> TargetPose:
     )
 
 
+def direction_of(record: Record, frame: int) -> TargetPose:
+    """The direction in the subscriber's record, as a pose of which nothing but the direction means anything."""
+    t_m = FAR_M * np.array(record["ray_cam"], dtype=np.float64)
+    return TargetPose(frame, np.eye(3), t_m, track=str(record["target"]), rotation_known=False)
+
+
 def frame_of_record(record: Record, recording: Recording, sequence: PlayedSequence) -> int | None:
     """Index of the frame that a peer's record was measured in."""
     return frame_of(recording.capture_ns(record), recording.start_at_ns, sequence.fps, len(sequence.scene.images))
@@ -76,10 +93,12 @@ def judge(sequence: PlayedSequence, recording: Recording) -> Result:
     """Compare what arrived over zenoh and over MAVLink with the ground truth and the exposure times."""
     subscriber = ((record, float(record["age_ms"])) for record in recording.poses)
     autopilot = ((record, latency_ms(record, recording)) for record in recording.targets)
+    directions = ((record, float(record["age_ms"])) for record in recording.directions)
     truths = _told_apart(sequence.scene)
     return Result(
-        _judge_peer(sequence, truths, recording, subscriber),
-        _judge_peer(sequence, truths, recording, autopilot),
+        _judge_peer(sequence, truths, recording, subscriber, pose_of),
+        _judge_peer(sequence, truths, recording, autopilot, pose_of),
+        _judge_peer(sequence, truths, recording, directions, direction_of),
         recording,
     )
 
@@ -105,6 +124,7 @@ def _judge_peer(
     truths: Sequence[Truth],
     recording: Recording,
     received: Iterable[tuple[Record, float]],
+    read: Callable[[Record, int], TargetPose],
 ) -> PeerResult:
     estimates, ages, strays = [], [], 0
     for record, age_ms in received:
@@ -112,7 +132,7 @@ def _judge_peer(
         if frame is None:
             strays += 1
         else:
-            estimates.append(pose_of(record, frame))
+            estimates.append(read(record, frame))
             ages.append((frame, age_ms))
     matches, false_poses = match_poses(truths, estimates)
     visible = tuple(match for match in matches if match.truth.visible)
@@ -132,6 +152,9 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
         "poses": len(recording.poses),
         "stray_poses": subscriber.strays,
         **statistics(frames, subscriber.matches, subscriber.false_poses),
+        "directions": direction_statistics(
+            result.directions.matches, subscriber.matches, len(result.directions.false_poses)
+        ),
         "latency_ms": _latency_ms(recording),
         "dropped_frames": recording.daemon_counters.get("dropped", 0),
         "peers": {
@@ -176,7 +199,7 @@ def drops_told(sequence: PlayedSequence, score: dict[str, Any]) -> str | None:
 
 
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
-    """Overlay data of each frame: its targets, as the subscriber received them.
+    """Overlay data of each frame: its targets as the subscriber received them, and every direction.
 
     A frame that was not recorded shows the image of the one before, and has its data.
     """
@@ -184,6 +207,10 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
     for found in result.subscriber.matches:
         shown = (found, sequence.scene.extents[found.truth.object_id])
         by_frame.setdefault(found.truth.frame, []).append(shown)
+    matched = [match.estimate for match in result.directions.matches if match.estimate is not None]
+    directions: dict[int, list[TargetPose]] = {}
+    for direction in (*matched, *result.directions.false_poses):
+        directions.setdefault(direction.frame, []).append(direction)
     latencies_ms = result.latencies_ms
     views: list[FrameView] = []
     for frame, K in enumerate(sequence.scene.K):
@@ -192,5 +219,6 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
             continue
         seen = by_frame.get(frame, [])
         match, extents = seen[0] if seen else (None, None)
-        views.append(FrameView(K, match, extents, latencies_ms.get(frame), tuple(seen[1:])))
+        others, told = tuple(seen[1:]), tuple(directions.get(frame, ()))
+        views.append(FrameView(K, match, extents, latencies_ms.get(frame), others, told))
     return views

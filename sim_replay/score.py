@@ -178,6 +178,20 @@ def pose_statistics(frames: int, matches: Sequence[Match], false_positives_per_1
     }
 
 
+def direction_statistics(seen: Sequence[Match], matches: Sequence[Match], false: int) -> dict[str, Any] | None:
+    """{"targets", "bearing_error_deg": {"mean", "median"}, "false"} of the targets without a pose but with a direction.
+
+    `seen` and `matches` are of the same targets in the same order, with their directions and with their poses; `false`
+    is the number of directions that belong to no target. None without a false one and without such a target.
+    """
+    alone = [one.bearing_error_deg for one, told in zip(seen, matches, strict=True) if told.estimate is None]
+    errors = np.array([error for error in alone if error is not None], dtype=np.float64)
+    if not errors.size and not false:
+        return None
+    mean, median = (round(float(of(errors)), 5) if errors.size else None for of in (np.mean, np.median))
+    return {"targets": errors.size, "bearing_error_deg": {"mean": mean, "median": median}, "false": false}
+
+
 def calibration(matches: Sequence[Match]) -> dict[str, dict[str, float | None]] | None:
     """Share of the true values within one and two predicted standard deviations, by axis; None without covariances.
 

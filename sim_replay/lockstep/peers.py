@@ -22,7 +22,7 @@ from sim_replay.autopilot import Autopilot
 from sim_replay.mavlink_record import message_record
 from sim_replay.play import PlayError
 from sim_replay.ports import LOOPBACK
-from sim_replay.subscriber import pose_record
+from sim_replay.subscriber import direction_record, pose_record
 
 Record = dict[str, Any]
 
@@ -90,12 +90,13 @@ class MavlinkPeer:
 
 
 class Subscriber:
-    """Receives poses like a user's program; the frame's detections say which poses belong to it."""
+    """Receives poses and directions like a user's program; the frame's detections say which poses belong to it."""
 
     def __init__(self, endpoint: str, uav: str, frame0_ns: int) -> None:
         """Raises PlayError if the daemon does not answer at `endpoint`."""
         self.records: list[Record] = []
-        self.received: list[Record] = []  # as in sim_replay.subscriber's output
+        self.received: list[Record] = []  # poses as in sim_replay.subscriber's output
+        self.directions: list[Record] = []  # likewise
         self._frame0_ns = frame0_ns
         self._receiver = PoseReceiver(uav)
         self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
@@ -104,7 +105,7 @@ class Subscriber:
         self._uav = uav
         self._session = _connect(endpoint)
         handler = zenoh.handlers.Callback(self._on_sample, indirect=False)
-        keys = [topics.subscription_key(topic, uav) for topic in (topics.POSE, topics.DETECTIONS)]
+        keys = [topics.subscription_key(topic, uav) for topic in (topics.POSE, topics.DIRECTION, topics.DETECTIONS)]
         self._subscribers = [self._session.declare_subscriber(key, handler) for key in keys]
         self._wait_until_known(uav)
 
@@ -136,6 +137,12 @@ class Subscriber:
         if row is not None and row[0] is topics.DETECTIONS:
             array = Detection3DArray.decode(payload)
             self._frames[array.stamp_ns] = [one.id for one in array.detections]
+            return
+        if row is not None and row[0] is topics.DIRECTION:
+            seen = self._receiver.receive_direction(key, payload, attachment, now_ns)
+            if seen is None:
+                raise PlayError(f"the subscriber refused a direction: {dict(self._receiver.refused)}")
+            self.directions.append(direction_record(seen))
             return
         pose = self._receiver.receive(key, payload, attachment, now_ns)
         if pose is None:

@@ -142,6 +142,7 @@ class Flight:
     def outputs(self) -> Outputs:
         recording = Recording(self._frame0_ns, 0, 0, "", 0)
         recording.poses, recording.targets = self._subscriber.received, self._mavlink.targets
+        recording.directions = self._subscriber.directions
         return Outputs(self._subscriber.records, self._mavlink.records, recording)
 
     def fly(self, before_frame: BeforeFrame, after_frame: AfterFrame) -> None:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from edge.errors import InputError
+from msgs.receive import RAY_TOLERANCE
 from sim_replay.play import MESSAGES_JSONL, Record, Recording
+from sim_replay.result import direction_of, pose_of
 from sim_replay.result import latency_ms as latency_ms_of
-from sim_replay.result import pose_of
 
 FLIGHT_JSON, RECEIVED_JSONL = "flight.json", "received.jsonl"
 # Files that `demo`, `play` and `score` write into a flight's folder; the daemon's recordings belong to the user.
@@ -20,7 +21,7 @@ WRITTEN = (
     *(FLIGHT_JSON, RECEIVED_JSONL, MESSAGES_JSONL, "poses.jsonl", "config.toml", "daemon.log", "gimbal.csv"),
     *("score.json", "frames.jsonl", "report.html", "overlay.mp4", "overlay.png"),
 )
-_PEER_OF = {"target_relative": "autopilot", "pose": "subscriber", "diagnostics": "subscriber"}
+_PEER_OF = {"target_relative": "autopilot"} | dict.fromkeys(("pose", "direction", "diagnostics"), "subscriber")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,8 @@ def write_flight(out: Path, flight: RecordedFlight) -> None:
         "daemon_counters": recording.daemon_counters,
     }
     (out / FLIGHT_JSON).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    lines = [(_PEER_OF[r["event"]], r) for r in (*recording.poses, *recording.targets, *recording.diagnostics)]
+    records = (*recording.poses, *recording.directions, *recording.targets, *recording.diagnostics)
+    lines = [(_PEER_OF[record["event"]], record) for record in records]
     summaries = (("autopilot", recording.mavlink), ("subscriber", recording.zenoh))
     lines += [(peer, {"event": "summary", **summary}) for peer, summary in summaries if summary]
     with (out / RECEIVED_JSONL).open("w", encoding="utf-8") as file:
@@ -105,7 +107,13 @@ def _read_received(path: Path, recording: Recording) -> None:
 
 
 def _check(record: Record, recording: Recording) -> None:
-    """Raise KeyError, ValueError or TypeError for a pose that cannot be evaluated."""
+    """Raise KeyError, ValueError or TypeError for a pose or direction that cannot be evaluated."""
+    if record["event"] == "direction":
+        ray_cam = np.array(record["ray_cam"], dtype=np.float64)
+        if ray_cam.shape != (3,) or not abs(np.linalg.norm(ray_cam) - 1.0) <= RAY_TOLERANCE:
+            raise ValueError("its direction is not a vector of length 1")
+        direction_of(record, 0)
+        _check_finite(float(record["age_ms"]), float(recording.capture_ns(record)))
     if record["event"] not in ("pose", "target_relative"):
         return
     pose = pose_of(record, 0)
@@ -117,5 +125,9 @@ def _check(record: Record, recording: Recording) -> None:
             raise ValueError("its covariance is not a 6×6 matrix")
         if not (np.isfinite(pose.covariance).all() and pose.covariance.diagonal().min() >= 0.0):
             raise ValueError("its covariance is not finite, or a variance is negative")
-    if not np.isfinite([*pose.t_cam_target_m, latency_ms, float(recording.capture_ns(record))]).all():
+    _check_finite(*pose.t_cam_target_m, latency_ms, float(recording.capture_ns(record)))
+
+
+def _check_finite(*numbers: float) -> None:
+    if not np.isfinite(numbers).all():
         raise ValueError("a number is not finite")

@@ -44,6 +44,10 @@ def view(frame: int, turned_deg: float | None, t_cam_target_m: tuple[float, floa
     return FrameView(K, Match(target, TargetPose(frame, R, target.t_cam_target_m)), EXTENTS, 12.5)
 
 
+def black() -> np.ndarray:
+    return np.zeros((360, 640, 3), np.uint8)
+
+
 def drawn(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
     return np.asarray((image == np.array(color)).all(axis=-1))
 
@@ -115,6 +119,31 @@ def test_a_missed_target_shows_its_truth_alone() -> None:
     centre = image[120:240, 220:420]
     assert drawn(centre, TRUTH_BGR).any()
     assert not drawn(centre, ESTIMATE_BGR).any()
+
+
+@pytest.mark.parametrize("of", ["no target", "a target"])
+def test_a_target_of_unknown_range_is_ringed_where_it_is_seen(of: str) -> None:
+    beside = truth(t_cam_target_m=(-10.0, 0.0, 60.0))
+    match, extents = (None, None) if of == "no target" else (Match(beside, None), EXTENTS)
+    seen = TargetPose(0, np.eye(3), np.array([0.8, 0.5, 6.0]), track="t1", rotation_known=False)
+    image = Overlay([FrameView(K, match, extents, None, directions=(seen,))], SIZE_WH).draw(0, black())
+    below_inset = image[180:290]
+    rows, columns = np.nonzero((below_inset[..., 1] < 64) & (below_inset[..., 2] > 64))  # thin, so not of full colour
+    u, v = (K @ seen.t_cam_target_m)[:2] / 6.0
+    away_px = np.hypot(columns - u, rows + 180 - v)
+    ring = away_px < 11.0
+    assert ring.sum() > 30
+    np.testing.assert_allclose(away_px[ring], 9.0, atol=2.0)
+    assert columns[ring].mean() == pytest.approx(u, abs=1.0)
+    assert (~ring).sum() > 10
+    assert columns[~ring].mean() == pytest.approx(u, abs=5.0)
+    assert rows[~ring].min() + 180 > v
+
+
+def test_a_direction_that_points_behind_the_camera_is_not_drawn() -> None:
+    behind = TargetPose(0, np.eye(3), np.array([0.0, 0.1, -6.0]), track="t1", rotation_known=False)
+    without, with_it = (Overlay([FrameView(K, None, None, None, directions=d)], SIZE_WH) for d in ((), (behind,)))
+    np.testing.assert_array_equal(without.draw(0, black()), with_it.draw(0, black()))
 
 
 def test_the_inset_stands_aside_when_targets_fly_there() -> None:

@@ -155,6 +155,23 @@ def test_directions_received_are_told_beside_the_poses(flown: PlayedSequence) ->
         assert re.search(rf"directions received, range not known +│ {told} ", shown.get())
 
 
+def test_a_view_with_a_direction_alone_is_told_in_a_report_of_the_flights_files(
+    flown: PlayedSequence, tmp_path: Path
+) -> None:
+    made = recording(flown, {0, 2})
+    captured_ns = START_NS + UTC_NS + round(1e9 / FPS)
+    ray_cam = flown.scene.truths[1].t_cam_target_m / np.linalg.norm(flown.scene.truths[1].t_cam_target_m)
+    told = {"event": "direction", "target": "t1", "capture_utc_ns": captured_ns, "age_ms": 14.0}
+    made.take("subscriber", told | {"ray_cam": ray_cam.tolist()})
+    write_flight(tmp_path, RecordedFlight(flown.scene.folder, MODEL, made))
+    assert read_flight(tmp_path).recording == made
+    assert main(["score", str(tmp_path)]) == 0
+    assert "4 views, 0 false poses, a direction alone in 1" in card(
+        (tmp_path / "report.html").read_text(), "Targets found"
+    )
+    assert json.loads((tmp_path / "score.json").read_text())["directions"]["targets"] == 1
+
+
 def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:
     assert main(["score", str(flight)]) == 0
     assert BROWSER is not None, "no chromium: sh deploy/bootstrap.sh dev installs it"

@@ -39,6 +39,12 @@ def pose(frame: int, x_m: float, late_ns: int = 0, rotation_known: bool = True) 
     }
 
 
+def direction(frame: int, ray_cam: np.ndarray) -> dict[str, object]:
+    captured_ns = exposure_ns(frame) + UTC_MINUS_MONOTONIC_NS
+    told = {"event": "direction", "target": "t1", "capture_utc_ns": captured_ns, "age_ms": 14.0}
+    return told | {"ray_cam": ray_cam.tolist()}
+
+
 def target_relative(frame: int, received_after_ms: float, rotation_known: bool = True) -> dict[str, object]:
     return {
         "event": "target_relative",
@@ -133,6 +139,22 @@ def test_the_overlay_gets_every_target_of_a_frame(sequence: PlayedSequence, reco
     two = replace(sequence, scene=replace(sequence.scene, truths=truths))
     views = frame_views(two, judge(two, recording))
     assert [len(view.others) for view in views] == [1, 0, 0, 0, 0]
+
+
+def test_directions_are_judged_where_there_is_no_pose_and_all_of_them_are_shown(
+    sequence: PlayedSequence, recording: Recording
+) -> None:
+    """Beside the pose of frame 0; in frame 1 alone, 0.1 degrees off; in the empty frame 4; before the sequence."""
+    assert score_json(sequence, judge(sequence, recording), {})["directions"] is None
+    off = so3_exp([0.0, np.deg2rad(0.1), 0.0])
+    ahead = np.array([0.0, 0.0, 200.0])
+    for frame, place_m in ((0, ahead - [40, 0, 0]), (1, off @ (ahead - [15, 0, 0])), (4, ahead), (-9, ahead)):
+        recording.take("subscriber", direction(frame, place_m / np.linalg.norm(place_m)))
+    result = judge(sequence, recording)
+    told = score_json(sequence, result, {})["directions"]
+    error_deg = {name: pytest.approx(0.1, abs=1e-5) for name in ("mean", "median")}
+    assert told == {"targets": 1, "bearing_error_deg": error_deg, "false": 1}
+    assert [len(view.directions) for view in frame_views(sequence, result)] == [1, 1, 0, 0, 1]
 
 
 def test_a_frame_that_was_not_recorded_shows_the_boxes_of_the_picture_before(

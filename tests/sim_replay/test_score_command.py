@@ -19,6 +19,12 @@ POSE = {
 }  # fmt: skip
 
 
+DIRECTION = {
+    "peer": "subscriber", "event": "direction", "target": "t1", "capture_utc_ns": 5, "age_ms": 9.5,
+    "ray_cam": [0.6, 0.0, 0.8],
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -62,6 +68,25 @@ def test_a_pose_that_is_one_is_taken(flight: Path) -> None:
 def test_a_pose_that_is_none_is_told_with_its_line(flight: Path, change: dict[str, Any], words: str) -> None:
     record = {key: value for key, value in (POSE | change).items() if value is not None}
     (flight / RECEIVED_JSONL).write_text(f"{json.dumps(POSE)}\n{json.dumps(record)}\n")
+    with pytest.raises(InputError) as error:
+        read_flight(flight)
+    assert str(error.value) == f"{flight / RECEIVED_JSONL}: line 2 is not a record of a peer: {words}"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"ray_cam": None}, "it has no 'ray_cam'"),
+        ({"ray_cam": [0.6, 0.8]}, "its direction is not a vector of length 1"),
+        ({"ray_cam": [0.6, 0.0, 1.8]}, "its direction is not a vector of length 1"),
+        ({"ray_cam": [0.6, 0.0, float("nan")]}, "its direction is not a vector of length 1"),
+        ({"age_ms": float("inf")}, "a number is not finite"),
+        ({"target": None}, "it has no 'target'"),
+    ],
+)
+def test_a_direction_that_is_none_is_told_with_its_line(flight: Path, change: dict[str, Any], words: str) -> None:
+    record = {key: value for key, value in (DIRECTION | change).items() if value is not None}
+    (flight / RECEIVED_JSONL).write_text(f"{json.dumps(DIRECTION)}\n{json.dumps(record)}\n")
     with pytest.raises(InputError) as error:
         read_flight(flight)
     assert str(error.value) == f"{flight / RECEIVED_JSONL}: line 2 is not a record of a peer: {words}"
