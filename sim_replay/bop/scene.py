@@ -24,7 +24,8 @@ Mask = NDArray[np.bool_]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later one is used if a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
-_TAIL_BYTES = 512  # of a JPEG, where its end marker is, unless something follows it
+_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  # how JPEG and PNG end, by how they begin
+_TAIL_BYTES = 512  # of a file, where its end is, unless something follows it
 SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _log = logging.getLogger(__name__)
 
@@ -219,18 +220,19 @@ def _pixels(path: Path, flags: int) -> NDArray[Any]:
 
 
 def refuse_broken(path: Path) -> None:
-    """Raises BopError for a file that is no picture or a truncated JPEG; reads little of most others."""
+    """Raises BopError for a file that is no picture, and for a truncated JPEG or PNG.
+
+    There may be tens of thousands: only a file whose end is not where it is expected is read as a whole.
+    """
     if header_size_wh(path) is None or not _ends_as_it_should(path):
         read_picture_bgr(path)
 
 
 def _ends_as_it_should(path: Path) -> bool:
-    """False for a JPEG without an end marker near its end: the whole file tells whether it is truncated."""
     with path.open("rb") as file:
-        if file.read(2) != b"\xff\xd8":
-            return True
+        end = _ENDS.get(file.read(2), b"")
         file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
-        return b"\xff\xd9" in file.read()
+        return end in file.read()
 
 
 def _is_torn_jpeg(coded: bytes) -> bool:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_replay.bop import DISTORTION_KEY, BopError
-from sim_replay.bop.scene import read_picture_bgr
+from sim_replay.bop.scene import read_picture_bgr, refuse_broken
 from sim_replay.datasets import open_dataset
 
 UNIT = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
@@ -100,6 +100,20 @@ def test_a_jpeg_that_is_cut_short_is_named_and_not_filled_up_with_gray(tmp_path:
             path.write_bytes(torn)
             with pytest.raises(BopError, match=r"000003\.jpg is cut short"):
                 read_picture_bgr(path)
+
+
+@pytest.mark.parametrize("kind", [".jpg", ".png"])
+def test_a_picture_that_is_cut_short_is_refused_without_being_decoded(tmp_path: Path, kind: str) -> None:
+    """Its header still tells its size; what a camera appends is no damage."""
+    image = np.random.default_rng(1).integers(0, 255, (90, 160, 3), np.uint8)
+    whole, path = cv2.imencode(kind, image)[1].tobytes(), tmp_path / f"000003{kind}"
+    for coded in (whole, whole + b"maker's notes" * 1000):
+        path.write_bytes(coded)
+        refuse_broken(path)
+    for length in (len(whole) - 12, len(whole) // 2):
+        path.write_bytes(whole[:length])
+        with pytest.raises(BopError, match=rf"000003\{kind} is (cut short|not a readable picture)"):
+            refuse_broken(path)
 
 
 def test_a_picture_that_cannot_be_read_is_named_like_one_that_is_none(tmp_path: Path) -> None:
