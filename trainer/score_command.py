@@ -122,6 +122,7 @@ def _warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
     splits = sorted({scene.split for scene in dataset.scenes if scene.split is not None})
     for split in splits:
         # Training on `train` takes in `train_pbr`.
-        if any(f"{dataset.name}, split {name}: " in contract.data for name in (split, split.partition("_")[0])):
+        names = tuple(f"{dataset.name}, split {name}: " for name in (split, split.partition("_")[0]))
+        if any(source.startswith(names) for source in contract.data.split("; ")):
             told = "%s: the model was trained on split %s of a dataset of this name; if it is this one, calibrated "
             _log.warning(told + "scores promise too much: give another --split, such as val", dataset.root, split)

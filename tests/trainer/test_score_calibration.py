@@ -170,7 +170,7 @@ def test_images_that_the_model_was_trained_on_are_warned_of(
         write_scene(tmp_path / "dataset" / split / "000000", spots=24, specks=24)
     model = tmp_path / "model.onnx"
     shutil.copy(dark_spot_model, model)
-    trained_on = "dataset, split train: 50%; rendered windows: 50%, of them 20% without a target"
+    trained_on = "my dataset, split val: 10%; dataset, split train: 40%; rendered windows: 50%, of them 20% empty"
     write_contract(model, read_contract(model).model_copy(update={"data": trained_on}))
     command = ["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]
     assert main([*command, "--split", "val"]) == 0
