@@ -68,9 +68,10 @@ def told_of_places(all_labelled: Iterable[Labelled]) -> str | None:
     odd = [scene for scene, own in scenes.items() if lie_beside_their_boxes(own)]
     if not odd:
         return None
+    first = f"{odd[0].parent.name}/{odd[0].name}"  # splits number their scenes alike
     others = f" and {len(odd) - 1} more" if len(odd) > 1 else ""
     return (
-        f"in scene {odd[0].name}{others}, most poses project beside their boxes: is cam_K in pixels of these images, "
+        f"in scene {first}{others}, most poses project beside their boxes: is cam_K in pixels of these images, "
         "and do poses and boxes belong to the same targets?"
     )
 

@@ -48,11 +48,11 @@ def test_a_camera_matrix_of_another_picture_size_is_told_and_not_trained_on(
 ) -> None:
     write_cameras(root / "train" / "000008", enlarged(factor))
     assert len(open_dataset(root).boxed_frames()) == 8  # the other scene can be learnt from
-    assert "in scene 000008, most poses project beside their boxes: is cam_K in pixels of these images" in caplog.text
+    assert "in scene train/000008, most poses project beside their boxes: is cam_K in pixels" in caplog.text
     caplog.clear()
     write_cameras(root / "train" / "000003", enlarged(factor))
     assert len(open_dataset(root).labelled_frames()) == 8  # poses in space can be compared all the same
-    assert "in scene 000003 and 1 more, most poses project beside their boxes" in caplog.text
+    assert "in scene train/000003 and 1 more, most poses project beside their boxes" in caplog.text
     with pytest.raises(BopError, match="most poses project beside their boxes"):
         open_dataset(root).boxed_frames()
     assert dataset_statistics(root)["beside_box_share"] == 1.0
