@@ -7,6 +7,7 @@ rendering process seconds and memory.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing as mp
 import os
 import queue
@@ -86,8 +87,17 @@ def _pooled(dense: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(dense, tiles_wh, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _serve(open_sampler: Callable[[], Sampler], batch_size: int, starts: range, prefetch: int, out: Connection) -> None:
+def _serve(
+    open_sampler: Callable[[], Sampler],
+    batch_size: int,
+    starts: range,
+    prefetch: int,
+    warns: bool,
+    out: Connection,
+) -> None:
     """Body of a rendering process: renders the batches that begin at `starts`, or until the trainer is gone."""
+    if not warns:
+        logging.disable(logging.WARNING)
     # The trainer terminates it: a signal to the whole process group must not end it before the trainer has saved.
     for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
@@ -162,7 +172,8 @@ class Feed:
             stride = workers * ranks * batch_size
             end = sys.maxsize if batches is None else first_index + batches * batch_size
             starts = range(first, end, stride)
-            arguments = (open_sampler, batch_size, starts, prefetch, writer)
+            warns = rank == worker == 0  # all open the same datasets
+            arguments = (open_sampler, batch_size, starts, prefetch, warns, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
             # Blocked until the process ignores them itself, after seconds of imports.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -60,6 +61,18 @@ def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
         assert len(feed.next().present) == 4
         with pytest.raises(RenderingError, match=r"renderer-0 failed:(.|\n)*no such aircraft"):
             feed.next()
+
+
+def opened_with_a_warning() -> PlateSampler:
+    logging.getLogger("dataset").warning("two pictures are missing")
+    return PlateSampler(5, 64)
+
+
+def test_what_every_renderer_would_warn_of_is_told_once(capfd: pytest.CaptureFixture[str]) -> None:
+    with Feed(opened_with_a_warning, 4, 0, workers=3) as feed:
+        for _ in range(3):
+            feed.next()
+    assert capfd.readouterr().err.count("two pictures are missing") == 1
 
 
 # Its rendering processes import it too, and need no torch.
