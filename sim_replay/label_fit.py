@@ -19,7 +19,9 @@ from sim_replay.bop import BopTarget, Distortion
 Array = NDArray[np.float64]
 NEAR_PX = 10.0  # the least distance that counts as beside a box: labels of small targets are rough
 FEWEST = 3  # targets of a scene: a single one may be cut, or hidden but for a wing tip
-SIZES_REL = (0.05, 1.5)  # the longer side of a whole target at its depth, over its model's diameter
+# The longer side of a whole target at its depth, over its model's diameter; 2.5 where a box around four pixels is drawn
+# three too large on each side.
+SIZES_REL = (0.05, 3.0)
 
 
 class Labelled(NamedTuple):

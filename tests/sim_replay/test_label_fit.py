@@ -81,3 +81,12 @@ def test_a_model_in_another_unit_than_the_poses_is_told(
     open_dataset(root).labelled_frames()
     assert "targets look as many times as large as their model: obj_id 1 " in caplog.text
     assert "millimetres" in caplog.text
+
+
+def test_rough_boxes_of_small_targets_are_not_told_of(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """0.8 m at 200 m are 5 px here; a box drawn by hand is soon twice as large."""
+    write_models_info(root, diameter=800.0)
+    for scene in (root / "train").iterdir():
+        write_json(scene / "scene_gt_info.json", {str(i): [{"bbox_visib": [60, 41, 10, 8]}] for i in PICTURES})
+    open_dataset(root).boxed_frames()
+    assert caplog.text == ""
