@@ -67,11 +67,14 @@ class DatasetSampler:
         return {frame.scene.folder.resolve() for frame in self._frames}
 
     def refuse_broken_pictures(self) -> None:
-        """Raises ConfigError, naming the first of the images that are none or are truncated."""
+        """Raises ConfigError, naming the first of the images and masks that are none or are truncated."""
+        paths = [frame.image_path for frame in self._frames]
+        for scene in dict.fromkeys(frame.scene for frame in self._frames):
+            paths += scene.mask_files
         broken: list[str] = []
-        for frame in self._frames:
+        for path in paths:
             try:
-                refuse_broken(frame.image_path)
+                refuse_broken(path)
             except BopError as error:
                 broken.append(str(error))
         if broken:

@@ -86,6 +86,11 @@ class BopScene:
         """The visible mask [H, W] of a target, or None if the dataset has no masks. Raises BopError."""
         return self._mask("mask_visib", frame, target_index)
 
+    @property
+    def mask_files(self) -> tuple[Path, ...]:
+        """Of mask(); none where masks are in JSON files."""
+        return tuple(path for (kind, *_), path in self._masks.items() if kind == "mask_visib")
+
     def whole_mask(self, frame: BopFrame, target_index: int) -> Mask | None:
         """The mask [H, W] of a target's whole silhouette inside the image, or None. Raises BopError."""
         return self._mask("mask", frame, target_index)

@@ -261,7 +261,8 @@ def test_a_broken_image_is_told_before_the_first_step(dataset: Path, tmp_path: P
     with pytest.raises(ConfigError, match=rf"{second} is cut short.*gray$"):
         refuse_unreadable(data)
     first.write_bytes(b"")
-    with pytest.raises(ConfigError, match=rf"{first} is not a readable picture \(and 1 more\)"):
+    next((root / split / "000003" / "mask_visib").iterdir()).write_bytes(b"")
+    with pytest.raises(ConfigError, match=rf"{first} is not a readable picture \(and 2 more\)"):
         refuse_unreadable(data)
 
 
