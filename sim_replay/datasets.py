@@ -179,7 +179,9 @@ class Dataset:
                     )
         if lie_beside_their_boxes(_labelled(frames)):
             raise BopError(
-                f"{self.root}: most poses project beside their boxes: nothing can be learnt from such labels"
+                f"{self.root}: most poses project beside their boxes, farther than these are long: nothing can be "
+                "learnt from such labels; is cam_K in pixels of these images, and do poses and boxes belong to the "
+                "same targets?"
             )
         return frames
 
