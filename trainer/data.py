@@ -16,8 +16,9 @@ import sys
 import threading
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -138,6 +139,24 @@ def _kill(processes: list[BaseProcess]) -> None:
         process.kill()
 
 
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """A signal to stop is handled afterwards; a process that is started meanwhile has it blocked."""
+    # Blocked in this thread, it is taken by another, and its handler runs in the main thread all the same.
+    came: list[int] = []
+    main = threading.current_thread() is threading.main_thread()
+    handlers = {number: signal.signal(number, lambda n, _: came.append(n)) for number in STOPPING} if main else {}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for late in came:
+            signal.raise_signal(late)
+
+
 class Feed:
     """Batches of consecutive samples from `first_index` on, rendered by `workers` processes. Use as a context."""
 
@@ -175,13 +194,10 @@ class Feed:
             warns = rank == worker == 0  # all open the same datasets
             arguments = (open_sampler, batch_size, starts, prefetch, warns, writer)
             process = context.Process(target=_serve, args=arguments, daemon=True, name=f"renderer-{worker}")
-            # Blocked until the process ignores them itself, after seconds of imports.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
-            try:
+            # The process ignores signals itself, after seconds of imports; one that is not in the list is never killed.
+            with _uninterrupted():
                 process.start()
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            self._processes.append(process)
+                self._processes.append(process)
             writer.close()  # otherwise the death of a renderer in the middle of a batch would go unnoticed
             self._readers.append(reader)
 

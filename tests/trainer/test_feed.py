@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import subprocess
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from odd_samplers import LARGE_PX, Broken, Telling
+from odd_samplers import LARGE_PX, Broken, Telling, opened_with_a_warning
 from synthetic_sampler import PlateSampler
 
 from tests.waiting import until
@@ -25,7 +24,14 @@ def rendered_pids(parent: int | None = None) -> set[int]:
     """Of this process, unless told."""
     pid = parent or os.getpid()
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return {pid for pid in map(int, children) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()}
+    return {pid for pid in map(int, children) if renders(pid)}
+
+
+def renders(pid: int) -> bool:
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):  # it has just ended
+        return False
 
 
 def test_batches_come_in_order_whoever_renders_them() -> None:
@@ -61,11 +67,6 @@ def test_what_a_renderer_failed_of_is_told_after_what_it_made() -> None:
         assert len(feed.next().present) == 4
         with pytest.raises(RenderingError, match=r"renderer-0 failed:(.|\n)*no such aircraft"):
             feed.next()
-
-
-def opened_with_a_warning() -> PlateSampler:
-    logging.getLogger("dataset").warning("two pictures are missing")
-    return PlateSampler(5, 64)
 
 
 def test_what_every_renderer_would_warn_of_is_told_once(capfd: pytest.CaptureFixture[str]) -> None:
