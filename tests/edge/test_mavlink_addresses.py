@@ -191,6 +191,22 @@ def test_each_address_of_a_silent_ground_station_has_its_turn_until_one_is_heard
             assert next_called() != "127.0.0.2"
 
 
+def test_a_name_that_is_lost_again_is_told_again_and_once(
+    name_service: dict[str, Callable[[], list[str]]], caplog: pytest.LogCaptureFixture
+) -> None:
+    asked, answers = list[int](), ["192.168..10"]
+    name_service["ground.test"] = lambda: asked.append(1) or answers
+    now_ns = count(time.monotonic_ns() + SILENT_NS, SILENT_NS)
+    with calling("ground.test", 14550) as caller:
+        for _ in range(2):
+            answers[:], many = ["192.168..10"], len(asked) + 5
+            until(lambda many=many: len(asked) > many, lambda: caller.tick(next(now_ns)), what="five turns")
+            assert caplog.text.count("cannot be resolved") == 1
+            answers[:], caller.peer = ["127.0.0.1"], None
+            until(lambda: caller.peer, lambda: caller.tick(next(now_ns)), what="an address")
+            caplog.clear()
+
+
 def test_the_doctor_hears_an_autopilot_behind_a_router_that_sends_only_to_who_has_spoken() -> None:
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3).pack(MAVLink(None, 1, 1))
     with socket.socket(type=socket.SOCK_DGRAM) as router, ThreadPoolExecutor() as pool:

@@ -63,7 +63,7 @@ class Connection:
             return None
         return Received(data, self.address, self._reader)
 
-    def send(self, data: bytes, *, yields: bool = False) -> bool:
+    def send(self, data: bytes, *, yields: bool) -> bool:
         if not self.open:
             return False
         fits = self._outbox.put(data, clock.monotonic_ns(), yields=yields)
