@@ -275,6 +275,59 @@ def test_each_lie_has_its_reason(payload: bytes, reason: Refusal) -> None:
     assert caught.value.reason is reason
 
 
+TURNED, NOT_TURNED = np.array([0.6, 0.0, 0.0, 0.8]), np.array([0.6, 0.0, 0.0, 0.9])
+NO_COVARIANCE = _covariance((0, 1, 1.5), (1, 0, 1.5))
+PLACE = np.array([1.0, 2.0, 3.0])
+
+
+def _odometry(**changes: Any) -> cdr.Odometry:
+    true = cdr.Odometry(1, "ned", "t0", PLACE, TURNED, np.eye(6), PLACE, PLACE, np.eye(6))
+    return dataclasses.replace(true, **changes)
+
+
+def _detections(**changes: Any) -> cdr.Detection3DArray:
+    hypothesis = cdr.Hypothesis("aircraft", 0.9, PLACE, TURNED, np.eye(6))
+    true = cdr.Detection3D(1, "cam", (hypothesis,), PLACE, TURNED, PLACE, "t0")
+    return cdr.Detection3DArray(1, "cam", (dataclasses.replace(true, **changes),))
+
+
+def _camera(**changes: Any) -> cdr.CameraInfo:
+    matrices = np.eye(3), np.eye(3), np.eye(3, 4)
+    return dataclasses.replace(cdr.CameraInfo(1, "cam", 1080, 1920, "plumb_bob", np.zeros(5), *matrices), **changes)
+
+
+@pytest.mark.parametrize("true", [_odometry(), _detections(), _camera()], ids=lambda message: type(message).__name__)
+def test_what_no_lie_was_put_into_is_taken(true: cdr.Payload) -> None:
+    assert same(type(true).decode(true.encode()), true)
+
+
+@pytest.mark.parametrize(
+    ("lie", "reason"),
+    [
+        (_odometry(covariance_twist=NO_COVARIANCE), Refusal.COVARIANCE),
+        (_odometry(covariance=NO_COVARIANCE), Refusal.COVARIANCE),
+        (_odometry(v_target_mps=np.array([1.0, np.nan, 3.0])), Refusal.NOT_FINITE),
+        (_detections(q_cam_box_xyzw=NOT_TURNED), Refusal.QUATERNION),
+        (_detections(size_m=np.full(3, np.inf)), Refusal.NOT_FINITE),
+        (cdr.TFMessage((cdr.TransformStamped(1, "ned", "base", PLACE, NOT_TURNED),)), Refusal.QUATERNION),
+        (_camera(K=np.full((3, 3), np.nan)), Refusal.NOT_FINITE),
+        (_camera(distortion=np.array([0.1, np.inf])), Refusal.NOT_FINITE),
+        (_camera(roi=cdr.RegionOfInterest(do_rectify=2)), Refusal.BOOL),  # type: ignore[arg-type]
+    ],
+)
+def test_a_lie_in_any_other_message_has_its_reason_too(lie: cdr.Payload, reason: Refusal) -> None:
+    with pytest.raises(PayloadError) as caught:
+        type(lie).decode(lie.encode())
+    assert caught.value.reason is reason
+
+
+def test_a_log_entry_of_no_time_is_refused() -> None:
+    payload = cdr.Log(1, 20, "edge", "started").encode()
+    with pytest.raises(PayloadError) as caught:
+        cdr.Log.decode(payload[:8] + struct.pack("<I", 10**9) + payload[12:])
+    assert caught.value.reason is Refusal.STAMP
+
+
 def test_padding_to_four_bytes_is_no_lie() -> None:
     assert same(cdr.PoseWithCovarianceStamped.decode(POSE.encode() + bytes(3)), POSE)
 

@@ -62,6 +62,28 @@ def test_poses_arrive_typed_with_their_age(network: Network, distribution: topic
     assert 0.1 <= taken[0].age_s < 1.0
 
 
+def test_a_domain_is_heard_by_who_asks_for_it_alone(network: Network) -> None:
+    every: list[TargetPose] = []
+    with (
+        client.connect(network.endpoint) as tool,
+        client.subscribe(tool, "uav1", domain=7) as poses,
+        client.subscribe_all(tool, "uav1", every.append, domain=7) as counts,
+        client.subscribe(tool, "uav1") as elsewhere,
+        Node(network.daemon, "uav1", domain=7) as node,
+    ):
+        publisher = node.publisher(POSE, "t0")
+        taken: list[TargetPose] = []
+
+        def step() -> None:
+            publisher.put(pose_now(321.0).encode())
+            taken.extend(filter(None, [poses.poll()]))
+
+        until(lambda: taken and every, step, what="a pose for both")
+        assert elsewhere.poll() is None
+        assert {one.pose.t_cam_target_m[2] for one in [*taken, *every]} == {321.0}
+        assert counts.refused() == dict(poses.refused) == dict(elsewhere.refused) == {}
+
+
 def test_of_a_frame_with_many_targets_none_is_lost(network: Network) -> None:
     with client.connect(network.endpoint) as tool, client.subscribe(tool, "uav1", depth=2000, max_age_s=60.0) as poses:
         publishers = [Node(network.daemon, "uav1").publisher(POSE, f"t{i}") for i in range(16)]
