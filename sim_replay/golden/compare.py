@@ -69,6 +69,7 @@ QUATERNIONS = frozenset({"q_cam_target_wxyz", "q_target", "q_sensor"})
 POSE_FIELDS = ("t_ns", "frame", "target", "rotation_known", "t_cam_target_m", "q_cam_target_wxyz")
 # Fields that identify a record.
 POSE_NAMES = ("kind", "t_ns", "frame", "target")
+DIRECTION_NAMES = ("kind", "t_ns", "target")
 MESSAGE_NAMES = ("kind", "t_ns", "system", "component")
 TARGET_NAMES = (*MESSAGE_NAMES, "id")  # one message per target
 
@@ -85,12 +86,15 @@ class Difference:
 
 
 def reduced(outputs: Outputs) -> list[Record]:
-    """The records in a golden file: poses first, then MAVLink messages, each in order of arrival."""
+    """The records in a golden file: poses first, then directions, then MAVLink messages, each in order of arrival."""
     records = []
     for pose in outputs.poses:
         std = [math.sqrt(max(pose["covariance"][k][k], 0.0)) for k in range(6)]
         kept = {name: pose[name] for name in POSE_FIELDS}
         records.append({"kind": "pose", **kept, "std": std})
+    for seen in outputs.recording.directions:
+        t_ns = outputs.recording.capture_ns(seen) - outputs.recording.start_at_ns
+        records.append({"kind": "direction", "t_ns": t_ns, "target": seen["target"], "ray_cam": seen["ray_cam"]})
     for message in outputs.mavlink:
         fields = {name: value for name, value in message.items() if name != "message"}
         records.append({"kind": message["message"], **fields})
@@ -125,6 +129,8 @@ def _keyed(records: Iterable[Record]) -> dict[Key, Record]:
 def _names(record: Record) -> tuple[str, ...]:
     if record["kind"] == "pose":
         return POSE_NAMES
+    if record["kind"] == "direction":
+        return DIRECTION_NAMES
     return TARGET_NAMES if record["kind"] == "TARGET_RELATIVE" else MESSAGE_NAMES
 
 
@@ -132,6 +138,8 @@ def _where(record: Record) -> str:
     told = f"{record['t_ns'] / 1e9:+.3f} s {record['kind']}"
     if record["kind"] == "pose":
         return f"{told} frame {record['frame']} {record['target']}"
+    if record["kind"] == "direction":
+        return f"{told} {record['target']}"
     return f"{told} from {record['system']}/{record['component']}"
 
 

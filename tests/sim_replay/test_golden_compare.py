@@ -17,6 +17,7 @@ from sim_replay.lockstep.player import Outputs
 from sim_replay.play import Recording
 
 S = math.sqrt(0.5)
+START_NS = 5_000_000_000
 POSE = {
     "frame": 7,
     "t_ns": 700_000_000,
@@ -120,6 +121,21 @@ def test_what_is_missing_and_what_is_new_is_named_in_the_order_of_time() -> None
         "+0.700 s pose frame 7 t0: expected, but missing",
         "+0.700 s pose frame 7 t1: present, but not expected",
         "+0.800 s pose frame 8 t0: expected, but missing",
+    ]
+
+
+def test_a_direction_that_is_lost_and_one_that_points_elsewhere_are_told() -> None:
+    recording = Recording(START_NS, 0, 0, "")
+    for target, ray_cam in (("t1", [0.6, 0.0, 0.8]), ("t2", [0.0, 0.6, 0.8])):
+        seen = {"event": "direction", "target": target, "capture_utc_ns": START_NS + 700_000_000, "ray_cam": ray_cam}
+        recording.take("subscriber", seen)
+    expected = reduced(Outputs([], [], recording))
+    assert told(expected, expected) == []
+    recording.directions[1]["ray_cam"] = [0.0, 0.58, 0.81]
+    del recording.directions[0]
+    assert told(expected, reduced(Outputs([], [], recording))) == [
+        "+0.700 s direction t1: expected, but missing",
+        "+0.700 s direction t2: ray_cam is [0 0.58 0.81], expected [0 0.6 0.8]: 0.02 off, 0.011 allowed",
     ]
 
 
