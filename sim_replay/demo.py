@@ -25,6 +25,7 @@ from sim_replay.result import drops_told, frame_of_record, latency_ms, pose_of
 from sim_replay.score import match_poses
 
 BUNDLED_SEQUENCE = Path(__file__).parent / "data" / "crossing"
+TOLD = ("pose", "direction")  # events of the subscriber
 _RATE_WINDOW = 30
 _PLAIN_PERIOD_S = 1.0
 
@@ -45,15 +46,21 @@ class LiveFigures:
         """Process one record of a peer."""
         if record["event"] == "target_relative":
             self.latency_ms = latency_ms(record, recording)
-        elif record["event"] == "pose":
-            self._take_pose(recording, record)
+        elif record["event"] in TOLD:
+            self._take_target(recording, record)
 
-    def _take_pose(self, recording: Recording, record: Record) -> None:
+    def _take_target(self, recording: Recording, record: Record) -> None:
+        captured_ns = recording.capture_ns(record)
+        newer = not self.captures_ns or captured_ns > self.captures_ns[-1]
+        if newer:
+            self.captures_ns.append(captured_ns)
+        elif record["event"] == "direction":
+            return  # the pose of another target of the same frame tells more
         self.frame = frame_of_record(record, recording, self.sequence)
-        if not self.captures_ns or recording.capture_ns(record) > self.captures_ns[-1]:
-            self.captures_ns.append(recording.capture_ns(record))
+        self.range_m = self.range_error_m = self.rotation_error_deg = None
+        if record["event"] == "direction":
+            return
         self.range_m = float(np.linalg.norm(record["t_cam_target_m"]))
-        self.range_error_m = self.rotation_error_deg = None
         if self.frame is None:
             return
         truths = [truth for truth in self.sequence.scene.truths if truth.frame == self.frame]
@@ -64,7 +71,7 @@ class LiveFigures:
 
     @property
     def rate_hz(self) -> float | None:
-        """Frames with a pose per second, over the last thirty."""
+        """Frames with a pose or direction per second, over the last thirty."""
         if len(self.captures_ns) < 2 or self.captures_ns[-1] <= self.captures_ns[0]:
             return None
         return (len(self.captures_ns) - 1) * 1e9 / (self.captures_ns[-1] - self.captures_ns[0])
@@ -74,7 +81,7 @@ class LiveFigures:
         frames = len(self.sequence.scene.images)
         return {
             "frame": "waiting" if self.frame is None else f"{self.frame + 1}/{frames}",
-            "range": _text(self.range_m, "{:.1f} m"),
+            "range": "not known" if self.captures_ns and self.range_m is None else _text(self.range_m, "{:.1f} m"),
             "range error": _text(self.range_error_m, "{:+.1f} m"),
             "rotation error": _text(self.rotation_error_deg, "{:.1f}°"),
             "latency": _text(self.latency_ms, "{:.1f} ms"),
@@ -104,7 +111,7 @@ class LiveView:
 
     def on_record(self, recording: Recording, record: Record) -> None:
         self._figures.take(recording, record)
-        if record["event"] != "pose":
+        if record["event"] not in TOLD:
             return
         if self._live is not None:
             self._live.update(self._table())
@@ -139,7 +146,8 @@ def show(settings: PlaySettings, model: Path, console: Console) -> Recording:
     if sequence.scene.can_be_scored:
         report_flight(sequence, flight, out, console)
     else:
-        told = f"{len(recording.poses)} poses over zenoh, {len(recording.targets)} by MAVLink"
+        told = f"{len(recording.poses)} poses and {len(recording.directions)} directions over zenoh"
+        told += f", {len(recording.targets)} poses by MAVLink"
         say(f"{told}, written to {out}; not scored: no ground truth")
     return recording
 
@@ -164,7 +172,7 @@ def summary_table(score: dict[str, Any]) -> Table:
     table = Table("metric", "value", title=f"score of {score['sequence']}", title_justify="left")
     rows = {
         "frames / poses received": f"{overall['frames']} / {score['poses']}",
-        "directions received, range not known": _text(_directions(score["zenoh_received"]), "{:d}"),
+        "directions received, range not known": str(score["directions_received"]),
         "recall": _text(overall["recall"], "{:.1%}"),
         "rotation error, mean / median": _pair(overall["rotation_error_deg"], "{:.2f}°"),
         "translation error, mean / median": _pair(overall["translation_error_m"], "{:.2f} m"),
@@ -179,11 +187,6 @@ def summary_table(score: dict[str, Any]) -> Table:
     for row in rows.items():
         table.add_row(*row)
     return table
-
-
-def _directions(received: dict[str, int]) -> int | None:
-    """Of the samples received by topic; None where the topics were not counted, as in lock-step."""
-    return sum(count for topic, count in received.items() if topic.endswith("/direction")) if received else None
 
 
 def _pair(values: dict[str, float | None], form: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ from sim_replay.score import (
 )
 
 PEERS = ("subscriber", "autopilot")
+Seen = tuple[TargetPose, float | None]  # a direction, and its error in degrees; None: it belongs to no target
 FAR_M = 1e4  # range that stands for an unknown one: further than any target is large, so that it is matched by bearing
 
 
@@ -55,6 +57,17 @@ class Result:
         for frame, age_ms in told_ages(self.autopilot, self.recording):
             first.setdefault(frame, age_ms)
         return first
+
+    @property
+    def directions_seen(self) -> defaultdict[int, list[Seen]]:
+        """By frame: every direction but those of hidden targets."""
+        seen: defaultdict[int, list[Seen]] = defaultdict(list)
+        for match in self.directions.matches:
+            if match.estimate is not None:
+                seen[match.truth.frame].append((match.estimate, match.bearing_error_deg))
+        for direction in self.directions.false_poses:
+            seen[direction.frame].append((direction, None))
+        return seen
 
 
 def told_ages(peer: PeerResult, recording: Recording) -> tuple[tuple[int, float], ...]:
@@ -150,6 +163,7 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
     return {
         "sequence": sequence.scene.name,
         "poses": len(recording.poses),
+        "directions_received": len(recording.directions),
         "stray_poses": subscriber.strays,
         **statistics(frames, subscriber.matches, subscriber.false_poses),
         "directions": direction_statistics(
@@ -207,11 +221,7 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
     for found in result.subscriber.matches:
         shown = (found, sequence.scene.extents[found.truth.object_id])
         by_frame.setdefault(found.truth.frame, []).append(shown)
-    matched = [match.estimate for match in result.directions.matches if match.estimate is not None]
-    directions: dict[int, list[TargetPose]] = {}
-    for direction in (*matched, *result.directions.false_poses):
-        directions.setdefault(direction.frame, []).append(direction)
-    latencies_ms = result.latencies_ms
+    directions, latencies_ms = result.directions_seen, result.latencies_ms
     views: list[FrameView] = []
     for frame, K in enumerate(sequence.scene.K):
         if frame in sequence.scene.unrecorded:
@@ -219,6 +229,6 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
             continue
         seen = by_frame.get(frame, [])
         match, extents = seen[0] if seen else (None, None)
-        others, told = tuple(seen[1:]), tuple(directions.get(frame, ()))
+        others, told = tuple(seen[1:]), tuple(direction for direction, _ in directions[frame])
         views.append(FrameView(K, match, extents, latencies_ms.get(frame), others, told))
     return views

@@ -70,10 +70,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
     with Progress(console=console, disable=told or not console.is_terminal) as progress:
         task = progress.add_task("playing", total=len(settings.frames))
 
-        def after_frame(frame: int, poses: list[Record]) -> None:
+        def after_frame(frame: int, found: list[Record]) -> None:
             progress.advance(task)
             if told:
-                text = f"frame {frame}: not recorded" if frame in sequence.scene.unrecorded else _line(frame, poses)
+                text = f"frame {frame}: not recorded" if frame in sequence.scene.unrecorded else line_of(frame, found)
                 console.print(text, highlight=False, soft_wrap=True)
 
         outputs = play_lockstep(settings, gate.before, after_frame)
@@ -83,7 +83,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
         files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.can_be_scored else ""
-    text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.mavlink)} MAVLink messages"
+    text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.recording.directions)} directions"
+    text += f", {len(outputs.mavlink)} MAVLink messages"
     console.print(f"{text}; written to {args.out}: {files}", highlight=False, soft_wrap=True)
     return 0
 
@@ -119,8 +120,14 @@ class Gate:
             return False
 
 
-def _line(frame: int, poses: list[Record]) -> str:
-    told = [f"{pose['target']} at {' '.join(f'{x:.2f}' for x in pose['t_cam_target_m'])} m" for pose in poses]
+def line_of(frame: int, found: list[Record]) -> str:
+    """The poses and directions of a frame, for the console."""
+    told = [
+        f"{one['target']} at {' '.join(f'{x:.2f}' for x in one['t_cam_target_m'])} m"
+        if "t_cam_target_m" in one
+        else f"{one['target']} towards {' '.join(f'{x:.3f}' for x in one['ray_cam'])}, range not known"
+        for one in found
+    ]
     return f"frame {frame}: {', '.join(told) or 'no target'}"
 
 

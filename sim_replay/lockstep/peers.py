@@ -110,7 +110,11 @@ class Subscriber:
         self._wait_until_known(uav)
 
     def collect(self, frame: int, now_ns: int) -> list[Record]:
-        """Wait for the records of the frame exposed at `now_ns`. Raises PlayError if they do not arrive."""
+        """Wait for the records of the frame exposed at `now_ns`: poses, then directions as in `directions`.
+
+        Raises PlayError if they do not arrive.
+        """
+        before = len(self.directions)
         deadline_s = time.monotonic() + ARRIVAL_TIMEOUT_S
         while now_ns not in self._frames or any((now_ns, name) not in self._poses for name in self._frames[now_ns]):
             try:
@@ -121,7 +125,7 @@ class Subscriber:
         names = sorted(self._frames.pop(now_ns))
         records = [self._record(frame, self._poses.pop((now_ns, name))) for name in names]
         self.records += records
-        return records
+        return records + self.directions[before:]
 
     def close(self) -> None:
         for subscriber in self._subscribers:

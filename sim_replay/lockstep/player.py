@@ -76,7 +76,7 @@ class Outputs:
 
 def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_frame: AfterFrame) -> Outputs:
     """Play the sequence. `before_frame` is called with each frame's number and may block; `after_frame` is called
-    afterwards with the number and the resulting poses, none for a frame that was not recorded.
+    afterwards with the number and the resulting poses and directions, none for a frame that was not recorded.
 
     Raises:
         InputError: the daemon rejects its input.

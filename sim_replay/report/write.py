@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from sim_replay.evaluation.files import target_record
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.overlay import Image, Overlay, showcase_index
 from sim_replay.report.flight_files import RecordedFlight
 from sim_replay.result import PEERS, PeerResult, Result, frame_views, judge, score_json, told_ages
+from sim_replay.score import TargetPose
 
 
 def write_report(
@@ -43,13 +45,16 @@ def write_report(
 
 
 def frame_records(sequence: PlayedSequence, result: Result) -> Iterator[dict[str, Any]]:
-    """One per frame: each visible target with what each peer received of it, its errors, and that pose's age."""
+    """One per frame: each visible target with what each peer received of it, its errors, and that pose's age; and the
+    directions, which only the subscriber receives."""
     peers = dict(zip(PEERS, (result.subscriber, result.autopilot), strict=True))
     told = {name: _by_frame(peer, told_ages(peer, result.recording)) for name, peer in peers.items()}
+    directions = result.directions_seen
     for frame, image in enumerate(sequence.scene.images):
         at_peers = {name: frames[frame] for name, frames in told.items()}
+        seen = [_direction_record(*one) for one in directions[frame]]
         name = None if frame in sequence.scene.unrecorded else image.name
-        yield {"frame": frame, "t_s": round(frame / sequence.fps, 6), "image": name, **at_peers}
+        yield {"frame": frame, "t_s": round(frame / sequence.fps, 6), "image": name, **at_peers, "directions": seen}
 
 
 def _by_frame(peer: PeerResult, ages: Iterable[tuple[int, float]]) -> defaultdict[int, dict[str, Any]]:
@@ -63,6 +68,12 @@ def _by_frame(peer: PeerResult, ages: Iterable[tuple[int, float]]) -> defaultdic
     for frame, age_ms in ages:
         told[frame]["age_ms"].append(round(age_ms, 3))
     return told
+
+
+def _direction_record(direction: TargetPose, error_deg: float | None) -> dict[str, Any]:
+    ray_cam = direction.t_cam_target_m / np.linalg.norm(direction.t_cam_target_m)
+    error_deg = None if error_deg is None else round(error_deg, 5)
+    return {"track": direction.track, "ray_cam": ray_cam.round(6).tolist(), "bearing_error_deg": error_deg}
 
 
 def _draw(sequence: PlayedSequence, result: Result, out: Path, on_frame: Callable[[], None]) -> None:

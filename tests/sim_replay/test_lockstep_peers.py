@@ -9,6 +9,7 @@ from edge.status_board import key_of
 from msgs import session, topics
 from msgs.cdr import Detection3DArray, Vector3Stamped
 from msgs.publish import Node
+from sim_replay.lockstep.command import line_of
 from sim_replay.lockstep.peers import Subscriber
 from sim_replay.ports import free_endpoint
 
@@ -25,9 +26,11 @@ def test_a_frame_of_a_target_whose_range_is_not_known_brings_its_direction_and_n
         try:
             directions.put(Vector3Stamped(NOW_NS, topics.FRAME_CAMERA, ray_cam).encode())
             detections.put(Detection3DArray(NOW_NS, topics.FRAME_CAMERA, ()).encode())
-            assert subscriber.collect(0, NOW_NS) == []
+            found = subscriber.collect(0, NOW_NS)
         finally:
             subscriber.close()
             answers.undeclare()
     told = {"event": "direction", "target": "t1", "capture_utc_ns": NOW_NS, "age_ms": 0.0}
-    assert subscriber.directions == [told | {"ray_cam": ray_cam.tolist()}]
+    assert found == subscriber.directions == [told | {"ray_cam": ray_cam.tolist()}]
+    assert subscriber.records == []
+    assert line_of(0, found) == "frame 0: t1 towards 0.600 0.000 0.800, range not known"

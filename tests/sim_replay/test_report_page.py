@@ -144,32 +144,29 @@ def test_what_mavlink_withheld_is_told_beside_its_latency(flown: PlayedSequence)
     assert re.search(r"withheld by MAVLink, too unsure or too old +│ 7 ", shown.get())
 
 
-def test_directions_received_are_told_beside_the_poses(flown: PlayedSequence) -> None:
-    received = {"uav1/target/t0/pose": 2, "uav1/target/t0/direction": 4, "uav1/target/t1/direction": 1}
-    for counts, told in ((received, "5"), ({}, "–")):
-        made = replace(recording(flown, {0, 2}), zenoh={"received": counts})
-        score = score_json(flown, judge(flown, made), MODEL)
-        console = Console(width=100)
-        with console.capture() as shown:
-            console.print(summary_table(score))
-        assert re.search(rf"directions received, range not known +│ {told} ", shown.get())
-
-
-def test_a_view_with_a_direction_alone_is_told_in_a_report_of_the_flights_files(
-    flown: PlayedSequence, tmp_path: Path
+def test_a_view_with_a_direction_alone_is_told_in_all_that_is_made_of_the_flights_files(
+    flown: PlayedSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = recording(flown, {0, 2})
     captured_ns = START_NS + UTC_NS + round(1e9 / FPS)
     ray_cam = flown.scene.truths[1].t_cam_target_m / np.linalg.norm(flown.scene.truths[1].t_cam_target_m)
     told = {"event": "direction", "target": "t1", "capture_utc_ns": captured_ns, "age_ms": 14.0}
     made.take("subscriber", told | {"ray_cam": ray_cam.tolist()})
+    made.take("subscriber", told | {"target": "t2", "ray_cam": [0.6, 0.0, 0.8]})
     write_flight(tmp_path, RecordedFlight(flown.scene.folder, MODEL, made))
     assert read_flight(tmp_path).recording == made
     assert main(["score", str(tmp_path)]) == 0
     assert "4 views, 0 false poses, a direction alone in 1" in card(
         (tmp_path / "report.html").read_text(), "Targets found"
     )
+    assert re.search(r"directions received, range not known +│ 2 ", capsys.readouterr().out)
     assert json.loads((tmp_path / "score.json").read_text())["directions"]["targets"] == 1
+    frames = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
+    assert frames[1]["directions"] == [
+        {"track": "t1", "ray_cam": pytest.approx(ray_cam, abs=1e-6), "bearing_error_deg": pytest.approx(0.0, abs=1e-5)},
+        {"track": "t2", "ray_cam": [0.6, 0.0, 0.8], "bearing_error_deg": None},
+    ]
+    assert [frame["directions"] for frame in frames if frame["frame"] != 1] == [[]] * 4
 
 
 def test_the_report_stands_by_itself_in_a_real_browser(flight: Path) -> None:

@@ -176,3 +176,9 @@ def test_the_live_line_follows_the_records(sequence: PlayedSequence, recording: 
     assert cells["rotation error"] == "0.0°"
     assert cells["latency"] == "18.0 ms"
     assert cells["rate"] == "30.0 Hz"
+    figures.take(recording, direction(2, np.array([0.6, 0.0, 0.8])))  # of another target
+    assert figures.cells() == cells
+    figures.take(recording, direction(3, np.array([0.6, 0.0, 0.8])))
+    assert figures.cells() == cells | {
+        "frame": "4/5", "range": "not known", "range error": "–", "rotation error": "–"
+    }  # fmt: skip
