@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     status = commands.add_parser("status", help="query the state of the running daemon")
     status.add_argument("--config", type=Path, help="the daemon's TOML file, for its address and name")
     status.add_argument(
-        "--connect", metavar="ENDPOINT", help="the daemon's zenoh endpoint (default tcp/127.0.0.1:7448)"
+        "-e", "--connect", metavar="ENDPOINT", help="the daemon's zenoh endpoint (default tcp/127.0.0.1:7448)"
     )
     status.add_argument("--vehicle", default=None, help="the vehicle's name (default: any that answers)")
     status.add_argument("--json", action="store_true", help="print one JSON object: info, config, model")

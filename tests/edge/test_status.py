@@ -71,7 +71,7 @@ def test_status_says_how_the_daemon_is(
     assert answer["model"]["contract"]["name"] == "toy"
     assert answer["model"]["file"] == str(toy_model)
     assert answer["config"]["config"]["camera"]["fps"] == 10
-    for_a_person = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}")
+    for_a_person = cli("status", "-e", f"tcp/127.0.0.1:{ports[0]}")
     assert for_a_person.returncode == 0
     assert for_a_person.stdout.startswith("kestrel  ")
     assert str(daemon.process.pid) in for_a_person.stdout
