@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 from edge.errors import InputError
 from edge.health import Activity, HealthState
@@ -13,6 +17,7 @@ from edge.stages import STAGES
 from edge.status_board import StatusBoard
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+RETRY_S = 0.2  # until a caller is accepted again, if the process has no file descriptor left
 QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
 
@@ -71,6 +76,15 @@ def _quoted(value: object) -> str:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        try:
+            return super().get_request()
+        except OSError as error:
+            # Such a caller stays pending and would wake the server without end.
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                time.sleep(RETRY_S)
+            raise
 
     def handle_error(self, request: object, client_address: object) -> None:
         """socketserver prints a traceback. A client that breaks off its connection is not worth one."""

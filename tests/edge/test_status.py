@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import socket
 import struct
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -18,7 +20,7 @@ import zenoh
 from edge.config import Config, ConfigFile
 from edge.estimator.model import load_model
 from edge.health import Activity, HealthState
-from edge.prometheus import MetricsServer
+from edge.prometheus import RETRY_S, MetricsServer
 from edge.stages import STAGES
 from edge.status import ask
 from edge.status_board import StatusBoard, key_of
@@ -144,23 +146,50 @@ def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
         urllib.request.urlopen(f"http://127.0.0.2:{ports[1]}/metrics", timeout=10)
 
 
-def test_a_reader_of_the_metrics_that_breaks_off_leaves_no_traceback_in_the_log(
-    tmp_path: Path, toy_model: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def metrics_port(tmp_path: Path, toy_model: Path) -> Iterator[int]:
     config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}})
     camera = CameraInfo("camera", (320, 180), np.eye(3), None)
     board = StatusBoard(ConfigFile(tmp_path / "config.toml", "", config), load_model(toy_model, 1), camera)
     port = free_port()
     server = MetricsServer(board, port)
-    try:
-        with socket.create_connection(("127.0.0.1", port)) as reader:
-            reader.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
-            assert b"uavpose_uptime_seconds" in answer.read()
-        until(lambda: not any("process_request" in thread.name for thread in threading.enumerate()))
-    finally:
-        server.stop()
+    yield port
+    server.stop()
+
+
+def test_a_reader_of_the_metrics_that_breaks_off_leaves_no_traceback_in_the_log(
+    metrics_port: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_connection(("127.0.0.1", metrics_port)) as reader:
+        reader.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics", timeout=10) as answer:
+        assert b"uavpose_uptime_seconds" in answer.read()
+    until(lambda: not any("process_request" in thread.name for thread in threading.enumerate()))
     assert capfd.readouterr().err == ""
+
+
+def test_without_file_descriptors_a_reader_of_the_metrics_waits_and_the_server_does_not_spin(
+    metrics_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried_s: list[float] = []
+    accept = socket.socket.accept
+
+    def noted(listening: socket.socket) -> tuple[socket.socket, object]:
+        tried_s.append(time.monotonic())
+        return accept(listening)
+
+    monkeypatch.setattr(socket.socket, "accept", noted)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with socket.socket() as reader:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (1, hard))  # 0 is too few for poll
+        try:
+            reader.connect(("127.0.0.1", metrics_port))
+            until(lambda: len(tried_s) > 1)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        assert tried_s[1] - tried_s[0] > 0.5 * RETRY_S
+        reader.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+        assert reader.recv(64).startswith(b"HTTP/1.0 200 OK")
 
 
 @pytest.mark.usefixtures("daemon")
