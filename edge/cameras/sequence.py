@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from edge import clock
 from edge.cameras.intrinsics import load_intrinsics, pinhole
+from edge.cameras.picture_file import read_pixels
 from edge.cameras.source import EndOfStream, wait_until
 from edge.config_camera import FolderCamera, SequenceCamera
 from edge.errors import InputError
@@ -213,7 +214,4 @@ def _flat(numbers: object) -> Array:
 
 
 def _decode(path: Path) -> NDArray[np.uint8]:
-    image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image_bgr is None:
-        raise InputError(f"{path} is not a readable picture")
-    return np.asarray(image_bgr, dtype=np.uint8)
+    return np.asarray(read_pixels(path, cv2.IMREAD_COLOR), dtype=np.uint8)

@@ -14,6 +14,8 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from edge.cameras.picture_file import read_pixels
+from edge.errors import InputError
 from sim_replay.bop.fields import by_number, load_json, load_object, matrix
 from sim_replay.bop.frames import Source, frame_of
 from sim_replay.bop.model_frame import ModelFrames
@@ -212,22 +214,15 @@ def _tell_once_of_dark_pictures(folder: Path) -> None:
 
 def _pixels(path: Path, flags: int) -> NDArray[Any]:
     try:
-        coded = path.read_bytes()
-    except OSError as error:
-        raise BopError(f"{path} cannot be read: {error.strerror}") from error
-    if _is_torn_jpeg(coded):
-        raise BopError(f"{path} is cut short: what is missing would be read as gray")
-    as_they_lie = flags | cv2.IMREAD_IGNORE_ORIENTATION  # labels refer to the pixels as stored
-    pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), as_they_lie) if coded else None
-    if pixels is None:
-        raise BopError(f"{path} is not a readable picture")
-    return pixels
+        return read_pixels(path, flags)  # never turned: labels refer to the pixels as stored
+    except InputError as error:
+        raise BopError(str(error)) from error
 
 
 def refuse_broken(path: Path) -> None:
-    """Raises BopError for a file that is no picture, and for a truncated JPEG or PNG.
+    """Raises BopError for a file that is no picture, or is truncated.
 
-    There may be tens of thousands: only a file whose end is not where it is expected is read as a whole.
+    There may be tens of thousands: a JPEG or PNG is read as a whole only if its end is not where it is expected.
     """
     if header_size_wh(path) is None or not _ends_as_it_should(path):
         read_picture_bgr(path)
@@ -235,19 +230,9 @@ def refuse_broken(path: Path) -> None:
 
 def _ends_as_it_should(path: Path) -> bool:
     with path.open("rb") as file:
-        end = _ENDS.get(file.read(2), b"")
+        end = _ENDS.get(file.read(2))
         file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
-        return end in file.read()
-
-
-def _is_torn_jpeg(coded: bytes) -> bool:
-    """Whether a JPEG is truncated before its end marker: OpenCV pads the rest. Anything may follow the marker."""
-    if not coded.startswith(b"\xff\xd8"):
-        return False
-    at = 2
-    while at + 4 <= len(coded) and coded[at] == 0xFF and coded[at + 1] != 0xDA:  # to the scan; a thumbnail has its own
-        at += 1 if coded[at + 1] == 0xFF else 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
-    return coded.find(b"\xff\xd9", at) < 0
+        return end is not None and end in file.read()
 
 
 def picture_size_wh(path: Path) -> tuple[int, int]:

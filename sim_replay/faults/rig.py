@@ -20,6 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from edge.cameras.picture_file import read_pixels
 from edge.cameras.sequence import read_scene
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
@@ -209,10 +210,7 @@ class Rig:
 
     def _config(self) -> str:
         picture = read_scene(self.settings.scene)[0]
-        image = cv2.imread(str(picture.path))
-        if image is None:
-            raise InputError(f"{picture.path} is not a readable image")
-        height, width = image.shape[:2]
+        height, width = read_pixels(picture.path, cv2.IMREAD_COLOR).shape[:2]
         K = picture.K
         return "\n".join([
             "[vehicle]",

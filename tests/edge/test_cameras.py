@@ -30,6 +30,7 @@ from .toy_scene import write_scene
 
 VIDEO_WH = (320, 180)
 INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=VIDEO_WH[0], height=VIDEO_WH[1])
+TORN_JPEG = cv2.imencode(".jpg", np.tile(np.arange(180, dtype=np.uint8)[:, None, None], (1, 320, 3)))[1].tobytes()[:-99]
 
 
 def write_video(path: Path, frames: int, fps: float) -> Path:
@@ -167,7 +168,8 @@ def test_a_capture_thread_that_breaks_ends_the_loop_instead_of_leaving_it_to_wai
         (lambda folder: (folder / "scene_camera.json").unlink(), "scene_camera.json"),
         (lambda folder: (folder / "scene_camera.json").write_text('{"0": {}}'), "scene_camera.json"),
         (lambda folder: (folder / "scene_camera.json").write_text("{}"), "scene_camera.json"),
-        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(b"junk"), "000000.png"),
+        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(b"junk"), "000000.png is not"),
+        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(TORN_JPEG), "000000.png is cut short"),
     ],
 )
 def test_a_damaged_scene_names_the_file(tmp_path: Path, damage: object, named: str) -> None:

@@ -1,0 +1,39 @@
+"""Files of pictures, read as they were stored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.errors import InputError
+
+
+def read_pixels(path: Path, flags: int) -> NDArray[Any]:
+    """The pixels as they lie, never turned; `flags` are those of cv2.imdecode.
+
+    Raises InputError for a file that is no picture, that cannot be read, or that was cut short.
+    """
+    try:
+        coded = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    if _is_torn_jpeg(coded):
+        raise InputError(f"{path} is cut short: what is missing would be read as gray")
+    pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION) if coded else None
+    if pixels is None:
+        raise InputError(f"{path} is not a readable picture")
+    return pixels
+
+
+def _is_torn_jpeg(coded: bytes) -> bool:
+    """Whether a JPEG is truncated before its end marker: OpenCV pads the rest. Anything may follow the marker."""
+    if not coded.startswith(b"\xff\xd8"):
+        return False
+    at = 2
+    while at + 4 <= len(coded) and coded[at] == 0xFF and coded[at + 1] != 0xDA:  # to the scan; a thumbnail has its own
+        at += 1 if coded[at + 1] == 0xFF else 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
+    return coded.find(b"\xff\xd9", at) < 0
