@@ -6,6 +6,7 @@ A scene made from a recording lacks pictures of frames that were not recorded: f
 from __future__ import annotations
 
 import json
+import logging
 import threading
 import time
 import tomllib
@@ -27,7 +28,10 @@ from edge.config_camera import FolderCamera, SequenceCamera
 from edge.errors import InputError
 from edge.types import Array, CameraInfo, Frame, FrameMeta
 
+log = logging.getLogger(__name__)
+
 DECODED_AHEAD = 2
+OFF_CENTRE_SHARE = 0.2  # of the sides; that of a camera of twice or half the size lies half or a quarter of them away
 DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"  # of scene_camera.json; BOP itself has pinhole cameras only
 SOURCE_KEY = "source"  # of sequence.toml, in scenes made from a video or a recording: what was filmed
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -68,6 +72,12 @@ class SequenceSource:
         if self._settings.intrinsics is not None:
             given = load_intrinsics(self._settings.intrinsics).scaled_to(self._image_size_wh)
             self._pictures = [replace(p, K=given.K, distortion=given.distortion) for p in self._pictures]
+        elif (np.abs((self._pictures[0].K[:2, 2] + 0.5) / self._image_size_wh - 0.5) > OFF_CENTRE_SHARE).any():
+            log.warning(
+                "%s: the principal point (%g, %g) is far from the middle of pictures of %dx%d: "
+                "unless they were cropped, its cam_K is for another size",
+                *(folder, *self._pictures[0].K[:2, 2], *self._image_size_wh),
+            )
         self._frames = [index if p.frame is None else p.frame for index, p in enumerate(self._pictures)]
         self._decoder = ThreadPoolExecutor(max_workers=1, thread_name_prefix="decode")
         self._start_ns, self._next = self._settings.start_at_ns, 0

@@ -102,6 +102,19 @@ def test_a_broken_index_is_told_with_file_and_key(scene: Path, entry: dict[str, 
         SequenceSource(SequenceCamera(type="sequence", path=scene)).open()
 
 
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_a_camera_for_pictures_of_another_size_is_warned_of(
+    scene: Path, scale: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    cameras = json.loads((scene / "scene_camera.json").read_text())
+    for entry in cameras.values():
+        entry["cam_K"][:6] = [scale * value for value in entry["cam_K"][:6]]
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    with closing(SequenceSource(SequenceCamera(type="sequence", path=scene))) as source:
+        source.open()
+    assert ("unless they were cropped, its cam_K is for another size" in caplog.text) == (scale != 1.0)
+
+
 def test_a_picture_without_a_camera_is_told(scene: Path) -> None:
     cameras = json.loads((scene / "scene_camera.json").read_text())
     del cameras["20"]
