@@ -327,7 +327,7 @@ def _stop_on_signal(after_s: float | None = None) -> threading.Event:
 def _router(options: argparse.Namespace) -> int:
     from msgs.ground.router import route
 
-    return route(options.config, _stop_on_signal(), lambda text: print(text, flush=True))
+    return route(options.config, _stop_on_signal(), say_aside)
 
 
 def _keys_init(options: argparse.Namespace) -> int:

@@ -39,7 +39,7 @@ END_S = 60.0
 
 def started(program: str, *arguments: str) -> subprocess.Popen[str]:
     command = ["env", "--default-signal=HUP", sys.executable, "-c", ANOTHER_THREAD_TAKES_IT + program, *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def line(process: subprocess.Popen[str]) -> str:

@@ -154,15 +154,15 @@ def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
     endpoint = free_endpoint().replace("tcp/", "tls/")
     path = write_router_config(tmp_path, [endpoint], keys["ground"], 'vehicles = ["uav1"]\n')
     command = [sys.executable, "-m", "msgs.ground.cli", "router", "--config", str(path)]
-    router = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    router = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
-        assert router.stdout is not None
-        assert router.stdout.readline() == f"listening on {endpoint}\n"
+        assert router.stderr is not None
+        assert router.stderr.readline() == f"listening on {endpoint}\n"
         with zenoh.open(peer_config([], [endpoint], tls=keys["uav1"])) as uav1:
             token = uav1.liveliness().declare_token(topics.alive_token("uav1"))
-            assert router.stdout.readline() == "uav1: here\n"
+            assert router.stderr.readline() == "uav1: here\n"
             token.undeclare()
-            assert router.stdout.readline() == "uav1: gone\n"
+            assert router.stderr.readline() == "uav1: gone\n"
         router.terminate()
         assert router.wait(60.0) == 0
     finally:
@@ -200,14 +200,14 @@ def test_the_router_command_says_nothing_of_who_bears_no_vehicle_s_name(tmp_path
     endpoint, path = free_endpoint(), tmp_path / "router.toml"
     path.write_text(f'listen = ["{endpoint}"]\n')
     command = [sys.executable, "-m", "msgs.ground.cli", "router", "--config", str(path)]
-    router = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    router = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
-        assert router.stdout is not None
-        assert router.stdout.readline() == f"listening on {endpoint}; everyone may do everything\n"
+        assert router.stderr is not None
+        assert router.stderr.readline() == f"listening on {endpoint}; everyone may do everything\n"
         with client.connect(endpoint) as session, ExitStack() as stack:
             for name in ("my-uav", "\x1b[2J", "uav1"):
                 stack.enter_context(session.liveliness().declare_token(f"uavpose/@v1/{name}/alive"))
-            assert router.stdout.readline() == "uav1: here\n"
+            assert router.stderr.readline() == "uav1: here\n"
     finally:
         router.kill()
 
