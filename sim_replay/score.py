@@ -282,4 +282,5 @@ def _mean_median(values: Array) -> dict[str, float | None]:
 
 
 def _rounded(value: float | np.floating[Any]) -> float:
-    return round(float(value), 4)
+    # Tables round once more: of 0.7895 for 15 of 19 they would make 79.0 %.
+    return round(float(value), 6)
