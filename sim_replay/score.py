@@ -88,10 +88,9 @@ class Match:
 
 
 def frame_of(capture_ns: int, start_ns: int, fps: float, frames: int) -> int | None:
-    """Index of the frame exposed at start_ns + k / fps nearest to `capture_ns`; None beyond half a frame."""
-    position = (capture_ns - start_ns) * fps * 1e-9
-    index = round(position)
-    return index if 0 <= index < frames and abs(position - index) < 0.5 else None
+    """Index of the frame exposed at start_ns + k / fps nearest to `capture_ns`; None beyond half a frame of all."""
+    index = round((capture_ns - start_ns) * fps * 1e-9)
+    return index if 0 <= index < frames else None
 
 
 def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tuple[list[Match], list[TargetPose]]:

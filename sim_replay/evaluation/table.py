@@ -87,10 +87,11 @@ def consistency_line(found: dict[str, Any]) -> str:
     told = {name: found[name] for name in ("position", "rotation") if found[name]}
     if not told:
         return f"NEES not available: the covariances of all {found['singular']} poses are singular"
-    low, high = next(iter(told.values()))["bounds_95"]
-    means = ", ".join(f"{name} {one['nees_mean']:.2f}" for name, one in told.items())
+    means = ", ".join(
+        "{} {:.2f} ({:.1f} to {:.1f})".format(name, one["nees_mean"], *one["bounds_95"]) for name, one in told.items()
+    )
     left_out = f"; {found['singular']} poses with a singular covariance excluded" if found["singular"] else ""
-    return f"NEES, mean over {found['flights']} flights (95 % bounds {low:.1f} to {high:.1f}): {means}{left_out}"
+    return f"NEES, mean over {found['flights']} flights (95 % bounds): {means}{left_out}"
 
 
 def _intervals(intervals: dict[str, tuple[float, float]]) -> str:

@@ -18,6 +18,7 @@ from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, write_results
+from sim_replay.evaluation.consistency import bounds_95
 from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.table import consistency_line, score_table
@@ -263,7 +264,14 @@ def test_covariances_that_cannot_be_inverted_are_told_in_the_table() -> None:
         console.print(consistency_line({"flights": 1, "singular": 4, **found}))
     said = console.export_text()
     assert (
-        "NEES, mean over 1 flights (95 % bounds 0.2 to 9.3): rotation 3.10; 4 poses with a singular covariance excluded"
-        in said
+        "NEES, mean over 1 flights (95 % bounds): rotation 3.10 (0.2 to 9.3); "
+        "4 poses with a singular covariance excluded" in said
     )
     assert "the covariances of all 4 poses are singular" in said
+
+
+def test_rotations_that_few_flights_know_are_held_against_bounds_of_so_many() -> None:
+    """14 flights, of which 3 tell a rotation: 5.9 is within theirs and far above those of 14."""
+    position, rotation = ({"nees_mean": mean, "bounds_95": bounds_95(n)} for mean, n in ((2.0, 14), (5.9, 3)))
+    said = consistency_line({"flights": 14, "singular": 0, "position": position, "rotation": rotation})
+    assert said == "NEES, mean over 14 flights (95 % bounds): position 2.00 (1.9 to 4.4), rotation 5.90 (0.9 to 6.3)"
