@@ -166,19 +166,25 @@ def accepted(peaks: Peaks) -> tuple[int, Counter[str]]:
 
 
 def test_what_is_no_pose_is_refused_and_counted() -> None:
-    nan, mirror, flat, vague = peaks_of(), peaks_of(), peaks_of(), peaks_of()
+    nan, mirror, flat, thin, vague = (peaks_of() for _ in range(5))
     vague.sigma[0, 0, 2] = 1e6
     nan.t_cam_target_m[0, 0, 0] = np.nan
     mirror.R_cam_target[0, 0, 0, 0] = -1
     flat.sigma[0, 0, 2] = 0
+    thin.size_px[0, 0, 1] = 0
     assert accepted(peaks_of()) == (1, Counter())
     assert accepted(peaks_of(score=0.4)) == (0, Counter())
     assert accepted(nan) == (0, Counter(not_finite=1))
     assert accepted(mirror) == (0, Counter(no_rotation=1))
-    assert accepted(flat) == (0, Counter(no_size=1))
+    assert accepted(flat) == accepted(thin) == (0, Counter(no_size=1))
     assert accepted(vague) == (0, Counter(unsure=1))
     assert accepted(peaks_of(z_m=-5.0)) == (0, Counter(out_of_range=1))
     assert accepted(peaks_of(z_m=1201.0)) == (0, Counter(out_of_range=1))
+    # What is only looked into, below what a stage asks for, is no loss.
+    contract, refused = ModelContract(**(CONTRACT | {"acquire_score_min": 0.5, "track_score_min": 0.3})), Counter[str]()
+    for stage, told in (("acquire", 0), ("track", 1)):
+        assert decode(peaks_of(score=0.4, z_m=-5.0), 0, WHOLE, contract, stage, 0.1, refused) == []
+        assert refused["out_of_range"] == told
 
 
 def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
@@ -276,16 +282,20 @@ def test_a_size_that_was_not_trained_is_less_sure() -> None:
 def test_two_peaks_on_one_aircraft_are_one_target_and_two_apart_are_two() -> None:
     assert accepted(peaks_of(n=2, apart_px=8.0))[0] == 1
     assert accepted(peaks_of(n=2, apart_px=60.0))[0] == 2
+    weaker_first = peaks_of(n=2, apart_px=8.0)
+    weaker_first.score[:] = weaker_first.score[:, ::-1].copy()
+    (kept,) = decode(weaker_first, 0, WHOLE, ModelContract(**CONTRACT), "track", 0.5, Counter())
+    assert kept.score == pytest.approx(0.9)
 
 
 def test_of_two_in_a_window_the_one_that_lies_where_the_target_should_be_is_taken() -> None:
     def at(left_px: float, score: float) -> Estimate:
-        box = np.array([left_px, 0.0, left_px + 40.0, 20.0])
+        box = np.array([1500.0 + left_px, 900.0, 1540.0 + left_px, 920.0])
         return Estimate(score, box, np.eye(3), np.array([0.0, 0.0, 200.0]), np.eye(6), "track")
 
     here, there = at(0.0, 0.8), at(80.0, 0.95)
-    assert nearest_expected([there, here], [2.0, 0.0, 42.0, 20.0]) is here
-    assert nearest_expected([at(1.0, 0.3), here], [2.0, 0.0, 42.0, 20.0]) is here, "as near, and more sure"
+    assert nearest_expected([there, here], [1502.0, 900.0, 1542.0, 920.0]) is here
+    assert nearest_expected([at(1.0, 0.3), here], [1502.0, 900.0, 1542.0, 920.0]) is here, "as near, and more sure"
 
 
 @pytest.mark.parametrize(("stage", "offset"), [("acquire", -1.0), ("track", 1.0)])
@@ -293,6 +303,17 @@ def test_each_stage_is_scored_by_its_own_calibration(stage: Literal["acquire", "
     contract = ModelContract(**(CONTRACT | {"acquire_score": {"offset": -1.0}, "track_score": {"offset": 1.0}}))
     (e,) = decode(peaks_of(score=0.9), 0, WHOLE, contract, stage, 0.5, Counter())
     assert e.score == pytest.approx(1.0 / (1.0 + np.exp(-(np.log(9.0) + offset))), rel=1e-4)
+
+
+@pytest.mark.parametrize(("scale", "shown_px"), [(2.0, 20.0), (0.5, 40.0)])
+def test_a_score_that_depends_on_size_counts_the_pixels_that_there_really_are(scale: float, shown_px: float) -> None:
+    """Of 40 in the network's image: enlarged from the frame's they tell no more than these did."""
+    contract = ModelContract(**(CONTRACT | {"track_score": {"size_slope": -0.5, "size_cap_px": 1000.0}}))
+    shown = WHOLE._replace(pixel_map=PixelMap((scale, scale), (0, 0)))
+    peaks = peaks_of()
+    peaks.center_px[:] = peaks.origin_px[:] = 400.0
+    (e,) = decode(peaks, 0, shown, contract, "track", 0.1, Counter())
+    assert e.score == pytest.approx(1.0 / (1.0 + np.exp(-(np.log(9.0) - 0.5 * np.log(shown_px)))), rel=1e-4)
 
 
 @given(boxes, boxes)

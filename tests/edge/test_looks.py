@@ -76,8 +76,11 @@ def test_only_what_is_turned_is_mirrored_and_turned_back() -> None:
     assert said.center_px[1, 0, 0] == WIDTH_PX - 1 - 30.0
 
 
-def look(range_m: float, heading_rad: float, rotation_std_rad: float = 0.1, score: float = 0.8) -> Estimate:
+def look(
+    range_m: float, heading_rad: float, rotation_std_rad: float = 0.1, score: float = 0.8, aside_rad: float = 0.0
+) -> Estimate:
     t_m = range_m * np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
+    t_m = Rotation.from_rotvec([0.0, aside_rad, 0.0]).apply(t_m)
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) + 0.01 * np.outer(t_m, t_m)
     covariance[3:, 3:] = rotation_std_rad**2 * np.eye(3)
@@ -97,7 +100,8 @@ def range_share(estimate: Estimate) -> float:
 
 
 def test_looks_that_agree_are_averaged_and_what_parts_them_is_told() -> None:
-    both = of_looks([look(100.0, 0.1), look(144.0, 0.3)])
+    both = of_looks([look(100.0, 0.1, score=0.9), look(144.0, 0.3, score=0.7)])
+    assert both.score == pytest.approx(0.8)
     assert np.linalg.norm(both.t_cam_target_m) == pytest.approx(120.0)
     np.testing.assert_allclose(both.box_xyxy_px, [11.22, 11.22, 51.22, 31.22])
     assert heading_rad(both) == pytest.approx(0.2)
@@ -105,6 +109,22 @@ def test_looks_that_agree_are_averaged_and_what_parts_them_is_told() -> None:
     assert range_share(alike) == pytest.approx(range_share(look(120.0, 0.2)))
     assert range_share(both) ** 2 == pytest.approx(range_share(alike) ** 2 + np.log(1.2) ** 2, rel=1e-3)
     assert both.covariance[4, 4] == pytest.approx(alike.covariance[4, 4] + 0.1**2)
+
+
+def test_looks_in_two_directions_are_told_as_the_one_between_and_less_sure_across() -> None:
+    both, alike = (of_looks([look(120.0, 0.2, aside_rad=a), look(120.0, 0.2, aside_rad=-a)]) for a in (0.01, 0.0))
+    np.testing.assert_allclose(both.t_cam_target_m, alike.t_cam_target_m, atol=1e-3)
+    across = np.cross(alike.t_cam_target_m, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    variances = [across @ one.covariance[:3, :3] @ across for one in (both, alike)]
+    assert variances[0] == pytest.approx(variances[1] + (120.0 * 0.01) ** 2, rel=0.01)
+
+
+def test_of_rotations_that_agree_the_middle_one_counts_and_the_surer_tells_how_sure() -> None:
+    three = of_looks([look(120.0, np.radians(deg)) for deg in (0.0, 35.0, 50.0)])
+    assert np.degrees(heading_rad(three)) == pytest.approx(28.3, abs=0.5), "the mean of all three"
+    surer = of_looks([look(120.0, 0.2, 0.1), look(120.0, 0.2, 0.4)])
+    assert surer.covariance[4, 4] == pytest.approx(2.0 / (1 / 0.1**2 + 1 / 0.4**2))
 
 
 def test_of_looks_that_contradict_the_surer_counts_and_the_doubt_is_told() -> None:

@@ -231,21 +231,31 @@ def test_a_target_seen_through_a_lens_is_where_it_is_and_its_box_where_the_frame
 
 
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, BARREL, (-0.45, 0.2, 0.0, 0.0, -0.05)])  # the last one folds
-def test_only_a_window_cuts_a_target_in_the_middle_of_the_frame(distortion: tuple[float, ...]) -> None:
+def test_only_a_window_that_lies_wrong_cuts_a_target_off_the_frame_s_edge(distortion: tuple[float, ...]) -> None:
     """Whatever the lens: the whole frame shows it all, and so does a window that lies right."""
     wh, lens = (1920, 1080), lens_of(K, distortion)
     box = np.array([850.0, 500.0, 1010.0, 560.0])
     _, pixel_map = fit_frame(np.zeros((wh[1], wh[0], 3), np.uint8), (768, 448), "letterbox", lens)
     assert not np.any(Shown(pixel_map, pixel_map.intrinsics(K), (768, 448), wh).cut_sides(box))
-    for moved_px, expected in ((0.0, [0, 0, 0, 0]), (110.0, [1, 0, 0, 0]), (-110.0, [0, 0, 1, 0])):
-        window = window_around(box + np.array([moved_px, 0, moved_px, 0]), 1.8, NETWORK_WH, wh, lens)
+    aside = window_around([60.0, 60.0, 140.0, 90.0], 1.8, NETWORK_WH, wh, lens).pixel_map(NETWORK_WH, lens)
+    view = Shown(aside, aside.intrinsics(K), NETWORK_WH, wh)
+    assert grown(np.array([60.0, 60.0, 140.0, 90.0]), view) is None, "where the lens bends most"
+    for moved_px, expected in (
+        ((0.0, 0.0), [0, 0, 0, 0]),
+        ((110.0, 0.0), [1, 0, 0, 0]),
+        ((0.0, 110.0), [0, 1, 0, 0]),
+        ((-110.0, 0.0), [0, 0, 1, 0]),
+        ((0.0, -110.0), [0, 0, 0, 1]),
+    ):
+        window = window_around(box + np.tile(moved_px, 2), 1.8, NETWORK_WH, wh, lens)
         window_map = window.pixel_map(NETWORK_WH, lens)
         view = Shown(window_map, window_map.intrinsics(K), NETWORK_WH, wh)
         np.testing.assert_array_equal(view.cut_sides(box), np.array(expected, dtype=bool))
         larger = grown(box, view)
-        assert (larger is None) == (moved_px == 0.0)
+        assert (larger is None) == (moved_px == (0.0, 0.0))
         if larger is not None:
-            assert larger[2] - larger[0] == pytest.approx(320.0)
+            outwards = np.array([-1.0, -1.0, 1.0, 1.0])
+            np.testing.assert_allclose(larger - box, 160.0 * outwards * expected)
 
 
 def test_the_first_frame_through_a_lens_finds_it_worked_out(toy_model: Path) -> None:
