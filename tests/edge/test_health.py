@@ -234,7 +234,7 @@ def test_the_stages_of_a_frame_add_up_to_its_whole(steps_ns: list[int], capture_
     clock.estimated(runs_ns)
     clock.lap("track")
     stages = clock.stages_ns()
-    assert set(stages) <= set(STAGES)
+    assert set(stages) == set(STAGES) - {"publish"} - (set() if runs_ns else {"inference", "decode"})
     assert sum(ns for stage, ns in stages.items() if stage != "total") == stages["total"]
     assert stages.get("inference", 0) == sum(end - begin for begin, end in runs_ns)
     assert (stages["capture"], stages["wait"]) == (capture_ns, wait_ns)

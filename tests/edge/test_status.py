@@ -18,11 +18,13 @@ import pytest
 import zenoh
 
 from edge.config import Config, ConfigFile
+from edge.config_ground import ZenohSettings
+from edge.errors import InputError
 from edge.estimator.model import load_model
-from edge.health import Activity, HealthState
+from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles, Reason
 from edge.prometheus import RETRY_S, MetricsServer
 from edge.stages import STAGES
-from edge.status import ask
+from edge.status import ask, for_a_person, loopback_endpoints, status, works
 from edge.status_board import StatusBoard, key_of
 from edge.types import CameraInfo
 from msgs import topics
@@ -108,6 +110,74 @@ def test_of_several_vehicles_behind_one_router_status_wants_to_know_which(cli: C
     answers = json.loads(asked.stdout)
     assert (asked.returncode, {one["vehicle"] for one in answers.values()}) == (0, {"uav2"})
     assert answers["model"]["sha256"] == "model of uav2"
+
+
+DROPS, SILENT = Reason("drops", "12 % of frames dropped"), Reason("no_frame", "no frame for 3 s")
+TRACKING = Condition(HealthState.TRACKING, Activity.TRACKING)
+
+
+@pytest.mark.parametrize(
+    ("condition", "age_s", "headline", "well"),
+    [
+        (None, 0.0, "starting", False),
+        (TRACKING, 0.5, "tracking", True),
+        (Condition(HealthState.SEARCHING, Activity.SEARCHING), 2.9, "searching", True),
+        (
+            Condition(HealthState.DEGRADED, Activity.TRACKING, (DROPS,)),
+            0.5,
+            "degraded, tracking: 12 % of frames dropped",
+            True,
+        ),
+        (Condition(HealthState.INIT, Activity.WAITING), 0.5, "init", False),
+        (
+            Condition(HealthState.FAULT, Activity.WAITING, (SILENT, DROPS)),
+            0.5,
+            f"fault: {SILENT.text}; {DROPS.text}",
+            False,
+        ),
+        (TRACKING, 4.0, "tracking", False),
+    ],
+)
+def test_what_works_and_what_a_person_is_told_of_it(
+    tmp_path: Path, toy_model: Path, stepped: int, condition: Condition | None, age_s: float, headline: str, well: bool
+) -> None:
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}, "vehicle": {"name": "kestrel"}})
+    camera = CameraInfo("nose", (320, 180), np.eye(3), None)
+    board = StatusBoard(ConfigFile(tmp_path / "flight.toml", "", config), load_model(toy_model, 1), camera)
+    if condition is not None:
+        told_ns, latency_ms = stepped - round(age_s * 1e9), {"total": Percentiles(11.0, 12.5, 40.25)}
+        board.snapshot = HealthSnapshot(told_ns, condition, 2, 29.97, {"dropped": 3, "frozen": 0}, latency_ms)
+    answer = {"info": board.info(), "config": board.config(), "model": board.model_card()}
+    assert works(answer["info"]) is well
+    lines = for_a_person(json.loads(json.dumps(answer))).splitlines()
+    assert lines[0] == f"kestrel  {headline}"
+    assert [line.split() for line in lines[2:5]] == [
+        ["camera", "nose", "320x180"],
+        ["model", "toy", "fp32", board.model.sha256[:12], "on", "cpu"],
+        ["config", str(tmp_path / "flight.toml")],
+    ]
+    stalled = "; 4 s OLD: the main loop has stalled" if age_s == 4.0 else ""
+    figures = [
+        *("  targets   2", f"  frames    30.0 a second{stalled}", ""),
+        f"  {'stage':12} {'p50 ms':>8} {'p95 ms':>8} {'p99 ms':>8}",
+        f"  {'total':12} {'11.00':>8} {'12.50':>8} {'40.25':>8}",
+        *("", f"  {'dropped':40} {3:>12}"),
+    ]
+    assert lines[5:] == ([] if condition is None else figures)
+
+
+def test_status_asks_on_loopback_where_the_daemon_listens_there(tmp_path: Path) -> None:
+    listen = ["tcp/0.0.0.0:7448", "tcp/[::]:7449", "tcp/192.168.1.2:7450", "tcp/localhost:7451"]
+    asked = loopback_endpoints(ZenohSettings(listen=listen))
+    assert asked == ["tcp/127.0.0.1:7448", "tcp/[::1]:7449", "tcp/localhost:7451"]
+    config = tmp_path / "flight.toml"
+    for zenoh_keys, words in (
+        ("enabled = false", r"\[zenoh\] enabled is false: the daemon cannot be queried"),
+        ('listen = ["tcp/192.168.1.2:7450"]', r"\[zenoh\] listen has no loopback address to query; use --connect"),
+    ):
+        config.write_text(f'[camera]\ntype = "sequence"\npath = "{tmp_path}"\n[zenoh]\n{zenoh_keys}\n')
+        with pytest.raises(InputError, match=words):
+            status(config, None, None, as_json=True)
 
 
 def test_status_refuses_what_is_no_address(cli: Cli) -> None:
