@@ -29,7 +29,7 @@ class Activity(Enum):
 
 
 class HealthState(Enum):
-    """State of the daemon in one word. From best to worst."""
+    """State of the daemon in one word."""
 
     TRACKING = "tracking"
     COASTING = "coasting"
@@ -45,7 +45,7 @@ _WELL = {
     Activity.SEARCHING: HealthState.SEARCHING,
     Activity.WAITING: HealthState.INIT,
 }
-_ACTIVITIES, _STATES = tuple(Activity), tuple(HealthState)
+_ACTIVITIES = tuple(Activity)
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,7 @@ class Condition:
         return (self.state, self.activity, self._kinds()) == (other.state, other.activity, other._kinds())
 
     def worse_than(self, other: Condition) -> bool:
-        """A worse state, or the same state with a worse activity or an additional reason."""
-        if self.state is not other.state:
-            return _STATES.index(self.state) > _STATES.index(other.state)
+        """A worse activity, or an additional reason."""
         less = _ACTIVITIES.index(self.activity) < _ACTIVITIES.index(other.activity)
         return less or bool(self._kinds() - other._kinds())
 

@@ -217,7 +217,7 @@ def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int
     visible = np.minimum(box_xyxy_px[2:], limit) - np.maximum(box_xyxy_px[:2], -0.5)
     if np.max(visible) < BOX_MIN_PX or np.min(visible) <= 0:
         return "too_small"
-    if cut and (not np.all(np.isfinite(origin_px)) or np.any(origin_px < -0.5) or np.any(origin_px > limit)):
+    if cut and not np.all((origin_px >= -0.5) & (origin_px <= limit)):
         return "cut_off"
     return None
 

@@ -16,7 +16,7 @@ import pytest
 
 from edge import clock
 from edge.estimator.model import load_model
-from edge.requests import POINTED_AGE_MAX_NS, RequestQueue, SelectTarget, StopTracking, TrackBox
+from edge.requests import POINTED_AGE_MAX_NS, WAITING_MAX, RequestQueue, SelectTarget, StopTracking, TrackBox
 from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, TrackState
@@ -269,5 +269,10 @@ def test_what_was_pointed_at_before_the_frames_stopped_is_not_looked_for_when_th
         assert requests.put(SelectTarget(2))
         assert requests.take() == [StopTracking(), SelectTarget(2)]
         assert [requests.too_late(), requests.too_late()] == [2, 0]
+        assert [requests.put(SelectTarget(1)) for _ in range(WAITING_MAX + 1)] == [True] * WAITING_MAX + [False]
+        clock.step_to(2 * (POINTED_AGE_MAX_NS + 1))
+        assert requests.put(SelectTarget(2)), "those that are too old keep no place"
+        assert requests.take() == [SelectTarget(2)]
+        assert requests.too_late() == WAITING_MAX
     finally:
         clock.run_freely()

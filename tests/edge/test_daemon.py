@@ -23,6 +23,7 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
 from edge.health import (
     RECENT_NS,
+    WINDOW_FRAMES,
     Activity,
     Announcer,
     Condition,
@@ -223,8 +224,18 @@ def test_a_snapshot_tells_rate_and_latency_and_notices_a_stuck_pipeline() -> Non
     assert snapshot.latency_ms["track"].p99 == 8.0
     assert snapshot.latency_ms["total"].p50 == 10.0
     assert 10.0 < snapshot.latency_ms["total"].p99 < 11.0
+    assert snapshot.counters == {"poses": 50, "dropped": 0}
+    health.frame_done(50, stages, (track_in(TrackState.TENTATIVE),), False, 49 * 50_000_000)
+    assert health.snapshot(50 * 50_000_000, {}).counters["poses"] == 50
     late = health.snapshot(49 * 50_000_000 + 2_100_000_000, {})
     assert (late.condition.state, late.tracks) == (HealthState.FAULT, 0)
+
+
+def test_latencies_of_longer_ago_than_half_a_minute_count_no_more() -> None:
+    health = Health(wants_attitude=False)
+    for k in range(WINDOW_FRAMES + 10):
+        health.frame_done(k, {"total": 90_000_000 if k < 10 else 10_000_000}, (), False, k * 33_000_000)
+    assert health.snapshot(WINDOW_FRAMES * 33_000_000, {}).latency_ms["total"].p99 == 10.0
 
 
 def test_percentiles_agree_with_counting() -> None:
@@ -275,6 +286,8 @@ def test_the_line_of_each_second_is_short_and_the_last_one_holds_every_counter()
     stages = {"track": Percentiles(8.0, 9.0, 10.0), "total": Percentiles(12.0, 15.0, 20.0)}
     snapshot = HealthSnapshot(0, WELL[Activity.TRACKING], 1, 30.0, counters, stages)
     assert snapshot.brief() == "tracking tracks=1 30.0 Hz, 12/15/20 ms p50/p95/p99, dropped=7"
+    limping = replace(snapshot, condition=degraded(Activity.TRACKING, "drops", text="12 % of frames dropped"))
+    assert limping.brief().startswith("degraded, tracking (12 % of frames dropped) tracks=1 30.0 Hz, ")
     assert all(f"{name}={count}" in snapshot.line().split() for name, count in counters.items())
 
 

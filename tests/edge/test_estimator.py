@@ -152,7 +152,7 @@ def peaks_of(*, score: float = 0.9, z_m: float = 300.0, n: int = 1, apart_px: fl
         score=np.array([[score - 0.1 * k for k in range(n)]], np.float32),
         center_px=center,
         size_px=np.full((1, n, 2), 40.0, np.float32),
-        origin_px=center,
+        origin_px=center.copy(),
         t_cam_target_m=np.tile(np.array([1.0, 2.0, z_m], np.float32), (1, n, 1)),
         R_cam_target=np.tile(np.eye(3, dtype=np.float32), (1, n, 1, 1)),
         sigma=np.full((1, n, 6), 0.05, np.float32),
@@ -225,11 +225,14 @@ def test_an_aircraft_seen_from_farther_above_or_below_than_in_training_is_less_s
 def test_what_may_not_be_what_it_is_taken_for_is_less_sure_in_all_it_tells() -> None:
     """Half a chance to be something else: half the variance of what such things are off by."""
     contract = ModelContract(**(CONTRACT | {"track_score_min": 0.3}))
-    stds = []
+    stds, across_px = [], []
     for score in (1.0, 0.5):
         peaks = peaks_of(score=score)
         (e,) = decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, Counter())
         stds.append(np.sqrt(np.diag(e.covariance)))
+        across = np.cross(e.t_cam_target_m, [1.0, 0.0, 0.0]) / np.linalg.norm(e.t_cam_target_m)
+        across_px.append(np.sqrt(across @ e.covariance[:3, :3] @ across) * K[1, 1] / e.t_cam_target_m[2])
+    assert across_px == pytest.approx([0.05, np.hypot(0.05, np.sqrt(0.5) * 0.05 * 40.0)], rel=0.01)
     certain, doubtful = stds
     assert np.all(doubtful > certain)
     assert doubtful[2] / 300.0 == pytest.approx(np.sqrt(0.05**2 + 0.5 * 0.5**2), rel=1e-3)
@@ -268,7 +271,8 @@ def test_a_target_cut_by_the_edge_is_told_with_doubt_in_place_and_range(left_px:
 
 
 def test_a_target_whose_middle_is_off_the_frame_is_not_told() -> None:
-    assert seen_at(-40.0, 60.0, origin_x_px=-10.0) == ([], Counter(cut_off=1))
+    for left_px, origin_x_px in ((-40.0, -10.0), (1900.0, 1930.0), (-20.0, np.nan)):
+        assert seen_at(left_px, 60.0, origin_x_px=origin_x_px) == ([], Counter(cut_off=1))
     assert seen_at(-90.0, 60.0) == ([], Counter(too_small=1))
 
 
@@ -369,7 +373,9 @@ def test_a_known_target_is_not_acquired_again_nor_one_seen_by_two_windows_twice(
 def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path) -> None:
     changes = {"track_size_wh": None, "acquire_size_wh": (640, 640), "acquire_fit": "squash"}
     model = load_model(write_toy_model(tmp_path / "paper.onnx", **changes), 1)
-    (estimate,) = Estimator(model).acquire(frame_of(draw((700.5, 300.5))))
+    estimator = Estimator(model)
+    estimator.warm_up(frame_of(np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)))
+    (estimate,) = estimator.acquire(frame_of(draw((700.5, 300.5))))
     assert estimate.stage == "acquire"
     np.testing.assert_allclose(estimate.t_cam_target_m, true_t_cam_target_m((700.5, 300.5)), rtol=0.03, atol=0.5)
 
