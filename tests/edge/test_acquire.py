@@ -71,9 +71,11 @@ def scripted(
 
 
 def test_a_place_is_looked_at_once_then_plain_and_mirrored_and_a_track_by_turns() -> None:
-    estimator, model, frame = scripted([answer(0.9)], [answer(0.9)], [answer(0.9)])
+    coarse = answer(0.9, range_m=1.2 * RANGE_M)
+    estimator, model, frame = scripted([answer(0.9)], [coarse, answer(0.9)], [answer(0.9)])
     (found,) = estimator.acquire(frame)
     assert model.asked == ["whole", "plain", "plain", "mirrored"]
+    assert np.linalg.norm(found.t_cam_target_m) == pytest.approx(RANGE_M, rel=1e-4), "as the finer two have it"
     np.testing.assert_allclose(found.box_xyxy_px, [*(TARGET_PX - SIZE_PX / 2), *(TARGET_PX + SIZE_PX / 2)], atol=0.01)
     model.asked.clear()
     estimator.acquire(frame, thrice=False)
@@ -137,6 +139,7 @@ def test_what_few_frames_have_shown_is_looked_at_both_ways_at_any_rate(unhurried
         (0.5, 0.9, 1, 0),  # windows show what the whole frame is not sure of
         (0.6, 0.7, 1, 0),  # neither is sure, both together are
         (0.6, 0.5, 0, 0),
+        (0.9, 0.25, 1, 0),  # less than a track needs, but the whole frame is sure
         (0.9, 0.15, 0, 1),  # the whole frame is sure, and wrong
         (0.09, 1.0, 0, 0),  # nobody looks
     ],
@@ -159,25 +162,38 @@ def test_what_the_finer_windows_do_not_show_is_no_target_however_sure_the_first_
     assert estimator.refused["unconfirmed"] == 1
 
 
+class TwoPlaces(Scripted):
+    """The whole frame shows two, the first the likelier."""
+
+    def run(self, images: np.ndarray, K_images: np.ndarray) -> Peaks:
+        self.script["whole"] = [answer(0.8, CLOUD_PX), answer(0.6)]
+        peaks = super().run(images, K_images)
+        if self.asked[-1] != "whole":
+            return peaks
+        both = zip(vars(peaks).values(), vars(super().run(images, K_images)).values(), strict=True)
+        return Peaks(*(np.concatenate(of_both, axis=1) for of_both in both))
+
+
 @pytest.mark.parametrize("max_targets", [1, 2])
-def test_where_there_is_room_for_few_a_false_place_hides_no_target(max_targets: int) -> None:
-    """A speck of cloud that the whole frame takes for likelier than the aircraft, frame after frame."""
-
-    class TwoPlaces(Scripted):
-        def run(self, images: np.ndarray, K_images: np.ndarray) -> Peaks:
-            self.script["whole"] = [answer(0.8, CLOUD_PX), answer(0.6)]
-            peaks = super().run(images, K_images)
-            if self.asked[-1] != "whole":
-                return peaks
-            both = zip(vars(peaks).values(), vars(super().run(images, K_images)).values(), strict=True)
-            return Peaks(*(np.concatenate(of_both, axis=1) for of_both in both))
-
+@pytest.mark.parametrize(
+    ("plain", "mirrored", "targets"),
+    [
+        # Nothing where the cloud is, in its window and in the next.
+        ([answer(0.0), answer(0.9)], [answer(0.9)], 1),
+        # It is an aircraft too, of which the windows are less sure.
+        ([answer(0.8, CLOUD_PX), answer(0.95)] * 2, [answer(0.8, CLOUD_PX), answer(0.95)], 2),
+    ],
+)
+def test_where_there_is_room_for_few_what_the_whole_frame_takes_for_likelier_hides_no_surer_target(
+    plain: list[Any], mirrored: list[Any], targets: int, max_targets: int
+) -> None:
+    """Such as a speck of cloud, frame after frame."""
     contract = ModelContract(**(CONTRACT | {"acquire_score_min": 0.7, "track_score_min": 0.3}))
-    # Nothing where the cloud is, in its window and in the next.
-    model = TwoPlaces({"whole": [], "plain": [answer(0.0), answer(0.9)], "mirrored": [answer(0.9)]}, contract)
+    model = TwoPlaces({"whole": [], "plain": list(plain), "mirrored": list(mirrored)}, contract)
     estimator = Estimator(model, max_targets)  # type: ignore[arg-type]
-    (found,) = estimator.acquire(Frame(FrameMeta(0, 0, 0), SLOPE, K))
-    np.testing.assert_allclose(found.box_xyxy_px[0], TARGET_PX[0] - SIZE_PX[0] / 2, atol=0.01)
+    found = estimator.acquire(Frame(FrameMeta(0, 0, 0), SLOPE, K))
+    assert len(found) == min(targets, max_targets)
+    np.testing.assert_allclose(found[0].box_xyxy_px[0], TARGET_PX[0] - SIZE_PX[0] / 2, atol=0.01)
 
 
 def test_no_more_targets_are_found_than_there_is_room_for(toy_model: Path) -> None:
