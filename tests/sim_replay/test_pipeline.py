@@ -23,6 +23,7 @@ from sim_replay.pipeline import flight as pipeline_flight
 from sim_replay.pipeline.flight import Flight, FlightSettings, fly, looped
 from sim_replay.pipeline.report import (
     WINDOW_FRAMES,
+    budgets,
     cpu,
     mavlink_latency_ms,
     memory_mb,
@@ -37,7 +38,7 @@ from tests.waiting import until
 
 PERIOD_S = 5.0
 START_NS = 7_000_000_000
-UTC_NS = 1_700_000_000_000_000_000
+UTC_NS = 1_700_000_002_345_678_000  # no whole number of rounds
 BUSY_CHILD = """
 import os, threading
 kept = bytearray(80_000_000)
@@ -95,11 +96,13 @@ def test_the_first_frame_of_a_round_is_no_steady_tracking_however_its_time_is_ro
 
 
 def test_stages_are_of_windows_that_do_not_overlap() -> None:
+    """The last, and those a whole window before it."""
     step = round(WINDOW_FRAMES / 30.0)
-    seconds = range(3 * step + 1)
-    told = [{f"latency_ms/inference/{p}": str(second) for p in ("p50", "p95", "p99")} for second in seconds]
+    ms = [second**2 if second % step == 5 else 1e6 for second in range(3 * step + 6)]
+    told = [{f"latency_ms/inference/{p}": str(one) for p in ("p50", "p95", "p99")} for one in ms]
     found = stage_latency_ms(told, 30.0)
-    assert found == {"inference": {"p50": 1.5 * step, "p95": 3.0 * step, "p99": 3.0 * step}}
+    middle = 0.5 * ((step + 5) ** 2 + (2 * step + 5) ** 2)
+    assert found == {"inference": {"p50": middle, "p95": ms[-1], "p99": ms[-1]}}
 
 
 def test_growth_is_of_the_second_half() -> None:
@@ -129,7 +132,9 @@ def test_budgets_are_met_missed_or_not_judged() -> None:
     flight = heard([0.3, 2.0, 3.0], [9.0, 20.0, 22.0])
     flight.poses_utc_ns = poses_at(frame for frame in range(150) if frame not in (40, 41, 100))
     flight.diagnostics = [{"values": {"dropped": "3", "captured": "90", "latency_ms/inference/p50": "4.5"}}]
-    judged = {budget["name"]: budget["met"] for budget in report(flight, 30.0, PERIOD_S, 2.0)["budgets"]}
+    result = report(flight, 30.0, PERIOD_S, 2.0)
+    assert result["cold_start_s"] == pytest.approx(1.0 + 0.3 + 0.009)  # ready after a second, then the first pose
+    judged = {budget["name"]: budget["met"] for budget in result["budgets"]}
     assert judged["capture to MAVLink, tracking, p50"] is False
     assert judged["capture to MAVLink, tracking, p99"] is True
     assert judged["frames dropped, tracking"] is False
@@ -146,6 +151,7 @@ def test_budgets_are_met_missed_or_not_judged() -> None:
         ((30, 31, 32, 33), 2, 2),  # the other two showed no target
         ((30, 31), 5, 2),
         ((30, 31), 0, 0),
+        (tuple(range(300)), 4, 0),  # nothing was tracked
     ],
 )
 def test_frames_dropped_when_the_target_jumps_are_not_dropped_while_tracking(
@@ -172,7 +178,8 @@ def test_what_was_too_old_for_the_autopilot_is_counted_since_no_latency_tells_of
     result = report(flight, 30.0, PERIOD_S, 2.0)
     assert {one["name"]: one["met"] for one in result["budgets"]}["poses withheld by MAVLink, tracking"] is True
     assert "too old" not in table(result)
-    assert report(flight, 60.0, PERIOD_S, 2.0)["poses_withheld"] is None  # more than it is sent
+    assert report(flight, 50.0, PERIOD_S, 2.0)["poses_withheld"] is not None
+    assert report(flight, 51.0, PERIOD_S, 2.0)["poses_withheld"] is None  # more than it is sent
 
 
 def test_an_autopilot_that_receives_nothing_any_more_while_poses_go_on_has_them_withheld() -> None:
@@ -183,12 +190,29 @@ def test_an_autopilot_that_receives_nothing_any_more_while_poses_go_on_has_them_
     assert {one["name"]: one["met"] for one in result["budgets"]}["poses withheld by MAVLink, tracking"] is False
 
 
-def test_sixty_frames_a_second_have_a_budget_of_their_own() -> None:
-    for p99_ms, met in ((32.0, True), (34.0, False)):
-        judged = report(heard([2.0, 3.0], [p99_ms, p99_ms]), 60.0, PERIOD_S, 2.0)["budgets"]
-        budgets = {budget["name"]: budget["met"] for budget in judged}
-        assert budgets["capture to MAVLink, tracking, p99"] is met
-        assert "capture to MAVLink, tracking, p50" not in budgets
+@pytest.mark.parametrize(("fps", "p50_ms", "p99_ms"), [(30.0, 15.0, 25.0), (60.0, None, 33.0)])
+def test_each_budget_is_met_up_to_its_limit_and_missed_above_it(
+    fps: float, p50_ms: float | None, p99_ms: float
+) -> None:
+    """The limits of docs/performance.md; memory growth takes an hour."""
+
+    def judged(above: float, minutes: float) -> list[bool | None]:
+        result = {
+            "fps": fps,
+            "minutes": minutes,
+            "capture_to_mavlink_ms": {"steady": {"p50": (p50_ms or 0.0) + above, "p99": p99_ms + above}},
+            "poses_withheld": above,
+            "stages_ms": {"inference": {"p50": 8.0 + above}},
+            "dropped_tracking": above,
+            "memory_mb": {"max": 400.0 + above, "growth_per_hour": 1.0 + above},
+            "cold_start_s": 3.0 + above,
+        }
+        return [budget.met for budget in budgets(result)]
+
+    count = 7 if p50_ms is None else 8
+    assert judged(0.0, minutes=60.0) == [True] * count
+    assert judged(0.01, minutes=60.0) == [False] * count
+    assert judged(0.01, minutes=59.9) == [*[False] * (count - 2), None, False]
 
 
 def test_what_is_played_faster_flies_the_same_way_faster() -> None:
