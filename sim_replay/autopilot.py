@@ -9,7 +9,7 @@ accepting answers within 10 ms.
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
 Prints one JSON object per line: `ready`, each `target_relative` with its arrival time, with --all each accepted
-`message`, and a `summary` when it is told to stop (SIGTERM, SIGINT) or its parent process ends.
+`message`, and a `summary` when it is told to stop (SIGTERM, SIGINT).
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import socket
 import sys
 import threading
@@ -276,15 +275,13 @@ def _emit(record: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def _fly(
-    autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event, parent: int
-) -> None:
-    """Exchange datagrams with the daemon at `address` until `stop` is set or the parent process has ended."""
+def _fly(autopilot: Autopilot, address: tuple[str, int], faults: LinkFaults, stop: threading.Event) -> None:
+    """Exchange datagrams with the daemon at `address` until `stop` is set."""
     outward, inward = Lane(faults), Lane(faults, seed=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((address[0] if address[0].startswith("127.") else "0.0.0.0", 0))
         _emit({"event": "ready", "port": link.getsockname()[1]})
-        while not stop.is_set() and os.getppid() == parent:
+        while not stop.is_set():
             times_ns = (autopilot.next_due_ns(), outward.next_due_ns(), inward.next_due_ns())
             next_ns = min((t_ns for t_ns in times_ns if t_ns is not None), default=None)
             wait_s = _POLL_S if next_ns is None else min((next_ns - time.monotonic_ns()) * 1e-9, _POLL_S)
@@ -341,7 +338,6 @@ def _system_id(text: str) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parent = os.getppid()  # now: later, it may already be the process that inherits orphans
     parser = argparse.ArgumentParser(prog="python -m sim_replay.autopilot", description=__doc__.splitlines()[0])
     parser.add_argument("--telemetry", type=Path, required=True, help="telemetry.csv of the sequence")
     parser.add_argument("--endpoint", type=_address, required=True, help="HOST:PORT the daemon listens on (udpin)")
@@ -375,7 +371,7 @@ def main(argv: list[str] | None = None) -> int:
         autopilot = Autopilot(
             telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
         )
-        _fly(autopilot, args.endpoint, link_faults(args), stop, parent)
+        _fly(autopilot, args.endpoint, link_faults(args), stop)
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0
 

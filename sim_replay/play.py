@@ -26,6 +26,7 @@ from edge.errors import InputError
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.bad_link import LinkFaults
 from sim_replay.daemon_config import UAV, sequence_config
+from sim_replay.faults.processes import ENDS_WITH_US
 from sim_replay.gimbal import write_gimbal
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.ports import LOOPBACK, free_endpoint, free_port
@@ -245,7 +246,7 @@ def _daemon(config: Path, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     command = Path(sys.executable).parent / "uavpose-edge"
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [str(command), "run", "--config", str(config)],
+            [*ENDS_WITH_US, str(command), "run", "--config", str(config)],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -263,7 +264,7 @@ def _peer(
 ) -> Iterator[subprocess.Popen[str]]:
     """`python -m sim_replay.<name>`, whose records go to `records`; at the end it is stopped and its output drained."""
     process = subprocess.Popen(
-        [sys.executable, "-m", f"sim_replay.{name}", *arguments],
+        [*ENDS_WITH_US, sys.executable, "-m", f"sim_replay.{name}", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,

@@ -4,7 +4,7 @@
 
 Prints one JSON object per line: `ready`, each valid `pose` and `direction`, each `diagnostics`, with --all each
 `sample`, valid or not, of the topics with a timestamp other than poses, and a `summary` of samples by topic and
-refusals by reason when it is told to stop (SIGTERM, SIGINT) or its parent process ends.
+refusals by reason when it is told to stop (SIGTERM, SIGINT).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import queue
 import sys
 import threading
@@ -96,24 +95,24 @@ def _content(topic: topics.Topic, payload: bytes) -> tuple[int, dict[str, Any]]:
     return min((one.stamp_ns for one in transforms), default=0), {"q_xyzw": turned}
 
 
-def _connect(endpoint: str, wait_s: float, stop: threading.Event, parent: int) -> zenoh.Session:
+def _connect(endpoint: str, wait_s: float, stop: threading.Event) -> zenoh.Session:
     """A session with the daemon, however late it starts.
 
-    Raises ConnectionError after `wait_s`, on `stop`, and if the parent process, whose id it was, has ended.
+    Raises ConnectionError after `wait_s`, and on `stop`.
     """
     deadline = time.monotonic() + wait_s
     while True:
         try:
             return connect(endpoint)
         except ConnectionError:
-            if stop.wait(_RETRY_S) or os.getppid() != parent or time.monotonic() > deadline:
+            if stop.wait(_RETRY_S) or time.monotonic() > deadline:
                 raise
 
 
 def _listen(
-    session: zenoh.Session, uav: str, stop: threading.Event, parent: int, everything: bool, max_age_s: float
+    session: zenoh.Session, uav: str, stop: threading.Event, everything: bool, max_age_s: float
 ) -> dict[str, Any]:
-    """Print what arrives until `stop` is set or the parent process has ended; returns the summary."""
+    """Print what arrives until `stop` is set; returns the summary."""
     records: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
 
     def on_diagnostics(sample: zenoh.Sample) -> None:
@@ -139,7 +138,7 @@ def _listen(
         for topic, taker in takers
     ]
     _emit({"event": "ready"})
-    while not stop.is_set() and os.getppid() == parent:
+    while not stop.is_set():
         try:
             _emit(records.get(timeout=_POLL_S))
         except queue.Empty:
@@ -159,7 +158,6 @@ def _emit(record: dict[str, Any]) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parent = os.getppid()  # now: later, it may already be the process that inherits orphans
     parser = argparse.ArgumentParser(prog="python -m sim_replay.subscriber", description=__doc__.splitlines()[0])
     parser.add_argument("--connect", required=True, help="zenoh endpoint of the daemon, e.g. tcp/127.0.0.1:7448")
     parser.add_argument("--uav", default="uav1", help="name of the vehicle")
@@ -171,8 +169,8 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     stop = stop_on_signals()
     try:
-        with _connect(args.connect, args.wait_s, stop, parent) as session:
-            summary = _listen(session, args.uav, stop, parent, args.all, args.max_age_s)
+        with _connect(args.connect, args.wait_s, stop) as session:
+            summary = _listen(session, args.uav, stop, args.all, args.max_age_s)
     except ConnectionError as error:
         print(error, file=sys.stderr)
         return 1

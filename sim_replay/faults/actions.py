@@ -20,7 +20,7 @@ from pathlib import Path
 
 from msgs.mavlink import dialect
 from sim_replay.faults import hostile
-from sim_replay.faults.processes import Process
+from sim_replay.faults.processes import ENDS_WITH_US, Process
 from sim_replay.faults.relay import LinkState, udp_queue
 from sim_replay.faults.rig import START_S, UAV, Rig
 from sim_replay.faults.timeline import (
@@ -159,7 +159,9 @@ def _model_file(step: ModelFile, rig: Rig) -> None:
 def _load(step: Load, rig: Rig) -> None:
     count = step.times * (os.cpu_count() or 1)
     # Linux shares the CPU between sessions first: in the rig's own, the load would slow the relays and not the daemon.
-    busy = [subprocess.Popen([sys.executable, "-c", _BUSY], start_new_session=True) for _ in range(count)]
+    busy = [
+        subprocess.Popen([*ENDS_WITH_US, sys.executable, "-c", _BUSY], start_new_session=True) for _ in range(count)
+    ]
     try:
         threading.Event().wait(step.for_s)
     finally:

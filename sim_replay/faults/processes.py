@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+# Before a command: it is told to stop (SIGTERM) when the process that starts it has ended, however that happened.
+ENDS_WITH_US = ("setpriv", "--pdeathsig", "TERM")  # of util-linux
 _END_S = 10.0
 
 Heard = Callable[[str, int], None]  # a line, and its arrival time (monotonic ns)
@@ -23,7 +25,7 @@ class Process:
     def __init__(self, command: Sequence[str | Path], heard: Heard, ended: Callable[[], object] = lambda: None) -> None:
         self._heard, self._ended = heard, ended
         self._popen = subprocess.Popen(
-            [str(word) for word in command],
+            [*ENDS_WITH_US, *(str(word) for word in command)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -21,7 +20,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from msgs.mavlink import MAVLink, dialect, pack, target_relative
 from sim_replay.autopilot import COMPONENT_ID, SYSTEM_ID
 from sim_replay.telemetry import COLUMNS, Telemetry, TelemetryError, read_telemetry, write_telemetry
-from tests.waiting import runs, until
 
 
 def turning_flight() -> Telemetry:
@@ -225,25 +223,3 @@ def test_telemetry_that_cannot_be_used_is_told_in_a_sentence(tmp_path: Path, tex
     with pytest.raises(TelemetryError, match=complaint) as raised:
         read_telemetry(path)
     assert str(path) in str(raised.value)
-
-
-def test_it_ends_with_a_player_that_is_killed_while_it_starts(tmp_path: Path) -> None:
-    write_telemetry(tmp_path / "flight.csv", turning_flight())
-    fifo = tmp_path / "telemetry.csv"
-    os.mkfifo(fifo)
-    command = [sys.executable, "-m", "sim_replay.autopilot", "--telemetry", str(fifo)]
-    command += ["--endpoint", "127.0.0.1:9", "--start-at-ns", str(time.monotonic_ns())]
-    player = f"import subprocess\nchild = subprocess.Popen({command})\nprint(child.pid, flush=True)\nchild.wait()"
-    with subprocess.Popen([sys.executable, "-c", player], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        pid = int(process.stdout.readline())
-        try:
-            with fifo.open("w") as telemetry:  # once the autopilot reads it
-                process.kill()
-                process.wait()
-                telemetry.write((tmp_path / "flight.csv").read_text())
-            until(lambda: not runs(pid), what="the end of the autopilot")
-        finally:
-            process.kill()
-            if runs(pid):
-                os.kill(pid, signal.SIGKILL)

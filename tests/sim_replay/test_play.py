@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ from sim_replay.ground_truth import read_sequence
 from sim_replay.play import PlayError, PlaySettings, Record, Recording, play
 from tests.edge.toy_model import write_toy_model
 from tests.sim_replay.toy_flight import write_toy_flight
+from tests.waiting import runs, until
 
 
 def peer_pid(name: str) -> int:
@@ -63,6 +66,38 @@ def test_a_daemon_that_is_told_to_stop_before_the_last_frame_fails_the_flight(aw
     sequence, model = read_sequence(write_toy_flight(tmp_path / "scene")), write_toy_model(tmp_path / "toy.onnx")
     with pytest.raises(PlayError, match=r"the daemon ended \d+\.\d s before the last frame, with exit code 0"):
         play(PlaySettings(sequence, tmp_path / "out", model), stop)
+
+
+STARTS_BOTH_KINDS = """
+import queue, time
+from sim_replay.faults.processes import Process
+from sim_replay.play import _peer
+daemon = Process(["sleep", "3600"], lambda *_: None)
+with _peer("subscriber", ["--connect", "tcp/127.0.0.1:9", "--wait-s", "3600"], queue.SimpleQueue()) as subscriber:
+    print(daemon.pid, subscriber.pid, flush=True)
+    time.sleep(3600.0)
+"""
+
+
+def is_tied(pid: int) -> bool:
+    """Whether it runs its command, and no longer what ties it to the process that started it."""
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    return b"3600" in words and words[0] != b"setpriv"
+
+
+def test_what_a_command_has_started_ends_with_it_also_when_it_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", STARTS_BOTH_KINDS], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        try:
+            assert len(pids) == 2
+            until(lambda: all(is_tied(pid) for pid in pids), what="the commands themselves")
+            process.kill()  # while the subscriber still imports
+            until(lambda: not any(runs(pid) for pid in pids), what="the end of what it started")
+        finally:
+            process.kill()
+            for pid in filter(runs, pids):
+                os.kill(pid, signal.SIGKILL)
 
 
 def test_what_a_slow_link_still_carries_when_the_daemon_has_ended_is_received(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -18,7 +17,7 @@ from msgs import session, topics
 from msgs.cdr import Vector3Stamped
 from msgs.publish import Node
 from sim_replay.ports import free_endpoint
-from tests.waiting import runs, until
+from tests.waiting import until
 
 PATIENCE_S = 3600.0
 
@@ -43,25 +42,6 @@ def test_a_signal_ends_the_wait_for_a_daemon() -> None:
                 process.kill()
     assert (process.returncode, said) == (1, "")
     assert complaint.startswith(f"no zenoh session with {endpoint}")
-
-
-def test_it_ends_with_a_player_that_is_killed_while_it_waits_for_a_daemon() -> None:
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))  # and does not listen
-        endpoint = f"tcp/127.0.0.1:{nobody.getsockname()[1]}"
-        command = [sys.executable, "-m", "sim_replay.subscriber", "--connect", endpoint, "--wait-s", str(PATIENCE_S)]
-        player = f"import subprocess\nchild = subprocess.Popen({command})\nprint(child.pid, flush=True)\nchild.wait()"
-        with subprocess.Popen([sys.executable, "-c", player], stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
-            pid = int(process.stdout.readline())
-            try:
-                until(lambda: heeds(pid, signal.SIGTERM), what="its handler")
-                process.kill()
-                until(lambda: not runs(pid), what="the end of the subscriber")
-            finally:
-                process.kill()
-                if runs(pid):
-                    os.kill(pid, signal.SIGKILL)
 
 
 def test_it_prints_the_directions_that_are_valid_and_counts_the_others() -> None:
