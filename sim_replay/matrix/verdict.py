@@ -13,8 +13,9 @@ def wrong_poses(sequence: PlayedSequence, result: Result) -> tuple[str, ...]:
     """
     told = []
     for name, peer in zip(PEERS, (result.subscriber, result.autopilot), strict=True):
-        if sequence.scene.shows_target and not peer.ages and not peer.strays:
-            told.append(f"the {name} received no pose")
+        if sequence.scene.shows_target and not peer.ages:
+            strays = f" of a frame, but {peer.strays} of none" if peer.strays else ""
+            told.append(f"the {name} received no pose{strays}")
         false = len(peer.false_poses) + peer.strays
         if sequence.scene.target_free and false:
             told.append(f"the {name} received {false} poses, but there is no target to be seen")

@@ -14,6 +14,7 @@ from edge.types import Mount
 from msgs.geometry import so3_exp
 from sim_replay.demo import LiveFigures
 from sim_replay.ground_truth import PlayedSequence, read_scene_truth
+from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.play import Recording
 from sim_replay.result import frame_views, judge, score_json
 from sim_replay.score import Truth
@@ -88,6 +89,13 @@ def test_records_become_the_score(sequence: PlayedSequence, recording: Recording
     assert score["latency_ms"]["p50"] == pytest.approx(15.0, abs=0.002)
     assert score["mavlink_received"] == {"TARGET_RELATIVE": 2}
     assert score["zenoh_received"] == {"uav1/target/t0/pose": 4}
+
+
+def test_poses_of_no_frame_are_no_poses_of_a_target_that_is_visible(sequence: PlayedSequence) -> None:
+    made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
+    made.take("subscriber", pose(-9, 0.0))
+    told = ("the subscriber received no pose of a frame, but 1 of none", "the autopilot received no pose")
+    assert wrong_poses(sequence, judge(sequence, made)) == told
 
 
 def test_a_rotation_that_neither_peer_was_told_is_not_judged(sequence: PlayedSequence) -> None:
