@@ -119,6 +119,12 @@ def test_a_device_that_is_pulled_out_or_gives_nothing_but_torn_pictures_is_lost_
     assert driver.opens == 3
 
 
+def test_a_device_that_says_no_size_is_tried_again_and_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", Driver({cv2.CAP_PROP_FRAME_WIDTH}, 1000.0))
+    with pytest.raises(SourceLost, match=r"/dev/video3 does not say the size of its picture"):
+        DeviceSource(settings()).open()
+
+
 class Modes(Driver):
     """Gives twenty pictures each time it is opened, and is of another shape the times that are told."""
 

@@ -163,20 +163,25 @@ def test_a_capture_thread_that_breaks_ends_the_loop_instead_of_leaving_it_to_wai
 
 
 @pytest.mark.parametrize(
-    ("damage", "named"),
+    ("file", "content", "sentence"),
     [
-        (lambda folder: (folder / "scene_camera.json").unlink(), "scene_camera.json"),
-        (lambda folder: (folder / "scene_camera.json").write_text('{"0": {}}'), "scene_camera.json"),
-        (lambda folder: (folder / "scene_camera.json").write_text("{}"), "scene_camera.json"),
-        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(b"junk"), "000000.png is not"),
-        (lambda folder: (folder / "rgb" / "000000.png").write_bytes(TORN_JPEG), "000000.png is cut short"),
+        ("scene_camera.json", None, "is no BOP scene: scene_camera.json cannot be read: No such file"),
+        ("scene_camera.json", b'{"0": {}}', "scene_camera.json: '0' has no 'cam_K'"),
+        ("scene_camera.json", b"{}", "scene_camera.json has no camera for picture 0"),
+        ("scene_camera.json", b"[]", "scene_camera.json is not as BOP writes it"),
+        ("rgb/000000.png", None, "has no pictures in rgb/ or gray/"),
+        ("rgb/000000.png", b"junk", "000000.png is not a readable picture"),
+        ("rgb/000000.png", TORN_JPEG, "000000.png is cut short"),
     ],
 )
-def test_a_damaged_scene_names_the_file(tmp_path: Path, damage: object, named: str) -> None:
+def test_a_damaged_scene_is_told_with_file_and_fault(
+    tmp_path: Path, file: str, content: bytes | None, sentence: str
+) -> None:
     folder = write_scene(tmp_path / "000001", frames=1)
-    assert callable(damage)
-    damage(folder)
-    with pytest.raises(InputError, match=named):
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_bytes(content)
+    with pytest.raises(InputError, match=sentence):
         SequenceSource(SequenceCamera(type="sequence", path=folder)).open()
 
 

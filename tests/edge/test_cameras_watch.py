@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import Counter
 from collections.abc import Container, Iterable
 from contextlib import suppress
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.cameras.capture import Capture
+from edge.cameras.capture import FROZEN_TOLD_NS, Capture
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.source import EndOfStream
 from edge.cameras.watch import FrameWatch
@@ -23,6 +24,7 @@ from edge.errors import InputError
 from edge.estimator.pace import Pace
 from edge.health import Health
 from edge.types import CameraInfo, Frame, FrameMeta
+from tests.waiting import until
 
 from .pictures import INTRINSICS, number_of, picture
 
@@ -131,6 +133,26 @@ def test_pictures_that_a_live_camera_repeats_are_no_drops_and_numbers_that_it_sk
         health.frame_done(meta.sequence, {"total": 1}, (), True, meta.capture_ns)
     assert [reason.text for reason in health.assess(taken[-1].capture_ns).reasons] == said
     assert (counters["captured"], counters["frozen"], counters["dropped"]) == (len(taken), frozen, dropped)
+
+
+def test_a_live_camera_that_is_frozen_is_told_from_the_second_on_until_it_moves() -> None:
+    source = Numbered()
+    capture = Capture(source, True)
+    capture.start()
+    try:
+        before_ns = time.monotonic_ns()
+        for number, (shade, frozen, captured) in enumerate(((1, 0, 1), (1, 1, 1), (2, 1, 2))):
+            source.show(number, shade)
+            until(
+                lambda frozen=frozen, captured=captured: (
+                    (capture.counters()["frozen"], capture.counters()["captured"]) == (frozen, captured)
+                )
+            )
+            told_from_ns = time.monotonic_ns() + FROZEN_TOLD_NS
+            kinds = [[one.kind for one in capture.reasons(at)] for at in (before_ns + FROZEN_TOLD_NS - 1, told_from_ns)]
+            assert kinds == [[], ["camera_frozen"] if number == 1 else []]
+    finally:
+        capture.stop()
 
 
 def test_a_camera_that_shows_each_picture_twice_leaves_the_time_of_both() -> None:

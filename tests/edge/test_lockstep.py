@@ -127,14 +127,26 @@ def test_a_daemon_whose_player_hangs_up_before_his_first_word_ends_as_after_a_re
     assert "stopped: " in said.splitlines()[-1]
 
 
-@pytest.mark.parametrize("line", ["frame 99", "time 5", "time -3", "frame", "jump 3", "time 1e3", "frame \xff"])
-def test_a_word_that_cannot_be_obeyed_is_told_with_its_key(player: Player, line: str) -> None:
+NO_WORD, LOCKSTEP = "neither time NS nor frame INDEX", ("camera", "lockstep")
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence", "key"),
+    [
+        ("frame 99", "has no picture 99 among its 40 frames", ()),
+        ("time 5", "the player's time goes back: 5 is before 10", LOCKSTEP),
+        *((line, NO_WORD, LOCKSTEP) for line in ("time -3", "frame", "jump 3", "time 1e3", "frame \xff")),
+    ],
+)
+def test_a_word_that_cannot_be_obeyed_is_told_with_its_key(
+    player: Player, line: str, sentence: str, key: tuple[str, ...]
+) -> None:
     player.say("time 10")
     player.capture.start(lambda: None)
     player.say(line)
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError, match=sentence) as refused:
         player.capture.newest(5.0)
-    assert refused.value.key in {("camera", "lockstep"), ()}
+    assert refused.value.key == key
 
 
 def test_the_clock_is_the_host_s_until_it_is_stepped_and_never_goes_back() -> None:

@@ -73,6 +73,17 @@ def test_slower_than_the_settings_allow_is_no_good_state(toy_model: Path, latenc
     assert (condition.state is HealthState.DEGRADED) == bool(kinds)
 
 
+@pytest.mark.parametrize(("no_frame_s", "state"), [(0.5, HealthState.FAULT), (1.5, HealthState.SEARCHING)])
+def test_no_frame_for_longer_than_the_settings_allow_is_a_fault(
+    toy_model: Path, stepped: int, no_frame_s: float, state: HealthState
+) -> None:
+    supervisor = supervised(toy_model, Outlets(None, None), {})
+    supervisor.apply(HealthSettings(no_frame_s=no_frame_s))
+    supervisor.frame_done(make_report(now_ns=stepped), {"total": 10_000_000})
+    clock.step_to(stepped + 1_000_000_000)
+    assert supervisor.snapshot().condition.state is state
+
+
 @pytest.mark.parametrize(("score", "activity"), [(0.6, Activity.SEARCHING), (0.9, Activity.TRACKING)])
 def test_a_bird_is_not_tracked(toy_model: Path, score: float, activity: Activity) -> None:
     supervisor = supervised(toy_model, Outlets(None, None), {})
