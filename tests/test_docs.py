@@ -16,10 +16,12 @@ import pytest
 from edge import cli, config_reference, stages, threads
 from edge.config import HealthSettings, load_config
 from edge.daemon import TICK_S
+from edge.links.zenoh_link import CLOSE_TIMEOUT_S
 from edge.systemd import FEEDS_PER_LIMIT
 from edge.watchdog import LAST_WORDS_S, LOOKS_PER_LIMIT
 from msgs import topics
 from msgs.ground.fleet import TargetRow
+from msgs.recording import STOP_TIMEOUT_S
 
 ROOT = Path(__file__).parents[1]
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
@@ -121,6 +123,8 @@ def test_the_unit_starts_reloads_and_watches_the_daemon() -> None:
     ours_s = longest_s * (1 + 1 / LOOKS_PER_LIMIT) + LAST_WORDS_S
     systemd_s = float(service["WatchdogSec"]) * (1 - 1 / FEEDS_PER_LIMIT) - TICK_S
     assert ours_s < systemd_s
+    # A router that does not answer, then a disk that takes nothing: what is lost is told after both.
+    assert float(service["TimeoutStopSec"]) > CLOSE_TIMEOUT_S + STOP_TIMEOUT_S
     users = (ROOT / "deploy" / "uavpose.sysusers").read_text()
     assert f"\nu {service['User']} " in users
     for group in service["SupplementaryGroups"].split():
