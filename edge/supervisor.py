@@ -53,6 +53,7 @@ class Supervisor:
         self._snapshot_due_ns = 0
         self._snapshots = 0
         self._flew = False
+        self._ended_ns: int | None = None
         self.apply(settings)
 
     def apply(self, settings: HealthSettings) -> None:
@@ -66,6 +67,8 @@ class Supervisor:
         self._notifier.ready()
 
     def stopping(self) -> None:
+        """The loop has ended: its state then is its last, however long the links take to stop."""
+        self._ended_ns = clock.monotonic_ns()
         self._notifier.stopping()
         self._notifier.close()
 
@@ -99,7 +102,8 @@ class Supervisor:
             self._tell_snapshot()
 
     def snapshot(self) -> HealthSnapshot:
-        return self._health.snapshot(clock.monotonic_ns(), self._count(), self._board.facts())
+        now_ns = clock.monotonic_ns() if self._ended_ns is None else self._ended_ns
+        return self._health.snapshot(now_ns, self._count(), self._board.facts())
 
     def _tell_snapshot(self) -> None:
         snapshot = self.snapshot()

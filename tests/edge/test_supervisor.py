@@ -93,6 +93,17 @@ def test_a_bird_is_not_tracked(toy_model: Path, score: float, activity: Activity
     assert supervisor.snapshot().tracks == (activity is Activity.TRACKING)
 
 
+def test_how_long_the_links_take_to_stop_does_not_change_the_last_state(toy_model: Path, stepped: int) -> None:
+    supervisor = supervised(toy_model, Outlets(None, None), {})
+    clock.step_to(stepped + PERIOD_NS)
+    supervisor.frame_done(make_report(now_ns=stepped), {"total": PERIOD_NS})
+    last = supervisor.snapshot().condition
+    assert last.state is HealthState.SEARCHING
+    supervisor.stopping()
+    clock.step_to(stepped + 10_000_000_000)
+    assert supervisor.snapshot().condition == last
+
+
 class Kept(Outlets):
     """Keeps the times of what goes out as diagnostics."""
 
