@@ -40,6 +40,9 @@ NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = (
     "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
 )
+ADVICE_RECORDER = (
+    "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, docs/install.md"
+)
 STARTING = ("the daemon is still starting", "run doctor again in a few seconds")
 ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
 HEARING_S = 4.0
@@ -48,12 +51,20 @@ LOOK_S = 0.1
 
 def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator[Finding]:
     """`running`: the running daemon's `info`, if any: its endpoints are then in use and not tried."""
+    if config.mavlink.enabled and config.mavlink.signing_key is not None:
+        yield signing_finding(signing_state_of(config.mavlink, config.mavlink.signing_key))
     if running is not None and is_starting(running):
         yield poor("daemon", *STARTING)
         return
     if running is not None:
+        counters = running["counters"]
+        if counters.get("recorder_stopped"):
+            yield wrong("recorder", "the running daemon cannot record", ADVICE_RECORDER)
         said = f"running (process {running['pid']}), state {running['state']}"
         others = {kind: text for kind, text in told_reasons(running) if not kind.startswith(CAMERA_REASONS)}
+        if config.mavlink.enabled and not counters.get("mavlink_received_HEARTBEAT"):
+            silent = f"no heartbeat of an autopilot received in {running['uptime_s']:.0f} s"
+            others.setdefault(NO_AUTOPILOT, silent)  # without frames the daemon does not miss its attitude
         if NO_AUTOPILOT in others:
             yield wrong("daemon", f"{said}: {'; '.join(others.values())}", ADVICE_AUTOPILOT)
         elif others:
@@ -124,8 +135,6 @@ def metrics_finding(port: int) -> Finding:
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
     """Speak and listen as the daemon does before its first frame, until a heartbeat is received: a router, or an
     autopilot, may send to nobody who has not spoken first."""
-    if settings.signing_key is not None:
-        yield signing_finding(signing_state_of(settings, settings.signing_key))
     for endpoint in settings.endpoints:
         named = parse_endpoint(endpoint)
         if isinstance(named, SerialEndpoint):

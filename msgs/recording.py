@@ -244,6 +244,8 @@ class Recorder:
         if not self._stopped:
             return
         self._stopped = False
+        with self._changed:
+            self._counters["stopped"] = 0
         log.info("recording again")
         self._tell(logging.INFO, "recording again")
 
@@ -268,6 +270,7 @@ class Recorder:
             self._failure = failure
             if failure is not None:
                 self._counters["failures"] += 1
+                self._counters["stopped"] = 1
                 self._counters["lost"] += lost + len(self._waiting)
                 self._in_hand = 0
                 self._waiting.clear()

@@ -22,7 +22,9 @@ from edge.config import load_config
 from edge.doctor import camera_as_told
 from edge.doctor_links import link_findings, signing_finding
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
+from edge.health import Health
 from edge.links.signing import timestamp_of
+from edge.links.signing_key import write_new_key
 from edge.reload import load_configured
 from edge.status import ask
 from edge.status_board import StatusBoard
@@ -235,6 +237,30 @@ def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model
     found = [*(one for one, _ in camera_as_told(running)), *link_findings(file.config, running)]
     told = ("poor", "the daemon is still starting", "run doctor again in a few seconds")
     assert [(one.what, one.verdict, one.says, one.advice) for one in found] == [("camera", *told), ("daemon", *told)]
+
+
+@pytest.mark.parametrize(
+    ("counters", "kept", "wrong"),
+    [
+        ({"mavlink_received_HEARTBEAT": 9, "recorder_stopped": 0}, "mavlink.timestamp", {}),
+        ({"mavlink_received_HEARTBEAT": 9, "recorder_stopped": 1}, "mavlink.timestamp", {"recorder": "cannot record"}),
+        ({"mavlink_sent_HEARTBEAT": 9}, "none/key", {"daemon": "no heartbeat", "signing": "cannot be written"}),
+    ],
+)
+def test_what_a_running_daemon_lacks_without_a_camera_is_told_too(
+    tmp_path: Path, toy_model: Path, swaying: Path, counters: dict[str, int], kept: str, wrong: dict[str, str]
+) -> None:
+    write_new_key(tmp_path / "key")
+    links = f'[mavlink]\nsigning_key = "key"\nsigning_state = "{kept}"\n'
+    text = toml(swaying, toy_model, free_port()).replace("[mavlink]\nenabled = false\n", links)
+    (tmp_path / "config.toml").write_text(text)
+    file = load_config(tmp_path / "config.toml")
+    board = StatusBoard(file, load_configured(file), CameraInfo("nose", (320, 180), np.eye(3), None))
+    board.snapshot = Health(wants_attitude=True).snapshot(1, counters)
+    found = {one.what: one for one in link_findings(file.config, board.info())}
+    assert {what for what, one in found.items() if one.verdict != "good"} == set(wrong)
+    for what, words in wrong.items():
+        assert (found[what].verdict, words in found[what].says) == ("wrong", True), found[what].says
 
 
 NO_ROOT_LOOKS = """

@@ -49,11 +49,13 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
     assert not recorder.recording
     until(lambda: recorder.counters().get("failures", 0) >= 3)
+    assert recorder.counters()["stopped"] == 1
     assert told == [(40, "recording stopped: No space left on device")]
     monkeypatch.setattr(os, "write", real_write)
     os.close(full)
     until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
     assert told[1] == (20, "recording again")
+    assert recorder.counters()["stopped"] == 0
     recorder.stop()
     kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
     assert (kept[0], kept[-1]) == (b"before", b"after")
