@@ -136,6 +136,13 @@ def test_an_encoder_that_leaves_out_pictures_by_itself_loses_few_of_those_it_sen
     assert sum(damaged) < 0.1 * len(sent)
 
 
+def test_an_encoder_that_halves_its_rate_in_flight_is_soon_taken_as_it_is() -> None:
+    """As in the dusk, when the camera exposes for longer; without a key frame."""
+    losses = Losses()
+    times_ms = [*(index * 100.0 / 3.0 for index in range(3000)), *(1e5 + index * 200.0 / 3.0 for index in range(1000))]
+    assert sum(losses.damaged(time_ms, key=False) for time_ms in times_ms) < 60
+
+
 class SilentCamera(threading.Thread):
     """A server that sends so many pictures of H.264 in MPEG-TS and then nothing, until told to stop."""
 

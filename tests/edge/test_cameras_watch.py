@@ -188,6 +188,8 @@ def test_stamps_that_jump_are_noticed_and_those_that_jitter_are_not() -> None:
     assert jumps(1000 + 600, 1550)  # in the future
     assert jumps(2000, 2900)  # much older than those before
     assert not jumps(2033, 2933)
+    assert [jumps(3000 + 500 * k, 3900 + 500 * k) for k in range(3)] == [False] * 3  # few frames a second
+    assert [jumps(5000, 5005), jumps(5033, 5032)] == [True, True]  # newer of a sudden, and a little in the future
 
 
 class Jumping(FolderSource):

@@ -111,6 +111,7 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(
     assert "WATCHDOG=1" not in words[:ready]
     assert "WATCHDOG=1" in words[ready:]
     assert any(word.startswith("STATUS=the main loop has stood still") for word in words)
+    assert any(word.startswith("STATUS=") and "p50/p95/p99, dropped=" in word for word in words)
     assert "STOPPING=1" not in words
     # Fed every 0.1 s while it turned, 5 s before the end no more: the last word is not that it lives.
     assert words[-1] != "WATCHDOG=1"

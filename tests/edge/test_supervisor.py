@@ -13,7 +13,7 @@ from edge import clock
 from edge.config import Config, ConfigFile, HealthSettings
 from edge.estimator.model import load_model
 from edge.health import Activity, Condition, HealthSnapshot, HealthState
-from edge.outlets import Outlets
+from edge.outlets import LEVELS, Outlets
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
 from edge.types import CameraInfo
@@ -105,14 +105,55 @@ def test_how_long_the_links_take_to_stop_does_not_change_the_last_state(toy_mode
 
 
 class Kept(Outlets):
-    """Keeps the times of what goes out as diagnostics."""
+    """Keeps the times of what goes out as diagnostics, each turn's state, and the events."""
 
     def __init__(self) -> None:
         super().__init__(None, None)
         self.times_ns: list[int] = []
+        self.states: list[HealthState] = []
+        self.events: list[tuple[int, str]] = []
 
     def publish_diagnostics(self, snapshot: HealthSnapshot) -> None:
         self.times_ns.append(snapshot.time_ns)
+
+    def set_health(self, condition: Condition) -> None:
+        self.states.append(condition.state)
+
+    def event(self, level: int, text: str) -> None:
+        self.events.append((level, text))
+
+    def tell(self, condition: Condition) -> None:
+        self.event(LEVELS.get(condition.state, logging.INFO), str(condition))
+
+
+def test_each_turn_has_a_state_and_each_change_and_target_is_told_once_to_the_links_and_the_log(
+    toy_model: Path, stepped: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    outlets = Kept()
+    supervisor = supervised(toy_model, outlets, {})
+    supervisor.apply(HealthSettings(latency_max_ms=100.0))
+    caplog.set_level(logging.INFO)
+    for turn in range(6 * FPS):  # frames for 2 s, from the third on with a target, then none
+        now_ns = stepped + turn * PERIOD_NS
+        clock.step_to(now_ns)
+        if turn < 2 * FPS:
+            tracks = (make_track(now_ns),) if turn >= 2 else ()
+            supervisor.frame_done(make_report(*tracks, sequence=turn, now_ns=now_ns), {"total": 10_000_000})
+        supervisor.turn()
+    S = HealthState
+    assert outlets.states == [S.SEARCHING] * 2 + [S.TRACKING] * (4 * FPS - 2) + [S.FAULT] * (2 * FPS)
+    told = [
+        (logging.INFO, "searching"),
+        (logging.INFO, "target 0 acquired at 240 m"),
+        (logging.INFO, "tracking"),
+        (logging.ERROR, "fault: no frame for 2 s"),
+    ]
+    assert outlets.events == told
+    logged = [(record.levelno, record.getMessage()) for record in caplog.records]
+    assert [one for one in logged if one in told] == told
+    assert [text for _, text in logged if text.startswith("first frame")] == [
+        "first frame done, 10 ms after its exposure"
+    ]
 
 
 def test_counters_and_latency_go_out_each_second_and_to_the_log_each_ten(
