@@ -110,22 +110,40 @@ def test_growth_is_of_the_second_half() -> None:
     rss_mb = [100.0 + 20.0 * second for second in range(10)] + [300.0 + 0.01 * second for second in range(10)]
     flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb, 20, 9) for second, mb in enumerate(rss_mb)]
     memory = memory_mb(flight)
-    assert memory["max"] == pytest.approx(300.09)
+    assert (memory["first"], memory["last"], memory["max"]) == (100.0, pytest.approx(300.09), pytest.approx(300.09))
     assert memory["growth_per_hour"] == pytest.approx(36.0)
 
 
 def test_memory_by_minute_tells_a_step_from_steady_growth() -> None:
     flight = heard([], [])
     rss_mb = [100.0 + (6.2 if 60 <= second < 75 else 0.0) + (6.2 if second >= 110 else 0.0) for second in range(180)]
-    flight.usage = [Usage(round(second * 1e9), 0.0, 0.0, mb, 20, 9) for second, mb in enumerate(rss_mb)]
+    flight.usage = [Usage(START_NS + round(second * 1e9), 0.0, 0.0, mb, 20, 9) for second, mb in enumerate(rss_mb)]
     assert memory_mb(flight)["floor_by_minute"] == pytest.approx([100.0, 100.0, 106.2])
 
 
 def test_processor_time_and_waiting_are_told_apart() -> None:
     flight = heard([], [])
-    flight.usage = [Usage(0, 3.0, 1.0, 100.0, 20, 9), Usage(20_000_000_000, 13.0, 5.0, 100.0, 20, 9)]
+    flight.usage = [
+        Usage(START_NS + round(second * 1e9), cpu_s, waited_s, 100.0, 20, 9)
+        for second, cpu_s, waited_s in ((0.0, 3.0, 1.0), (1.0, 12.0, 2.0), (20.0, 13.0, 5.0))
+    ]
     found = cpu(flight, captured=500)
     assert found == {"cpu_cores": 0.5, "cpu_cores_waited_for": 0.2, "cpu_ms_per_frame": 20.0}
+    assert cpu(flight, captured=None)["cpu_ms_per_frame"] is None
+
+
+@pytest.mark.parametrize(("waited_s", "busy"), [(9.0, False), (11.0, True)])
+def test_the_table_tells_values_verdicts_and_whether_the_machine_was_busy(waited_s: float, busy: bool) -> None:
+    flight = heard([2.0, 3.0], [20.0, 22.0])
+    flight.usage = [Usage(0, 0.0, 0.0, 100.0, 20, 9), Usage(20_000_000_000, 10.0, waited_s, 100.0, 20, 9)]
+    told = table(report(flight, 30.0, PERIOD_S, 2.0))
+    rows = [" ".join(line.split()) for line in told.splitlines()]
+    assert "capture to MAVLink, tracking, p50 15 21.0 ms MISSED" in rows
+    assert "capture to MAVLink, tracking, p99 25 22.0 ms met" in rows
+    assert "resident memory, largest 400 - MB not judged" in rows
+    assert "capture to MAVLink, steady 21.00 21.90 21.98" in rows
+    assert f"0.50 cores busy, {waited_s / 20:.2f} waited for while other processes used them" in rows
+    assert ("The machine was busy with other work" in told) is busy
 
 
 def test_budgets_are_met_missed_or_not_judged() -> None:
