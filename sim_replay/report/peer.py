@@ -96,7 +96,7 @@ def range_error_m(matches: Sequence[Match]) -> dict[str, float | None]:
     range_m = np.linalg.norm(t_gt, axis=1)
     error = np.linalg.norm(t_est, axis=1) - range_m
     values = {"mean": error.mean(), "rms": np.sqrt((error**2).mean()), "mean_rel": (error / range_m).mean()}
-    return {name: round(float(value), 4) for name, value in values.items()}
+    return {name: round(float(value), 6) for name, value in values.items()}
 
 
 def nees(matches: Sequence[Match]) -> dict[str, dict[str, float] | None] | None:
@@ -130,7 +130,7 @@ def _honesty(told: Array, dof: int) -> dict[str, float] | None:
         "mean": round(float(nees.mean()), 4),
         "median": round(float(np.median(nees)), 4),
         "degrees_of_freedom": dof,
-        "within_95pct": round(float((nees <= CHI2_95[dof]).mean()), 4),
+        "within_95pct": round(float((nees <= CHI2_95[dof]).mean()), 6),
         "singular": len(told) - len(nees),
     }
 

@@ -124,7 +124,9 @@ def test_nees_of_an_honest_covariance_is_its_degrees_of_freedom() -> None:
     assert told is not None
     for part, dof in (("pose", 6), ("position", 3), ("rotation", 3)):
         assert told[part]["mean"] == pytest.approx(dof, rel=0.1)
+        assert told[part]["median"] == pytest.approx(chi2.median(dof), rel=0.05)
         assert told[part]["within_95pct"] == pytest.approx(0.95, abs=0.02)
+        assert told[part]["singular"] == 0
     boastful = nees(drawn(3000, 0.25))
     assert boastful is not None
     assert boastful["pose"]["mean"] == pytest.approx(4 * told["pose"]["mean"], rel=1e-3)
@@ -147,6 +149,28 @@ def test_rmse_and_bias_of_a_pose_that_is_short_and_turned_about_the_optical_axis
     assert max(value for value in angles if value is not None) == pytest.approx(np.rad2deg(0.1), rel=1e-3)
     bias = range_error_m(turned)["mean"]
     assert bias == pytest.approx(np.hypot(3, 180) - 200, abs=1e-3)
+
+
+def test_range_errors_of_a_hand_worked_case() -> None:
+    """10 m of 200 m too near, 30 m of 400 m too far."""
+    pairs = [(np.array([0.0, 120.0, 160.0]), 0.95), (np.array([240.0, 0.0, 320.0]), 1.075)]
+    seen = [
+        Match(Truth(k, np.eye(3), t_m, 1, 12.0), TargetPose(k, np.eye(3), t_m * stretched))
+        for k, (t_m, stretched) in enumerate(pairs)
+    ]
+    rms = pytest.approx(500.0**0.5, abs=1e-5)
+    assert range_error_m(seen) == {"mean": 10.0, "rms": rms, "mean_rel": 0.0125}
+
+
+def test_angles_are_compared_the_short_way_round() -> None:
+    """Yaw of 179 and -178 degrees: 3 apart; of -179 and 179: 2."""
+    yawed = lambda deg: R_FORWARD_CAM.T @ so3_exp([0.0, 0.0, np.deg2rad(deg)])  # noqa: E731
+    t_m = np.array([0.0, 0.0, 200.0])
+    seen = [
+        Match(Truth(k, yawed(true), t_m, 1, 12.0), TargetPose(k, yawed(told), t_m))
+        for k, (true, told) in enumerate([(179.0, -178.0), (-179.0, 179.0)])
+    ]
+    assert rmse(seen)["yaw_deg"] == pytest.approx(6.5**0.5, abs=1e-4)
 
 
 def test_rotations_that_are_not_known_are_in_no_figure_of_rotations() -> None:
@@ -176,6 +200,18 @@ def test_rotations_that_are_not_known_are_in_no_figure_of_rotations() -> None:
     assert json.loads(json.dumps(unturned, allow_nan=False)) == unturned
 
 
+@pytest.mark.parametrize(
+    ("pattern", "silence_s"),
+    [("00---", 0.5 - 0.12), ("00000          ---00", 1.82 - 1.5)],  # to the end of the view, from where it begins anew
+)
+def test_silence_is_from_a_poses_arrival_or_the_beginning_of_a_view_to_the_next_or_its_end(
+    pattern: str, silence_s: float
+) -> None:
+    seen = matches(pattern)
+    received = [(m.truth.frame, 20.0) for m in seen if m.estimate is not None]
+    assert longest_silence_s(seen, received, FPS) == pytest.approx(silence_s)
+
+
 def test_silence_counts_only_while_a_target_is_to_be_seen() -> None:
     seen = matches("00000-----00000     00000")
     received = [(m.truth.frame, 20.0) for m in seen if m.estimate is not None]
@@ -197,6 +233,11 @@ def test_tracks_tell_what_they_followed_and_what_was_false() -> None:
     }
     assert (told["t1"]["first_frame"], told["t1"]["last_frame"]) == (2, 3)
     assert told["t1"]["range_error_m"] == -10.0
+
+
+def test_ages_are_told_by_their_percentiles() -> None:
+    told = peer_figures(1, FPS, matches("0"), [], [(0, float(ms)) for ms in range(101)])
+    assert told["age_ms"] == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
 
 
 def test_nothing_received_is_told_with_nulls_and_not_nan() -> None:
