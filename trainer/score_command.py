@@ -81,7 +81,7 @@ def calibrate_file(
     try:
         datasets = [open_dataset(folder, split) for folder in folders]
         for dataset in datasets:
-            _warn_of_training_images(dataset, contract)
+            warn_of_training_images(dataset, contract)
         of_each = [dataset.boxed_frames() for dataset in datasets]
         pictures = [picture for frames in of_each for picture in frames]
         on_start(len(pictures))
@@ -117,12 +117,13 @@ def calibrate_file(
     return contract
 
 
-def _warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
+def warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
     """By name, as a model file knows no folders: a network is too sure of images that it was trained on."""
     splits = sorted({scene.split for scene in dataset.scenes if scene.split is not None})
     for split in splits:
-        # Training on `train` takes in `train_pbr`.
-        names = tuple(f"{dataset.name}, split {name}: " for name in (split, split.partition("_")[0]))
+        # Training on `train` takes in `train_pbr`, and may have been given the split's folder for the dataset's.
+        asked = (split, split.partition("_")[0])
+        names = tuple(f"{folder}, split {name}: " for folder in (dataset.name, split) for name in asked)
         if any(source.startswith(names) for source in contract.data.split("; ")):
             told = "%s: the model was trained on split %s of a dataset of this name; if it is this one, calibrated "
             _log.warning(told + "scores promise too much: give another --split, such as val", dataset.root, split)

@@ -26,6 +26,7 @@ from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.graph import read_contract, write_contract
 from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
+from trainer.score_command import warn_of_training_images
 
 __all__ = ["dark_spot_model"]
 
@@ -177,6 +178,10 @@ def test_images_that_the_model_was_trained_on_are_warned_of(
     assert caplog.text == ""
     assert main(command) == 0
     assert f"{tmp_path / 'dataset'}: the model was trained on split train_pbr of a dataset of this name" in caplog.text
+    caplog.clear()
+    of_its_folder = read_contract(model).model_copy(update={"data": "train_pbr, split train: 40%"})
+    warn_of_training_images(open_dataset(tmp_path / "dataset"), of_its_folder)
+    assert "the model was trained on split train_pbr" in caplog.text
 
 
 def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_spot_model: Path) -> None:
