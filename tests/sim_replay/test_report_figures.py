@@ -62,6 +62,26 @@ def test_out_of_view_is_no_loss_and_coming_back_is_a_reacquisition() -> None:
     assert held["time_to_reacquire_s"]["max"] == pytest.approx(0.2)
 
 
+def test_a_loss_that_ends_out_of_view_is_regained_by_nothing_that_comes_after() -> None:
+    """Lost in frames 2 and 3, out of view in 4, back in 5 and found in 6."""
+    held = continuity(matches("00-- -00"), FPS)
+    (target,) = held["targets"]
+    assert target["losses"] == [
+        {"frame": 2, "lasted_s": 0.2, "regained": False, "while_in_view": True},
+        {"frame": 5, "lasted_s": 0.1, "regained": True, "while_in_view": False},
+    ]
+    assert (held["fragments"], held["reacquired"], held["never_reacquired"]) == (0, 1, 1)
+
+
+def test_figures_are_over_all_targets_each_from_when_it_came_into_view() -> None:
+    late, at_once, last = "--0-0", "1-1", "-----2"
+    held = continuity(
+        [m for k, pattern in enumerate((late, at_once, last)) for m in matches(pattern, k, first_frame=7 * k)], FPS
+    )
+    assert held["time_to_acquire_s"] == {"median": 0.2, "max": 0.5}
+    assert held["fragments"] == 2
+
+
 @pytest.mark.parametrize("pattern", ["---00---0011-1--", "0000     --00", "0-0 -0"])
 def test_what_was_not_recorded_is_no_loss_and_ends_none(pattern: str) -> None:
     """Every third frame has an image, as a recording of 10 out of 30 a second has them."""
