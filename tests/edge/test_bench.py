@@ -19,10 +19,10 @@ from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_
 
 from edge.bench import peak
 from edge.bench.macs import Macs, count_macs
-from edge.bench.measure import measure
+from edge.bench.measure import ORT, Case, Machine, Measured, Row, measure
 from edge.bench.peak import Peak
 from edge.bench.report import table, to_tree
-from edge.bench.timing import UNTIMED_ROUNDS, time_in_turns
+from edge.bench.timing import UNTIMED_ROUNDS, Milliseconds, time_in_turns
 from tests.waiting import until
 
 from .conftest import Cli
@@ -186,6 +186,46 @@ def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) 
     assert result["acquire_ms"] == rows["int8", "acquire", 2]["ms"]["p50"]
     assert {model["precision"]: len(model["sha256"]) for model in result["models"]} == {"fp32": 64, "int8": 64}
     assert all(peak["int8_gmac_per_s"] > 0 and peak["fp32_gmac_per_s"] > 0 for peak in result["peaks"])
+
+
+def test_ratios_are_told_as_worked_by_hand() -> None:
+    """Of 10th percentiles, and of processor time; p50 and p99 are other numbers."""
+
+    def row(kind: str, stage: str, threads: int, p10: float, cpu: float, engine: str = ORT) -> Row:
+        configuration, precision = kind.split()
+        case, ms = Case(f"{configuration}-{precision}.onnx", stage, threads, engine), Milliseconds(p10, 50.0, 99.0, cpu)
+        return Row(case, configuration, precision, (224, 224), Macs(60_000_000, 500_000), ms, limit_ms=2.0)
+
+    rows = (
+        row("edge int8", "track", 1, 6.0, 6.0),
+        row("edge fp32", "track", 1, 20.0, 12.0),
+        row("edge int8", "track", 2, 4.0, 5.0),
+        row("edge fp32", "track", 2, 10.0, 20.0),
+        row("edge int8", "acquire", 2, 8.0, 9.0),
+        row("edge fp32", "acquire", 2, 30.0, 36.0),
+        row("paper fp32", "track", 2, 40.0, 40.0),
+        row("paper fp32", "acquire", 2, 60.0, 90.0),
+        row("edge int8", "track", 2, 5.0, 2.5, "openvino"),
+        row("edge fp32", "track", 2, 25.0, 80.0, "pytorch"),
+    )
+    measured = Measured(Machine("a CPU", 2, "1.31", None), 50, {}, (Peak(2, 435.0, 80.0),), rows)
+    tree = to_tree(measured)
+    assert tree["ratios"] == {
+        "int8_over_fp32": pytest.approx(0.4),
+        "edge_over_paper_fp32": pytest.approx(0.5),
+        "ort_over_openvino": pytest.approx(0.8),
+        "ort_over_eager": pytest.approx(0.4),
+        "over_vnni_limit": pytest.approx(2.0),
+    }
+    told = [" ".join(line.split()) for line in table(measured).splitlines()]
+    assert "INT8 / FP32 of the edge configuration at one input size track 1 0.30 0.50" in told
+    assert "INT8 / FP32 of the edge configuration at one input size track 2 0.40 0.25" in told
+    assert "INT8 / FP32 of the edge configuration at one input size acquire 2 0.27 0.25" in told
+    assert "edge / paper configuration, FP32, each at its own input size acquire 2 0.50 0.40" in told
+    assert "ONNX Runtime / OpenVINO, INT8 track 2 0.80 2.00" in told
+    assert "INT8 / its multiply-accumulates at this machine's peak track 1 3.00 -" in told
+    assert "edge-int8 track 224x224 2 onnxruntime 4.00 50.00 99.00 5.00 60.0 0.5 2.00" in told
+    assert "2 threads: INT8 435, FP32 80" in told
 
 
 def test_other_engines_infer_the_same_files(cli: Cli, tmp_path: Path) -> None:

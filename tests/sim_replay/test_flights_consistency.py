@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from edge.tracking import view
 from sim_replay.bop import BopScene
@@ -89,6 +91,19 @@ def test_what_is_told_too_wide_or_too_narrow_is_out_by_that_factor(told_wider: f
         assert found[part]["nees_mean"] == pytest.approx(honest[part]["nees_mean"] / told_wider, rel=1e-3)
         low, high = found[part]["bounds_95"]
         assert not low < found[part]["nees_mean"] < high
+
+
+@pytest.mark.parametrize("told_wider", [0.4, 4.0])
+def test_flights_inside_and_above_their_own_bounds_are_counted(told_wider: float) -> None:
+    found = consistency(flights(told_wider))
+    assert found is not None
+    off = (np.random.default_rng(3).normal(scale=STD, size=(FLIGHTS, 6)) / STD) ** 2 / told_wider  # as in `flights`
+    low, high = chi2.ppf([0.025, 0.975], 3)
+    for part, of_flights in (("position", off[:, :3].sum(axis=1)), ("rotation", off[:, 3:].sum(axis=1))):
+        assert found[part]["nees_median"] == pytest.approx(np.median(of_flights), abs=1e-4)
+        assert found[part]["flights_above"] == pytest.approx(np.mean(of_flights > high), abs=1e-4)
+        inside = (of_flights >= low) & (of_flights <= high)
+        assert found[part]["flights_inside"] == pytest.approx(np.mean(inside), abs=1e-4)
 
 
 def test_nothing_is_said_where_no_pose_tells_how_sure_it_is() -> None:
@@ -213,14 +228,19 @@ def test_a_late_stamp_turns_the_attitude_of_a_turning_camera() -> None:
 
 def test_a_covariance_without_an_inverse_is_counted_and_left_out() -> None:
     frames = flights(1.0)
-    first = frames[0].matches[0]
-    assert first.estimate is not None
-    flat = replace(first, estimate=replace(first.estimate, covariance=np.zeros((6, 6))))
-    found = consistency([replace(frames[0], matches=(flat,)), *frames[1:]])
-    assert found is not None
-    assert (found["flights"], found["singular"]) == (FLIGHTS, 1)
-    assert found["position"] == consistency(frames)["position"]  # a flight's frames share their error
-    alone = consistency([replace(frames[0], matches=(flat,))])
+    whole = consistency(frames)
+
+    def flat(frame: JudgedFrame, variances: Sequence[float]) -> JudgedFrame:
+        (match,) = frame.matches
+        assert match.estimate is not None
+        return replace(frame, matches=(Match(match.truth, replace(match.estimate, covariance=np.diag(variances))),))
+
+    in_two_flights = {0: np.zeros(6), 1: np.zeros(6), FRAMES: [0.0, 1.0, 1.0, *STD[3:] ** 2]}
+    found = consistency(
+        [flat(frame, in_two_flights[k]) if k in in_two_flights else frame for k, frame in enumerate(frames)]
+    )
+    assert found == {**whole, "singular": 3}  # a flight's frames share their error
+    alone = consistency([flat(frames[0], np.zeros(6))])
     assert alone == {"flights": 1, "singular": 1, "position": None, "rotation": None}
 
 
