@@ -87,7 +87,6 @@ class StreamClock:
         self._last_ns: int | None = None  # stamp, of the last frame whose stamp increased
         self._back_ns: int | None = None  # stamp of the frame just before, if it did not increase
         self._fastest: tuple[int, int] | None = None  # (arrival, arrival - stamp)
-        self._began_ns = 0
         self._slow = SlowClock()
         self._recent: deque[tuple[int, int]] = deque()  # the same for the last WINDOW_NS, delays increasing
         self._first_ns: int | None = None  # arrival
@@ -111,8 +110,6 @@ class StreamClock:
         self._last_ns = stamp_ns
         delay_ns = arrival_ns - stamp_ns
         self._slow.take(arrival_ns, delay_ns)
-        if self._fastest is None:
-            self._began_ns = arrival_ns
         if self._fastest is None or delay_ns <= self._reference_ns(arrival_ns):
             self._fastest = (arrival_ns, delay_ns)
         while self._recent and self._recent[-1][1] >= delay_ns:
@@ -123,10 +120,9 @@ class StreamClock:
         # For a frame that was buffered for seconds, the clocks' offset at its own time counts.
         return stamp_ns + self._reference_ns(stamp_ns + self._reference_ns(arrival_ns))
 
-    def behind_ns(self, now_ns: int) -> int:
-        """How much later even the fastest frame of the last WINDOW_NS was than the least delay: a backlog."""
-        if self._fastest is None or now_ns - self._began_ns < WINDOW_NS:
-            return 0
+    def behind_ns(self) -> int:
+        """How much later even the fastest frame of the last WINDOW_NS was than the least delay: a backlog. To be called
+        after `monotonic_ns`."""
         arrival_ns, delay_ns = self._recent[0]
         return delay_ns - self._reference_ns(arrival_ns)
 

@@ -101,7 +101,7 @@ class StreamSource(LiveSource):
             key = int(self._capture.get(cv2.CAP_PROP_FRAME_TYPE)) == KEY_FRAME
             self._damaged = self._losses.damaged(position_ms, key)
         stamp_ns = self._clock.monotonic_ns(0 if self._timeless else round(position_ms * 1e6), arrival_ns)
-        if (behind_ns := self._clock.behind_ns(arrival_ns)) > BEHIND_MAX_NS:
+        if (behind_ns := self._clock.behind_ns()) > BEHIND_MAX_NS:
             raise SourceLost(f"the stream runs {behind_ns / 1e9:.1f} s behind itself")
         if stamp_ns is None:
             self.counts["unstamped"] += 1

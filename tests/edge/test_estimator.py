@@ -6,6 +6,8 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import onnx
+import onnx.parser
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -385,6 +387,7 @@ def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path
     [
         (lambda path: None, "cannot be read"),
         (lambda path: path.write_bytes(b"\x08\x07junk"), "not a loadable ONNX file"),
+        (lambda path: onnx.save(onnx.parser.parse_model(GRAPH), path), "carries no contract"),
         (lambda path: write_toy_model(path, metadata="{"), "contract is not JSON"),
         (lambda path: write_toy_model(path, metadata="[]"), "contract version None"),
         (lambda path: write_toy_model(path, metadata='{"version": 7}'), "contract version 7; this program reads 1"),

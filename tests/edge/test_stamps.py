@@ -127,7 +127,7 @@ def test_a_stream_that_stays_behind_says_so_and_one_that_jitters_or_drifts_does_
         backlog_ns = 400_000_000 if k >= 2000 else 0
         arrival_ns = exposed_ns + backlog_ns + int(rng.exponential(40e6))
         clock.monotonic_ns(round(k * PERIOD_NS * (1 - 100e-6)), arrival_ns)
-        behind_s.append(clock.behind_ns(arrival_ns) / S)
+        behind_s.append(clock.behind_ns() / S)
     assert max(behind_s[:2000]) < 0.05
     assert behind_s[-1] == pytest.approx(0.4, abs=0.05)
 
@@ -139,12 +139,13 @@ def test_a_stream_clock_that_runs_slow_is_followed_and_what_was_held_back_keeps_
     for k in range(90 * 30):
         exposed_ns = 10 * S + k * PERIOD_NS
         released_ns = 72 * S if exposed_ns >= 70 * S else 0
-        now_ns = max(exposed_ns + int(rng.uniform(0, 30e6)), released_ns, now_ns + PERIOD_NS // 2)
+        late_ns = int(rng.uniform(0, 30e6)) + (200_000_000 if rng.random() < 0.02 else 0)
+        now_ns = max(exposed_ns + late_ns, released_ns, now_ns + PERIOD_NS // 2)
         stamp_ns = clock.monotonic_ns(round(k * PERIOD_NS * (1 + ppm * 1e-6)), now_ns)
         assert stamp_ns is not None
         assert stamp_ns <= now_ns
         errors_ns.append(abs(stamp_ns - exposed_ns))
-        behind_ns.append(clock.behind_ns(now_ns))
+        behind_ns.append(clock.behind_ns())
     assert max(errors_ns[30 * 30 :]) < 15_000_000
     assert max(behind_ns) < BEHIND_MAX_NS  # it is not opened again
 
@@ -164,7 +165,7 @@ def test_a_stream_that_falls_behind_evenly_is_not_taken_for_one_with_a_slow_cloc
     for k in range(60 * 30):
         arrival_ns = 10 * S + round(k * PERIOD_NS * 1.01) + int(rng.uniform(0, 5e6))
         clock.monotonic_ns(k * PERIOD_NS, arrival_ns)
-        behind_s.append(clock.behind_ns(arrival_ns) / S)
+        behind_s.append(clock.behind_ns() / S)
     assert behind_s[-1] > 0.4
 
 
@@ -174,13 +175,14 @@ def test_a_backlog_is_told_whether_or_not_the_streams_clock_runs_slow(ppm: int) 
     for k in range(60 * 30):
         arrival_ns = 10 * S + k * PERIOD_NS + (400_000_000 if k >= 40 * 30 else 0) + int(rng.uniform(0, 30e6))
         clock.monotonic_ns(round(k * PERIOD_NS * (1 + ppm * 1e-6)), arrival_ns)
-        behind_s.append(clock.behind_ns(arrival_ns) / S)
+        behind_s.append(clock.behind_ns() / S)
     assert max(behind_s[20 * 30 : 40 * 30]) < 0.05
     assert behind_s[46 * 30] == pytest.approx(0.4, abs=0.05)
     assert behind_s[-1] == pytest.approx(0.4, abs=0.05)
 
 
 @settings(max_examples=40, deadline=None)
+@example([(at_s, 0.016) for at_s in (10.0, 18.0, 26.0, 34.0)], 0)
 @given(
     st.lists(st.tuples(st.floats(3.0, 40.0), st.floats(0.02, 0.2)), min_size=1, max_size=3),
     st.integers(0, 2**32 - 1),
