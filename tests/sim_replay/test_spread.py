@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,11 @@ def test_flights_of_unequal_length_agree_with_scipys_bootstrap() -> None:
     assert found["pose_10deg_5pct"] == pytest.approx((oracle.low, oracle.high), abs=0.01)
 
 
-def test_one_flight_tells_nothing_of_others() -> None:
-    assert intervals_95(flights([[0.0] * 50])) is None
+def test_one_flight_tells_nothing_of_others_nor_does_an_empty_sky() -> None:
+    one, two = flights([[0.0] * 50]), flights([[0.0] * 5, [90.0] * 5])
+    empty = replace(two[-1], matches=(), picture=replace(two[-1].picture, scene=BopScene(Path("all"), 9)))
+    assert intervals_95([*one, empty]) is None
     assert intervals_95([]) is None
+    found = intervals_95([*two, empty])
+    assert found is not None
+    assert found["pose_10deg_5pct"] == (0.0, 1.0)
