@@ -44,8 +44,7 @@ class JudgedFrame:
 
 def is_seen(target: BopTarget) -> bool:
     """Whether it may be visible: the dataset says so, or it does not say and the target is not behind the camera."""
-    known = target.visible_px is not None or target.box_visible_xyxy_px is not None
-    return target.visible_px != 0 if known else bool(target.t_cam_target_m[2] > 0)
+    return bool(target.t_cam_target_m[2] > 0) if target.visible_px is None else target.visible_px != 0
 
 
 def is_hidden(target: BopTarget) -> bool:

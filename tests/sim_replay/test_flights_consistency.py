@@ -190,7 +190,9 @@ def test_directions_count_for_targets_without_a_pose_by_their_bearing() -> None:
             directions=(Match(match.truth, direction),),
         )
 
-    found = directions([frame, seen(1e-3, False), seen(2e-3, False), seen(6e-3, False), seen(9e-3, True)])
+    false = (TargetPose(0, np.eye(3), np.array([0.0, 99.0, 9.0]), rotation_known=False),)
+    beside = [replace(seen(off_rad, False), false_directions=false) for off_rad in (1e-3, 2e-3)]
+    found = directions([frame, *beside, seen(6e-3, False), seen(9e-3, True)])
     across = np.hypot(y, z) / np.linalg.norm([x, y, z])
     assert found == {
         "targets": 3,
@@ -198,7 +200,7 @@ def test_directions_count_for_targets_without_a_pose_by_their_bearing() -> None:
             "mean": pytest.approx(np.degrees(3e-3 * across), abs=2e-5),
             "median": pytest.approx(np.degrees(2e-3 * across), abs=2e-5),
         },
-        "false": 0,
+        "false": 2,
     }
     assert directions([frame]) is None
 
@@ -208,7 +210,7 @@ def test_own_ship_errors_are_a_flights_own_and_of_the_size_that_the_tracker_allo
     again = OwnShipErrors.of_flight("000003")
     assert np.array_equal(again.attitude_rad, drawn[3].attitude_rad)
     assert again.clock_s == drawn[3].clock_s
-    R = Rotation.from_euler("ZYX", [80.0, 5.0, -10.0], degrees=True).as_matrix()
+    R = Rotation.from_euler("ZYX", [80.0, 5.0, -70.0], degrees=True).as_matrix()  # a camera's axes are far from ned's
     still = np.zeros(3)
     off = np.array([Rotation.from_matrix(one.attitude(R, still) @ R.T).as_rotvec() for one in drawn])
     expected = [view.TILT_STD_RAD, view.TILT_STD_RAD, view.HEADING_STD_RAD]
@@ -217,13 +219,18 @@ def test_own_ship_errors_are_a_flights_own_and_of_the_size_that_the_tracker_allo
     late_m = 1000.0 * view.EXPOSURE_STD_S
     north, east = view.POSITION_STD_M, np.hypot(view.POSITION_STD_M, late_m)
     assert moved.std(axis=0) == pytest.approx([north, east, north], rel=0.15)
+    jitter = np.array([Rotation.from_matrix(drawn[0].attitude(np.eye(3), still)).as_rotvec() for _ in drawn])
+    for apart in (np.array([one.position_m for one in drawn]), jitter):
+        assert np.corrcoef(apart, rowvar=False) == pytest.approx(np.eye(3), abs=0.2)
 
 
-def test_a_late_stamp_turns_the_attitude_of_a_turning_camera() -> None:
+def test_a_late_stamp_turns_the_attitude_of_a_turning_camera_and_moves_it_on() -> None:
     errors = OwnShipErrors.of_flight("a")
     errors = OwnShipErrors(np.random.default_rng(1), np.zeros(3), errors.position_m, 0.02)
     R = errors.attitude(np.eye(3), np.array([0.0, 0.0, 1.5]))
     assert Rotation.from_matrix(R).as_rotvec() == pytest.approx([0.0, 0.0, 0.03], abs=5 * view.ATTITUDE_JITTER_RAD)
+    velocity_mps = np.array([50.0, 0.0, -5.0])
+    assert errors.position(np.zeros(3), velocity_mps) == pytest.approx(errors.position_m + 0.02 * velocity_mps)
 
 
 def test_a_covariance_without_an_inverse_is_counted_and_left_out() -> None:
