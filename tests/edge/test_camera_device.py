@@ -151,11 +151,11 @@ def test_a_device_that_comes_back_in_another_mode_is_opened_until_it_is_in_its_o
     capture.start()
     try:
         while modes.opens < 4 or capture.newest(20.0) is None:
-            told |= {reason.text for reason in capture.reasons(0)}
+            told |= {(reason.kind, reason.text) for reason in capture.reasons(0)}
             capture.newest(0.05)
     finally:
         capture.stop()
-    assert any("these intrinsics are for" in text for text in told)
+    assert {kind for kind, text in told if text.startswith("camera lost: these intrinsics are for")} == {"camera_lost"}
 
 
 def test_a_device_that_never_fitted_ends_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge.cameras.capture import FROZEN_TOLD_NS, Capture
+from edge.cameras.capture import FROZEN_TOLD_NS, JUMPS_TOLD_S, Capture
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.source import EndOfStream
 from edge.cameras.watch import FrameWatch
@@ -204,7 +204,7 @@ class Jumping(FolderSource):
 def test_every_frame_tells_how_often_the_cameras_time_has_jumped(tmp_path: Path) -> None:
     folder = write_pictures(tmp_path / "pictures", list(range(1, 7)))
     settings = FolderCamera(type="folder", path=folder, fps=10.0, intrinsics=INTRINSICS)
-    capture = Capture(Jumping(settings), False)
+    capture, before_ns = Capture(Jumping(settings), False), time.monotonic_ns()
     capture.start()
     told = {}
     try:
@@ -218,6 +218,9 @@ def test_every_frame_tells_how_often_the_cameras_time_has_jumped(tmp_path: Path)
     # There and back again.
     assert all(jumps == {0: 0, 1: 0, 2: 0, 3: 1}.get(sequence, 2) for sequence, jumps in told.items())
     assert max(told.values()) == 2
+    (reason,) = capture.reasons(before_ns + JUMPS_TOLD_S * 1_000_000_000)
+    assert (reason.kind, reason.text) == ("camera_stamps", "camera timestamps jump (2 in 5 s)")
+    assert capture.reasons(time.monotonic_ns() + JUMPS_TOLD_S * 1_000_000_000 + 1) == ()
 
 
 def test_one_pixel_that_changed_is_another_picture() -> None:
