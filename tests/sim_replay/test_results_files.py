@@ -257,6 +257,37 @@ def test_a_distractor_without_a_model_is_neither_right_nor_wrong_where_it_is_not
         assert [truth.object_id for truth in frames[0].not_asked] == [77]
 
 
+def test_an_aircraft_without_a_model_is_as_large_as_its_box_tells_and_without_one_not_there(root: Path) -> None:
+    """Hidden at 200 m: a pose beside it is false from its length on."""
+    scene = root / "test" / "000000"
+    truth = json.loads((scene / "scene_gt.json").read_text())
+    truth["0"][1]["obj_id"] = 77
+    write_json(scene / "scene_gt.json", truth)
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60, "px_count_all": 60}
+    hidden = {"bbox_visib": [-1, -1, -1, -1], "px_count_visib": 0, "px_count_all": 60}
+    K = open_dataset(root).labelled_frames()[0].K
+    length_m = 30 / K[0, 0] * 200.0
+    for whole, off, false_poses in (
+        ({"bbox_obj": [70, 9, 30, 9]}, 0.95, 0),
+        ({"bbox_obj": [70, 9, 30, 9]}, 1.05, 1),
+        ({}, 0.0, 1),
+    ):
+        write_json(scene / "scene_gt_info.json", {"0": [seen, hidden | whole], "1": []})
+        frames = judged(root, [(1, 0.9, LEFT, True), (0, 0.8, RIGHT + off * length_m, True)])
+        assert turns_deg(frames) == [0]
+        assert len(frames[0].false_poses) == false_poses
+
+
+def test_a_hidden_aircraft_takes_no_pose_from_one_that_is_seen(root: Path) -> None:
+    """The pose is nearer to the hidden one, on the left."""
+    hidden = {"bbox_visib": [-1, -1, -1, -1], "bbox_obj": [9, 9, 9, 9], "px_count_visib": 0, "px_count_all": 60}
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60, "px_count_all": 60}
+    write_json(root / "test" / "000000" / "scene_gt_info.json", {"0": [hidden, seen], "1": []})
+    dataset = open_dataset(root)
+    frames = judge_frames(dataset.labelled_frames(), dataset.models, said(-0.5))
+    assert turns_deg(frames) == [0]
+
+
 def test_covariances_that_cannot_be_inverted_are_told_in_the_table() -> None:
     console = Console(record=True, width=200)
     rotation = {"nees_mean": 3.1, "bounds_95": [0.2, 9.3]}
