@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from edge.cameras.capture import Capture
-from edge.cameras.device import EXPOSURE_MANUAL, DeviceSource
+from edge.cameras.device import BUFFERS, EXPOSURE_MANUAL, DeviceSource
 from edge.cameras.live import UNDECODABLE_MAX
-from edge.cameras.source import SourceLost
+from edge.cameras.source import EndOfStream, SourceLost
 from edge.config_camera import DeviceCamera
 from edge.errors import InputError
 
@@ -36,7 +36,7 @@ class Driver:
         self.opened: tuple[str, int] | None = None
         self.held: dict[int, float] = {}
         self.asked: list[int] = []
-        self.opens = 0
+        self.opens = self.releases = 0
         self.comes: Iterator[object] = iter(())  # for each grab a picture, TORN, or GONE
         self._grabbed: object = None
 
@@ -68,7 +68,7 @@ class Driver:
         return self._grabbed is not EMPTY, self._grabbed
 
     def release(self) -> None:
-        pass
+        self.releases += 1
 
 
 def settings(exposure_ms: float | None = None, latency_ms: float = 0.0) -> DeviceCamera:
@@ -100,6 +100,10 @@ def test_a_picture_that_cannot_be_decoded_is_left_out_and_the_device_stays_open(
     assert [frame.meta.sequence for frame in frames] == [0, 3]
     assert source.counts["undecodable"] == 2
     assert driver.opens == 1
+    stop, driver.comes = Event(), iter([PICTURE])
+    stop.set()
+    with pytest.raises(EndOfStream):
+        source.read(stop)
 
 
 def test_a_device_that_is_pulled_out_or_gives_nothing_but_torn_pictures_is_lost_and_opened_again(
@@ -116,7 +120,7 @@ def test_a_device_that_is_pulled_out_or_gives_nothing_but_torn_pictures_is_lost_
     source.open()
     driver.comes = iter([PICTURE])
     assert source.read(Event()).meta.sequence == UNDECODABLE_MAX + 2
-    assert driver.opens == 3
+    assert (driver.opens, driver.releases) == (3, 2), "it could not be opened again while it is held"
 
 
 def test_a_device_that_says_no_size_is_tried_again_and_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,9 +147,9 @@ class Modes(Driver):
 
 
 def test_a_device_that_comes_back_in_another_mode_is_opened_until_it_is_in_its_own(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    modes, told = Modes((2, 3)), set()
+    modes, told = Modes((2,)), set()
     monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", modes)
     capture = Capture(DeviceSource(settings()), False)
     capture.start()
@@ -156,15 +160,21 @@ def test_a_device_that_comes_back_in_another_mode_is_opened_until_it_is_in_its_o
     finally:
         capture.stop()
     assert {kind for kind, text in told if text.startswith("camera lost: these intrinsics are for")} == {"camera_lost"}
+    warned = [text for text in caplog.messages if text.startswith("camera lost: ")]
+    assert warned[:2] == ["camera lost: the camera gives no more frames; trying again"] * 2, (
+        "at each loss, not each try"
+    )
 
 
 def test_a_device_that_never_fitted_ends_the_daemon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", Modes((1, 2)))
+    modes = Modes((1, 2))
+    monkeypatch.setattr("edge.cameras.device.cv2.VideoCapture", modes)
     capture = Capture(DeviceSource(settings()), False)
     capture.start()
     with pytest.raises(InputError, match="these intrinsics are for"):
         capture.newest(20.0)
     capture.stop()
+    assert modes.releases == modes.opens
 
 
 def test_the_drivers_stamp_is_the_exposure_less_the_latency_and_without_one_the_arrival_is(driver: Driver) -> None:
@@ -207,6 +217,7 @@ def test_format_size_rate_and_exposure_are_asked_of_the_driver(
         cv2.CAP_PROP_FRAME_WIDTH: width,
         cv2.CAP_PROP_FRAME_HEIGHT: height,
         cv2.CAP_PROP_FPS: 60,
+        cv2.CAP_PROP_BUFFERSIZE: BUFFERS,
         cv2.CAP_PROP_AUTO_EXPOSURE: EXPOSURE_MANUAL,
         cv2.CAP_PROP_EXPOSURE: 25,  # V4L2 counts in 100 microseconds
     }
