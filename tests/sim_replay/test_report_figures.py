@@ -120,6 +120,21 @@ def test_two_of_one_airframe_are_told_apart_when_one_leaves_and_comes_back() -> 
     assert instances([*truths, *other], [t.t_cam_target_m for t in [*truths, *other]]) == [*expected, *expected]
 
 
+@pytest.mark.parametrize(
+    ("x_m", "expected"),
+    [
+        ({0: (-30.0, 30.0), 2: (30.0, 90.0)}, [0, 1, 0, 1]),  # a frame without any, and all are back
+        ({0: (-30.0, 30.0), 1: (30.0,), 2: (-30.0,)}, [0, 1, 1, 1]),  # the left one has gone
+    ],
+)
+def test_where_as_many_are_in_view_as_before_their_order_tells_them_apart_however_the_camera_turns(
+    x_m: dict[int, tuple[float, ...]], expected: list[int]
+) -> None:
+    places = [(frame, np.array([x, 0.0, 200.0])) for frame, row in x_m.items() for x in row]
+    truths = [Truth(frame, np.eye(3), place_m, 1, 12.0) for frame, place_m in places]
+    assert instances(truths, [place_m for _, place_m in places]) == expected
+
+
 def test_one_that_is_never_found_is_counted_and_has_no_time() -> None:
     held = continuity(matches("0000") + matches("----", object_id=2), FPS)
     assert held["never_acquired"] == 1
