@@ -173,6 +173,38 @@ def test_a_model_beside_is_told_by_its_name_and_how_long_it_learnt() -> None:
     assert "| d | mf-uavpose6d-edge, int8, after 24,000 windows | 1 |" in text
 
 
+def test_each_column_tells_the_figure_of_its_name_and_the_papers_row_the_papers() -> None:
+    method = {"file": "m.onnx", "precision": "int8", "sha256": "0" * 64}
+    group = {
+        "frames": 9,
+        "targets": 8,
+        "recall": 0.911,
+        "false_positives_per_1000": 12.4,
+        "rotation_error_deg": {"mean": 1.11, "median": 2.22},
+        "translation_error_m": {"mean": 3.33, "median": 30.3},
+        "depth_error_m": {"mean": 4.44, "median": 40.4},
+        "depth_error_rel": {"mean": 0.055, "median": 0.066},
+        "bearing_error_deg": {"mean": 0.0777, "median": 0.0888},
+        "rot_10deg": 0.822,
+        "depth_5pct": 0.733,
+        "pose_10deg_5pct": 0.644,
+        "add_0_5d": 0.555,
+        "add_0_1d": 0.466,
+    }
+    score = {"dataset": "d", "mode": "frames", "method": method, "recipe": "", "overall": group}
+    text = page([{**score, "by_range": {"100-200": group}, "by_airframe": {"glider": group}}], "the command", "")
+    figures = "91.1 | 12 | 1.1 | 2.2 | 82.2 | 3.3 | 4.4 | 73.3 | 64.4 | 55.5 | 46.6 | 0.078 |"
+    names = "recall % | false / 1,000 | E_r mean ° | median ° | Rot<10° % | E_t mean m | E_z mean m | Depth<5 % % |"
+    names += " Pose@10°/5 % % | ADD-0.5d % | ADD-0.1d % | bearing mean ° |"
+    rows = text.splitlines()
+    assert f"| dataset | model | frames | Pose, 95 % | {names}" in rows
+    assert f"| d | int8 | 9 | – | {figures}" in rows
+    assert f"| 100-200 | 8 | {figures}" in rows
+    assert f"| glider | 8 | {figures}" in rows
+    papers = "– | – | 5.0 | – | 90.9 | 7.3 | 7.0 | 89.0 | 82.8 | 88.5 | – | – |"
+    assert f"| FW-UAV6DPose (the paper's own data) | the paper, FP32 | 4,500 | – | {papers}" in rows
+
+
 def test_a_rate_is_told_with_how_far_other_flights_may_put_it() -> None:
     method = {"file": "m.onnx", "precision": "int8", "sha256": "0" * 64}
     score = {"dataset": "d", "mode": "frames", "overall": {"frames": 9}, "by_range": {}, "by_airframe": {}}
