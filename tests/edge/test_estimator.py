@@ -49,8 +49,15 @@ def test_a_window_is_the_same_camera_with_other_pixels(box: np.ndarray, point_m:
 
 def test_the_window_of_a_target_about_to_collide_is_no_larger_than_the_picture() -> None:
     window = window_around(np.array([-14_000.0, -9_000.0, 16_000.0, 10_000.0]), 2.0, TRACK_WH, SIZE_WH)
-    assert max(window.width, window.height) <= max(SIZE_WH)
+    assert 0.95 * max(SIZE_WH) < max(window.width, window.height) <= max(SIZE_WH)
     assert cut(np.zeros((SIZE_WH[1], SIZE_WH[0], 3), dtype=np.uint8), window, TRACK_WH).shape == (256, 256, 3)
+
+
+def test_a_window_s_shorter_side_is_that_of_its_box_times_the_scale() -> None:
+    box = np.array([900.0, 500.0, 1000.0, 540.0])
+    for size_wh, window_wh in (((256, 256), (200, 200)), ((320, 256), (250, 200)), ((256, 320), (200, 250))):
+        window = window_around(box, 2.0, size_wh, SIZE_WH)
+        assert (window.width, window.height) == window_wh
 
 
 @given(boxes)
@@ -80,6 +87,8 @@ def test_a_fitted_frame_shows_a_target_where_its_map_says(fit: str, size_wh: tup
     np.testing.assert_allclose(seen, pixel_map.to_network(center), atol=0.02)
     if fit == "letterbox":
         assert pixel_map.scale_xy[0] == pytest.approx(pixel_map.scale_xy[1], rel=0.01)
+    else:
+        assert pixel_map.scale_xy == pytest.approx(np.array(size_wh) / SIZE_WH)
 
 
 @pytest.mark.parametrize(("wide", "high"), [(1, 2), (2, 1), (1, 1.42), (1.33, 1)])
@@ -116,6 +125,7 @@ def test_the_network_is_shown_square_pixels_whatever_the_camera_s_are(
 
 
 def test_a_slip_in_a_focal_length_asks_for_no_more_memory_than_there_is() -> None:
+    assert pixel_aspect(K * [[1, 1, 1], [1, 1.02, 1], [1, 1, 1]]) == 1.0, "as calibrations scatter"
     mistyped = K * [[1, 1, 1], [1, 1000, 1], [1, 1, 1]]
     window = window_around([900, 500, 1000, 560], 2.0, TRACK_WH, SIZE_WH, None, pixel_aspect(mistyped))
     assert window.width * window.height <= 8 * SIZE_WH[0] * SIZE_WH[1]
