@@ -20,6 +20,10 @@ FAULTS_REMEMBERED = 64
 LINES_WAITING = 1000
 DRAIN_S = 1.0
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+JOURNAL_FORMAT = "%(levelname)s %(name)s: %(message)s"  # the journal has a time of its own
+# Of syslog.
+PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4}
+INFORMATION = 6
 # OpenCV and ffmpeg write their own lines, which are not counted: one for each attempt to open a camera, many for each
 # corrupted picture. For debugging, set these variables differently.
 QUIET = {"OPENCV_LOG_LEVEL": "ERROR", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
@@ -116,9 +120,30 @@ class CountingHandler(logging.StreamHandler[TextIO]):
         super().emit(again)
 
 
+class JournalFormatter(logging.Formatter):
+    """Begins each line with its priority, by which `journalctl -p` selects (sd-daemon(3))."""
+
+    def __init__(self) -> None:
+        super().__init__(JOURNAL_FORMAT)
+
+    def format(self, record: logging.LogRecord) -> str:
+        priority = f"<{PRIORITIES.get(record.levelno, INFORMATION)}>"
+        return priority + super().format(record).replace("\n", f"\n{priority}")
+
+
+def _is_journal(stream: TextIO) -> bool:
+    """Whether systemd connected this stream to its journal: it says which one (systemd.exec(5))."""
+    try:
+        opened = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{opened.st_dev}:{opened.st_ino}"
+
+
 def set_up_logging() -> None:
     """Log everything from INFO on to standard error. To be called before OpenCV is imported."""
     for variable, level in QUIET.items():
         os.environ.setdefault(variable, level)
     handler = CountingHandler(PatientStream(sys.stderr))  # type: ignore[arg-type]
-    logging.basicConfig(level=logging.INFO, format=FORMAT, handlers=[handler])
+    handler.setFormatter(JournalFormatter() if _is_journal(sys.stderr) else logging.Formatter(FORMAT))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])

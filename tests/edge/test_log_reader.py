@@ -5,6 +5,8 @@ from __future__ import annotations
 import fcntl
 import io
 import os
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -54,6 +56,35 @@ def test_a_flood_of_commands_fills_no_log(tmp_path: Path, toy_model: Path, swayi
         flight.until("stopped: ")
     told = sum("command over zenoh" in line for line in flight.lines)
     assert 1 <= told <= LOGGED_AT_ONCE + flood_s + 1
+
+
+LOGS_A_FAULT = """
+import logging, os, sys
+from edge.logs import set_up_logging
+if sys.argv[1] == "journal":
+    opened = os.fstat(2)
+    os.environ["JOURNAL_STREAM"] = f"{opened.st_dev}:{opened.st_ino}"
+set_up_logging()
+logging.getLogger("camera").info("open")
+try:
+    raise ValueError("torn")
+except ValueError:
+    logging.getLogger("camera").exception("failed")
+logging.shutdown()
+"""
+
+
+def test_the_journal_is_told_how_grave_each_line_is_and_a_terminal_when_it_was() -> None:
+    def logged(reader: str) -> list[str]:
+        command = [sys.executable, "-c", LOGS_A_FAULT, reader]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stderr.splitlines()
+
+    journal, terminal = logged("journal"), logged("terminal")
+    assert journal[0] == "<6>INFO camera: open"
+    assert journal[1] == "<3>ERROR camera: failed"
+    assert journal[-1] == "<3>ValueError: torn"
+    assert terminal[0].endswith(" INFO camera: open")
+    assert terminal[0][:4].isdecimal()
 
 
 def test_what_a_slow_reader_missed_is_told_to_it() -> None:
