@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msgs.contract import ScoreCalibration
+from trainer.comparison import Measured, Tolerance, Views, comparison_table
 from trainer.data import TrainingBatch
 from trainer.evaluate import Predictions, calibrated, difference, measure, measure_each
 
@@ -94,6 +95,33 @@ def test_two_networks_differ_by_so_much() -> None:
     assert differ["depth_rel_median"] == pytest.approx(0.02)
     assert differ["center_px_median"] == pytest.approx(6.0)
     assert differ["sigma_rel_median"] == pytest.approx(0.75)
+
+
+def test_int8_is_held_against_fp32_as_worked_by_hand() -> None:
+    """Turned by 12 degrees, 4 % too far, a quarter of the sigma, and seen too faintly to be found."""
+    fp32 = Predictions(SCORES.astype(np.float32), *labelled_answers())
+    fp32.score[:] = np.where(PRESENT, 0.9, SCORES)
+    turn = Rotation.from_euler("y", 12.0, degrees=True).as_matrix().astype(np.float32)
+    int8 = fp32._replace(
+        score=np.full(7, 0.2, np.float32),
+        R_cam_target=turn @ fp32.R_cam_target,
+        t_cam_target_m=1.04 * fp32.t_cam_target_m,
+        sigma=fp32.sigma / 4,
+    )
+    views = Views([labelled()], [labelled()])
+    table, strayed = comparison_table(views, "", Measured(None, int8), Measured(fp32, fp32), (0.3, 0.95))
+    assert strayed == pytest.approx((12.0, 4.0, 100.0, 75.0, 100.0), abs=1e-3)
+    assert strayed.refusal(Tolerance()) == (
+        "median rotation differs from FP32's by 12 degrees, more than --tolerance 2"
+    )
+    (row,) = [" ".join(line.split()) for line in table.splitlines() if "acquire" in line]
+    differences = "12.000 / 12.000 4.000 / 4.000 0.000 / 0.000 75.000 / 75.000 0.700 / 0.700"
+    assert row == f"acquire {differences} 0.0 / 100.0 0.0 / 100.0 0.0 / 50.0"
+    _, better = comparison_table(views, "", Measured(fp32, fp32), Measured(None, int8), (0.3, 0.95))
+    assert better[2:] == (0.0, 0.0, 0.0)  # poses, sigma, recall
+    crowded = labelled()._replace(others=np.ones((7, 2, 2), dtype=bool))
+    alike = comparison_table(Views([], [crowded]), "", Measured(None, fp32), Measured(None, fp32), (0.3, 0.95))[1]
+    assert alike == (0.0, 0.0, 0.0, 0.0, 0.0)  # of poses such windows tell nothing
 
 
 def labelled_answers() -> tuple[np.ndarray, ...]:

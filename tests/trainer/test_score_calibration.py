@@ -67,8 +67,11 @@ def test_peaks_that_part_perfectly_have_a_finite_answer() -> None:
 
 
 def test_too_few_peaks_are_refused_with_their_number() -> None:
-    with pytest.raises(TooFewCandidates, match=r"^7 peaks on targets and 30 elsewhere"):
-        fit([Candidate("track", 0.7, 50.0, True)] * 7 + [Candidate("track", 0.2, 50.0, False)] * 30)
+    on, off = Candidate("track", 0.7, 50.0, True), Candidate("track", 0.2, 50.0, False)
+    for targets, elsewhere in ((19, 30), (30, 19)):
+        with pytest.raises(TooFewCandidates, match=rf"^{targets} peaks on targets and {elsewhere} elsewhere"):
+            fit([on] * targets + [off] * elsewhere)
+    fit([on] * 20 + [off] * 20)
 
 
 def test_a_network_whose_higher_peaks_are_no_surer_is_refused() -> None:
