@@ -53,8 +53,8 @@ def _logistic(X: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[NDArray[np.
     for _ in range(_STEPS):
         p = 1.0 / (1.0 + np.exp(-np.clip(X @ weights, -30.0, 30.0)))
         weights += np.linalg.solve(X.T @ (X * (p * (1.0 - p))[:, None]) + prior, X.T @ (y - p) - prior @ weights)
-    p = np.clip(1.0 / (1.0 + np.exp(-np.clip(X @ weights, -30.0, 30.0))), 1e-12, 1.0 - 1e-12)
-    return weights, float(-2.0 * np.sum(np.log(np.where(y, p, 1.0 - p))))
+    z = X @ weights
+    return weights, float(2.0 * np.sum(np.logaddexp(0.0, np.where(y, -z, z))))
 
 
 def expected_calibration_error(calibration: ScoreCalibration, candidates: Sequence[Candidate], bins: int = 10) -> float:

@@ -58,6 +58,13 @@ def test_what_is_told_comes_true_as_often_as_told_on_peaks_not_seen_before() -> 
     assert expected_calibration_error(ScoreCalibration(), later) > 0.1
 
 
+def test_what_is_told_too_often_in_one_bin_does_not_make_up_for_too_seldom_in_another() -> None:
+    """Of two at 15 % one is a target, of two at 85 % none, and the one at 100 % is: (0.7 + 1.7 + 0) / 5."""
+    told = [(0.15, True), (0.15, False), (0.85, False), (0.85, False), (1.0, True)]
+    seen = [Candidate("track", peak, 50.0, on) for peak, on in told]
+    assert expected_calibration_error(ScoreCalibration(), seen) == pytest.approx(2.4 / 5, abs=1e-5)
+
+
 def test_peaks_that_part_perfectly_have_a_finite_answer() -> None:
     seen = [Candidate("track", 0.7, 50.0, True)] * 30 + [Candidate("track", 0.2, 50.0, False)] * 30
     found = fit(seen)
