@@ -174,9 +174,17 @@ def test_a_window_has_the_pixels_of_the_straightened_frame() -> None:
         assert np.abs(own - reference).mean() < 0.5 * np.abs(shifted - reference).mean()
 
 
-def test_a_lens_that_folds_the_picture_shows_nothing_twice() -> None:
+def test_what_is_made_smaller_through_a_lens_is_averaged_as_without_one() -> None:
+    """Sampled at points, the grain of a sensor would be as coarse as the aircraft."""
+    grain = np.random.default_rng(5).integers(0, 255, (1080, 1920, 3), dtype=np.uint8)
+    bent, straight = (fit_frame(grain, (480, 270), "squash", lens)[0] for lens in (lens_of(K, BARREL), None))
+    assert bent[100:-100, 100:-100].std() < 1.2 * straight[100:-100, 100:-100].std()
+
+
+@pytest.mark.parametrize("away_px", [(180.0, 0.0), (127.0, 127.0)])
+def test_a_lens_that_folds_the_picture_shows_nothing_twice(away_px: tuple[float, float]) -> None:
     camera = Camera(np.array([[300.0, 0, 319.5], [0, 300.0, 239.5], [0, 0, 1]]), (640, 480), (-0.3, 0, 0, 0, 0))
-    on_frame = np.array([319.5 + 180.0, 239.5])
+    on_frame = np.array([319.5, 239.5]) + away_px
     image, pixel_map = fit_frame(dot((640, 480), on_frame), (640, 480), "squash", camera.lens)
     bright = (image[..., 0] > 100).astype(np.uint8)
     count, _ = cv2.connectedComponents(bright)
