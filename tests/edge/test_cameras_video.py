@@ -47,9 +47,9 @@ def matrix(a: int, b: int, c: int, d: int) -> bytes:
     return struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
 
 
-def bare_jpeg(path: Path) -> Path:
+def bare_jpeg(path: Path, before: bytes = b"", after: bytes = b"") -> Path:
     jpegs = [cv2.imencode(".jpg", picture(index))[1].tobytes() for index in range(3)]
-    path.write_bytes(b"".join(jpegs))
+    path.write_bytes(b"".join(before + jpeg + after for jpeg in jpegs))
     return path
 
 
@@ -138,6 +138,20 @@ def test_a_video_of_jpeg_whose_recorder_never_ended_it_has_its_times_all_the_sam
 
 def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path: Path) -> None:
     """As a camera's encoder writes it where nothing packs it into a file with times."""
-    for path in (write_film(tmp_path / "flight.h264", [0, 40, 80], "libx264"), bare_jpeg(tmp_path / "flight.mjpeg")):
+    part = b"--next\r\nContent-Type: image/jpeg\r\n\r\n"  # as a web camera's answer is saved
+    for path in (
+        write_film(tmp_path / "flight.h264", [0, 40, 80], "libx264"),
+        bare_jpeg(tmp_path / "flight.mjpeg"),
+        bare_jpeg(tmp_path / "answer.mjpeg", part, b"\r\n"),
+    ):
         with closing(source_of(path)) as source, pytest.raises(InputError, match=f"when its frames.*{path.name}"):
             source.open()
+
+
+def test_a_video_that_ends_before_its_first_frame_is_no_flight_that_went_well(tmp_path: Path) -> None:
+    path = write_film(tmp_path / "flight.avi", [0, 40, 80])
+    path.write_bytes(path.read_bytes().partition(b"movi")[0] + b"movi")
+    with closing(source_of(path)) as source:
+        source.open()
+        with pytest.raises(InputError, match=r"flight.avi has no readable frame"):
+            source.read(threading.Event())

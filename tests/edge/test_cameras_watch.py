@@ -40,7 +40,7 @@ class Playing(FolderSource):
 def write_pictures(folder: Path, numbers: list[int]) -> Path:
     folder.mkdir()
     for index, number in enumerate(numbers):
-        cv2.imwrite(str(folder / f"frame{index}.png"), picture(number))
+        cv2.imwrite(str(folder / f"frame{index}.{'PNG' if index % 2 else 'png'}"), picture(number))
     return folder
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -59,7 +60,8 @@ def scene(tmp_path: Path) -> Path:
         K = camera(focal_px)
         cameras[str(image_id)] = {"cam_K": K.ravel().tolist()} | ({} if lens is None else {DISTORTION_KEY: lens})
         if image_id != 3:
-            cv2.imwrite(str(folder / "gray" / f"{image_id:04d}.tif"), dots(K, lens or (0.0,) * 5))
+            suffix = "TIF" if image_id == 20 else "tif"
+            cv2.imwrite(str(folder / "gray" / f"{image_id:04d}.{suffix}"), dots(K, lens or (0.0,) * 5))
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
     return folder
 
@@ -125,11 +127,15 @@ def test_a_picture_without_a_camera_is_told(scene: Path) -> None:
 
 def test_a_number_left_out_of_what_was_recorded_is_a_frame_that_was_dropped(scene: Path) -> None:
     (scene / "sequence.toml").write_text('source = "flight.mcap"\nfps = 100.0\n')
-    settings = SequenceCamera(type="sequence", path=scene, fps=100, loop=True)
+    now_ns = time.monotonic_ns()
+    began_ns = now_ns - 20 * 86_400 * 1_000_000_000  # many rounds ago
+    settings = SequenceCamera(type="sequence", path=scene, fps=100, loop=True, start_at_ns=began_ns)
     with closing(SequenceSource(settings)) as source:
         source.open()
-        frames = [source.read(threading.Event()) for _ in range(2)]
-        assert frames[0].meta.sequence % 15 in (0, 13, 14)  # of 15 frames a round, pictures 7, 20 and 21
+        frames = [source.read(threading.Event()) for _ in range(4)]
+        assert abs(frames[0].meta.capture_ns - now_ns) < 2_000_000_000
+        # Of 15 frames a round, pictures 7, 20 and 21.
+        assert {frame.meta.sequence % 15 for frame in frames} <= {0, 13, 14}
         apart = frames[1].meta.sequence - frames[0].meta.sequence
         assert frames[1].meta.capture_ns - frames[0].meta.capture_ns == pytest.approx(apart * 1e7, abs=1)
         shown = source.exposed_now(13, 0).image_bgr
