@@ -31,7 +31,8 @@ class _Rounded(NamedTuple):
 def correct_biases(
     quantised: onnx.ModelProto, floats: onnx.GraphProto, inputs: Iterable[Mapping[str, NDArray]]
 ) -> None:
-    """Add to each bias the channel's mean output that the rounded weights miss, over the pixels of all `inputs`.
+    """Add to each bias the channel's mean output that the rounded weights miss: over the pixels of each of `inputs`,
+    then over these, however large they are.
 
     `floats` is the graph that `quantised` (QDQ, int32 biases) was made from, with the same names of nodes. Inputs of a
     convolution are taken as quantised, so that the correction does not depend on that of the layers before.

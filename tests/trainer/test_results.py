@@ -235,7 +235,9 @@ def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None
     made = ["generate", "--preset", str(preset), "--seed", "3", "--every", "2", "--out", str(dataset), "--workers", "1"]
     assert replay(made) == 0
     assert {path.name for path in dataset.iterdir()} >= {"train", "test"}
-    (score,) = measure([None], [dataset], lambda _: None)
+    other = Path(shutil.copy(SHIPPED_MODEL, tmp_path / "other.onnx"))
+    score, of_other = measure([None, other], [dataset], lambda _: None)
+    assert (score["method"]["file"], of_other["method"]["file"]) == (SHIPPED_MODEL.name, "other.onnx")
     assert score["overall"]["frames"] == len(list((dataset / "test").glob("*/rgb/*")))
     assert score["recipe"].endswith("--every 2 --split test")
 
