@@ -60,6 +60,7 @@ def run_folder(folder: Path, samples: list[int]) -> Path:
 def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
     history = gathered([], [run_folder(tmp_path / "a", [100, 250]), run_folder(tmp_path / "b", [40])])
     assert [line["total_samples"] for line in history] == [100, 250, 290]
+    assert (history[0]["E_r_mean_deg"], history[0]["pose_10deg_5pct"]) == (30.0, 0.3)
     assert told(history, {}).startswith("Trained on 290 windows in 2 runs")
     refined = {"refined_windows": 1200, "refined_epochs": 3, "refined_seed": 7, "refined_strangers": 0.35}
     ending = "3 epochs on 1,200 further windows (seed 7; 35 % of the targets are randomly generated aircraft)."
@@ -192,14 +193,23 @@ def test_each_column_tells_the_figure_of_its_name_and_the_papers_row_the_papers(
         "add_0_1d": 0.466,
     }
     score = {"dataset": "d", "mode": "frames", "method": method, "recipe": "", "overall": group}
-    text = page([{**score, "by_range": {"100-200": group}, "by_airframe": {"glider": group}}], "the command", "")
+    bands = {"100-200": group, "200-300": {"targets": 0}}
+    measured = [{**score, "by_range": bands, "by_airframe": {"glider": group}}]
+    measured += [{**score, "dataset": "e", "by_range": {}, "by_airframe": {}}]
+    beside = {**score, "method": {"file": "another.csv"}}
+    text = page(measured, "the command", "", [beside])
     figures = "91.1 | 12 | 1.1 | 2.2 | 82.2 | 3.3 | 4.4 | 73.3 | 64.4 | 55.5 | 46.6 | 0.078 |"
     names = "recall % | false / 1,000 | E_r mean ° | median ° | Rot<10° % | E_t mean m | E_z mean m | Depth<5 % % |"
     names += " Pose@10°/5 % % | ADD-0.5d % | ADD-0.1d % | bearing mean ° |"
     rows = text.splitlines()
     assert f"| dataset | model | frames | Pose, 95 % | {names}" in rows
-    assert f"| d | int8 | 9 | – | {figures}" in rows
+    overall = [f"| {name} | 9 | – | {figures}" for name in ("d | int8", "d | another.csv", "e | int8")]
+    first = rows.index(overall[0])
+    assert rows[first : first + 3] == overall
+    assert f"| range m | targets | {names}" in rows
+    assert f"| airframe | targets | {names}" in rows
     assert f"| 100-200 | 8 | {figures}" in rows
+    assert not any("200-300" in row for row in rows)
     assert f"| glider | 8 | {figures}" in rows
     papers = "– | – | 5.0 | – | 90.9 | 7.3 | 7.0 | 89.0 | 82.8 | 88.5 | – | – |"
     assert f"| FW-UAV6DPose (the paper's own data) | the paper, FP32 | 4,500 | – | {papers}" in rows
