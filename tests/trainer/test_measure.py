@@ -45,7 +45,7 @@ def predicted() -> Predictions:
     R[1] = Rotation.from_euler("y", 12.0, degrees=True).as_matrix()
     t_m[1:4] = [3.0, 4.0, 200.0], [0.0, 0.0, 208.0], [0.0, 5.0, 212.0]
     center_px, size_px = labels.center_px.copy(), labels.size_px.copy()
-    center_px[:4, 0] += [3.0, 9.0, 0.0, 11.0]
+    center_px[:4, 0] += [3.0, 9.0, 0.0, -11.0]
     size_px[2] *= 2.0
     sigma = np.ones((len(PRESENT), 6), np.float32)
     return Predictions(SCORES.astype(np.float32), center_px, size_px, center_px, t_m, R, sigma)
