@@ -257,15 +257,15 @@ def test_evaluation_measures_the_windows_of_its_seed(exported: Exported) -> None
 
 
 def test_the_constant_guess_lies_midway() -> None:
-    """Headings of -30, 0 and 30 degrees at 100, 200 and 400 m: level at 200 m errs by 20 degrees and by half."""
+    """Headings of -30, 0 and 30 degrees at 100, 200 and 800 m: the middle one errs by 20 degrees and 7/12."""
     batch = windows(5, 64)
     on = np.zeros(len(batch.present), dtype=bool)
     on[:3] = True
     R, t = batch.R_cam_target.copy(), batch.t_cam_target_m.copy()
-    R[:3] = R_from_euler(0.0, 0.0, np.deg2rad([-30.0, 0.0, 30.0]))
-    t[:3, 2] = [100.0, 200.0, 400.0]
+    R[:3] = R_from_euler(0.4, -0.7, 1.1) @ R_from_euler(0.0, 0.0, np.deg2rad([-30.0, 0.0, 30.0]))
+    t[:3, 2] = [100.0, 200.0, 800.0]
     got = constant_guess([batch._replace(present=on, R_cam_target=R, t_cam_target_m=t)])
-    assert got == pytest.approx({"constant_E_r_mean_deg": 20.0, "constant_depth_rel_mean": 0.5}, abs=1e-4)
+    assert got == pytest.approx({"constant_E_r_mean_deg": 20.0, "constant_depth_rel_mean": 7 / 12}, abs=1e-4)
 
 
 def test_windows_are_measured_on_alike_whatever_was_trained_on() -> None:
