@@ -43,6 +43,10 @@ ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
 }
 ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"
 ADVICE_NO_IMAGE = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
+ADVICE_NO_STREAM = (
+    "check that it is on and reachable from this computer; with OPENCV_FFMPEG_LOGLEVEL=16 before this command, ffmpeg "
+    "says what the server answers"
+)
 
 
 def doctor(file: ConfigFile, as_json: bool) -> int:
@@ -113,7 +117,8 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         capture.stop()
     if size_wh is None:
         said = "; ".join(text for _, text in reasons)
-        advice = ADVICE[DAMAGED] if DAMAGED in dict(reasons) else ADVICE_NO_IMAGE
+        not_there = ADVICE_NO_STREAM if camera.type == "stream" else ADVICE_NO_IMAGE
+        advice = ADVICE[DAMAGED] if DAMAGED in dict(reasons) else not_there
         why = f": {said}" if said else ""
         yield wrong("camera", f"{name}: no image within {FRAME_S:.0f} s{why}", advice), None
         return
