@@ -117,7 +117,10 @@ def test_a_test_split_without_truth_or_masks_can_be_read(tmp_path: Path) -> None
         ("scene_camera.json", '"3"', '"three"', r"'three' is not the number"),
         ("scene_gt.json", '"obj_id": 5', '"obj_id": "a"', r"scene_gt\.json: '3' has no integer 'obj_id'"),
         ("scene_gt.json", "}]", "}", r"scene_gt\.json line 3 is not JSON"),
+        ("scene_gt.json", "[{", '7, "4": [{', r"scene_gt\.json: '3' is not a list of objects"),
         ("scene_gt_info.json", '"bbox_visib"', '"bbox"', r"scene_gt_info\.json: '3' has no 'bbox_visib'"),
+        ("scene_gt_info.json", "[{", '7, "4": [{', r"scene_gt_info\.json: '3' does not list the 1 objects of scene_gt"),
+        ("scene_gt_info.json", "[{", "[{}, {", r"scene_gt_info\.json: '3' does not list the 1 objects of scene_gt"),
     ],
 )
 def test_broken_files_are_named_with_their_key(tmp_path: Path, name: str, old: str, new: str, said: str) -> None:
