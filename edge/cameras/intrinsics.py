@@ -20,7 +20,6 @@ FOCAL_RATIO_MAX = 2.0  # pixels are square, or nearly so in anamorphic video
 OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, the principal point may lie outside the image, which may be cropped
 CLEAR_SHARE = 0.5  # share of the sides, in the middle, in which the lens model must not fold
 ROUNDING = 1e-6  # tolerance for the zeros and the one of K, from tools that multiply matrices
-YAML_HEAD = "%YAML:1.0\n---\n"  # required by OpenCV to recognise YAML
 
 
 @dataclass(frozen=True)
@@ -89,9 +88,8 @@ def read_calibration(path: Path) -> Intrinsics:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError(f"calibration {path} cannot be read: {reason}", INTRINSICS_KEY) from error
-    read = _as_opencv_reads(text)
     try:
-        storage = cv2.FileStorage(read, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(_as_opencv_reads(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         size_wh = (_side_px(storage, path, "image_width"), _side_px(storage, path, "image_height"))
         K = pinhole(_matrix(storage, path, "camera_matrix"), f"calibration {path}: camera_matrix", INTRINSICS_KEY)
         if storage.getNode("distortion_coefficients").empty():
@@ -101,8 +99,7 @@ def read_calibration(path: Path) -> Intrinsics:
         model = storage.getNode("distortion_model").string()
         fisheye = storage.getNode("fisheye_model")
     except (cv2.error, SystemError) as error:  # OpenCV's constructor wraps its error in SystemError
-        reason = _opencv_reason(error, lines_before=read.count("\n") - text.count("\n"))
-        hint = f"not YAML as OpenCV reads it{reason}; lists stand in brackets, as data: [1.0, 0.0]"
+        hint = f"not YAML as OpenCV reads it{_opencv_reason(error)}; lists stand in brackets, as data: [1.0, 0.0]"
         raise InputError(f"calibration {path} is {hint}", INTRINSICS_KEY) from error
     if model not in DISTORTION_MODELS:
         raise InputError(
@@ -123,19 +120,18 @@ def _as_opencv_reads(text: str) -> str:
     """The same YAML, with the same lines, without parts that OpenCV cannot read and that are not needed: comments after
     values, the camera's name."""
     plain = re.sub(r"(?m)(?:^|[ \t]+)#.*$", "", text)
-    plain = re.sub(r"(?m)^camera_name[ \t]*:.*$(?:\n[ \t]+\S.*$)*", lambda name: "\n" * name[0].count("\n"), plain)
-    return plain if plain.startswith("%YAML") else YAML_HEAD + plain.removeprefix("---\n")
+    return re.sub(r"(?m)^camera_name[ \t]*:.*$(?:\n[ \t]+\S.*$)*", lambda name: "\n" * name[0].count("\n"), plain)
 
 
-def _opencv_reason(error: Exception, lines_before: int) -> str:
-    """`, line N: OpenCV's message`; empty if there is none. `lines_before`: lines that were put before the file's."""
+def _opencv_reason(error: Exception) -> str:
+    """`, line N: OpenCV's message`; empty if there is none."""
     said = re.search(r"\((\d+)\): (.+)", str(error.__cause__ or error))
     if said is None:
         return ""
     words = said[2].partition(" in function")[0].strip()
     if words.count("'") % 2:
         words = words.removesuffix("'")  # OpenCV 5 quotes the whole message
-    return f", line {int(said[1]) - lines_before}: {words.rstrip('!')}"
+    return f", line {said[1]}: {words.rstrip('!')}"
 
 
 def pinhole(numbers: Array, named: str, key: tuple[str, ...] = ()) -> Array:

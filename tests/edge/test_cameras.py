@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from edge.cameras.capture import Capture
 from edge.cameras.file import FileSource
-from edge.cameras.intrinsics import Intrinsics
+from edge.cameras.intrinsics import Intrinsics, load_intrinsics
 from edge.cameras.reconnect import LONGEST_WAIT_NS, Reconnect
 from edge.cameras.sequence import SequenceSource
 from edge.cameras.source import EndOfStream
@@ -262,6 +262,15 @@ def test_scaled_intrinsics_see_the_same_ray_through_the_same_spot(up: int, down:
     scale = 80 * down / 640
     point = small.K @ [*ray, 1.0]
     np.testing.assert_allclose((large.K @ [*ray, 1.0])[:2], (point[:2] + 0.5) * scale - 0.5, atol=1e-9)
+
+
+def test_the_numbers_of_the_configuration_are_the_camera_s() -> None:
+    numbers = IntrinsicsSettings(
+        fx=300, fy=310, cx=159.5, cy=89.5, width=320, height=180, distortion=[-0.1, 0.02, 0, 0]
+    )
+    lens = load_intrinsics(numbers)
+    np.testing.assert_array_equal(lens.K, [[300, 0, 159.5], [0, 310, 89.5], [0, 0, 1]])
+    assert (lens.image_size_wh, lens.distortion) == ((320, 180), (-0.1, 0.02, 0.0, 0.0))
 
 
 def test_a_frame_of_another_size_than_the_intrinsics_is_refused(tmp_path: Path) -> None:

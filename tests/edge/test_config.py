@@ -332,6 +332,15 @@ def test_a_file_that_an_editor_began_with_a_mark_is_read(tmp_path: Path) -> None
 
 def test_a_calibration_that_opencv_does_not_read_is_told_as_that(tmp_path: Path) -> None:
     path = tmp_path / "nose.yaml"
+    with pytest.raises(InputError, match=r"nose\.yaml cannot be read: No such file"):
+        read_calibration(path)
+    for content, said in (
+        (b"\xff\xfe", "cannot be read: not UTF-8 text"),
+        (b"", "is not YAML as OpenCV reads it; lists"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            read_calibration(path)
     for written, instead, line, said in (
         ("data: [-0.1, 0.02, 0.001, -0.002, 0.0]", "data:\n  - -0.1\n  - 0.02", 13, "Incorrect indentation"),
         ("  cols: 5", "\tcols: 5", 11, "Tabs are prohibited in YAML"),

@@ -367,7 +367,10 @@ def test_what_the_window_s_edge_cuts_is_looked_at_again_whole(toy_model: Path, s
 def test_track_says_none_where_the_window_holds_no_target(toy_model: Path) -> None:
     frame = frame_of(draw((500.5, 500.5)))
     expected = [np.array([450.0, 480.0, 570.0, 540.0]), np.array([1500.0, 200.0, 1620.0, 260.0])]
-    seen, missed = Estimator(load_model(toy_model, 1)).track(frame, expected)
+    model = load_model(toy_model, 1)
+    seen, missed = Estimator(model).track(frame, expected)
+    ((begin_ns, end_ns),) = model.take_runs_ns()
+    assert (begin_ns < end_ns, model.take_runs_ns()) == (True, []), "one inference, timed once"
     assert seen is not None
     assert missed is None
     np.testing.assert_allclose(seen.t_cam_target_m, true_t_cam_target_m((500.5, 500.5)), rtol=0.02, atol=0.2)

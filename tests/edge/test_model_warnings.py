@@ -21,6 +21,7 @@ from edge.config import load_config
 from edge.doctor import _model
 from edge.estimator.model import NOT_CALIBRATED, load_model
 from edge.status import ask
+from edge.types import PROBABLE_SCORE
 from msgs.cdr import Log
 from msgs.client import connect, subscribe
 from sim_replay.ports import free_port
@@ -159,6 +160,7 @@ def test_a_gpu_that_does_not_start_leaves_standard_output_to_the_command(
 def test_scores_that_are_not_calibrated_are_told_of_by_every_command(
     cli: Cli, tmp_path: Path, swaying: Path, toy_model: Path, calibrated: Path
 ) -> None:
+    assert [load_model(path, 1).doubtful_below for path in (calibrated, toy_model)] == [PROBABLE_SCORE, 0.0]
     config = tmp_path / "config.toml"
     config.write_text(toml(swaying, calibrated, free_port()))
     assert NOT_CALIBRATED not in cli("check", "--config", config).stdout

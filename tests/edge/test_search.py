@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -110,6 +111,22 @@ def test_the_model_looks_over_whole_frames_at_a_lower_priority_than_through_wind
     yielding = min(own + threads.YIELDS, LOWEST)
     priorities = sorted(os.getpriority(os.PRIO_PROCESS, int(thread)) for thread in begun)
     assert priorities == [own, own, yielding, yielding], model.path  # two beside the caller's for each kind
+
+
+def test_the_search_itself_yields_to_the_loop_too(search: Search) -> None:
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "search")
+    own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    yielding = min(own + threads.YIELDS, LOWEST)
+    until(lambda: os.getpriority(os.PRIO_PROCESS, thread.native_id or 0) == yielding)
+
+
+@pytest.mark.usefixtures("stepped")
+def test_in_lock_step_what_is_searched_for_is_found_at_once(estimator: Estimator) -> None:
+    search, seen = Search(), frame(0, OTHER)
+    search.start()
+    assert search.begin(estimator, seen, [])
+    (place,) = search.places(seen.meta.capture_ns, [], 4)
+    np.testing.assert_allclose(place.box_xyxy_px, box_around(OTHER), atol=3.0)
 
 
 @pytest.fixture
