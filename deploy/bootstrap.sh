@@ -36,9 +36,9 @@ apt_install() {
 }
 
 find_python() {
-    for candidate in python3 python3.13 python3.12 python3.11; do
+    for candidate in python3 python3.14 python3.13 python3.12 python3.11; do
         if command -v "$candidate" >/dev/null &&
-            "$candidate" -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+            "$candidate" -c 'import sys; raise SystemExit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null; then
             echo "$candidate"; return
         fi
     done
@@ -54,7 +54,7 @@ made_elsewhere() {
 if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2>&1 || made_elsewhere; then
     if ! python=$(find_python); then
         apt_install python3 python3-venv
-        python=$(find_python) || { say "Python 3.11, 3.12 or 3.13 is needed and none was found"; exit 2; }
+        python=$(find_python) || { say "Python 3.11 to 3.14 is needed and none was found"; exit 2; }
     fi
     "$python" -c 'import ensurepip, venv' 2>/dev/null || apt_install "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
     say "making .venv with $("$python" --version)"

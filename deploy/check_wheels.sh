@@ -20,7 +20,7 @@ with open("pyproject.toml", "rb") as file:
     print("\n".join(tomllib.load(file)["project"]["dependencies"]))
 END
 failed=0
-for version in 3.11 3.12 3.13; do
+for version in 3.11 3.12 3.13 3.14; do
     # shellcheck disable=SC2086
     if "$python" -m pip download -qq --disable-pip-version-check --only-binary=:all: $older \
         --implementation cp --python-version "$version" --constraint deploy/constraints.txt \
