@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 import time
@@ -50,7 +49,7 @@ class FileSource:
         if not self._capture.isOpened():
             raise InputError(f"{path} is not a readable video")
         fps = self._capture.get(cv2.CAP_PROP_FPS)
-        if not math.isfinite(fps) or not 0 < fps <= 1000:
+        if not 0 < fps <= 1000:
             raise InputError(f"{path} does not say its frame rate")
         if not tells_times(path):
             raise InputError(

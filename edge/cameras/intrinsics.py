@@ -156,13 +156,8 @@ def _side_px(storage: cv2.FileStorage, path: Path, name: str) -> int:
 
 
 def _matrix(storage: cv2.FileStorage, path: Path, name: str) -> Array:
-    """Flat numbers of a matrix in OpenCV's or ROS's form (rows, cols, data); empty if there is none.
-
-    Raises InputError.
-    """
+    """Flat numbers of a matrix in OpenCV's or ROS's form (rows, cols, data). Raises InputError."""
     node, named = storage.getNode(name), f"calibration {path}: {name}"
-    if node.empty():
-        return np.zeros(0)
     if not node.isMap() or not node.getNode("data").isSeq():
         raise InputError(f"{named} has no list of data", INTRINSICS_KEY)
     data = node.getNode("data")
