@@ -34,9 +34,7 @@ PUBLISHER_SILENT_NS = 1_000_000_000  # then another may replace it
 # 200 MB when decoded, more than any camera's: a PNG of 200 kB may unpack to gigabytes, which end the process.
 PIXELS_MAX = 2**26
 PNG_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # then width and height
-# JPEG: the markers of a frame's header, and those without a length.
-JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD9)})
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of a frame's header
 # A picture rotated according to its EXIF data would not fit the calibration.
 DECODING = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
 UNDECODABLE = f"cannot be decoded, or has more than 8 bits a channel or {PIXELS_MAX // 10**6} megapixels"
@@ -215,7 +213,7 @@ def picture_size_wh(data: bytes) -> tuple[int, int] | None:
         if marker in JPEG_FRAMES:
             return _big_endian(data, at + 7, 2), _big_endian(data, at + 5, 2)
         # A marker may follow any number of bytes 0xFF.
-        at += 1 if marker == 0xFF else 2 if marker in JPEG_BARE else 2 + _big_endian(data, at + 2, 2)
+        at += 1 if marker == 0xFF else 2 + _big_endian(data, at + 2, 2)
     return None
 
 

@@ -170,7 +170,14 @@ def test_a_small_file_that_would_unpack_to_more_than_the_memory_is_not_decoded(
     _, progressive = cv2.imencode(
         ".jpg", picture(1)[..., 0], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
     )
-    pictures = [jpeg.tobytes(), progressive.tobytes(), turned_jpeg(1), message(1)[message(1).index(b"\x89PNG") :]]
+    padded = jpeg.tobytes()[:2] + b"\xff\xff" + jpeg.tobytes()[2:]
+    pictures = [
+        jpeg.tobytes(),
+        padded,
+        progressive.tobytes(),
+        turned_jpeg(1),
+        message(1)[message(1).index(b"\x89PNG") :],
+    ]
     for data in pictures:
         assert picture_size_wh(data) == SIZE_WH
         assert decode_picture(data) is not None
