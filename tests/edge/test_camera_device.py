@@ -228,6 +228,13 @@ def test_format_size_rate_and_exposure_are_asked_of_the_driver(
     assert caplog.messages == []
 
 
+def test_before_a_device_answers_it_is_told_as_it_is_asked_for() -> None:
+    width, height = SIZE_WH
+    asked = settings().model_copy(update={"width": 2 * width, "height": 2 * height})
+    info = DeviceSource(asked).nominal()
+    assert (info.image_size_wh, info.K[0, 0], info.frame_rate_hz) == ((2 * width, 2 * height), 600.0, None)
+
+
 def test_an_exposure_that_is_not_set_is_left_to_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not EXPOSURES & set(opened(monkeypatch, exposure_ms=None).asked)
 

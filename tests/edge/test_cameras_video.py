@@ -87,12 +87,17 @@ def test_the_times_of_a_steady_video_are_those_of_its_rate_however_its_file_roun
 
 def test_where_a_video_has_no_times_or_those_of_another_clock_frames_follow_at_its_rate() -> None:
     joined, none_at_the_end = [0, 40, 80, 9_000_000, 9_000_040, 20, 60], [80, 120, 160, 0, 0]
-    for stamps_ms in (joined, none_at_the_end):
+    joined_to_another_rate = [0, 40, 80, 9_000_000, 9_000_100, 9_000_200]
+    for stamps_ms, expected_ms in (
+        (joined, [40.0 * k for k in range(7)]),
+        (none_at_the_end, [40.0 * k for k in range(5)]),
+        (joined_to_another_rate, [0.0, 40.0, 80.0, 120.0, 220.0, 320.0]),
+    ):
         times, told_ms = VideoTimes(FPS), []
         for stamp_ms in stamps_ms:
             times.take(stamp_ms * 1_000_000)
             told_ms.append(times.last_ns / 1e6)
-        assert told_ms == [40.0 * k for k in range(len(stamps_ms))]
+        assert told_ms == expected_ms
 
 
 @pytest.mark.parametrize("wrong_ms", [0, 360, 359, 200, 9_000_000])
