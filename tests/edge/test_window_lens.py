@@ -174,6 +174,25 @@ def test_a_window_has_the_pixels_of_the_straightened_frame() -> None:
         assert np.abs(own - reference).mean() < 0.5 * np.abs(shifted - reference).mean()
 
 
+@pytest.mark.parametrize(
+    ("distortion", "folds"),
+    [
+        ((-0.3, 0.1, 0.0, 0.0, -0.015), True),
+        ((0.5, 0.1, 0.0, 0.0, 0.0, 0.8, 0.2, 0.05), True),  # eight coefficients
+        ((0.5, 0.1, 0.0, 0.0, 0.02, 0.8, 0.2, 0.01), False),
+    ],
+)
+def test_a_lens_is_looked_through_as_far_as_what_is_farther_out_is_shown_farther_out(
+    distortion: tuple[float, ...], folds: bool
+) -> None:
+    lens = Lens(np.diag([1000.0, 1000.0, 1.0]), distortion)
+    radius = np.linspace(0.0, 1.2 * lens.radius_max, 1201)
+    shown_px = lens.to_frame(np.stack([1000.0 * radius, np.zeros_like(radius)], axis=-1))[:, 0]
+    grows = np.diff(shown_px) > 0
+    assert grows[:998].all()
+    assert grows[1002:].any() != folds
+
+
 def test_what_is_made_smaller_through_a_lens_is_averaged_as_without_one() -> None:
     """Sampled at points, the grain of a sensor would be as coarse as the aircraft."""
     grain = np.random.default_rng(5).integers(0, 255, (1080, 1920, 3), dtype=np.uint8)
