@@ -388,6 +388,7 @@ def test_a_known_target_is_not_acquired_again_nor_one_seen_by_two_windows_twice(
 def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path) -> None:
     changes = {"track_size_wh": None, "acquire_size_wh": (640, 640), "acquire_fit": "squash"}
     model = load_model(write_toy_model(tmp_path / "paper.onnx", **changes), 1)
+    model.warm_up()
     estimator = Estimator(model)
     estimator.warm_up(frame_of(np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)))
     (estimate,) = estimator.acquire(frame_of(draw((700.5, 300.5))))
@@ -406,6 +407,8 @@ def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path
         (lambda path: write_toy_model(path, metadata='{"version": 7}'), "contract version 7; this program reads 1"),
         (lambda path: write_toy_model(path, metadata='{"version": 1}'), "contract key name"),
         (lambda path: write_toy_model(path, acquire_size_wh=(640, 380)), "not a multiple of 32"),
+        (lambda path: write_toy_model(path, graph=GRAPH.replace("[N, H, W,", "[N, 256, 256,")), "run at 640x384: "),
+        (lambda path: write_toy_model(path, graph=GRAPH.replace("[N, H, W,", "[N, 384, 640,")), "run at 256x256: "),
         (lambda path: write_toy_model(path, graph=GRAPH.replace("uint8[N", "int8[N")), "input image is tensor(int8)"),
         (
             lambda path: write_toy_model(path, graph=GRAPH.replace(" image", " picture").replace("(image", "(picture")),
