@@ -152,6 +152,16 @@ def said(*x_m: float) -> Any:
     return lambda index, _: Answer(tuple(TargetPose(index, np.eye(3), t_m) for t_m in poses), None)
 
 
+def test_a_line_of_a_list_asks_for_one_aircraft_unless_it_says_more_and_the_most_visible_ones_count(root: Path) -> None:
+    sides = [{"bbox_visib": [9, 9, 9, 9], "px_count_visib": px} for px in (60, 70)]
+    write_json(root / "test" / "000000" / "scene_gt_info.json", {"0": sides, "1": []})
+    one = {"scene_id": 0, "im_id": 0, "obj_id": 1}
+    for lines, asked in (((one,), [RIGHT]), ((one, one), [LEFT, RIGHT]), ((one | {"inst_count": 2},), [LEFT, RIGHT])):
+        listed(root, *lines)
+        (picture,) = open_dataset(root).labelled_frames()
+        assert [target.t_cam_target_m[0] for target in picture.targets] == asked  # in the order of scene_gt.json
+
+
 def test_a_pose_of_an_aircraft_that_is_not_asked_for_is_neither_right_nor_wrong(root: Path) -> None:
     listed(root, {"scene_id": 0, "im_id": 0, "obj_id": 1, "inst_count": 1})
     dataset = open_dataset(root)
