@@ -97,11 +97,13 @@ def test_a_hand_written_file_answers_for_its_pictures(dark_spot_scene: Path, tmp
         (HEADER + f"0,1,1,1,{EYE},0 0,-1\n", "line 2: t is not 3 finite numbers"),
         (HEADER + f"0,1,1,1,{EYE},0 0 nan,-1\n", "line 2: t is not 3 finite numbers"),
         (HEADER + f"0,1,1,1,{EYE},0 0 1e300,-1\n", "line 2: t is not 3 finite numbers"),
+        (HEADER + f"0,1,1,1,{EYE},0 -1e300 1,-1\n", "line 2: t is not 3 finite numbers"),
         (HEADER + f"0,1,1,1,{EYE},0 0 1,1e300\n", "line 2: time is not 1 finite number"),
         (HEADER + f"0.5,1,1,1,{EYE},0 0 1,-1\n", "line 2: scene_id is not a whole number: '0.5'"),
         (HEADER + f"0,1.5,1,1,{EYE},0 0 1,-1\n", "line 2: im_id is not a whole number: '1.5'"),
         (HEADER + "0,1,1,1,1 0 0 0 1 0 0 0 -1,0 0 1,-1\n", "line 2: R is not a rotation"),
         (HEADER + "0,1,1,1,2 0 0 0 2 0 0 0 2,0 0 1,-1\n", "line 2: R is not a rotation"),
+        (HEADER + "0,1,1,1,.5 0 0 0 .5 0 0 0 .5,0 0 1,-1\n", "line 2: R is not a rotation"),
     ],
 )
 def test_a_bad_row_is_named(tmp_path: Path, content: str, words: str) -> None:

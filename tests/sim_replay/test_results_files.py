@@ -69,6 +69,7 @@ def test_the_score_chooses_among_several_poses_of_one_aircraft_and_not_the_truth
         frames = judged(root, rows)
         assert turns_deg(frames) == [180, 0]
         assert [pose.score for pose in frames[0].false_poses] == [0.1]
+        assert frames[0].time_ms is None  # -1 in the file: not known
 
 
 def test_of_equal_scores_the_first_count(root: Path) -> None:
