@@ -7,6 +7,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
@@ -193,7 +194,10 @@ def test_ratios_are_told_as_worked_by_hand() -> None:
 
     def row(kind: str, stage: str, threads: int, p10: float, cpu: float, engine: str = ORT) -> Row:
         configuration, precision = kind.split()
-        case, ms = Case(f"{configuration}-{precision}.onnx", stage, threads, engine), Milliseconds(p10, 50.0, 99.0, cpu)
+        case, ms = (
+            Case(f"{configuration}-{precision}.onnx", stage, threads, engine),
+            Milliseconds(p10, 9 * p10, 99.0, cpu),
+        )
         return Row(case, configuration, precision, (224, 224), Macs(60_000_000, 500_000), ms, limit_ms=2.0)
 
     rows = (
@@ -210,6 +214,9 @@ def test_ratios_are_told_as_worked_by_hand() -> None:
     )
     measured = Measured(Machine("a CPU", 2, "1.31", None), 50, {}, (Peak(2, 435.0, 80.0),), rows)
     tree = to_tree(measured)
+    assert (tree["track_ms"], tree["acquire_ms"]) == (36.0, 72.0)
+    floats = to_tree(replace(measured, rows=tuple(row for row in rows if row.precision == "fp32")))
+    assert (floats["track_ms"], floats["ratios"]["int8_over_fp32"]) == (90.0, None)
     assert tree["ratios"] == {
         "int8_over_fp32": pytest.approx(0.4),
         "edge_over_paper_fp32": pytest.approx(0.5),
@@ -224,7 +231,7 @@ def test_ratios_are_told_as_worked_by_hand() -> None:
     assert "edge / paper configuration, FP32, each at its own input size acquire 2 0.50 0.40" in told
     assert "ONNX Runtime / OpenVINO, INT8 track 2 0.80 2.00" in told
     assert "INT8 / its multiply-accumulates at this machine's peak track 1 3.00 -" in told
-    assert "edge-int8 track 224x224 2 onnxruntime 4.00 50.00 99.00 5.00 60.0 0.5 2.00" in told
+    assert "edge-int8 track 224x224 2 onnxruntime 4.00 36.00 99.00 5.00 60.0 0.5 2.00" in told
     assert "2 threads: INT8 435, FP32 80" in told
 
 
