@@ -85,6 +85,17 @@ def test_who_names_no_object_or_another_one_fills_what_is_left_by_score(root: Pa
     assert len(frames[0].false_poses) == 1
 
 
+def test_a_second_pose_of_one_aircraft_does_not_take_the_place_of_another(root: Path) -> None:
+    write_json(root / "models" / "models_info.json", {name: {"diameter": 6000.0} for name in ("1", "2")})
+    scene_gt = root / "test" / "000000" / "scene_gt.json"
+    truth = json.loads(scene_gt.read_text())
+    truth["0"][1]["obj_id"] = 2
+    write_json(scene_gt, truth)
+    frames = judged(root, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)])
+    assert turns_deg(frames) == [0, None]
+    assert len(frames[0].false_poses) == 1
+
+
 def test_poses_in_metres_are_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = results(root.parent, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)])
     file_answers(path, open_dataset(root))
