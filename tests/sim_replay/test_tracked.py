@@ -16,10 +16,12 @@ from edge.estimator.pace import Pace
 from edge.links import outgoing
 from msgs.contract import ScoreCalibration
 from sim_replay import metrics
+from sim_replay.bop import read_scene
 from sim_replay.datasets import open_dataset
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.evaluation import tracked
 from sim_replay.evaluation.judge import JudgedFrame, judge_frames
+from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.evaluation.tracked import tracker_answers
 from sim_replay.offline import SHIPPED_MODEL, load_model
 from trainer.graph import read_contract, write_contract
@@ -135,6 +137,32 @@ def test_own_attitude_takes_the_cameras_shaking_out_of_the_track(tmp_path: Path,
         for pose in (*frame.false_poses, *(m.estimate for m in frame.matches if m.estimate is not None))
     ]
     assert not all(told(blind)[2:]) or max(errors_deg) > 0.1
+
+
+def test_the_own_ship_is_told_as_an_autopilot_would_with_a_flights_errors_at_the_cameras_own_rates(
+    tmp_path: Path,
+) -> None:
+    """It flies north at 30 m/s and turns right by 20 degrees a second, seen ten times a second."""
+    scene = tmp_path / "data" / "test" / "000003"
+    write_scene(scene, [2.0 * image for image in range(4)])
+    cameras = json.loads((scene / "scene_camera.json").read_text())
+    true = []
+    for image, camera in enumerate(cameras.values()):
+        R_cam_ned, t_ned_m = np.reshape(camera["cam_R_w2c"], (3, 3)), np.array([3.0 * image, 20.0, -30.0])
+        camera["cam_t_w2c"] = (-1e3 * R_cam_ned @ t_ned_m).tolist()
+        true.append((R_cam_ned.T, t_ned_m))
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    (scene / "sequence.toml").write_text("fps = 10.0\n")
+    errors = OwnShipErrors.of_flight("000003")
+    exact, usual = (tracked._Sequence.of(read_scene(scene), told) for told in ("exact", "usual"))
+    for image, (R_ned_cam, t_ned_m) in enumerate(true):
+        seen = exact.own_ship(image)
+        np.testing.assert_allclose(seen.R_ned_body, R_ned_cam, atol=1e-9)
+        np.testing.assert_allclose(seen.t_ned_body_m, t_ned_m, atol=1e-9)
+        off = usual.own_ship(image)
+        R = errors.attitude(R_ned_cam, np.array([0.0, 0.0, np.deg2rad(20.0)]))
+        np.testing.assert_allclose(off.R_ned_body, R, atol=1e-9)
+        np.testing.assert_allclose(off.t_ned_body_m, errors.position(t_ned_m, np.array([30.0, 0.0, 0.0])), atol=1e-9)
 
 
 @pytest.mark.parametrize("text", ["", "fps = 0\n", "fps = 'fast'\n", "fps = "])
