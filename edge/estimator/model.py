@@ -241,7 +241,7 @@ def _contract(session: ort.InferenceSession, path: Path) -> ModelContract:
     except json.JSONDecodeError as error:
         raise InputError(f"model {path}: its contract is not JSON: {error}") from error
     for size_wh in filter(None, (contract.acquire_size_wh, contract.track_size_wh)):
-        if any(side <= 0 or side % SIZE_STEP_PX for side in size_wh):
+        if any(side % SIZE_STEP_PX for side in size_wh):
             raise InputError(f"model {path}: input size {size_wh} is not a multiple of {SIZE_STEP_PX}")
     return contract
 

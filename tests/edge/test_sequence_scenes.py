@@ -79,7 +79,7 @@ def test_every_frame_is_as_on_disk_and_says_what_its_lens_does(scene: Path) -> N
 def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) -> None:
     plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
     frames = frames_of(scene, plain)
-    assert [frame.K[0, 0] for frame in frames] == [310.0] * 3
+    assert [(frame.K[0, 0], frame.distortion) for frame in frames] == [(310.0, ())] * 3
     # Its lens has no distortion, so the pixels stay what they are on disk.
     np.testing.assert_array_equal(frames[0].image_bgr[:, :, 0], dots(camera(300.0), LENS))
 
