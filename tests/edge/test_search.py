@@ -25,6 +25,7 @@ from msgs.contract import ScoreCalibration
 from tests.waiting import until
 
 from .looping import HELD, OTHER, PERIOD_NS, Ear, Gated, box_around, frame, looping
+from .toy_model import write_toy_model
 from .toy_scene import SIZE_WH, K, draw
 
 # Of a target that a larger window shows smaller, this one makes the model surer.
@@ -118,6 +119,15 @@ def test_the_search_itself_yields_to_the_loop_too(search: Search) -> None:
     own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     yielding = min(own + threads.YIELDS, LOWEST)
     until(lambda: os.getpriority(os.PRIO_PROCESS, thread.native_id or 0) == yielding)
+
+
+def test_what_the_search_refuses_is_counted(search: Search, tmp_path: Path) -> None:
+    near = load_model(write_toy_model(tmp_path / "near.onnx", trained_range_m=(1.0, 10.0)), 1)
+    seen = frame(0, OTHER)
+    assert search.begin(Estimator(near), seen, [])
+    until(lambda: search.counters()["searches"] == 1)
+    assert search.places(seen.meta.capture_ns, [], 4) == []
+    assert search.counters()["refused_out_of_range"] == 1
 
 
 @pytest.mark.usefixtures("stepped")
