@@ -91,6 +91,20 @@ def test_records_become_the_score(sequence: PlayedSequence, recording: Recording
     assert score["zenoh_received"] == {"uav1/target/t0/pose": 4}
 
 
+def test_hidden_targets_and_frames_that_were_not_recorded_are_in_no_rate(
+    sequence: PlayedSequence, recording: Recording
+) -> None:
+    """The target of frame 1 is hidden, and frame 4, which shows none, was not recorded."""
+    truths = [replace(truth, visible=truth.frame != 1) for truth in sequence.scene.truths]
+    scene = replace(sequence.scene, truths=truths, unrecorded=frozenset({4}))
+    played = replace(sequence, scene=scene)
+    score = score_json(played, judge(played, recording), {})
+    peer = score["peers"]["subscriber"]
+    assert (peer["poses"], peer["stray_poses"]) == (4, 1)
+    for overall in (score["overall"], peer["overall"]):
+        assert (overall["frames"], overall["targets"], overall["recall"]) == (4, 3, pytest.approx(2 / 3, abs=1e-6))
+
+
 def test_poses_of_no_frame_are_no_poses_of_a_target_that_is_visible(sequence: PlayedSequence) -> None:
     made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
     made.take("subscriber", pose(-9, 0.0))
@@ -115,15 +129,20 @@ def test_a_rotation_that_neither_peer_was_told_is_not_judged(sequence: PlayedSeq
     assert figures.cells()["range error"] == "+0.0 m"
 
 
-def test_one_of_two_alike_that_leaves_takes_no_name_with_it(sequence: PlayedSequence) -> None:
-    """Two of one airframe, 30 m left and right at 200 m. The left one leaves, and the camera turns to the other: it
-    then stands in the picture where the left one stood, but not in the world."""
-    turned = so3_exp([0.0, 2.0 * np.arctan(30.0 / 200.0), 0.0])
+@pytest.mark.parametrize(
+    ("turn_rad", "moved_m"), [([0.0, 2.0 * np.arctan(30.0 / 200.0), 0.0], [0.0] * 3), ([0.0] * 3, [60.0, 0.0, 0.0])]
+)
+def test_one_of_two_alike_that_leaves_takes_no_name_with_it(
+    sequence: PlayedSequence, turn_rad: list[float], moved_m: list[float]
+) -> None:
+    """Two of one airframe, 30 m left and right at 200 m. The left one leaves, and the camera turns, or flies, to the
+    other: it then stands in the picture where the left one stood, but not in the world."""
+    turned, there_m = so3_exp(turn_rad), np.array(moved_m)
     left_m, right_m = np.array([-30.0, 0.0, 200.0]), np.array([30.0, 0.0, 200.0])
     shown = [[left_m, right_m], [left_m, right_m], [left_m], [left_m], [left_m]]  # in `cam`
-    assert turned @ left_m == pytest.approx(right_m)
+    assert turned @ left_m + there_m == pytest.approx(right_m)
     truths = [Truth(k, np.eye(3), t_m, 1, 12.0) for k, places_m in enumerate(shown) for t_m in places_m]
-    cameras = [(np.eye(3), np.zeros(3)) if k < 2 else (turned, np.zeros(3)) for k in range(5)]
+    cameras = [(np.eye(3), np.zeros(3)) if k < 2 else (turned, there_m) for k in range(5)]
     alike = replace(sequence, scene=replace(sequence.scene, truths=truths, cameras_world=cameras))
     made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
     for truth in truths:
