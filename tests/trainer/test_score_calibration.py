@@ -215,6 +215,9 @@ def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_s
     pictures = open_dataset(tmp_path / "dataset").labelled_frames()
     seen = list(candidates(load_model(dark_spot_model, threads=1), pictures))
     assert [(one.stage, one.is_target) for one in seen] == [("acquire", True), ("track", True)]
+    side_px = FOCAL_PX * 12.0 / SPOT_Z_M  # in the frame; squashed to 640x384, and a window 1.8 as large in 256 px
+    shown_px = (side_px * np.sqrt(640 / 1920 * 384 / 1080), 256 / 1.8)
+    assert [one.shown_px for one in seen] == pytest.approx(shown_px, rel=0.01)
 
 
 def test_a_peak_on_an_aircraft_that_the_list_of_targets_leaves_out_is_neither_right_nor_wrong(
