@@ -47,6 +47,12 @@ def nothing_stale(rig: Rig) -> Iterator[None]:
     assert faults_since(rig.witness, poses, messages) == []
 
 
+@pytest.fixture
+def volume(rig: Rig) -> None:
+    if not rig.settings.volume:
+        pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
+
+
 def played(rig: Rig, name: str, tell_recovery: Callable[[str], None]) -> Outcome:
     outcome = play_timeline(rig, load_timeline(TIMELINES / f"{name}.toml"), print)
     tell_recovery(f"{name}: {outcome.recovery()}")
@@ -61,13 +67,11 @@ def test_the_daemon_comes_through(rig: Rig, name: str, tell_recovery: Callable[[
 
 
 @pytest.mark.timeout(400)
-@pytest.mark.usefixtures("nothing_stale")
+@pytest.mark.usefixtures("volume", "nothing_stale")
 @pytest.mark.parametrize("name", sorted(NEED_VOLUME))
 def test_the_daemon_comes_through_on_a_disk_of_its_own(
     rig: Rig, name: str, tell_recovery: Callable[[str], None]
 ) -> None:
-    if not rig.settings.volume:
-        pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
     assert played(rig, name, tell_recovery).wrong == []
 
 
