@@ -9,7 +9,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-# Before a command: it is told to stop (SIGTERM) when the process that starts it has ended, however that happened.
+# Before a command: it is told to stop (SIGTERM) when what starts it has ended, however that happened. For the kernel
+# that is the thread: start nothing from one that ends sooner.
 ENDS_WITH_US = ("setpriv", "--pdeathsig", "TERM")  # of util-linux
 _END_S = 10.0
 
