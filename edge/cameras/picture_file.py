@@ -30,7 +30,8 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
 
 
 def _is_torn_jpeg(coded: bytes) -> bool:
-    """Whether a JPEG is truncated before its end marker: OpenCV pads the rest. Anything may follow the marker."""
+    """Whether a JPEG is truncated before its end marker, after which anything may follow. cv2.imread would pad the rest
+    with gray; cv2.imdecode refuses it without saying why."""
     if not coded.startswith(b"\xff\xd8"):
         return False
     at = 2

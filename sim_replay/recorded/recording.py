@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.cameras.zenoh_topic import decode_picture
 from edge.errors import InputError
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import Array, Mount
@@ -176,10 +176,10 @@ def _add(
     """The recorded image, byte for byte, unless scenes do not support its lens model."""
     distortion = tuple(float(value) for value in lens.distortion)
     if len(distortion) > 5:
-        pixels = cv2.imdecode(np.frombuffer(image.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        pixels = decode_picture(image.data)
         if pixels is None:
             raise InputError(f"the picture of {image.stamp_ns} ns is damaged")
-        add_picture(writer, slot, np.asarray(pixels, dtype=np.uint8), lens.K, distortion)
+        add_picture(writer, slot, pixels, lens.K, distortion)
         return
     R_cam_ned = R_ned_cam.T
     frame = BopFrame(slot, lens.K, (), R_cam_ned, -R_cam_ned @ t_ned_cam_m, scene_distortion(distortion))
