@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 
 from edge import clock
+from edge.estimator.model import load_model
 
 from .flying import write_swaying_scene
+from .looping import Gated
 from .toy_model import write_toy_model
 from .toy_scene import write_scene
 
@@ -53,3 +55,8 @@ def stepped() -> Iterator[int]:
     clock.step_to(now_ns)
     yield now_ns
     clock.run_freely()
+
+
+@pytest.fixture
+def gated(toy_model: Path) -> Gated:
+    return Gated(load_model(toy_model, 1))
