@@ -20,7 +20,7 @@ from msgs.geometry import Array
 from sim_replay.bop import Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
-from sim_replay.evaluation.judge import is_seen
+from sim_replay.evaluation.judge import is_hidden, is_seen
 from sim_replay.gimbal import R_GIMBAL_CAM, GimbalTrack, track_of
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
@@ -104,7 +104,7 @@ def read_scene_truth(folder: Path) -> SceneTruth:
                 )
             model, R, t_m = models[target.object_id], target.R_cam_target, target.t_cam_target_m
             known = (target.object_id, model.diameter_m, model.name, model.points_m)
-            truths.append(Truth(index, R, t_m, *known, visible=is_seen(target)))
+            truths.append(Truth(index, R, t_m, *known, visible=is_seen(target), occluded=is_hidden(target)))
     return SceneTruth(
         folder,
         [scene.image_path(frame) for frame in frames],

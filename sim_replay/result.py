@@ -160,12 +160,13 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
     """
     recording, subscriber = result.recording, result.subscriber
     frames = len(sequence.scene.images) - len(sequence.scene.unrecorded)
+    occluded = {truth.frame for truth in sequence.scene.truths if truth.occluded}
     return {
         "sequence": sequence.scene.name,
         "poses": len(recording.poses),
         "directions_received": len(recording.directions),
         "stray_poses": subscriber.strays,
-        **statistics(frames, subscriber.matches, subscriber.false_poses),
+        **statistics(frames, subscriber.matches, subscriber.false_poses, occluded),
         "directions": direction_statistics(
             result.directions.matches, subscriber.matches, len(result.directions.false_poses)
         ),
@@ -176,7 +177,7 @@ def score_json(sequence: PlayedSequence, result: Result, model: dict[str, Any]) 
                 "poses": len(peer.ages) + peer.strays,
                 "stray_poses": peer.strays,
                 **peer_figures(
-                    frames, sequence.fps, peer.matches, peer.false_poses, peer.ages, sequence.scene.unrecorded
+                    frames, sequence.fps, peer.matches, peer.false_poses, peer.ages, sequence.scene.unrecorded, occluded
                 ),
                 "age_ms": percentiles([age_ms for _, age_ms in told_ages(peer, recording)]),
             }

@@ -44,6 +44,7 @@ class Truth(TargetPose):
     points_body_m: Array | None = None  # [P, 3] model points for ADD, where the dataset has a model
     instance: int = field(default=0, kw_only=True)  # distinguishes several targets of the same object
     visible: bool = field(default=True, kw_only=True)  # False: not visible according to the dataset
+    occluded: bool = field(default=False, kw_only=True)  # True: not visible, as it is entirely behind something
     wanted: bool = field(default=True, kw_only=True)  # False: present, but not to be estimated according to the dataset
 
     @property

@@ -27,6 +27,7 @@ def peer_figures(
     false_poses: Sequence[TargetPose],
     ages: Sequence[tuple[int, float]],
     unrecorded: Collection[int] = (),
+    also_occupied: Collection[int] = (),
 ) -> dict[str, Any]:
     """JSON's types: shares 0..1, degrees, metres, milliseconds, seconds; None where there is no data.
 
@@ -36,9 +37,10 @@ def peer_figures(
         false_poses: Those of a frame that belong to no target.
         ages: Of each pose in the order of arrival: its frame, and ms from exposure to arrival.
         unrecorded: Frames without an image.
+        also_occupied: As in `sim_replay.score.statistics`.
     """
     return {
-        **statistics(frames, matches, false_poses),
+        **statistics(frames, matches, false_poses, also_occupied),
         "rmse": rmse(matches),
         "range_error_m": range_error_m(matches),
         "nees": nees(matches),

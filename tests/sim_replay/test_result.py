@@ -12,12 +12,14 @@ import pytest
 
 from edge.types import Mount
 from msgs.geometry import so3_exp
+from sim_replay.datasets import open_dataset
 from sim_replay.demo import LiveFigures
+from sim_replay.evaluation.judge import Answer, judge_frames, score_of
 from sim_replay.ground_truth import PlayedSequence, read_scene_truth
 from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.play import Recording
 from sim_replay.result import frame_views, judge, score_json
-from sim_replay.score import Truth
+from sim_replay.score import TargetPose, Truth
 
 START_NS = 50_000_000_000
 UTC_MINUS_MONOTONIC_NS = 1_700_000_000_000_000_123
@@ -103,6 +105,30 @@ def test_hidden_targets_and_frames_that_were_not_recorded_are_in_no_rate(
     assert (peer["poses"], peer["stray_poses"]) == (4, 1)
     for overall in (score["overall"], peer["overall"]):
         assert (overall["frames"], overall["targets"], overall["recall"]) == (4, 3, pytest.approx(2 / 3, abs=1e-6))
+
+
+@pytest.mark.parametrize(("px_count_all", "false_alarms"), [(60, 0.0), (0, 500.0)])
+def test_a_frame_is_without_a_target_if_it_is_in_an_evaluation_of_single_images(
+    px_count_all: int, false_alarms: float, dark_spot_scene: Path
+) -> None:
+    """A pose beside the target of frame 1, which is behind something or out of view; frame 4 shows none."""
+    seen = {"bbox_visib": [9, 9, 9, 9], "px_count_visib": 60, "px_count_all": 60}
+    hidden = {"bbox_visib": [-1, -1, -1, -1], "px_count_visib": 0, "px_count_all": px_count_all}
+    info = {str(k): [hidden if k == 1 else seen] for k in range(4)}
+    (dark_spot_scene / "scene_gt_info.json").write_text(json.dumps(info))
+    mount = Mount(np.eye(3), np.zeros(3))
+    played = PlayedSequence(read_scene_truth(dark_spot_scene), FPS, mount, dark_spot_scene / "telemetry.csv", 0)
+    made = Recording(START_NS, UTC_MINUS_MONOTONIC_NS, 14550, "tcp/127.0.0.1:7448")
+    made.take("subscriber", pose(1, 5.0))
+    made.take("autopilot", target_relative(1, 12.0))
+    score = score_json(played, judge(played, made), {})
+    beside = TargetPose(1, np.eye(3), np.array([5.0, 0.0, 200.0]))
+    dataset = open_dataset(dark_spot_scene.parents[1])
+    images = judge_frames(
+        list(dataset.frames()), dataset.models, lambda k, _: Answer((beside,) if k == beside.frame else (), None)
+    )
+    for told in (score, *score["peers"].values(), score_of(dataset, {}, images)):
+        assert (told["overall"]["false_poses"], told["overall"]["false_positives_per_1000"]) == (1, false_alarms)
 
 
 def test_poses_of_no_frame_are_no_poses_of_a_target_that_is_visible(sequence: PlayedSequence) -> None:
