@@ -33,6 +33,7 @@ CASES = {
     "crossing": Case(BUNDLED_SEQUENCE, 60),  # one target, tracked
     "away_and_back": Case(FOLDER / "away_and_back", 50),  # lost for longer than a track lasts, then re-acquired
     "two_targets": Case(FOLDER / "two_targets", 30),
+    "unknown_range": Case(FOLDER / "unknown_range", 12),  # directions instead of poses
 }
 
 

@@ -1,9 +1,10 @@
-"""Renders the two short sequences that golden files need beside the bundled one.
+"""Renders the short sequences that golden files need beside the bundled one.
 
     python -m sim_replay.golden.sequences --out sim_replay/data/golden
 
 `away_and_back`: the own ship swings its nose off the target for longer than a track lasts, and back.
-`two_targets`: a second aircraft crosses the first. Both are BOP scenes with telemetry, like `sim_replay.sequence`'s.
+`two_targets`: a second aircraft crosses the first. `unknown_range`: a small image of an aircraft that the model was not
+trained on, so that its range is not known. They are BOP scenes with telemetry, like `sim_replay.sequence`'s.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from sim_replay.sequence import (
 SEED = 34
 FPS = 10.0
 SIZE_WH_PX = (1280, 720)
+SMALL_WH_PX = (640, 360)
 JPEG_QUALITY = 60
 AWAY_RAD = np.radians(42.0)
 AWAY_FROM_S, AWAY_TO_S, SWING_S = 1.1, 3.6, 0.1
@@ -43,6 +45,7 @@ def sequences() -> dict[str, Filmed]:
     return {
         "away_and_back": Filmed(50, FPS, SIZE_WH_PX, SEED, _swinging(own), (first,)),
         "two_targets": Filmed(30, FPS, SIZE_WH_PX, SEED, own, (first, ("glider", 3, _glider()))),
+        "unknown_range": Filmed(12, FPS, SMALL_WH_PX, SEED, own, (("canard_pusher", 3, target_flight(SEED)),)),
     }
 
 

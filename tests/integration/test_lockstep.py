@@ -79,7 +79,7 @@ def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
         (["play", "--loop", "0"], "--loop 0: must be at least 1"),
         (["play", "--pause", "150"], "--pause 150: is not one of the frames 0 to 149"),
         (["play", "--speed", "0.1"], "'0.1' is neither a number of at least 0.25 nor max"),
-        (["golden", "crosing"], "golden crosing: no such case; the cases are crossing, away_and_back, two_targets"),
+        (["golden", "crosing"], f"golden crosing: no such case; the cases are {', '.join(CASES)}"),
     ],
 )
 def test_what_cannot_be_played_is_said_in_a_sentence(
