@@ -63,13 +63,10 @@ def to_tensors(batch: TrainingBatch, device: torch.device) -> tuple[Tensor, Labe
 def gaussian_radius(size_cells: Tensor, overlap: float = 0.7) -> Tensor:
     """CenterNet's radius [...]: a box [..., 2] whose corners move by it keeps IoU >= overlap; at least one cell."""
     w, h = size_cells[..., 0], size_cells[..., 1]
+    # IoU falls most where both corners move inwards: (w - 2r) (h - 2r) = overlap w h.
     total, area = w + h, w * h
-    solve = lambda a, b, c: (b - torch.sqrt(torch.clamp(b * b - 4 * a * c, min=0.0))) / (2 * a)  # noqa: E731
-    both = solve(1.0, total, area * (1 - overlap) / (1 + overlap))
-    inside = solve(4.0, 2 * total, (1 - overlap) * area)
-    b = 2 * overlap * total
-    outside = (-b + torch.sqrt(b * b - 16 * overlap * (overlap - 1) * area)) / (8 * overlap)
-    return torch.clamp(torch.minimum(torch.minimum(both, inside), outside), min=1.0)
+    radius = 0.25 * (total - torch.sqrt(total * total - 4 * (1 - overlap) * area))
+    return torch.clamp(radius, min=1.0)
 
 
 def center_cell(center_px: Tensor, rows: int, columns: int) -> Tensor:

@@ -13,7 +13,7 @@ from test_losses import labels_at, perfect
 
 from trainer.cli import EDGE_CONFIG
 from trainer.config import LossConfig, load_config
-from trainer.losses import heatmap_target, joint_loss, pose_terms
+from trainer.losses import heatmap_loss, heatmap_target, joint_loss, pose_terms
 
 PAPER = load_config(EDGE_CONFIG.with_name("paper.toml")).loss
 # Origin projected at (40, 25), 200 m away, f = 900 px, c = (32, 32): t = (16/9, -14/9, 200) m.
@@ -63,6 +63,7 @@ def test_the_weights_are_the_papers() -> None:
         log_size=torch.log(LABELS.size_px * 1.3)[:, None],
         log_Z=torch.log(torch.tensor([[230.0]])),
         origin_px=torch.tensor([[[44.0, 20.0]]]),
+        R_allo_k=perfect(LABELS, 1).R_allo_k.flip(-1),
         R_ego_k=perfect(LABELS, 1).R_ego_k.flip(-1),
     )
     logits = torch.randn(1, 8, 8, generator=torch.Generator().manual_seed(1))
@@ -71,7 +72,8 @@ def test_the_weights_are_the_papers() -> None:
     L_rot = terms["geodesic"] + 5 * terms["rotation_6d"]
     L_total = 50 * terms["heatmap"] + 4 * terms["size"] + 4 * L_trans + 25 * L_rot
     torch.testing.assert_close(total, L_total)
-    assert all(terms[name] > 0 for name in ("heatmap", "size", "depth", "planar", "geodesic"))
+    torch.testing.assert_close(terms["heatmap"], heatmap_loss(logits, heatmap_target(LABELS, 8, 8)))
+    assert all(terms[name] > 0 for name in ("size", "depth", "planar", "geodesic", "rotation_6d"))
 
 
 def test_windows_without_a_target_count_in_the_heatmap_alone() -> None:
@@ -101,7 +103,7 @@ def test_sigma_is_a_laplace_scale() -> None:
 
 
 def test_what_is_corrected_is_no_error_of_sigma_s_law() -> None:
-    """Depth e^0.2 times too far and corrected by it: (b = 0.1) 6 ln b alone; by half of it 0.1 / b more."""
+    """Depth e^0.2 times too far and corrected by it: (b = 0.1) 6 ln b alone; off by 0.1 either way 0.1 / b more."""
     log_Z = torch.log(torch.tensor([[200.0]])) + 0.2
 
     def cost(correction: float) -> float:
@@ -113,13 +115,14 @@ def test_what_is_corrected_is_no_error_of_sigma_s_law() -> None:
         return pose_terms(out, LABELS, LossConfig(uncertainty=1.0))["uncertainty"].item()
 
     assert cost(-0.2) == pytest.approx(6 * math.log(0.1), abs=5e-3)
-    assert cost(-0.1) == pytest.approx(6 * math.log(0.1) + 1.0, abs=5e-3)
+    for correction in (-0.1, -0.3):
+        assert cost(correction) == pytest.approx(6 * math.log(0.1) + 1.0, abs=5e-3)
 
 
 def test_the_batch_counts_targets_and_not_windows() -> None:
-    """Of two windows one holds a target: the mean is over that one."""
-    both = type(LABELS)(*(torch.cat([a, a]) for a in LABELS))._replace(present=torch.tensor([1.0, 0.0]))
-    out = perfect(both, tiny.config().model.hypotheses)
-    out = out._replace(log_Z=out.log_Z + 0.2)
-    _, terms = joint_loss(torch.zeros(2, 8, 8), out, None, both, PAPER)
-    assert terms["depth"].item() == pytest.approx(0.02, rel=1e-4)
+    """Of three windows two hold a target: the mean is over those."""
+    three = type(LABELS)(*(torch.cat([a, a, a]) for a in LABELS))._replace(present=torch.tensor([1.0, 0.0, 1.0]))
+    out = perfect(three, tiny.config().model.hypotheses)
+    out = out._replace(log_Z=out.log_Z + torch.tensor([[0.2], [0.5], [0.4]]))
+    _, terms = joint_loss(torch.zeros(3, 8, 8), out, None, three, PAPER)
+    assert terms["depth"].item() == pytest.approx((0.02 + 0.08) / 2, rel=1e-4)
