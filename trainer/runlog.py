@@ -33,13 +33,16 @@ SOURCES = ("trainer", "sim_replay", "msgs")
 def run_folder(out: Path, resume: bool, hold: bool = True) -> Iterator[None]:
     """A run's folder; `hold` locks it against a second run until this one ends.
 
-    Raises ConfigError if another run is using it, or if a new one would overwrite a run or weights.
+    Raises ConfigError if another run is using it, if a new one would overwrite a run or weights, or if there are only
+    weights to resume from.
     """
     with _alone_in(out) if hold and (not resume or out.is_dir()) else nullcontext():
-        if not resume and (out / RESUME_NAME).exists():
+        can_resume, weights = (out / RESUME_NAME).exists(), out / WEIGHTS_NAME
+        if can_resume and not resume:
             raise ConfigError(f"{out}: already contains a run; add --resume or give another --out")
-        if not resume and (out / WEIGHTS_NAME).exists():
-            raise ConfigError(f"{out}: already contains weights; give another --out")
+        if weights.exists() and not can_resume:
+            told = f"{out}: already contains weights, but no {RESUME_NAME} to continue from"
+            raise ConfigError(f"{told}; give another --out, and --start-from {weights} to begin with these")
         yield
 
 
@@ -97,10 +100,17 @@ def starts_of(out: Path) -> list[dict[str, Any]]:
 
 
 def _write_whole(path: Path, text: str) -> None:
-    """Write to a temporary file and rename, so that a crash leaves the last complete file."""
+    """Write to a temporary file and rename, so that a crash or a full disk leaves the last complete file.
+
+    Raises ConfigError.
+    """
     part = path.with_suffix(".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _is_of_the_past(line: str, samples: int) -> bool:
@@ -121,7 +131,7 @@ class RunLog:
         ConfigError if the folder cannot be written.
         """
         made_folder(out)
-        (out / "config.toml").write_text(config_text, encoding="utf-8")
+        _write_whole(out / "config.toml", config_text)
         digest = hashlib.sha256(config_text.encode()).hexdigest()
         starts = [*starts_of(out), {**start, "config_sha256": digest}]
         _write_whole(out / RUN_NAME, json.dumps({"starts": starts}, indent=2) + "\n")
