@@ -81,10 +81,14 @@ if [ ! -e "$stamp" ]; then
     *) say "no such use: $use"; exit 2 ;;
     esac
     free_mb=$(df -Pm . | awk 'NR == 2 { print $4 }')
-    needed_mb=$((needed_mb - $(du -sm .venv | cut -f1)))  # less what is there from before
+    there_mb=$(du -sm .venv | cut -f1)  # from before
+    needed_mb=$((needed_mb - there_mb))
     if [ "$free_mb" -lt "$needed_mb" ]; then
         say "$free_mb MB are free on the disk of $PWD and the packages for $use need $needed_mb: make room, then run this again"
         exit 2
+    fi
+    if [ "$use" = dev ] && [ "$free_mb" -lt $((6900 - there_mb)) ]; then
+        say "$free_mb MB are free on the disk of $PWD: too few if pip's index offers CUDA builds of torch (see README.md)"
     fi
     say "installing Python packages for $use"
     .venv/bin/python -m pip install -qq --disable-pip-version-check --constraint deploy/constraints.txt --editable ".[$extras]"

@@ -12,13 +12,13 @@ import pytest
 from sim_replay.faults.rig import can_mount
 
 ROOT = Path(__file__).parents[1]
-# A checkout on a disk of 20 MB, with a virtual environment that has pip and nothing else made.
+# A checkout on a small disk, with a virtual environment that has pip and nothing else made.
 ON_A_SMALL_DISK = """
-mount -t tmpfs -o size=20m none "$1"
+mount -t tmpfs -o size="$5" none "$1"
 mkdir -p "$1/.venv/bin" && printf '#!/bin/sh\nexec "%s" "$@"\n' "$2" >"$1/.venv/bin/python"
 chmod +x "$1/.venv/bin/python"
 cp -r "$3/deploy" "$3/pyproject.toml" "$1"
-sh "$1/deploy/bootstrap.sh" demo
+sh "$1/deploy/bootstrap.sh" "$4"
 status=$?
 ls -A "$1/.venv"
 exit $status
@@ -63,11 +63,25 @@ def test_packages_are_installed_again_where_an_upgrade_of_the_system_brought_ano
     assert done.returncode != 0
 
 
-def test_a_disk_too_small_for_the_packages_is_told_before_any_is_fetched(tmp_path: Path) -> None:
-    if not can_mount(tmp_path):
+def set_up_on_a_disk(folder: Path, size: str, use: str, python: str) -> subprocess.CompletedProcess[str]:
+    if not can_mount(folder):
         pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
     mounting = ["unshare", "--map-root-user", "--mount", "sh", "-c", ON_A_SMALL_DISK, "sh"]
-    done = subprocess.run([*mounting, tmp_path, sys.executable, ROOT], capture_output=True, text=True)
+    return subprocess.run([*mounting, folder, python, ROOT, use, size], capture_output=True, text=True)
+
+
+def test_a_disk_too_small_for_the_packages_is_told_before_any_is_fetched(tmp_path: Path) -> None:
+    done = set_up_on_a_disk(tmp_path, "20m", "demo", sys.executable)
     assert done.returncode == 2
     assert done.stdout.split() == ["bin"]
     assert f"MB are free on the disk of {tmp_path} and the packages for demo need" in done.stderr
+
+
+@pytest.mark.parametrize(("size", "enough"), [("5g", False), ("8g", True)])
+def test_a_disk_too_small_for_cuda_builds_is_told_of_before_any_is_fetched(
+    size: str, enough: bool, tmp_path: Path
+) -> None:
+    done = set_up_on_a_disk(tmp_path, size, "dev", "/bin/true")  # which installs nothing
+    assert done.returncode == 0
+    told = f"MB are free on the disk of {tmp_path}: too few if pip's index offers CUDA builds of torch (see README.md)\n"
+    assert (told in done.stderr) is not enough
