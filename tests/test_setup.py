@@ -83,5 +83,7 @@ def test_a_disk_too_small_for_cuda_builds_is_told_of_before_any_is_fetched(
 ) -> None:
     done = set_up_on_a_disk(tmp_path, size, "dev", "/bin/true")  # which installs nothing
     assert done.returncode == 0
-    told = f"MB are free on the disk of {tmp_path}: too few if pip's index offers CUDA builds of torch (see README.md)\n"
+    told = (
+        f"MB are free on the disk of {tmp_path}: too few if pip's index offers CUDA builds of torch (see README.md)\n"
+    )
     assert (told in done.stderr) is not enough
