@@ -19,7 +19,8 @@ POSITION_GATE_D2 = 49.0  # squared Mahalanobis distance, 3 degrees of freedom; w
 # only within this many times its apparent size. What is seen farther off may be another aircraft.
 OUT_OF_SIGHT_NS = 250_000_000
 SIZES_OFF_MAX = 5.0
-FRESH_NS = 150_000_000  # a target seen that recently is predicted well, whatever the camera does
+# A target seen that recently, or in the frame before, is predicted as well as can be, whatever the camera does.
+FRESH_NS = 150_000_000
 ROTATION_D2_MAX = 9.0  # limit of a rotation's cost: the network may be wrong, and aircraft roll
 
 
@@ -52,7 +53,7 @@ def associate(
             if d2 < POSITION_GATE_D2 and not elsewhere:
                 seen[i, j], cost[i, j] = one, d2
     contested = np.isfinite(cost)
-    fresh = np.array([view.time_ns - motion.seen_ns <= FRESH_NS for motion, *_ in targets], dtype=bool)
+    fresh = np.array([misses == 0 or view.time_ns - motion.seen_ns <= FRESH_NS for motion, _, misses in targets], bool)
     for (i, j), one in seen.items():
         if contested[i].sum() > 1 or contested[:, j].sum() > 1:
             d2 = rotation.disagreement_d2(targets[i][1], estimates[j], view)
