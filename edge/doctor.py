@@ -15,7 +15,15 @@ from edge.cameras import open_source
 from edge.cameras.capture import Capture
 from edge.cameras.source import EndOfStream
 from edge.config import ConfigFile
-from edge.doctor_links import CAMERA_REASONS, STARTING, is_starting, link_findings, running_daemon, told_reasons
+from edge.doctor_links import (
+    CAMERA_REASONS,
+    STARTING,
+    config_findings,
+    is_starting,
+    link_findings,
+    running_daemon,
+    told_reasons,
+)
 from edge.doctor_machine import machine_findings
 from edge.errors import InputError
 from edge.estimator.model import NOT_CALIBRATED, Model
@@ -67,7 +75,10 @@ def doctor(file: ConfigFile, as_json: bool) -> int:
 def findings(file: ConfigFile) -> Iterator[Finding]:
     """All checks in order; none raises because of what it finds."""
     yield from machine_findings(file.config)
-    running = running_daemon(file.config)
+    answer = running_daemon(file.config)
+    running = None if answer is None else answer["info"]
+    if answer is not None:
+        yield from config_findings(file.config, answer["config"])
     frame_ms: float | None = None
     for finding, rate_hz in _camera(file) if running is None else camera_as_told(running):
         frame_ms = 1e3 / rate_hz if rate_hz else frame_ms

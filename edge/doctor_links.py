@@ -20,6 +20,7 @@ import serial
 import zenoh
 
 from edge import clock
+from edge.addresses import no_passwords
 from edge.config import Config, MavlinkSettings
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
@@ -30,7 +31,7 @@ from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.links.signing import ahead_of_clock
 from edge.links.transports.medium import resolve
 from edge.requests import RequestQueue
-from edge.status import ask, loopback_endpoints
+from edge.status import ANY, ask, loopback_endpoints
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
 from msgs.session import client_config, peer_config
@@ -41,8 +42,10 @@ ADVICE_AUTOPILOT = (
     "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
 )
 ADVICE_RECORDER = (
-    "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, docs/install.md"
+    "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, and a restart "
+    "if the disk was read-only when it started, docs/install.md"
 )
+ADVICE_CONFIG = "restart it (`sudo systemctl restart uavpose-edge`); SIGHUP is enough for [model]"
 STARTING = ("the daemon is still starting", "run doctor again in a few seconds")
 ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
 HEARING_S = 4.0
@@ -92,13 +95,31 @@ def told_reasons(running: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def running_daemon(config: Config) -> Mapping[str, Any] | None:
-    """`info` of the daemon that runs with this configuration; None if there is none."""
+    """`info`, `config` and `model` of the daemon that listens where this configuration says, whatever its name; None if
+    there is none."""
     tls = config.zenoh.tls.files() if config.zenoh.tls is not None else None
     for endpoint in loopback_endpoints(config.zenoh) if config.zenoh.enabled else []:
-        if (answer := ask(endpoint, config.vehicle.name, tls)) is not None:
-            info: Mapping[str, Any] = answer["info"]
-            return info
+        try:
+            answer = ask(endpoint, ANY, tls)
+        except InputError:  # several answer, as at a router
+            answer = ask(endpoint, config.vehicle.name, tls)
+        if answer is not None:
+            return answer
     return None
+
+
+def config_findings(config: Config, running: Mapping[str, Any]) -> Iterator[Finding]:
+    """Whether the running daemon uses other values than the file has now. `running`: its `config`."""
+    now, used = no_passwords(config.model_dump(mode="json")), running["config"]
+    keys = [
+        f"[{section}] {key}"
+        for section, values in now.items()
+        for key, value in values.items()
+        if used.get(section, {}).get(key) != value
+    ]
+    if keys:
+        says = f"the daemon runs as {used['vehicle']['name']}, with other values than the file of {', '.join(keys)}"
+        yield poor("config", says, ADVICE_CONFIG)
 
 
 def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:

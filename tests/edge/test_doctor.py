@@ -229,6 +229,20 @@ def test_what_the_running_daemon_says_of_its_links_is_taken(
     assert "autopilot" in found["daemon"]["advice"]
 
 
+def test_a_daemon_that_was_started_with_other_values_is_told_by_its_name(
+    cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
+) -> None:
+    text = toml(swaying, toy_model, free_port())
+    with flying(tmp_path, text):
+        _, as_started = findings(cli, tmp_path, text)
+        code, found = findings(cli, tmp_path, f'[vehicle]\nname = "uav2"\n{text.replace("fps = 10", "fps = 11")}')
+    assert (code, found["config"]["verdict"]) == (0, "poor")
+    assert "runs as uav1, with other values than the file of [vehicle] name, [camera] fps" in found["config"]["says"]
+    assert "restart" in found["config"]["advice"]
+    assert "reported by the running daemon" in found["camera"]["says"]
+    assert "config" not in as_started
+
+
 def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
     (tmp_path / "config.toml").write_text(toml(swaying, toy_model, free_port()))
     file = load_config(tmp_path / "config.toml")
