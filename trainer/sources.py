@@ -55,9 +55,14 @@ def _open_window_sampler(config: DataConfig, seed: int, size_px: int, judging: b
 
 def validated_from(config: DataConfig, counts: Sequence[int]) -> dict[str, NDArray[np.bool_]]:
     """Which validation windows, in consecutive batches of `counts`, come from where: masks [N] by the dataset's folder
-    or RENDERED. Empty if all come from one place."""
+    (its whole path, if the name is another's too) or RENDERED. Empty if all come from one place."""
     drawn = _shares(config, judging=True)
-    names = [RENDERED if source is None else source.path.resolve().name for source, _ in drawn]
+    paths = [None if source is None else source.path.resolve() for source, _ in drawn]
+    names = [RENDERED if path is None else path.name for path in paths]
+    names = [
+        name if path is None or names.count(name) == 1 else str(path.relative_to(path.anchor))
+        for name, path in zip(names, paths, strict=True)
+    ]
     if len(set(names)) < 2:
         return {}
     whose: list[str] = []

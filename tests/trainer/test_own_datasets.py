@@ -96,6 +96,21 @@ def test_validation_windows_are_also_measured_by_where_they_come_from(
     assert validated_from(config.data.model_copy(update={"datasets": []}), [16]) == {}
 
 
+def test_sources_of_one_name_are_measured_each_by_itself(tmp_path: Path) -> None:
+    depths_m = {"rendered": 150.0, "here/birds": 200.0, "there/birds": 250.0}
+    for name, depth_m in depths_m.items():
+        for split in ("train", "val"):
+            discs(tmp_path / name / split / "000001", 1500.0, (depth_m,))
+    sources = [DatasetSource(path=tmp_path / name, share=0.25, validation_split="val") for name in depths_m]
+    data = tiny.config().data.model_copy(update={"datasets": sources})
+    Z_m = window_sampler(data, data.validation_seed, 64)().batch(0, 16).t_cam_target_m[:, 2]
+    masks = validated_from(data, [16])
+    assert masks.keys() == {"rendered", *(str(tmp_path / name)[1:] for name in depths_m)}
+    for name, depth_m in depths_m.items():
+        np.testing.assert_array_equal(masks[str(tmp_path / name)[1:]], Z_m == depth_m)
+    np.testing.assert_array_equal(masks["rendered"], ~np.isin(Z_m, list(depths_m.values())))
+
+
 def test_rendered_windows_are_rendered_for_a_checkpoint_of_a_dataset_that_is_no_longer_there(tmp_path: Path) -> None:
     text = on_dataset(tmp_path / "moved")
     assert parse_config(text, "own.toml").data.rendered_share == 0.0
