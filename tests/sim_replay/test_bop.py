@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -151,8 +152,14 @@ def test_models_come_back_in_metres(tmp_path: Path) -> None:
     model = read_models(tmp_path, ModelFrames())[2]
     assert model.diameter_m == pytest.approx(pdist(mesh.vertices_m.astype(float)).max(), abs=1e-6)
     np.testing.assert_allclose(model.size_m, np.ptp(points, axis=0), atol=1e-5)
+    np.testing.assert_allclose(model.points_m, points, atol=1e-5)
     raw = json.loads((tmp_path / "models" / "models_info.json").read_text())["2"]
     assert raw["size_y"] == pytest.approx(1000.0 * np.ptp(points[:, 1]), abs=1e-2)
+    (tmp_path / "models" / "obj_000002.ply").unlink()
+    bounds = read_models(tmp_path, ModelFrames())[2].points_m
+    assert bounds is not None
+    corners = sorted(product(*zip(points.min(axis=0), points.max(axis=0), strict=True)))
+    np.testing.assert_allclose(sorted(map(tuple, bounds)), corners, atol=1e-5)
 
 
 @given(st.integers(2, 200), st.sampled_from([(1, 1, 1), (10, 0.1, 0.1), (5, 8, 0), (0, 0, 0)]), st.integers(0, 99))
