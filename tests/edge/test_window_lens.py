@@ -193,6 +193,36 @@ def test_a_lens_is_looked_through_as_far_as_what_is_farther_out_is_shown_farther
     assert grows[1002:].any() != folds
 
 
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        (-0.3, 0.0, 0.0, 0.0, 0.0),  # no ray comes to a pixel beyond the circle
+        (-0.28, 0.03, 0.0, 0.0, 0.0),  # rays from beyond the fold do
+    ],
+)
+def test_a_lens_shows_what_lies_in_the_circle_that_its_rays_fill_before_they_fold(
+    distortion: tuple[float, ...],
+) -> None:
+    camera = Camera(np.array([[900.0, 0, 960], [0, 900.0, 540], [0, 0, 1]]), SIZE_WH, distortion)
+    on_axis = np.stack([np.linspace(0.0, 4.0, 4001), np.zeros(4001)], axis=-1)
+    reach_px = camera.bend(on_axis)[:, 0] - 960
+    circle_px = reach_px[np.argmax(np.diff(reach_px) < 0)]
+    grid = np.stack(np.meshgrid(np.arange(0.0, 1920, 4), np.arange(0.0, 1080, 4)), axis=-1)
+    away_px = np.linalg.norm(grid - [960, 540], axis=-1)
+    shown = camera.lens.shows(grid)
+    assert shown[away_px < circle_px - 3].all()
+    assert not shown[away_px > circle_px + 1].any()
+    assert (away_px > circle_px + 1).any()
+
+
+def test_a_pixel_that_a_lens_shows_is_where_its_ray_comes_to() -> None:
+    camera = Camera(np.array([[900.0, 0, 960], [0, 900.0, 540], [0, 0, 1]]), SIZE_WH, (-0.4, 0.0, 0.01, -0.01, 0.0))
+    grid = np.stack(np.meshgrid(np.arange(0.0, 1920, 4), np.arange(0.0, 1080, 4)), axis=-1)
+    shown = grid[camera.lens.shows(grid)]
+    assert 0.3 < len(shown) / (480 * 270) < 0.6
+    np.testing.assert_allclose(camera.bend(camera.lens.rays(camera.lens.to_pinhole(shown))[:, :2]), shown, atol=0.5)
+
+
 def test_what_is_made_smaller_through_a_lens_is_averaged_as_without_one() -> None:
     """Sampled at points, the grain of a sensor would be as coarse as the aircraft."""
     grain = np.random.default_rng(5).integers(0, 255, (1080, 1920, 3), dtype=np.uint8)
