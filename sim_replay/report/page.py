@@ -14,6 +14,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
+from edge.config import MavlinkSettings
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.play import Recording
 from sim_replay.report import plots
@@ -53,6 +54,7 @@ def report_html(sequence: PlayedSequence, result: Result, score: dict[str, Any],
         bands={name: band for name, band in score["by_range"].items() if band["targets"]},
         frames=frames,
         fps=fps,
+        mavlink_hz=MavlinkSettings().target_relative_rate_hz,
         svg={name: Markup(text) for name, text in svg.items()},
         video=video,
         poster=_poster(drawn / "overlay.png"),

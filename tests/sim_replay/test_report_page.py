@@ -256,6 +256,15 @@ def test_frames_that_the_machine_dropped_are_told_apart_from_misses_of_the_model
     assert drops_told(recorded, score) is None  # they were never recorded
 
 
+@pytest.mark.parametrize(("fps", "told"), [(50.0, 0), (60.0, 1)])
+def test_frames_that_mavlink_is_too_slow_for_are_told_apart_from_misses_of_the_daemon(
+    fps: float, told: int, flown: PlayedSequence, tmp_path: Path
+) -> None:
+    faster = replace(flown, fps=fps)
+    write_report(faster, RecordedFlight(flown.scene.folder, MODEL, recording(flown, {0, 1})), tmp_path, lambda: None)
+    assert (tmp_path / "report.html").read_text().count("is sent poses at most 50 times per second") == told
+
+
 def test_a_report_says_where_no_rotation_was_told(flown: PlayedSequence, tmp_path: Path) -> None:
     unturned = recording(flown, {0, 1, 2, 3}, rotation_known=False)
     write_report(flown, RecordedFlight(flown.scene.folder, MODEL, unturned), tmp_path, lambda: None)
