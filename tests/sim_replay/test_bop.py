@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 from itertools import product
 from pathlib import Path
 
@@ -169,6 +170,14 @@ def test_the_diameter_is_exact_for_any_cloud_of_points(count: int, size: tuple[f
     assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.parametrize("seed", [0, 17, 22])
+def test_the_diameter_is_exact_for_more_points_than_are_compared_at_once(seed: int) -> None:
+    """Of a sphere none can be left out; its farthest two lie in both blocks of 2048, in the last or in the first."""
+    points = np.random.default_rng(seed).normal(size=(2600, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    assert largest_distance(points) == pytest.approx(pdist(points).max(), rel=1e-12)
+
+
 def test_ascii_models_of_others_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "obj_000001.ply"
     path.write_text(
@@ -196,6 +205,62 @@ def test_binary_models_of_either_byte_order_and_any_number_type_can_be_read(tmp_
         path.write_bytes(head.encode() + rows.tobytes()[:-4])
         with pytest.raises(BopError, match="vertices cannot be read"):
             read_ply_vertices_m(path)
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize(
+    ("names", "code"),
+    [
+        (("char", "int8"), "b"),
+        (("uchar", "uint8"), "B"),
+        (("short", "int16"), "h"),
+        (("ushort", "uint16"), "H"),
+        (("int", "int32"), "i"),
+        (("uint", "uint32"), "I"),
+        (("float", "float32"), "f"),
+        (("double", "float64"), "d"),
+    ],
+)
+def test_either_name_of_a_number_type_in_a_binary_model_is_known(
+    tmp_path: Path, names: tuple[str, str], code: str, order: str
+) -> None:
+    kind = {"<": "little", ">": "big"}[order]
+    for name in names:
+        head = f"ply\nformat binary_{kind}_endian 1.0\nelement vertex 2\nproperty {name} x\n"
+        head += f"property float y\nproperty {name} z\nelement face 0\nend_header\n"
+        rows = struct.pack(f"{order}{code}f{code}", 100, -2.5, 3) + struct.pack(f"{order}{code}f{code}", 4, 0.5, 60)
+        (tmp_path / "obj_000001.ply").write_bytes(head.encode() + rows)
+        points = read_ply_vertices_m(tmp_path / "obj_000001.ply")
+        np.testing.assert_allclose(points, [[0.1, -0.0025, 0.003], [0.004, 0.0005, 0.06]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("element vertex 2", "element camera 1\nelement vertex 2", "its first element is not 'vertex'"),
+        ("element vertex 2", "comment nothing", "its first element is not 'vertex'"),
+        ("element vertex 2", "element vertex", "its vertices cannot be read"),
+        ("element vertex 2", "element vertex 3", "its vertices cannot be read"),
+        ("element vertex 2", "element vertex 0", "it holds no vertices, or some that are not finite"),
+        ("4 5 6", "4 5 inf", "it holds no vertices, or some that are not finite"),
+        ("4 5 6", "4 5", "its vertices cannot be read"),
+        ("property float z", "property float w", "its vertices cannot be read"),
+        ("format ascii", "format morse", "its vertices cannot be read"),
+        ("end_header", "the end", "is not a PLY file"),
+        ("format ascii 1.0", "comment ascii", "is not a PLY file"),
+    ],
+)
+def test_a_broken_model_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    path = tmp_path / "obj_000001.ply"
+    path.write_text((head + "1 2 3\n4 5 6\n").replace(old, new))
+    with pytest.raises(BopError, match=rf"obj_000001\.ply:? {said}"):
+        read_ply_vertices_m(path)
+
+
+def test_a_model_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BopError, match=r"obj_000001\.ply cannot be read: No such file"):
+        read_ply_vertices_m(tmp_path / "obj_000001.ply")
 
 
 def test_a_lens_comes_back_and_a_pinhole_camera_has_none(tmp_path: Path) -> None:

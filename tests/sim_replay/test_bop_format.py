@@ -7,6 +7,7 @@ thodan/bop_toolkit docs/bop_datasets_format.md gives them.
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -92,12 +93,29 @@ def by_the_document(root: Path) -> list[dict[str, Any]]:
     return objects
 
 
-def vertices_mm(root: Path) -> np.ndarray:
-    """x, y, z of a binary PLY whose vertices are six floats, as its header says."""
+def ply(root: Path) -> tuple[np.ndarray, list[tuple[int, ...]]]:
+    """Vertices [V, 6] (x, y, z and normal) and faces of a binary PLY, laid out as its header says."""
     head, body = (root / "models" / f"obj_{OBJECT_ID:06d}.ply").read_bytes().split(b"end_header\n", 1)
-    assert b"format binary_little_endian 1.0" in head
-    assert head.count(b"property float") == 6
-    return np.frombuffer(body, "<f4", 4 * 6).reshape(4, 6)[:, :3].astype(float)
+    assert head.decode().splitlines() == [
+        "ply", "format binary_little_endian 1.0", "element vertex 4",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        "element face 4", "property list uchar int vertex_indices",
+    ]  # fmt: skip
+    vertices, at, faces = np.frombuffer(body, "<f4", 4 * 6).reshape(4, 6), 4 * 6 * 4, []
+    while at < len(body):
+        faces.append(struct.unpack_from(f"<{body[at]}i", body, at + 1))
+        at += 1 + 4 * body[at]
+    return vertices.astype(float), faces
+
+
+def vertices_mm(root: Path) -> np.ndarray:
+    return ply(root)[0][:, :3].copy()
+
+
+def test_the_model_file_holds_the_mesh(written: Path) -> None:
+    vertices, faces = ply(written)
+    np.testing.assert_allclose(vertices, np.hstack([1000.0 * VERTICES_M, dart().normals]), rtol=1e-6)
+    assert faces == [tuple(face) for face in FACES.tolist()]
 
 
 def test_the_model_projected_by_opencv_lies_on_its_masks_and_boxes(written: Path) -> None:
