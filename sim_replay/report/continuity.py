@@ -23,9 +23,10 @@ def continuity(matches: Sequence[Match], fps: float, unrecorded: Collection[int]
         unrecorded: Frames without an image, in which no target could be seen: nothing begins or ends there.
 
     Returns:
-        JSON's types. `time_to_acquire_s` counts from a target's first visible frame to the first with a pose of it;
-        `time_to_reacquire_s` from the first frame without one, or from where it came into view again. A target that was
-        not found (again) before it left counts as `never_acquired` or `never_reacquired` and in no time.
+        JSON's types. `time_to_acquire_s` is the time for which a target was in view before the first frame with a pose
+        of it; `time_to_reacquire_s` counts from the first frame without one, or from where it came into view again. A
+        target that was never found counts as `never_acquired`, one that was not found again before it left as
+        `never_reacquired`, and in no time.
     """
     by_target: dict[tuple[int, int], list[Match]] = {}
     for match in sorted(matches, key=lambda match: match.truth.frame):
@@ -67,7 +68,9 @@ def target_continuity(seen: Sequence[Match], fps: float, unrecorded: Collection[
                 "while_in_view": in_view[start],
             }
         )
-    acquired = None if first is None else (frames[first] - frames[0]) / fps
+    # Out of view it could not be found: of a view, the last frame lasts as long as any.
+    lasted = [frames[k] - frames[k - 1] if in_view[k] else 1 for k in range(1, len(frames))]
+    acquired = None if first is None else sum(lasted[:first]) / fps
     return {
         "target": seen[0].truth.airframe_label,
         "instance": seen[0].truth.instance,

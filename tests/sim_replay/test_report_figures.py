@@ -73,6 +73,13 @@ def test_a_loss_that_ends_out_of_view_is_regained_by_nothing_that_comes_after() 
     assert (held["fragments"], held["reacquired"], held["never_reacquired"]) == (0, 1, 1)
 
 
+def test_the_time_to_acquire_is_that_in_view() -> None:
+    """Missed in two frames, out of view for twenty, found in the second frame after that."""
+    held = continuity(matches(f"--{20 * ' '}-00"), FPS)
+    assert held["time_to_acquire_s"]["max"] == pytest.approx(0.3)
+    assert (held["never_acquired"], held["reacquired"], held["never_reacquired"]) == (0, 0, 0)
+
+
 def test_figures_are_over_all_targets_each_from_when_it_came_into_view() -> None:
     late, at_once, last = "--0-0", "1-1", "-----2"
     held = continuity(
