@@ -1,4 +1,8 @@
-"""Small offsets on the WGS 84 ellipsoid, flat-earth: error below 3 m at 2 km, below 75 degrees of latitude."""
+"""Small offsets on the WGS 84 ellipsoid, flat-earth: error below 3 m at 2 km, below 75 degrees of latitude.
+
+Towards the poles, meridians converge within the offset: half a kilometre from an own ship that is 2 km from the origin,
+the error is 2 m at 85 degrees, 9 m at 89, a kilometre at 89.999.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from numpy.typing import ArrayLike
 
 SEMI_MAJOR_M = 6_378_137.0
 FLATTENING = 1.0 / 298.257223563
+LATITUDE_MAX_DEG = 85.0  # beyond it, places computed here are not fit to be sent
 ORIGIN_ROUNDS = 2  # iterations; error below a millimetre at 100 km
 
 

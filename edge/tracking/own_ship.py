@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edge.tracking.geodesy import lat_lon_alt_from_ned, origin_of_ned
+from edge.tracking.geodesy import LATITUDE_MAX_DEG, lat_lon_alt_from_ned, origin_of_ned
 from edge.types import Array, OwnShip
 from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so3_log
 
@@ -197,6 +197,8 @@ class OwnShipBuffer:
         if self._global is None:
             return None
         place, age_ns = self._global.lat_lon_alt, time_ns - self._global.time_ns
+        if abs(place[0]) > LATITUDE_MAX_DEG:
+            return None
         if not in_local_ned:
             if self._in_local_ned and not _goes_on(self._positions, time_ns):
                 return None

@@ -151,6 +151,21 @@ def test_far_from_the_origin_a_target_lies_where_it_is_beside_the_own_ship(lat: 
     np.testing.assert_allclose(ned_from_lat_lon_alt(own, told), [300.0, -200.0, -50.0], atol=1.0)
 
 
+@pytest.mark.parametrize("local", [False, True])
+@pytest.mark.parametrize("lat", [84.9, 85.1, -85.1, 89.9999999, -90.0])
+def test_by_a_pole_no_place_on_the_globe_is_told(lat: float, local: bool) -> None:
+    buffer = OwnShipBuffer()
+    for k in range(3):
+        buffer.add_attitude(k * 20 * MS, [1, 0, 0, 0], np.zeros(3))
+        if local:
+            buffer.add_position(k * 20 * MS, [2_000.0, 0.0, -100.0], np.zeros(3))
+    buffer.add_global(20 * MS, (lat, 8.0, 100.0), (0.0, 0.0, 0.0))
+    own_ship = buffer.at(40 * MS)
+    assert own_ship is not None
+    assert (own_ship.t_ned_body_m is not None) == local
+    assert (own_ship.lat_lon_alt is None) == (abs(lat) > 85.0)
+
+
 def test_a_place_on_the_globe_is_not_told_by_one_of_long_ago() -> None:
     buffer = OwnShipBuffer()
     buffer.add_global(0, (47.0, 8.0, 400.0), (0.0, 0.0, 0.0))
