@@ -231,6 +231,12 @@ def card(page: str, label: str) -> str:
     return re.sub(r"(<[^>]*>)+", " ", f"{found[1]}: {found[2]}")
 
 
+def test_a_target_that_is_held_throughout_is_without_a_gap(flown: PlayedSequence, tmp_path: Path) -> None:
+    made = recording(flown, {0, 1, 2, 3})
+    write_report(flown, RecordedFlight(flown.scene.folder, MODEL, made), tmp_path, lambda: None)
+    assert card((tmp_path / "report.html").read_text(), "Gaps").startswith("good:  0 ")
+
+
 def test_ranges_that_are_too_far_and_too_near_are_not_right_on_average(flown: PlayedSequence, tmp_path: Path) -> None:
     made = recording(flown, {0, 1, 2, 3})
     for k, pose in enumerate(made.poses):
@@ -288,6 +294,8 @@ def test_a_flight_that_brought_nothing_has_a_report_and_stills_of_too_large_a_fi
     assert "<video" not in page
     assert page.count('alt="still ') == moments.STILLS
     assert "no pose received" in page
+    assert card(page, "Time to acquire").startswith("bad: ")
+    assert card(page, "Gaps").startswith(":  0 "), "what was never held is no good"
     assert "nan" not in page.split("<details>")[0].split("</svg>")[-1].lower()
 
 
@@ -304,7 +312,9 @@ def test_an_empty_sky_is_scored_by_the_poses_received_in_it(
     assert re.search(r"poses that match no target +│ 2 ", capsys.readouterr().out)
     score = json.loads((folder / "score.json").read_text())
     assert (score["overall"]["false_poses"], score["overall"]["false_positives_per_1000"]) == (2, 400.0)
-    assert "0 views, 2 false poses" in (folder / "report.html").read_text()
+    page = (folder / "report.html").read_text()
+    assert "0 views, 2 false poses" in page
+    assert card(page, "Gaps").startswith(":  0 ")
     labels.unlink()
     assert main(["score", str(folder)]) == 2
     assert "there is no ground truth to score against" in capsys.readouterr().err
