@@ -159,9 +159,10 @@ def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:
 
 
 def _places(target: Sequence[Match], scene: SceneTruth, in_ned: bool) -> tuple[Array, Array]:
-    """[N, 3] true and received positions, NaN where no pose was received."""
-    true, seen = (np.full((len(target), 3), np.nan) for _ in range(2))
-    for k, match in enumerate(target):
+    """[N, 3] true and received positions of each recorded frame, NaN out of view and where no pose was received."""
+    recorded = np.setdiff1d(np.arange(len(scene.images)), list(scene.unrecorded))
+    true, seen = (np.full((len(recorded), 3), np.nan) for _ in range(2))
+    for k, match in zip(np.searchsorted(recorded, [m.truth.frame for m in target]), target, strict=True):
         camera = scene.cameras_world[match.truth.frame]
         R, t_m = camera if in_ned and camera is not None else (np.eye(3), np.zeros(3))
         true[k] = R @ match.truth.t_cam_target_m + t_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,9 @@ from scipy.stats import chi2
 
 from msgs.geometry import so3_exp
 from sim_replay.evaluation.instances import instances
+from sim_replay.golden.run import CASES
+from sim_replay.ground_truth import read_scene_truth
+from sim_replay.report import plots
 from sim_replay.report.continuity import continuity
 from sim_replay.report.peer import (
     CHI2_95,
@@ -78,6 +82,17 @@ def test_the_time_to_acquire_is_that_in_view() -> None:
     held = continuity(matches(f"--{20 * ' '}-00"), FPS)
     assert held["time_to_acquire_s"]["max"] == pytest.approx(0.3)
     assert (held["never_acquired"], held["reacquired"], held["never_reacquired"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("unrecorded", "lines"), [(range(0), 2), (range(11, 36), 1)])
+def test_no_line_is_drawn_where_a_target_flew_out_of_view(unrecorded: range, lines: int) -> None:
+    """It is from frame 11 to 35. Over frames that no camera recorded, lines run on."""
+    scene = replace(read_scene_truth(CASES["away_and_back"].folder), unrecorded=frozenset(unrecorded))
+    held = [Match(truth, truth) for truth in scene.truths if truth.visible]
+    svg = plots.trajectory(held, scene)
+    for color in (plots.TRUTH_COLOR, plots.ESTIMATE_COLOR):
+        drawn = re.findall(rf'<path d="([^"]*)" clip-path[^>]*stroke: {color}', svg)
+        assert [path.count("M") for path in drawn] == [lines, lines], "in 3-D and from above"
 
 
 def test_figures_are_over_all_targets_each_from_when_it_came_into_view() -> None:
