@@ -184,10 +184,12 @@ def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
     """COCO's uncompressed run lengths: alternately unset and set, starting with unset, column by column."""
     try:
         height, width = entry["size"]
+        if sum(entry["counts"]) != height * width:  # before so many pixels are made
+            raise ValueError("another number of pixels")
         counts = np.asarray(entry["counts"], dtype=np.int64)
         flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
         return flat.reshape(width, height).T
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise BopError(f"{path}: '{target_index}' does not hold 'size' and 'counts' of one mask") from error
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sim_replay.bop import DISTORTION_KEY, BopError, read_scene
+from sim_replay.bop import DISTORTION_KEY, BopError, find_scenes, read_scene
 from sim_replay.bop.scene import picture_size_wh
 from sim_replay.cli import main
 from sim_replay.datasets import open_dataset
@@ -20,6 +20,7 @@ from tests.sim_replay.foreign import (
     BOX_EDGES,
     SIZE_WH,
     UNIT,
+    K,
     silhouette,
     write_json,
     write_models_info,
@@ -40,6 +41,50 @@ def seen(scene: Path, **info: Any) -> Any:
 
 def placed(scene: Path, *t_mm: float) -> None:
     write_json(scene / "scene_gt.json", {"0": [{"obj_id": 1, "cam_R_m2c": UNIT, "cam_t_m2c": t_mm}]})
+
+
+def test_pictures_come_by_their_number_however_the_index_lists_them(scene: Path) -> None:
+    cameras = {
+        key: {"cam_K": [float(f), 0, 79.5, 0, 1200.0, 59.5, 0, 0, 1]} for f, key in ((3, "10"), (1, "2"), (2, "9"))
+    }
+    write_json(scene / "scene_camera.json", cameras)
+    assert [(frame.image_id, frame.K[0, 0]) for frame in read_scene(scene).frames] == [(2, 1.0), (9, 2.0), (10, 3.0)]
+
+
+def test_a_scene_with_its_own_cameras_does_not_take_the_datasets(scene: Path) -> None:
+    write_json(scene.parents[1] / "camera.json", {"fx": 9.0, "fy": 9.0, "cx": 9.0, "cy": 9.0})
+    assert read_scene(scene).frames[0].K.ravel().tolist() == K
+
+
+def test_of_two_pictures_of_one_number_the_coloured_is_used_and_the_first_suffix(scene: Path) -> None:
+    for name, value in (("gray/000000.jpg", 10), ("rgb/000000.png", 50), ("rgb/000000.bmp", 90)):
+        (scene / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(scene / name), np.full((120, 160, 3), value, np.uint8))
+    opened = read_scene(scene)
+    assert opened.image_path(opened.frames[0]) == scene / "rgb" / "000000.bmp"
+    assert opened.image_bgr(opened.frames[0]).max() == 90
+    assert (opened.pictures_without_camera, len(opened.pictured)) == (0, 1)
+
+
+def test_other_files_in_an_imagewise_folder_are_passed_over_and_broken_masks_are_named(tmp_path: Path) -> None:
+    key = "000004_000007"
+    for name in (f"{key}.camera.json", "notes.camera.json", f"{key}.gt.json"):
+        content = {"cam_K": K} if name.startswith(key) else {}
+        write_json(tmp_path / name, [] if "gt" in name else content)
+    for suffix, value in ((".rgb.png", 90), (".rgb.jpg", 50), (".rgb.txt", 0)):
+        cv2.imwrite(str(tmp_path / f"{key}.png"), np.full((120, 160, 3), value, np.uint8))
+        (tmp_path / f"{key}.png").rename(tmp_path / f"{key}{suffix}")
+    (scene,) = find_scenes(tmp_path)
+    (frame,) = scene.pictured
+    assert (scene.scene_id, frame.image_id, scene.image_path(frame).suffix) == (4, 7, ".jpg")
+    assert scene.mask(frame, 0) is None
+    counts = ([5], [10**13], [10**30], [-(10**30), 10**30 + 19200], [19205, -5], [1.5, 19198.5], "0dV2", None)
+    broken_masks: list[Any] = [{"size": [120, 160]}, {"size": 1, "counts": [1]}, [1]]
+    for broken in [*broken_masks, *({"size": [120, 160], "counts": one} for one in counts)]:
+        write_json(tmp_path / f"{key}.mask_visib.json", {"1": broken})
+        assert scene.mask(frame, 0) is None
+        with pytest.raises(BopError, match=r"mask_visib\.json: '1' does not hold 'size' and 'counts' of one mask"):
+            scene.mask(frame, 1)
 
 
 def test_a_side_of_nil_is_one_pixel_where_pixels_are_counted(scene: Path) -> None:
