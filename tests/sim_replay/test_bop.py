@@ -134,6 +134,25 @@ def test_broken_files_are_named_with_their_key(tmp_path: Path, name: str, old: s
         read_scene(folder)
 
 
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[]", "does not hold an object of pictures or models"),
+        (b"\xff\xfe{", "cannot be read: not UTF-8 text"),
+        (None, "cannot be read: Is a directory"),
+    ],
+)
+def test_files_of_something_else_are_named(tmp_path: Path, content: bytes | None, said: str) -> None:
+    path = _write(tmp_path, _frame()) / "scene_camera.json"
+    path.unlink()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(BopError, match=rf"scene_camera\.json {said}"):
+        read_scene(tmp_path)
+
+
 def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(BopError, match=r"scene_camera\.json is missing"):
         read_scene(tmp_path)

@@ -35,7 +35,7 @@ quality = { ordinary = 1 }
 FLEET = range(len(AIRFRAMES))
 
 
-def _fly(folder: Path, *more: str) -> Path:
+def fly(folder: Path, *more: str) -> Path:
     (folder / "flown.toml").write_text(PRESET)
     words = ["generate", "--preset", str(folder / "flown.toml"), "--out", str(folder / "data"), "--seed", "3"]
     assert main([*words, "--labels-only", *more]) == 0
@@ -44,7 +44,7 @@ def _fly(folder: Path, *more: str) -> Path:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _fly(tmp_path_factory.mktemp("flown"), "--undistorted")
+    return fly(tmp_path_factory.mktemp("flown"), "--undistorted")
 
 
 def _frames(dataset: Path) -> list[BopFrame]:
@@ -129,7 +129,7 @@ def test_what_cannot_be_drawn_anew_is_refused(flown: Path, tmp_path: Path) -> No
     with pytest.raises(BopError, match="shows one of the airframes"):
         read_flown([flown], [airframe_id("glider")])
     with pytest.raises(BopError, match="--undistorted"):
-        read_flown([_fly(tmp_path)], FLEET)
+        read_flown([fly(tmp_path)], FLEET)
     changed = {
         "scene_gt.json": (r'"obj_id": \d+', '"obj_id": 99', "obj_id 99"),
         "scene_camera.json": (r'"cam_R_w2c"', '"elsewhere"', "cam_R_w2c"),

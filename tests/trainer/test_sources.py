@@ -1,0 +1,60 @@
+"""What training windows are drawn from, as the configuration says, and that none of it is in what is judged by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from sim_replay.bop import find_scenes
+from tests.sim_replay.foreign import T_MM, write_models_info, write_scene
+from tests.sim_replay.test_flown import fly
+from trainer.config import DataConfig
+from trainer.data import TrainingBatch
+from trainer.refine import fleet_size
+from trainer.sources import refinement_sampler, window_sampler
+
+DATA = tiny.config().data.model_copy(update={"empty_share": 0.0})
+
+
+@pytest.mark.parametrize(("seed", "held_out", "invents"), [(5, False, True), (5, True, False), (4, False, False)])
+def test_training_draws_its_share_of_invented_aircraft_and_the_judge_none(
+    seed: int, held_out: bool, invents: bool
+) -> None:
+    """4 is the seed of the validation windows."""
+    data = DATA.model_copy(update={"invented_share": 0.5})
+    batch = window_sampler(data, seed, 64, held_out)().batch(0, 30)
+    assert 0.2 < np.mean(batch.airframe_id >= fleet_size()) < 0.8 if invents else batch.airframe_id.max() < fleet_size()
+
+
+def test_training_shows_its_share_of_flown_frames_and_the_judge_none(tmp_path: Path) -> None:
+    dataset = fly(tmp_path, "--undistorted")
+    flown_m = np.array([frame.targets[0].t_cam_target_m for scene in find_scenes(dataset) for frame in scene.frames])
+    data = DATA.model_copy(update={"flown": [dataset], "flown_share": 0.5, "acquire_share": 0.0})
+    samplers = {
+        "train": window_sampler(data, 5, 64),
+        "refine": refinement_sampler(data, 5, 64, 0.0),
+        "validate": window_sampler(data, data.validation_seed, 64),
+    }
+    for purpose, sampler in samplers.items():
+        t_m = sampler().batch(0, 16).t_cam_target_m
+        of_flight = np.abs(t_m[:, None] - flown_m).max(axis=-1).min(axis=-1) < 1e-3
+        assert of_flight.any() == (purpose != "validate"), purpose
+        assert not of_flight.all(), purpose
+
+
+def test_datasets_to_refine_on_share_alike_in_what_they_are_given(tmp_path: Path) -> None:
+    """Half of 24 windows are of two datasets, of which one shows its targets twice as far."""
+    depths_m = (T_MM[2] / 1e3, 2 * T_MM[2] / 1e3)
+    for name, depth_m in zip(("near", "far"), depths_m, strict=True):
+        write_models_info(tmp_path / name)
+        scene = write_scene(tmp_path / name / "train" / "000000")
+        text = (scene / "scene_gt.json").read_text()
+        (scene / "scene_gt.json").write_text(text.replace(str(T_MM[2]), str(1e3 * depth_m)))
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, acquire_share=0.0)
+    batch = refinement_sampler(data, 12, 64, 0.0, (tmp_path / "near", tmp_path / "far"), 0.5)().batch(0, 24)
+    assert isinstance(batch, TrainingBatch)
+    Z_m = batch.t_cam_target_m[np.isnan(batch.noc).all(axis=(1, 2, 3)), 2]
+    assert [int(np.sum(Z_m == depth_m)) for depth_m in depths_m] == [6, 6]
