@@ -182,7 +182,7 @@ def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> 
     folder = root / "test" / "000002"
     poses = [{"obj_id": obj_id, "cam_R_m2c": UNIT, "cam_t_m2c": [x, 0, 2e5]} for x, obj_id in enumerate((1, 1, 8, 1))]
     write_json(folder / "scene_gt.json", {"1": poses, "12": poses})
-    seen = [{"bbox_visib": BOX, "px_count_visib": count, "px_count_all": 99} for count in (10, 50, 99, 40)]
+    seen = [{"bbox_visib": BOX, "px_count_visib": count, "px_count_all": 99} for count in (10, 40, 99, 50)]
     write_json(folder / "scene_gt_info.json", {"1": seen, "12": seen})
     listed = [{"scene_id": 2, "im_id": 12, "obj_id": 1, "inst_count": 2}]
     write_json(root / "test_targets_bop19.json", listed)
@@ -191,6 +191,9 @@ def test_the_list_of_test_targets_chooses_pictures_and_instances(root: Path) -> 
     frame = next(dataset.frames())
     assert frame.target_indices == (1, 3)  # the two of object 1 of which most is visible
     assert [target.t_cam_target_m[0] for target in frame.targets] == [0.001, 0.003]
+    del listed[0]["inst_count"]
+    write_json(root / "test_targets_bop19.json", listed)
+    assert next(open_dataset(root).frames()).target_indices == (3,)
     write_json(root / "test_targets_bop19.json", [{"scene_id": 2, "obj_id": 1}])
     with pytest.raises(BopError, match=r"test_targets_bop19\.json: 'entry 0' has no integer 'im_id'"):
         list(open_dataset(root).frames())

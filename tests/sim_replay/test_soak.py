@@ -18,7 +18,7 @@ from sim_replay.faults.rig import Rig, RigSettings
 from sim_replay.ground_truth import read_sequence
 from sim_replay.pace import at_speed
 from sim_replay.pipeline.flight import Flight
-from sim_replay.pipeline.soak import silences, trends
+from sim_replay.pipeline.soak import silences, table, trends
 from sim_replay.pipeline.usage import Usage
 from tests.edge.toy_model import write_toy_model
 from tests.sim_replay.toy_flight import write_toy_flight
@@ -58,6 +58,50 @@ def growing(flight: Flight) -> set[str]:
 def test_what_wavers_does_not_grow() -> None:
     told = trends(steady(), FPS)
     assert all(trend.grows is False for trend in told), told
+
+
+def constant() -> Flight:
+    """As `steady`, with nothing left to chance, and one frame dropped in each ten seconds."""
+    flight = Flight(START_NS - 10**9, START_NS, UTC_NS)
+    for second in SECONDS.tolist():
+        now_ns = START_NS + second * 10**9
+        # The daemon had run and waited before: of that nothing is this flight's.
+        flight.usage.append(Usage(now_ns, 500.0 + 0.8 * second, 2000.0 + 0.1 * second, 200.0, 40, 14))
+        flight.logged.append((now_ns, 150))
+        flight.diagnostics.append({"stamp_utc_ns": now_ns + UTC_NS, "values": {"dropped": str(second // 10)}})
+        flight.targets.append({"capture_utc_us": (now_ns + UTC_NS) // 1000, "received_ns": now_ns + 20_000_000})
+        flight.poses_ns.append(now_ns + 20_000_000)
+    return flight
+
+
+def test_what_is_allowed_is_told_as_worked_by_hand() -> None:
+    """239 s without their first quarter are thirds of 59.75 s: of sixty samples each, and of 1792.5 frames."""
+    log = 60 * 150 / (59.75 / 60)
+    allowed = {
+        "memory": (200.0, 200.0 + 22.0),
+        "open descriptors": (40.0, 43.0),
+        "threads": (14.0, 16.0),
+        "log": (log, 2 * log + 6000.0),
+        "frames dropped": (5.0, 2 * 5.0 + 17.925),
+        "age at the autopilot, p50": (20.0, 1.5 * 20.0 + 10.0),
+    }
+    told = trends(constant(), FPS)
+    for trend in told:
+        early, limit = allowed[trend.name]
+        assert (trend.early, trend.late, trend.allowed) == pytest.approx((early, early, limit)), trend.name
+        assert trend.grows is False, trend.name
+    at_limit, above, unheard = constant(), constant(), constant()
+    for flight, more_mb in ((at_limit, 22.0), (above, 22.5)):
+        flight.usage = [replace(u, rss_mb=u.rss_mb + more_mb * (k >= 120)) for k, u in enumerate(flight.usage)]
+    unheard.targets.clear()
+    assert growing(at_limit) == set()
+    assert growing(above) == {"memory"}
+    lines = [" ".join(line.split()) for line in table(trends(above, FPS), MINUTES).splitlines()]
+    assert lines[0] == "4 minutes early late allowed"
+    assert lines[1:3] == ["memory 200.0 222.5 222.0 MB GROWS", "open descriptors 40.0 40.0 43.0 flat"]
+    assert " ".join(table(trends(unheard, FPS), MINUTES).split()).endswith(
+        "age at the autopilot, p50 - - - ms not judged"
+    )
 
 
 def test_pictures_in_flight_are_no_leak() -> None:
@@ -118,10 +162,11 @@ def test_poses_that_never_came_or_stopped_are_told_of_each_peer(share: float) ->
     assert silences(flight) == [told, "the subscriber received no pose"]
 
 
-def test_a_target_that_is_found_late_is_no_silence() -> None:
-    flight = steady()
-    flight.poses_ns = flight.poses_ns[-20:]
-    assert silences(flight) == []
+def test_a_target_that_is_found_late_or_lost_at_the_end_is_no_silence() -> None:
+    found, lost = steady(), steady()
+    found.poses_ns = found.poses_ns[-20:]
+    lost.poses_ns = lost.poses_ns[: round(0.8 * len(lost.poses_ns))]
+    assert silences(found) == silences(lost) == []
 
 
 def test_a_flight_of_moments_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
