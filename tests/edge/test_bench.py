@@ -115,6 +115,45 @@ def test_cases_take_turns() -> None:
     assert all(0 <= one.p10 <= one.p50 <= one.p99 for one in ms.values())
 
 
+class Clocks:
+    """Clocks that stand still except where a call takes its time."""
+
+    def __init__(self) -> None:
+        self.wall_ns, self.cpu_ns, self.calls = 5_000_000_000, 700_000_000, 0
+
+    def perf_counter_ns(self) -> int:
+        return self.wall_ns
+
+    def process_time_ns(self) -> int:
+        return self.cpu_ns
+
+    def monotonic(self) -> float:
+        return 1e-9 * self.wall_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.wall_ns += round(1e9 * seconds)
+
+    def take(self, wall_ms: int) -> None:
+        """A call that keeps two threads busy."""
+        self.calls += 1
+        self.wall_ns += 1_000_000 * wall_ms
+        self.cpu_ns += 2_000_000 * wall_ms
+
+
+def test_times_are_of_the_calls_alone_and_of_those_after_the_first_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One takes 0 to 100 ms, from both ends, after two rounds of an hour; another 7 ms, untimed for 20 first."""
+    clocks, rounds = Clocks(), list[int]()
+    monkeypatch.setattr("edge.bench.timing.time", clocks)
+    monkeypatch.setattr("edge.bench.timing.wait_until_quiet", lambda: clocks.sleep(1.0))
+    left = [3_600_000, 3_600_000, *(k // 2 if k % 2 == 0 else 100 - k // 2 for k in range(101))]
+    calls = {"one": lambda: clocks.take(left.pop(0)), "other": lambda: clocks.take(7)}
+    ms = time_in_turns(calls, 101, rounds.append, warm={"other"})
+    assert ms["one"] == Milliseconds(10.0, 50.0, 99.0, 100.0)
+    assert ms["other"] == Milliseconds(7.0, 7.0, 7.0, 14.0)
+    assert clocks.calls == 103 * (1 + 3 + 1)
+    assert rounds == list(range(1, 104))
+
+
 def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
     """As those of OpenVINO and PyTorch, which spin after a call has returned."""
 
@@ -233,6 +272,9 @@ def test_ratios_are_told_as_worked_by_hand() -> None:
     assert "INT8 / its multiply-accumulates at this machine's peak track 1 3.00 -" in told
     assert "edge-int8 track 224x224 2 onnxruntime 4.00 36.00 99.00 5.00 60.0 0.5 2.00" in told
     assert "2 threads: INT8 435, FP32 80" in told
+    alone = [" ".join(line.split()) for line in table(replace(measured, rows=rows[:1])).splitlines()]
+    assert "INT8 / FP32 of the edge configuration at one input size needs two such models" in alone
+    assert "ONNX Runtime / OpenVINO, INT8 no such engine" in alone
 
 
 def test_other_engines_infer_the_same_files(cli: Cli, tmp_path: Path) -> None:
