@@ -34,10 +34,10 @@ HISTORY = Path(__file__).parent / "checkpoints" / "history.jsonl"
 EXPLANATION = (
     "Missed targets count as failures in every rate; mean and median errors are over detected targets. Results are for "
     "single frames; where a row says *track*, they are for the output of the daemon's tracker, which is given the own "
-    "ship's attitude and position with the errors typical of an autopilot; a pose whose rotation is not known counts as "
-    "a failure in the rates that need one, and in no rotation error. *False / 1,000*: false positives per 1,000 frames "
-    "in which no target is visible. *Pose, 95 %*: 95 % bootstrap confidence interval of Pose@10°/5 %, resampled over "
-    "flights."
+    "ship's attitude and position with the errors typical of an autopilot; a pose whose rotation is not known counts "
+    "as a failure in the rates that need one, and in no rotation error. *False / 1,000*: false positives per 1,000 "
+    "frames in which no target is visible. *Pose, 95 %*: 95 % bootstrap confidence interval of Pose@10°/5 %, resampled "
+    "over flights."
 )
 CURVES = (
     "Held-out windows as training went on. Each run has its own curves: a thin vertical line marks its first "
