@@ -61,6 +61,10 @@ class Ear(Outlets):
     def __init__(self) -> None:
         super().__init__(None, None)
         self.reports: list[Report] = []
+        self.events: list[tuple[int, str]] = []
+
+    def event(self, level: int, text: str) -> None:
+        self.events.append((level, text))
 
     def publish(self, report: Report) -> None:
         self.reports.append(report)

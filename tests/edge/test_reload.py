@@ -21,9 +21,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zenoh import handlers
 
+from edge import clock
 from edge.config import SHIPPED_MODEL, Config, ConfigFile, load_config
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
+from edge.health import HealthState
 from edge.links.signing_key import write_new_key
 from edge.reload import Reloaded, Reloader, needs_restart, with_live_keys
 from edge.requests import ReloadOutcome
@@ -38,6 +40,7 @@ from tests.certificates import redate
 from tests.waiting import until
 
 from .flying import Flight, flying, toml
+from .looping import HELD, Gated, frame, looping
 from .toy_model import CONTRACT, ONE_PICTURE_GRAPH, write_toy_model
 
 
@@ -283,6 +286,34 @@ def test_a_reload_that_fails_as_nobody_foresaw_is_told_of_and_the_next_is_carrie
     assert refused.said.startswith("reload refused, flying on as before: ")
     assert refused.model_sha256 == estimator.model.sha256 != made.model_sha256
     assert events == [(logging.ERROR, refused.said)]
+
+
+def test_what_is_taken_over_is_flown_by(tmp_path: Path, gated: Gated, stepped: int) -> None:
+    another = write_toy_model(tmp_path / "another.onnx", name="another")
+    (tmp_path / "config.toml").write_text(
+        f'[camera]\ntype = "sequence"\npath = "/scene"\n[model]\npath = "{another}"\nthreads = 1\n'
+        "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
+        "[estimator]\nacquire_every_n = 1\n[health]\nno_frame_s = 60\n"
+    )
+    gated.refused["size"] = 3
+    with looping(gated) as (loop, ear, _):
+        board = loop._board
+        board.file = replace(board.file, path=tmp_path / "config.toml")
+        loop._process(frame(0, HELD))
+        loop._reloader.ask()
+        until(lambda: board.model.contract.name == "another", loop._take_reload)
+        for index in range(1, 4):  # with 5, as it was, no search would begin
+            loop._process(frame(index, HELD))
+            until(lambda count=index: loop.search.counters()["searches"] == count, what="a search")
+        clock.step_to(stepped + 30_000_000_000)
+        loop.supervisor.turn()
+        snapshot = loop.supervisor.snapshot()
+    assert snapshot.condition.state is not HealthState.FAULT, "no frame for 30 s, but 60 are allowed now"
+    assert snapshot.counters["refused_size"] == 3
+    assert board.config()["config"]["health"]["no_frame_s"] == 60.0
+    (said,) = [(level, text) for level, text in ear.events if text.startswith("reloaded: ")]
+    assert said[0] == logging.INFO
+    assert "taken over: [estimator] acquire_every_n, [health] no_frame_s" in said[1]
 
 
 def test_who_is_told_how_a_reload_went_may_ask_for_the_next_at_once(tmp_path: Path, toy_model: Path) -> None:

@@ -40,3 +40,31 @@ def test_a_loop_that_was_suspended_with_its_process_flies_on_and_one_that_is_stu
             assert turns(process.stdout, 50), "ended though it was not stuck"
         process.stdin.close()
         assert process.wait(timeout=60) == 70
+
+
+SLOW_START = f"""
+import time
+from edge.watchdog import Watchdog
+
+watchdog = Watchdog({LIMIT_S}, print)
+with watchdog.armed():
+    time.sleep({0.5 * LIMIT_S})
+    watchdog.beat(time.monotonic_ns())
+"""
+
+SPEECHLESS = """
+import threading
+from edge.watchdog import Watchdog
+
+forever = threading.Event()
+with Watchdog(0.1, lambda sentence: forever.wait()).armed():
+    forever.wait()
+"""
+
+
+def test_a_first_turn_that_takes_long_is_not_counted_from_before_it() -> None:
+    assert subprocess.run([sys.executable, "-c", SLOW_START], timeout=60, check=False).returncode == 0
+
+
+def test_last_words_that_nobody_takes_do_not_keep_a_stuck_process_from_ending() -> None:
+    assert subprocess.run([sys.executable, "-c", SPEECHLESS], timeout=60, check=False).returncode == 70
