@@ -148,8 +148,10 @@ def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
 def longest_silence_s(
     matches: Sequence[Match], ages: Sequence[tuple[int, float]], fps: float, unrecorded: Collection[int] = ()
 ) -> float | None:
-    """The longest time without a pose while a target was visible, from the first pose on; None: there was no pose."""
-    arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages)
+    """The longest time without a pose of a target while one was visible, from the first on; None: there was no such
+    pose."""
+    found = {match.truth.frame for match in matches if match.estimate is not None}
+    arrivals = sorted(frame / fps + age_ms * 1e-3 for frame, age_ms in ages if frame in found)
     if not arrivals:
         return None
     frames = np.unique([match.truth.frame for match in matches])

@@ -269,6 +269,13 @@ def test_silence_is_from_a_poses_arrival_or_the_beginning_of_a_view_to_the_next_
     assert longest_silence_s(seen, received, FPS) == pytest.approx(silence_s)
 
 
+def test_a_pose_of_no_target_is_silence_about_those_in_view() -> None:
+    """A target is lost in frames 2 to 4, in which something else was taken for one."""
+    everywhere = [(frame, 0.0) for frame in range(7)]
+    assert longest_silence_s(matches("00---00"), everywhere, FPS) == pytest.approx(0.4)
+    assert longest_silence_s(matches("-------"), everywhere, FPS) is None
+
+
 def test_silence_counts_only_while_a_target_is_to_be_seen() -> None:
     seen = matches("00000-----00000     00000")
     received = [(m.truth.frame, 20.0) for m in seen if m.estimate is not None]
