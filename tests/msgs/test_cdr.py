@@ -362,6 +362,38 @@ def test_a_covariance_is_taken_by_the_sign_of_its_least_eigenvalue_whatever_its_
         assert np.array_equal(decoded.covariance, matrix)
 
 
+@pytest.mark.parametrize(
+    ("message", "at"),
+    [
+        (cdr.TFMessage((cdr.TransformStamped(1, "ned", "base", PLACE, TURNED),)), 4),
+        (cdr.CompressedImage(1, "", "jpeg", b"data"), 32),
+        (dataclasses.replace(_camera(distortion=np.array([0.1])), distortion_model="", frame_id=""), 36),
+        (cdr.DiagnosticArray(1, "", (cdr.DiagnosticStatus(0, "", "", "", ()),)), 20),
+        (dataclasses.replace(_detections(), frame_id=""), 20),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_sequence_that_claims_more_than_there_is_room_for_is_refused_before_it_is_read(
+    message: cdr.Payload, at: int
+) -> None:
+    payload = message.encode()
+    (count,) = struct.unpack_from("<I", payload, at)
+    assert count == (4 if isinstance(message, cdr.CompressedImage) else 1)
+    for claimed in (count + len(payload), 2**32 - 1):
+        with pytest.raises(PayloadError) as caught:
+            type(message).decode(payload[:at] + struct.pack("<I", claimed) + payload[at + 4 :])
+        assert caught.value.reason is Refusal.LENGTH
+
+
+def test_whole_numbers_and_single_precision_are_sent_as_doubles() -> None:
+    whole, single = np.array([1, -2, 300]), np.array([0.1, 2.5, 300.0], np.float32)
+    for vector in (whole, single, [1, -2, 300]):
+        message = _with(t_cam_target_m=vector)
+        assert message == _with(t_cam_target_m=np.asarray(vector, np.float64))
+        np.testing.assert_array_equal(cdr.PoseWithCovarianceStamped.decode(message).t_cam_target_m, vector)
+    assert _camera(distortion=[0, 1]).encode() == _camera(distortion=np.array([0.0, 1.0])).encode()
+
+
 def test_a_misshapen_array_is_never_sent() -> None:
     with pytest.raises(ValueError, match="shape"):
         _with(covariance=np.eye(3))
