@@ -1,0 +1,67 @@
+"""Evaluation of a model that is known on sequences: every frame is tracked, and every n-th is scored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.sim_replay.conftest import dark_spot_model
+from tests.sim_replay.test_tracked import flown, write_scene
+from trainer.config import ConfigError
+from trainer.evaluate_dataset import DatasetRequest, Evaluation, evaluate_dataset
+
+__all__ = ["dark_spot_model"]
+
+
+@pytest.fixture(scope="module")
+def spots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven frames of a camera that turns, with a target that a track tells from the third on."""
+    root = tmp_path_factory.mktemp("spots")
+    write_scene(root / "test" / "000004", [0.5 + 0.4 * k for k in range(7)])
+    (root / "test" / "000004" / "sequence.toml").write_text("fps = 30.0\n")
+    return root
+
+
+def estimates(evaluation: Evaluation) -> dict[int, np.ndarray | None]:
+    found = {frame.picture.image_id: frame.matches[0].estimate for frame in evaluation.judged}
+    return {image: None if one is None else one.t_cam_target_m for image, one in found.items()}
+
+
+def test_the_tracker_sees_all_frames_of_which_every_third_is_scored(spots: Path, dark_spot_model: Path) -> None:
+    request, counts = DatasetRequest(dark_spot_model, dataset=spots, every=3), list[int]()
+    track = evaluate_dataset(request._replace(mode="track", own_ship="exact"), on_start=counts.append)
+    frames = evaluate_dataset(request, on_start=counts.append)
+    assert counts == [7, 3]
+    assert {image: one is not None for image, one in estimates(track).items()} == {0: False, 3: True, 6: True}
+    assert {image: one is not None for image, one in estimates(frames).items()} == {0: True, 3: True, 6: True}
+    assert [(e.score["mode"], e.score["every"], e.score["own_ship"]) for e in (track, frames)] == [
+        ("track", 3, "exact"),
+        ("frames", 3, None),
+    ]
+    assert (track.score["overall"]["recall"], frames.score["overall"]["recall"]) == (pytest.approx(2 / 3), 1.0)
+    assert track.method == frames.method == "dark-spot"
+
+
+def test_the_tracker_is_told_the_own_ship_s_pose_as_well_as_asked(spots: Path, dark_spot_model: Path) -> None:
+    request = DatasetRequest(dark_spot_model, dataset=spots, mode="track")
+    exact, usual = (evaluate_dataset(request._replace(own_ship=told)) for told in ("exact", "usual"))
+    for image, frame in enumerate(flown(spots, dark_spot_model)):
+        one, expected = estimates(exact)[image], frame.matches[0].estimate
+        assert (one is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_allclose(one, expected.t_cam_target_m, atol=1e-9)
+    assert not np.allclose(estimates(usual)[6], estimates(exact)[6], atol=1e-6)
+
+
+def test_a_threshold_may_be_given_for_the_files_own(spots: Path, dark_spot_model: Path) -> None:
+    """No peak is as certain as 1."""
+    request = DatasetRequest(dark_spot_model, dataset=spots, every=6)
+    for score_min, recall in ((None, 1.0), (0.9, 1.0), (1.0, 0.0)):
+        score = evaluate_dataset(request._replace(score_min=score_min)).score
+        assert score["overall"]["recall"] == recall
+    with pytest.raises(ConfigError, match=r"the score threshold 1\.5 is not between 0 and 1"):
+        evaluate_dataset(request._replace(score_min=1.5))
+    with pytest.raises(ConfigError, match="--score-min: needs a model"):
+        evaluate_dataset(request._replace(results=spots / "any.csv", score_min=0.5))
