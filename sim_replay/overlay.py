@@ -47,7 +47,7 @@ class FrameView:
     """Everything that is drawn for one frame, except its pixels."""
 
     K: Array  # [3, 3], pixel centres at integers
-    match: Match | None  # of the target in the inset and the charts; None: the frame has no target
+    match: Match | None  # of the target in the inset and the charts; None: it is not in view
     extents: Extents | None  # of that target
     latency_ms: float | None
     others: tuple[tuple[Match, Extents], ...] = ()  # the frame's other targets

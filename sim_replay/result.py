@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -216,8 +216,10 @@ def drops_told(sequence: PlayedSequence, score: dict[str, Any]) -> str | None:
 def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
     """Overlay data of each frame: its targets as the subscriber received them, and every direction.
 
-    A frame that was not recorded shows the image of the one before, and has its data.
+    Inset and charts are of the target that is in view most; in frames without it they have none. A frame that was not
+    recorded shows the image of the one before, and has its data.
     """
+    most_seen = Counter(_target(found) for found in result.subscriber.matches).most_common(1)
     by_frame: dict[int, list[tuple[Match, Extents]]] = {}
     for found in result.subscriber.matches:
         shown = (found, sequence.scene.extents[found.truth.object_id])
@@ -229,7 +231,13 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
             views.append(views[-1])
             continue
         seen = by_frame.get(frame, [])
-        match, extents = seen[0] if seen else (None, None)
-        others, told = tuple(seen[1:]), tuple(direction for direction, _ in directions[frame])
+        main = next((one for one in seen if _target(one[0]) == most_seen[0][0]), None)
+        match, extents = main or (None, None)
+        others = tuple(one for one in seen if one is not main)
+        told = tuple(direction for direction, _ in directions[frame])
         views.append(FrameView(K, match, extents, latencies_ms.get(frame), others, told))
     return views
+
+
+def _target(match: Match) -> tuple[int, int]:
+    return match.truth.object_id, match.truth.instance

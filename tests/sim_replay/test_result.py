@@ -194,6 +194,17 @@ def test_the_overlay_gets_every_target_of_a_frame(sequence: PlayedSequence, reco
     assert [len(view.others) for view in views] == [1, 0, 0, 0, 0]
 
 
+def test_inset_and_charts_of_the_overlay_stay_with_one_target(sequence: PlayedSequence, recording: Recording) -> None:
+    """Another is listed before it, in frames 0, 1 and 4, the last of which is without it."""
+    beside = [replace(truth, object_id=2) for truth in sequence.scene.truths[:2]]
+    truths = [*beside, replace(beside[0], frame=4), *sequence.scene.truths]
+    extents = sequence.scene.extents | {2: sequence.scene.extents[1]}
+    two = replace(sequence, scene=replace(sequence.scene, truths=truths, extents=extents))
+    views = frame_views(two, judge(two, recording))
+    assert [None if view.match is None else view.match.truth.object_id for view in views] == [1, 1, 1, 1, None]
+    assert [[match.truth.object_id for match, _ in view.others] for view in views] == [[2], [2], [], [], [2]]
+
+
 def test_directions_are_judged_where_there_is_no_pose_and_all_of_them_are_shown(
     sequence: PlayedSequence, recording: Recording
 ) -> None:
