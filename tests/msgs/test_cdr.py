@@ -225,6 +225,17 @@ def test_a_damaged_payload_is_refused_or_still_valid(message: cdr.Payload, data:
     assert same(type(message).decode(decoded.encode()), decoded)
 
 
+@settings(max_examples=100, deadline=None)
+@given(payloads, st.data())
+def test_no_message_is_shorter_or_longer_than_what_it_holds(message: cdr.Payload, data: st.DataObject) -> None:
+    payload = message.encode()
+    with pytest.raises(PayloadError):
+        type(message).decode(payload[: data.draw(st.integers(0, len(payload) - 1))])
+    with pytest.raises(PayloadError) as caught:
+        type(message).decode(payload + bytes(4))
+    assert caught.value.reason is Refusal.TRAILING
+
+
 POSE = cdr.PoseWithCovarianceStamped(
     1_700_000_000_123_456_789, "cam", np.array([1.0, -2.0, 300.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)
 )
