@@ -111,7 +111,7 @@ def _model(path: Path, key: str, entry: Any, ply: Path | None, frame: ModelFrame
     if diameter_m <= 0:
         raise BopError(f"{path}: 'diameter' of {key!r} is not above zero")
     if corners is None:
-        return Model(diameter_m, ply=ply, frame=frame, name=name)
+        return Model(diameter_m, name=name)  # nor is there a mesh
     return Model(diameter_m, _triple(corners.min(axis=0)), _triple(np.ptp(corners, axis=0)), ply, frame, name)
 
 
