@@ -121,3 +121,38 @@ def test_what_all_frames_share_is_mirrored_with_the_rotation_when_the_other_side
     assert other.log_odds == pytest.approx(3.0)
     np.testing.assert_allclose(other.P, np.diag([3.0, 2.0, 1.0]), atol=1e-12)
     np.testing.assert_allclose(other.common, np.diag([6.0, 5.0, 4.0]), atol=1e-12)
+
+
+def test_what_the_own_ship_flew_since_the_last_frame_counts_where_the_origin_changes_meanwhile() -> None:
+    tracker, rng, flying = Tracker(1, LOOKING_NORTH), np.random.default_rng(6), np.array([25.0, 0.0, 0.0])
+
+    def own_at(time_s: float) -> OwnShip:
+        return replace(STILL, time_ns=1 + round(time_s * 1e9), t_ned_body_m=time_s * flying, v_ned_body_mps=flying)
+
+    for k in range(60):  # the target keeps its place in ned
+        own = own_at(k / 30)
+        tracker.update(
+            own.time_ns, [sight(rng, np.array([0.0, 0.0, 300.0 - 25.0 * k / 30]), NORTH_EAST)], own, K, SIZE_WH
+        )
+    later = own_at(59 / 30 + 1.5)
+    same = tracker.predict(later.time_ns, later, K, SIZE_WH)[0].t_cam_target_m
+    elsewhere = replace(later, t_ned_body_m=np.array([-700.0, 80.0, 10.0]), origin_epoch=1)
+    moved = tracker.predict(later.time_ns, elsewhere, K, SIZE_WH)[0].t_cam_target_m
+    np.testing.assert_allclose(moved, same, atol=1e-6)
+
+
+def test_a_velocity_from_before_own_attitude_was_known_is_told_as_unsure() -> None:
+    """In `cam`, a camera that turns makes a target that stands still fly by at 87 m/s."""
+    tracker, rng, turning_radps = Tracker(1, LOOKING_NORTH), np.random.default_rng(7), 0.35
+    for k in range(40):
+        yaw = turning_radps * (k / 30 - 0.65)
+        R_ned_body = so3.exp(np.array([0.0, 0.0, yaw]))
+        own = replace(STILL, time_ns=1 + 33 * k * MS, R_ned_body=R_ned_body)
+        t_cam_m = (R_ned_body @ LOOKING_NORTH.R_body_cam).T @ np.array([250.0, 0.0, 0.0])
+        seen = sight(rng, t_cam_m, NORTH_EAST)
+        (track,) = tracker.update(own.time_ns, [seen], own if k == 39 else None, K, SIZE_WH)
+    assert track.v_ned_target_mps is not None
+    assert track.covariance_ned is not None
+    v_mps, P_v = track.v_ned_target_mps, track.covariance_ned[3:6, 3:6]
+    assert np.linalg.norm(v_mps) > 50.0
+    assert v_mps @ np.linalg.solve(P_v, v_mps) < 3.0
