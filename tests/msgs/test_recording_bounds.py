@@ -69,6 +69,27 @@ def test_a_disk_that_is_too_slow_is_told_again_only_after_a_while(
     assert told == ["recording has gaps: the disk is too slow, 2 messages were lost"] * warnings
 
 
+def test_a_writer_that_was_woken_to_be_switched_rests_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until its second ends, which lasts an hour here, or much is to be written."""
+    syncs, real_sync = list[int](), os.fdatasync
+
+    def sync(fd: int) -> None:
+        syncs.append(fd)
+        real_sync(fd)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    monkeypatch.setattr(recording, "FLUSH_S", 3600.0)
+    recorder = Recorder(tmp_path, "uav1", ROOM, print)
+    recorder.start()
+    record_some(recorder, [b"pose"])
+    recorder.switch(True)
+    until(lambda: recorder.counters()["recorded"] == 1)
+    recorder.record(topics.IMAGE, "uav1", None, bytes(20 * 1024**2), 1)
+    until(lambda: recorder.counters()["recorded"] == 2)
+    assert len(syncs) == 2
+    recorder.stop()
+
+
 def test_made_up_names_fill_no_memory_and_do_not_push_out_what_is_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
