@@ -52,7 +52,7 @@ class Evaluation(NamedTuple):
     """The result: `score` has the keys of sim_replay.score.statistics and describes what was evaluated."""
 
     score: dict[str, Any]
-    method: str  # name for the results file
+    method: str  # name for the results file of a model
     dataset: Dataset
     judged: list[JudgedFrame]
     models: Mapping[int, TargetModel]
@@ -93,7 +93,6 @@ def evaluate_dataset(
             judged = judged[:: request.every]
     except InputError as error:
         raise ConfigError(str(error)) from error
-    name = Path(method["file"]).stem.split("_")[0] if request.results else Path(method["file"]).stem
     score = {
         "mode": request.mode,
         "own_ship": request.own_ship if request.mode == "track" else None,
@@ -104,7 +103,7 @@ def evaluate_dataset(
         "filtering": filtering(judged),
         "directions": directions(judged),
     }
-    return Evaluation(score, name, dataset, judged, dataset.models)
+    return Evaluation(score, Path(method["file"]).stem, dataset, judged, dataset.models)
 
 
 def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any], Answerer]:

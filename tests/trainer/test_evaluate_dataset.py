@@ -189,6 +189,15 @@ def test_a_results_file_that_lies_where_the_figures_go_stays_as_it_is(
     assert results.read_bytes() == content
 
 
+def test_results_that_cannot_be_written_are_told_in_a_sentence(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results, out = write_results(tmp_path / "truth_plane-test.csv", [(0, *true_pose(0))]), tmp_path / "out"
+    (out / "metrics.json").mkdir(parents=True)
+    assert main(["evaluate", "--results", str(results), "--dataset", str(dataset), "--out", str(out)]) == 2
+    assert f"uavpose-trainer: {out}: cannot be written: Is a directory" in capsys.readouterr().err
+
+
 def test_figures_of_an_earlier_evaluation_do_not_stand_beside_the_new_metrics(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
