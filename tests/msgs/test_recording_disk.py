@@ -56,7 +56,10 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
     assert told[1] == (20, "recording again")
     assert recorder.counters()["stopped"] == 0
+    recorded = recorder.counters()["recorded"]
+    until(lambda: recorder.counters()["recorded"] > recorded, lambda: record_some(recorder, [b"after"]))
     recorder.stop()
+    assert len(told) == 2, "it was told once"
     kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
     assert (kept[0], kept[-1]) == (b"before", b"after")
     assert b"lost" not in kept
