@@ -9,8 +9,6 @@ import pwd
 import socket
 import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +18,9 @@ import serial
 
 from edge.config import load_config
 from edge.doctor import camera_as_told
-from edge.doctor_links import link_findings, signing_finding
+from edge.doctor_links import link_findings
 from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.health import Health
-from edge.links.signing import timestamp_of
 from edge.links.signing_key import write_new_key
 from edge.reload import load_configured
 from edge.status import ask
@@ -356,46 +353,3 @@ def test_a_disk_that_is_mounted_read_only_is_not_taken_for_one_that_others_own(t
     said = subprocess.run([*mounting, sys.executable, LOOK_AT_DISK], capture_output=True, text=True, check=True).stdout
     assert f"WRONG  disk         {tmp_path}/rec is on a disk that is mounted read-only" in said
     assert "$USER" not in said
-
-
-NO_ROOT_KEEPS = """
-import encodings.utf_8_sig
-import os
-from pathlib import Path
-from edge.config import load_config
-from edge.doctor_links import signing_finding
-from edge.links.signing_key import write_new_key
-if os.geteuid() == 0:  # who may everything
-    os.setgroups([])
-    os.setgid(65534)
-    os.setuid(65534)
-write_new_key(Path("key"))
-print(signing_finding(load_config(Path("config.toml")).config.mavlink.signing_state).line())
-"""
-
-
-def test_a_signing_timestamp_in_a_folder_that_may_not_be_entered_is_a_fault_and_no_traceback() -> None:
-    with tempfile.TemporaryDirectory() as name:  # whoever is not root may enter this one
-        folder = Path(name).resolve()
-        folder.chmod(0o777)
-        (folder / "home").mkdir(mode=0o000)
-        (folder / "config.toml").write_text(
-            '[camera]\ntype = "sequence"\npath = "scene"\n'
-            '[mavlink]\nsigning_key = "key"\nsigning_state = "home/mavlink.timestamp"\n'
-        )
-        done = subprocess.run([sys.executable, "-c", NO_ROOT_KEEPS], capture_output=True, text=True, cwd=folder)
-        assert f"WRONG  signing      {folder}/home/mavlink.timestamp cannot be written" in done.stdout, done.stderr
-
-
-def test_a_signing_timestamp_that_cannot_be_kept_is_a_fault(tmp_path: Path) -> None:
-    kept = tmp_path / "mavlink.timestamp"
-    assert signing_finding(kept).verdict == "good"
-    kept.write_text("5")
-    assert signing_finding(kept).verdict == "good"
-    for lost in (tmp_path / "none" / "mavlink.timestamp", Path("/proc/mavlink.timestamp"), tmp_path):
-        found = signing_finding(lost)
-        assert (found.verdict, str(lost) in found.says) == ("wrong", True)
-        assert "signing_state" in found.advice
-    kept.write_text(str(timestamp_of(time.time_ns() + 3 * 86400 * 10**9)))
-    found = signing_finding(kept)
-    assert (found.verdict, "3.0 days ahead" in found.says, "clock" in found.advice) == ("poor", True, True)

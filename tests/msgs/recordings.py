@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from pathlib import Path
 
+import pytest
 from mcap.reader import make_reader
 
 from msgs import topics
@@ -23,3 +26,16 @@ def read(path: Path) -> list[tuple[str, str, bytes, int]]:
 def record_some(recorder: Recorder, payloads: list[bytes]) -> None:
     for payload in payloads:
         recorder.record(topics.POSE, "uav1", "t0", payload, time.time_ns())
+
+
+def standing(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Events of a disk: it stands still since something was written, and it goes on."""
+    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
+
+    def sync(fd: int) -> None:
+        stands.set()
+        goes_on.wait()
+        real_sync(fd)
+
+    monkeypatch.setattr(os, "fdatasync", sync)
+    return stands, goes_on

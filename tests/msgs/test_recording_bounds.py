@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -18,7 +17,7 @@ from msgs.recording import Recorder
 from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
-from .recordings import ROOM, read, record_some
+from .recordings import ROOM, read, record_some, standing
 
 
 def fill_twice(recorder: Recorder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -26,17 +25,10 @@ def fill_twice(recorder: Recorder, monkeypatch: pytest.MonkeyPatch) -> None:
     room, where 3500 bytes may wait."""
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     monkeypatch.setattr(recording, "WAITING_BYTES_MAX", 3500)
-    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
-
-    def sync(fd: int) -> None:
-        stands.set()
-        goes_on.wait()
-        real_sync(fd)
-
-    monkeypatch.setattr(os, "fdatasync", sync)
     recorder.start()
     try:
         for turn in (1, 2):
+            stands, goes_on = standing(monkeypatch)
             record_some(recorder, [b"before"])  # opens the file; whether it is waiting or in hand, three have room
             assert stands.wait(60)
             for name in (b"kept", b"kept", b"kept", b"lost", b"lost"):
@@ -44,8 +36,6 @@ def fill_twice(recorder: Recorder, monkeypatch: pytest.MonkeyPatch) -> None:
             assert recorder.counters()["lost"] == 2 * turn
             goes_on.set()
             until(lambda written=4 * turn: recorder.counters()["recorded"] == written)  # type: ignore[misc]
-            goes_on.clear()
-            stands.clear()
     finally:
         goes_on.set()
         recorder.stop()

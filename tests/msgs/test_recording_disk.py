@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import threading
 from collections import Counter
 from pathlib import Path
 
@@ -15,20 +14,7 @@ from msgs.recording import Recorder
 from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
-from .recordings import ROOM, read, record_some
-
-
-def standing(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Events of a disk: it stands still since something was written, and it goes on."""
-    stands, goes_on, real_sync = threading.Event(), threading.Event(), os.fdatasync
-
-    def sync(fd: int) -> None:
-        stands.set()
-        goes_on.wait()
-        real_sync(fd)
-
-    monkeypatch.setattr(os, "fdatasync", sync)
-    return stands, goes_on
+from .recordings import ROOM, read, record_some, standing
 
 
 def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
