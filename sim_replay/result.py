@@ -219,7 +219,7 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
     Inset and charts are of the target that is in view most; in frames without it they have none. A frame that was not
     recorded shows the image of the one before, and has its data.
     """
-    most_seen = Counter(_target(found) for found in result.subscriber.matches).most_common(1)
+    most_seen = Counter(found.truth.target for found in result.subscriber.matches).most_common(1)
     by_frame: dict[int, list[tuple[Match, Extents]]] = {}
     for found in result.subscriber.matches:
         shown = (found, sequence.scene.extents[found.truth.object_id])
@@ -231,13 +231,9 @@ def frame_views(sequence: PlayedSequence, result: Result) -> list[FrameView]:
             views.append(views[-1])
             continue
         seen = by_frame.get(frame, [])
-        main = next((one for one in seen if _target(one[0]) == most_seen[0][0]), None)
+        main = next((one for one in seen if one[0].truth.target == most_seen[0][0]), None)
         match, extents = main or (None, None)
         others = tuple(one for one in seen if one is not main)
         told = tuple(direction for direction, _ in directions[frame])
         views.append(FrameView(K, match, extents, latencies_ms.get(frame), others, told))
     return views
-
-
-def _target(match: Match) -> tuple[int, int]:
-    return match.truth.object_id, match.truth.instance

@@ -48,6 +48,11 @@ class Truth(TargetPose):
     wanted: bool = field(default=True, kw_only=True)  # False: present, but not to be estimated according to the dataset
 
     @property
+    def target(self) -> tuple[int, int]:
+        """Which of the sequence's targets it is, the same in every frame."""
+        return self.object_id, self.instance
+
+    @property
     def airframe_label(self) -> str:
         """The airframe's name, otherwise one made from its number in BOP's files."""
         return self.airframe or f"obj_{self.object_id:06d}"

@@ -30,7 +30,7 @@ def continuity(matches: Sequence[Match], fps: float, unrecorded: Collection[int]
     """
     by_target: dict[tuple[int, int], list[Match]] = {}
     for match in sorted(matches, key=lambda match: match.truth.frame):
-        by_target.setdefault((match.truth.object_id, match.truth.instance), []).append(match)
+        by_target.setdefault(match.truth.target, []).append(match)
     targets = [target_continuity(seen, fps, unrecorded) for seen in by_target.values()]
     acquired = [target["time_to_acquire_s"] for target in targets if target["time_to_acquire_s"] is not None]
     losses = [loss for target in targets for loss in target["losses"]]

@@ -57,7 +57,7 @@ def _choose(matches: Sequence[Match], fps: float) -> list[Match]:
 
 
 def _apart_s(a: Match, b: Match, fps: float) -> float:
-    same = (a.truth.object_id, a.truth.instance) == (b.truth.object_id, b.truth.instance)
+    same = a.truth.target == b.truth.target
     return abs(a.truth.frame - b.truth.frame) / fps if same else np.inf
 
 

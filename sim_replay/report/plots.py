@@ -277,7 +277,7 @@ def errors_over_range(matches: Sequence[Match]) -> str:
 def _by_target(matches: Sequence[Match]) -> list[list[Match]]:
     groups: dict[tuple[int, int], list[Match]] = {}
     for match in matches:
-        groups.setdefault((match.truth.object_id, match.truth.instance), []).append(match)
+        groups.setdefault(match.truth.target, []).append(match)
     return list(groups.values())
 
 
