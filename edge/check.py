@@ -32,12 +32,14 @@ def check(file: ConfigFile) -> list[str]:
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
     if contract.track_size_wh is not None:
         stages += f", track {contract.track_size_wh[0]}x{contract.track_size_wh[1]}"
+    size = config.target.size()
     return [
         f"{file.path}: valid",
         f"vehicle  {config.vehicle.name}",
         f"model    {model.path.name}: {contract.name} {contract.precision}, {stages}, sha256 {model.sha256[:12]}",
         f"runs on  {model.provider}" + (f": {model.fallback_reason}" if model.fallback_reason else ""),
         *([] if contract.scores_calibrated else [f"warning  {NOT_CALIBRATED}"]),
+        *([] if size is None else [f"target   wingspan {size.wingspan_m:g} m, length {size.length_m:g} m"]),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
         + ("" if opened else "; not reachable now, the daemon will keep trying"),

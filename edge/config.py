@@ -20,19 +20,18 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from edge.config_camera import CameraSettings
 from edge.config_camera import SequenceCamera as SequenceCamera
 from edge.config_camera import camera_key as camera_key
+from edge.config_estimator import SHIPPED_MODEL as SHIPPED_MODEL
+from edge.config_estimator import EstimatorSettings, ModelSettings, TargetSettings
 from edge.config_ground import RecorderSettings, ZenohSettings, ZenohTlsSettings
 from edge.config_path import ConfigPath
 from edge.config_ports import collision, mavlink_listener, metrics_listener, zenoh_listener
 from edge.errors import InputError
-from edge.estimator.providers import Provider
 from edge.links.mavlink_endpoints import parse_endpoint, plain_host
 from edge.links.signing_key import load_key
 from edge.types import Array, Mount
 from msgs.geometry import R_from_euler
 from msgs.settings import Fault, Section, faults_of, parse_toml, read_text
 from msgs.topics import check_uav_name
-
-SHIPPED_MODEL = Path(__file__).parent / "estimator" / "models" / "mf-uavpose6d-edge-int8.onnx"
 
 # The mount with all three angles zero: optical axis along the nose, image right along the right wing.
 R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -110,24 +109,6 @@ class MountSettings(Section):
             angles_rad = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
             R_body_cam = R_from_euler(*angles_rad) @ R_BODY_CAM_FORWARD
         return Mount(R_body_cam, np.array(self.t_body_cam_m))
-
-
-class ModelSettings(Section):
-    path: ConfigPath = Field(default=SHIPPED_MODEL, description="ONNX file with its contract in the metadata")
-    provider: Provider = Field(
-        default="cpu",
-        description="execution provider; if it is not available, or fails, the CPU takes over, with a warning",
-    )
-    threads: int = Field(default=2, ge=1, le=64, description="CPU threads per inference")
-    spinning: bool = Field(
-        default=False,
-        description="threads spin between inferences: faster on an idle machine, slower beside other load",
-    )
-
-
-class EstimatorSettings(Section):
-    max_targets: int = Field(default=4, ge=1, le=4, description="maximum number of simultaneously tracked targets")
-    acquire_every_n: int = Field(default=30, ge=1, description="while tracking, search the whole frame every N frames")
 
 
 class MavlinkSettings(Section):
@@ -250,6 +231,7 @@ class Config(Section):
     camera: CameraSettings
     mount: MountSettings = MountSettings()
     model: ModelSettings = ModelSettings()
+    target: TargetSettings = TargetSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     zenoh: ZenohSettings = ZenohSettings()
     # The default is validated too, so that it is relative to the file's folder.

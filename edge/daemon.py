@@ -21,11 +21,13 @@ from edge.estimator.decode import lies_on
 from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
 from edge.estimator.upright import up_in_cam
+from edge.health import Reason
 from edge.memory import MemoryKeeper
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
 from edge.search import Search
+from edge.size_watch import SizeWatch
 from edge.stages import StageClock
 from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
@@ -52,6 +54,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         board = StatusBoard(file, model, camera_info)
         outlets = start_outlets(board, own_ship, requests, reloader.ask_for, cleanup)
         estimator = warm_estimator(model, config.estimator.max_targets, camera_info)
+        estimator.target_size = config.target.size()
         pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader)
         cleanup.callback(pipeline.search.stop)
         pipeline.search.start()
@@ -100,7 +103,8 @@ class Pipeline:
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
-        self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, capture.reasons)
+        self._size_watch = SizeWatch()
+        self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, self._reasons)
         self.search = Search()  # not started yet; until then each search runs in the caller's thread
         self._since_acquire = 0
         self._out_of_order = self._time_jumps = 0
@@ -139,6 +143,9 @@ class Pipeline:
             **self._outlets.counters(),
         }
 
+    def _reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        return (*self._capture.reasons(now_ns), *self._size_watch.reasons(now_ns))
+
     def _process(self, frame: Frame) -> None:
         if self._slept():
             return
@@ -158,6 +165,7 @@ class Pipeline:
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
         estimates = self._estimate(frame, expected, pointed_at, clock)
+        self._size_watch.seen(capture_ns, estimates)
         chosen_id = self._by_hand.chosen_id
         doubtful_below = self._estimator.model.doubtful_below
         tracks = self._tracker.update(
@@ -268,6 +276,7 @@ class Pipeline:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
         self._acquire_every_n = new.file.config.estimator.acquire_every_n
+        self._estimator.target_size = new.file.config.target.size()
         self.supervisor.apply(new.file.config.health)
         log.info("%s", new.outcome.said)
         self._outlets.event(logging.INFO, new.outcome.said)

@@ -3,6 +3,7 @@
 | key                                                       | when it is changed         |
 |-----------------------------------------------------------|----------------------------|
 | [model], the file's content too                           | from the next frame on     |
+| [target]                                                  | from the next frame on     |
 | [estimator] acquire_every_n                               | from the next frame on     |
 | [health] no_frame_s, latency_max_ms                       | from the next frame on     |
 | all others, the content of calibration, certificates, key | named; they need a restart |
@@ -29,7 +30,15 @@ from edge.types import CameraInfo, Frame, FrameMeta
 
 log = logging.getLogger(__name__)
 
-LIVE_KEYS = frozenset({("estimator", "acquire_every_n"), ("health", "no_frame_s"), ("health", "latency_max_ms")})
+LIVE_KEYS = frozenset(
+    {
+        ("target", "wingspan_m"),
+        ("target", "length_m"),
+        ("estimator", "acquire_every_n"),
+        ("health", "no_frame_s"),
+        ("health", "latency_max_ms"),
+    }
+)
 LIVE_SECTIONS = frozenset({"model"})
 
 

@@ -34,12 +34,12 @@ class Supervisor:
         outlets: Outlets,
         board: StatusBoard,
         count: Callable[[], Mapping[str, int]],
-        camera_reasons: Callable[[int], tuple[Reason, ...]],
+        reasons: Callable[[int], tuple[Reason, ...]],
     ) -> None:
         self._outlets = outlets
         self._board = board
         self._count = count
-        self._camera_reasons = camera_reasons
+        self._reasons = reasons
         config = board.file.config
         links: dict[str, MavlinkSettings | ZenohSettings] = {"mavlink": config.mavlink, "zenoh": config.zenoh}
         self._age_max_ms = {name: link.max_age_ms for name, link in links.items() if link.enabled}
@@ -91,7 +91,7 @@ class Supervisor:
         now_ns = clock.monotonic_ns()
         self.watchdog.beat(time.monotonic_ns())
         self._notifier.feed(now_ns)
-        self._health.faults = (*self._camera_reasons(now_ns), *self._faults)
+        self._health.faults = (*self._reasons(now_ns), *self._faults)
         condition = self._health.assess(now_ns)
         self._outlets.set_health(condition)
         if self._announcer.due(condition, now_ns):

@@ -12,6 +12,7 @@ from edge.estimator.model import Model, load_model
 from edge.types import Frame, FrameMeta
 from msgs.contract import samples_behind
 from sim_replay.datasets import DatasetFrame
+from sim_replay.evaluation.given_sizes import SizeOf, no_size
 from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.score import TargetPose
 
@@ -29,16 +30,17 @@ __all__ = [
 DEFAULT_THREADS = 2
 
 
-def estimator_answers(model: Model) -> Answerer:
+def estimator_answers(model: Model, size_of: SizeOf = no_size) -> Answerer:
     """Acquire and track stage on each image alone, as in the daemon on a frame without known targets.
 
-    Raises InputError if the model does not run.
+    `size_of`: what [target] says in each scene. Raises InputError if the model does not run.
     """
     estimator = Estimator(model)
     model.warm_up()
 
     def answer(index: int, picture: DatasetFrame) -> Answer:
         image_bgr = picture.undistorted_bgr()
+        estimator.target_size = size_of(picture.scene)
         started_ns = time.monotonic_ns()
         found = estimator.acquire(Frame(FrameMeta(index, started_ns, started_ns), image_bgr, picture.K))
         time_ms = (time.monotonic_ns() - started_ns) * 1e-6

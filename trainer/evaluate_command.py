@@ -63,6 +63,12 @@ def register(commands: argparse._SubParsersAction) -> None:
         "and windows (default: those of the ONNX file; 0.3 for a checkpoint)",
     )
     evaluate.add_argument(
+        "--size-given",
+        action="store_true",
+        help="give the estimator the wingspan and length of each scene's aircraft from the dataset's models, as "
+        "[target] does in flight; scenes with several types are evaluated without",
+    )
+    evaluate.add_argument(
         "--out", type=Path, default=DEFAULT_OUT, metavar="DIR", help="output folder (default %(default)s)"
     )
     windows = evaluate.add_argument_group("rendered windows instead of a dataset")
@@ -105,7 +111,15 @@ def _on_dataset(arguments: argparse.Namespace) -> None:
     refuse_no_folder(asked.out)
     own_ship: OwnShipTold = asked.own_ship or "usual"
     request = DatasetRequest(
-        asked.model, asked.results, asked.dataset, asked.split, asked.every, asked.mode, own_ship, asked.score_min
+        asked.model,
+        asked.results,
+        asked.dataset,
+        asked.split,
+        asked.every,
+        asked.mode,
+        own_ship,
+        asked.score_min,
+        asked.size_given,
     )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     errors = Console(stderr=True)
@@ -140,6 +154,7 @@ def _on_windows(arguments: argparse.Namespace) -> None:
     from trainer.held_out import Request, evaluate_file
 
     alone = {"results": None, "dataset": None, "split": None, "every": 1, "mode": "frames", "own_ship": None}
+    alone |= {"size_given": False}
     for name, unasked in alone.items():
         if getattr(arguments, name) != unasked:
             raise ConfigError(

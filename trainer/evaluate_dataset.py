@@ -20,6 +20,7 @@ from sim_replay.evaluation.consistency import consistency
 from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.files import write_files
 from sim_replay.evaluation.filtering import filtering
+from sim_replay.evaluation.given_sizes import no_size, sizes_of
 from sim_replay.evaluation.judge import Answerer, JudgedFrame, judge_frames, score_of
 from sim_replay.evaluation.spread import intervals_95
 from sim_replay.evaluation.tracked import OwnShipTold, tracker_answers
@@ -46,6 +47,7 @@ class DatasetRequest(NamedTuple):
     mode: Literal["frames", "track"] = "frames"  # each image alone, or sequences through the tracker
     own_ship: OwnShipTold = "usual"  # in mode track: accuracy of the own-ship pose given to the tracker
     score_min: float | None = None  # detection threshold; None: the model file's own
+    size_given: bool = False  # give the estimator each scene's wingspan and length, as [target] does
 
 
 class Evaluation(NamedTuple):
@@ -97,6 +99,7 @@ def evaluate_dataset(
         "mode": request.mode,
         "own_ship": request.own_ship if request.mode == "track" else None,
         "every": request.every,
+        "size_given": request.size_given,
         **score_of(dataset, method, judged),
         "intervals_95": intervals_95(judged),
         "consistency": consistency(judged),
@@ -113,17 +116,20 @@ def _subject(request: DatasetRequest, dataset: Dataset) -> tuple[dict[str, Any],
             raise ConfigError("--mode track: needs a model; a results file already contains poses")
         if request.score_min is not None:
             raise ConfigError("--score-min: needs a model; a results file already contains poses")
+        if request.size_given:
+            raise ConfigError("--size-given: needs a model; a results file already contains poses")
         return {"file": request.results.name, "precision": None}, file_answers(request.results, dataset)
     tracker = partial(tracker_answers, own_ship=request.own_ship)
     answers = tracker if request.mode == "track" else estimator_answers
+    size_of = sizes_of(dataset.models) if request.size_given else no_size
     path = request.model or SHIPPED_MODEL
     if path.suffix == ".onnx":
         model = with_score_min(load_model(path, DEFAULT_THREADS), request.score_min)
-        return method_of(model), answers(model)
+        return method_of(model), answers(model, size_of)
     from trainer.evaluate import SCORE_THRESHOLD  # torch is slow to import
     from trainer.export import export_unmeasured
 
     with tempfile.TemporaryDirectory() as folder:
         exported = export_unmeasured(path, Path(folder), score_min=SCORE_THRESHOLD)
         model = with_score_min(load_model(exported, DEFAULT_THREADS), request.score_min)
-    return method_of(model) | {"file": path.name}, answers(model)
+    return method_of(model) | {"file": path.name}, answers(model, size_of)

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
 from edge.estimator.model import Peaks
 from edge.estimator.window import PixelMap, whole_frame
 from edge.types import Array, Estimate
@@ -73,10 +74,12 @@ def decode(
     stage: Literal["acquire", "track"],
     score_min: float,
     refused: Counter[str],
+    size: TargetSize | None = None,
 ) -> list[Estimate]:
     """Accepted, distinct targets of one image of the batch, best score first.
 
-    Rejected peaks are counted in `refused` by reason if their score reaches the contract's minimum.
+    Rejected peaks are counted in `refused` by reason if their score reaches the contract's minimum. If the targets'
+    `size` is given, it goes into the depth of those that no edge cuts.
 
     The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training,
     at a limit of depth, or seen from farther above or below than in training. A cut target with its origin off the
@@ -108,9 +111,14 @@ def decode(
         nearest_m, farthest_m = contract.depth_limits_m
         if not nearest_m * (1.0 + LIMIT_TOLERANCE) < t_m[2] < farthest_m * (1.0 - LIMIT_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], LIMIT_SIGMA_LOG_Z)
+        # Outside the trained range the depth may be as far off as its distance to it.
+        sigma[2] = np.hypot(sigma[2], np.log(_excess(t_m[2], contract.trained_range_m)))
         sigma[3:] = np.hypot(sigma[3:], max(_steepness_rad(t_m, shown.up_cam) - TRAINED_STEEPNESS_RAD, 0.0))
-        covariance = pose_covariance(t_m, sigma, shown.K, contract.trained_range_m)
-        found.append(Estimate(score, on_frame, _nearest_rotation(R), t_m, covariance, stage))
+        R, oversize = _nearest_rotation(R), None
+        if size is not None and not cut:
+            sides = peaks.size_px[image, peak] / np.diag(shown.K)[:2]
+            t_m, sigma, oversize = _sized(size, R, t_m, sides, sigma, score)
+        found.append(Estimate(score, on_frame, R, t_m, pose_covariance(t_m, sigma, shown.K), stage, oversize))
     return distinct(sorted(found, key=lambda estimate: -estimate.score))
 
 
@@ -121,20 +129,16 @@ def shown_size_px(size_px: ArrayLike, pixel_map: PixelMap) -> float:
     return float(np.sqrt(width * height / enlarged))
 
 
-def pose_covariance(
-    t_cam_target_m: ArrayLike, sigma: ArrayLike, K: ArrayLike, trained_range_m: tuple[float, float]
-) -> Array:
+def pose_covariance(t_cam_target_m: ArrayLike, sigma: ArrayLike, K: ArrayLike) -> Array:
     """Covariance [6, 6] (x, y, z m, rotation x, y, z rad; cam) from sigma [6] of (u, v, log Z, rotation).
 
     t = Z K^-1 [u, v, 1], so J = [Z K^-1 e_u, Z K^-1 e_v, t]. `K` is that of the image whose pixels u and v are in.
-    Outside the trained range, the distance to it in log Z is added to the sigma of log Z, in quadrature.
     """
     t_m, sigma = np.asarray(t_cam_target_m, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
     K_inverse = np.linalg.inv(np.asarray(K, dtype=np.float64))
-    sigma_log_z = np.hypot(sigma[2], np.log(_excess(t_m[2], trained_range_m)))
     J = np.column_stack([t_m[2] * K_inverse[:, 0], t_m[2] * K_inverse[:, 1], t_m])
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = J @ np.diag([sigma[0] ** 2, sigma[1] ** 2, sigma_log_z**2]) @ J.T
+    covariance[:3, :3] = J @ np.diag(sigma[:3] ** 2) @ J.T
     covariance[3:, 3:] = np.diag(sigma[3:] ** 2)
     return covariance
 
@@ -234,6 +238,24 @@ def _widened(sigma: Array, score: float, longer_px: float, cut: bool, trained_bo
         wider[2] = np.hypot(wider[2], CUT_SIGMA_LOG_Z)
         wider[3:] = np.hypot(wider[3:], CUT_SIGMA_ROTATION_RAD)
     return wider
+
+
+def _sized(
+    size: TargetSize, R: Array, t_m: Array, sides: Array, sigma: Array, score: float
+) -> tuple[Array, Array, float | None]:
+    """Position [3] and sigma [6] with the depth by the given size taken in, and how many times as large the target
+    appears to be, if that contradicts it. `sides` [2]: of the box, in units of Z."""
+    by_size = depth_by_size(size, R, t_m[:2] / t_m[2], sides, sigma[3:])
+    # What may be none may also have a wrong box.
+    by_size = by_size._replace(variance=by_size.variance + (1.0 - score) * DOUBT_SIGMA_LOG_Z**2)
+    appearance = Depth(float(np.log(t_m[2])), float(sigma[2] ** 2))
+    (log_z, variance), contradicted = combined(appearance, by_size)
+    oversize = float(np.exp(appearance.log_z - by_size.log_z)) if contradicted else None
+    return (
+        t_m * np.exp(log_z - appearance.log_z),
+        np.array([*sigma[:2], np.sqrt(variance), *sigma[3:]]),
+        oversize,
+    )
 
 
 def _excess(value: float, trained: tuple[float, float]) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.estimator.decode import Shown, decode, distinct, grown, nearest_expected
+from edge.estimator.given_size import TargetSize
 from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
@@ -26,10 +27,11 @@ LOOKS_MOST = 3  # evaluations of one target, each in a larger window, until no w
 
 class Estimator:
     """Poses of the targets in single frames. Between frames it keeps only whether the last windows were evaluated
-    mirrored, and the counts of rejections."""
+    mirrored, and the counts of rejections. `target_size`, if known, may be changed between frames."""
 
-    def __init__(self, model: Model, max_targets: int = 4) -> None:
+    def __init__(self, model: Model, max_targets: int = 4, target_size: TargetSize | None = None) -> None:
         self.model = model
+        self.target_size = target_size
         self.refused: Counter[str] = Counter()
         self._max_targets = max_targets
         self._mirror = True
@@ -120,7 +122,7 @@ class Estimator:
         shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh, frame.up_cam)
         turns = quarter_turns(frame.up_cam)
         peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), contract.acquire_size_wh, turns)
-        found = decode(peaks, 0, shown, contract, "acquire", score_min, refused)
+        found = decode(peaks, 0, shown, contract, "acquire", score_min, refused, self.target_size)
         return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 1)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
@@ -179,10 +181,11 @@ class Estimator:
         flipped = np.array(mirrors, dtype=bool) if mirrors else np.zeros(len(images), dtype=bool)
         peaks = unmirrored(self.model.run(*mirrored(images, K, flipped)), images.shape[2], flipped)
         peaks = turned_back(peaks, size_wh, turns)
-        found = [
-            nearest_expected(decode(peaks, i, one, contract, "track", score_min, self.refused), boxes_xyxy_px[i])
+        decoded = [
+            decode(peaks, i, one, contract, "track", score_min, self.refused, self.target_size)
             for i, one in enumerate(shown)
         ]
+        found = [nearest_expected(estimates, box) for estimates, box in zip(decoded, boxes_xyxy_px, strict=True)]
         beyond = {
             i: box
             for i, (estimate, one) in enumerate(zip(found, shown, strict=True))

@@ -29,6 +29,7 @@ from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report
 from msgs.geometry import so3_log
 from sim_replay.bop import BopFrame, BopScene
 from sim_replay.datasets import DatasetFrame, read_undistorted_bgr
+from sim_replay.evaluation.given_sizes import SizeOf, no_size
 from sim_replay.evaluation.judge import Answer, Answerer
 from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import TargetPose
@@ -119,10 +120,11 @@ def _by_number(image_ids: Sequence[int]) -> list[int]:
     return list(accumulate((max(1, round(gap / frame)) for gap in apart), initial=0))
 
 
-def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
+def tracker_answers(model: Model, size_of: SizeOf = no_size, own_ship: OwnShipTold = "usual") -> Answerer:
     """What the daemon would send for each image if it flew through its scene; images must come in their order.
 
-    It also sees the scene's images in between, which the dataset may not ask to evaluate.
+    It also sees the scene's images in between, which the dataset may not ask to evaluate. `size_of`: what [target] says
+    in each scene.
 
     Raises InputError if the model does not run.
     """
@@ -133,6 +135,7 @@ def tracker_answers(model: Model, own_ship: OwnShipTold = "usual") -> Answerer:
     def answer(index: int, picture: DatasetFrame) -> Answer:
         if not current or current[-1].scene is not picture.scene:
             current[:] = [_Sequence.of(picture.scene, own_ship)]
+            estimator.target_size = size_of(picture.scene)
         for shown in current[-1].until(picture.image_id):
             report, estimates, time_ms = _flown(estimator, current[-1], shown)
         told = sendable(report, report.meta.capture_ns, _MAX_AGE_MS)

@@ -84,6 +84,8 @@ def write(tmp_path: Path, text: str) -> Path:
         (CAMERA + "[mount]\nt_body_cam_m = 3", "config.toml:5: [mount] t_body_cam_m: must be a list"),
         (CAMERA + "[mount]\nt_body_cam_m = [true, 0, 0]", "config.toml:5: [mount] t_body_cam_m[0]: must be"),
         (CAMERA + "[model]\npath = 3", "config.toml:5: [model] path: must be text"),
+        (CAMERA + "[target]\nwingspan_m = 11", "config.toml:4: [target]: give both wingspan_m and length_m"),
+        (CAMERA + "[target]\nwingspan_m = 11\nlength_m = 8000", "config.toml:6: [target] length_m: must be at most"),
         ("camera = 3", "config.toml:1: [camera]: must hold keys with values"),
         ("zenoh = 3\n" + CAMERA, "config.toml:1: [zenoh]: must hold keys with values"),
         ("[camera\n", "config.toml: not valid TOML: "),

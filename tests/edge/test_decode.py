@@ -26,7 +26,7 @@ WHOLE = Shown(PixelMap((1, 1), (0, 0)), K, SIZE_WH, SIZE_WH)  # the frame as it 
 @given(points, st.floats(0.1, 3), st.floats(0.1, 3), st.floats(0.01, 0.2))
 def test_covariance_is_what_sampling_the_uncertainty_gives(t_m: np.ndarray, su: float, sv: float, slz: float) -> None:
     sigma = np.array([su, sv, slz, 0.1, 0.2, 0.3])
-    covariance = pose_covariance(t_m, sigma, K, (50.0, 600.0))
+    covariance = pose_covariance(t_m, sigma, K)
     # Derivatives of t = Z K^-1 [u, v, 1] by central differences, as an independent way to the same matrix.
     u, v = project(K, t_m)
 
@@ -82,10 +82,14 @@ def test_what_is_no_pose_is_refused_and_counted() -> None:
 
 
 def test_a_depth_beyond_the_trained_range_is_less_sure() -> None:
-    sigma = np.full(6, 0.05)
-    inside, outside = (pose_covariance([0, 0, z], sigma, K, (50, 600))[2, 2] ** 0.5 / z for z in (599.0, 900.0))
-    assert inside == pytest.approx(0.05, rel=1e-6)
-    assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-6)
+    contract = ModelContract(**(CONTRACT | {"trained_range_m": (50.0, 600.0), "depth_limits_m": (1.0, 5000.0)}))
+    inside, outside = (
+        decode(peaks_of(score=1.0, z_m=z_m), 0, WHOLE, contract, "track", 0.5, Counter())[0].covariance[2, 2] ** 0.5
+        / z_m
+        for z_m in (599.0, 900.0)
+    )
+    assert inside == pytest.approx(0.05, rel=1e-3)
+    assert outside == pytest.approx(np.hypot(0.05, np.log(1.5)), rel=1e-3)
 
 
 def test_a_depth_at_either_end_of_what_a_graph_can_tell_is_a_bound() -> None:

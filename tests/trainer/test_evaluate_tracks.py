@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -65,3 +66,21 @@ def test_a_threshold_may_be_given_for_the_files_own(spots: Path, dark_spot_model
         evaluate_dataset(request._replace(score_min=1.5))
     with pytest.raises(ConfigError, match="--score-min: needs a model"):
         evaluate_dataset(request._replace(results=spots / "any.csv", score_min=0.5))
+
+
+def test_the_size_of_a_scene_s_aircraft_may_be_given(spots: Path, dark_spot_model: Path) -> None:
+    """The spot is 12 m long and wide to its network, which knows that it is 200 m away; a larger one is farther."""
+    (spots / "models").mkdir(exist_ok=True)
+    box = {"min_x": -9e3, "min_y": -9e3, "min_z": -1e3, "size_x": 14e3, "size_y": 14e3, "size_z": 2e3}
+    (spots / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": 20e3, **box}}))
+    for mode in ("frames", "track"):
+        request = DatasetRequest(dark_spot_model, dataset=spots, mode=mode, own_ship="exact")
+        without, sized = (evaluate_dataset(request._replace(size_given=given)) for given in (False, True))
+        assert [one.score["size_given"] for one in (without, sized)] == [False, True]
+        for image, t_m in estimates(without).items():
+            larger = estimates(sized)[image]
+            assert (t_m is None) == (larger is None)
+            if t_m is not None:
+                assert np.linalg.norm(larger) > np.linalg.norm(t_m) + 2.0
+    with pytest.raises(ConfigError, match="--size-given: needs a model"):
+        evaluate_dataset(request._replace(mode="frames", results=spots / "any.csv", size_given=True))
