@@ -24,11 +24,11 @@ ROUNDNESS = 2.5
 SHAPE_SIGMA = 0.07  # of log depth: what an aircraft of this size may look larger or smaller for its shape
 TURN_MAX_RAD = 0.5  # larger errors of rotation than this are not a matter of derivatives
 # The network's own log depth, of sigma s, is a mixture (docs/tracker.md, the table of known and strange aircraft): with
-# the probability 1 / (1 + (s / EVEN_SIGMA) ** STEEPNESS) it knows the aircraft and errs by KNOWN_SHARE * s, else by s
-# or STRANGE_SIGMA.
+# the probability 1 / (1 + (s / EVEN_SIGMA) ** STEEPNESS) it knows the aircraft and errs by KNOWN_SHARE * s, else by s,
+# but at least by STRANGE_SIGMA, the largest of that table.
 EVEN_SIGMA, STEEPNESS = 0.18, 2.7
 KNOWN_SHARE, KNOWN_SIGMA_MIN = 0.25, 0.02
-STRANGE_SIGMA = 0.33
+STRANGE_SIGMA = 0.45
 # Probability that the given size is not this aircraft's, and the width of log depth that it then may lie in: a factor
 # of twenty.
 WRONG_SHARE, WRONG_WIDTH = 0.03, 3.0

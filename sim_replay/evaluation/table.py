@@ -47,6 +47,8 @@ def score_table(score: dict[str, Any]) -> Group:
     """The metrics of a score (sim_replay.evaluation.judge.score_of)."""
     overall = score["overall"]
     title = f"{score['method']['file']} on {score['dataset']}, {overall['frames']} frames"
+    if score.get("size_given"):
+        title += ", size given"
     false_rate = _text(overall["false_positives_per_1000"], "{:.1f}")
     caption = f"false positives per 1,000 frames without a target: {false_rate}\n{_calibration(overall)}"
     if overall["rotations_not_known"]:

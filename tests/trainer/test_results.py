@@ -115,12 +115,23 @@ def scores() -> list[dict[str, Any]]:
 
 
 def test_the_page_has_a_row_for_each_score_and_one_of_the_paper(scores: list[dict[str, Any]]) -> None:
-    assert [score["mode"] for score in scores] == ["frames", "track"]
+    kinds = [(score["mode"], score["size_given"]) for score in scores]
+    assert kinds == [("frames", False), ("frames", True), ("track", False), ("track", True)]
     text = page(scores, "the command", "Trained on much.")
     rows = [line for line in text.splitlines() if line.startswith("| crossing")]
-    assert len(rows) == 2
-    found = 100 * scores[1]["overall"]["recall"]
-    assert f"| {found:.1f} |" in rows[1]
+    assert [row.split(" | ")[:2] for row in rows] == [
+        ["| crossing", "int8"],
+        ["| crossing", "int8, size given"],
+        ["| crossing, track", "int8"],
+        ["| crossing, track", "int8, size given"],
+    ]
+    for score, row in zip(scores, rows, strict=True):
+        assert f"| {100 * score['overall']['recall']:.1f} |" in row
+        assert f"| {score['overall']['translation_error_m']['mean']:.1f} |" in row
+    assert [line for line in text.splitlines() if line.startswith("## crossing")] == [
+        "## crossing, int8, frames",
+        "## crossing, int8, track",
+    ]
     paper = next(line for line in text.splitlines() if "the paper, FP32" in line)
     assert f"{100 * PAPER['pose_10deg_5pct']:.1f}" in paper
     assert "the command" in text
@@ -137,16 +148,11 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(
     beside = read_beside([path])
     refuse_other_pictures(beside, [CROSSING])
     rows = [line for line in page(scores, "the command", "", beside).splitlines() if line.startswith("| ")]
-    first = [row.split(" | ")[:2] for row in rows[1:5]]
-    assert [row[0] for row in first] == [
-        "| crossing",
-        "| crossing, track",
-        "| crossing",
-        "| FW-UAV6DPose (the paper's own data)",
-    ]
-    assert first[2][1] == "other_crossing-all.csv"
+    first = [row.split(" | ")[:2] for row in rows[5:7]]
+    assert [row[0] for row in first] == ["| crossing", "| FW-UAV6DPose (the paper's own data)"]
+    assert first[0][1] == "other_crossing-all.csv"
 
-    track = {**scores[1], "method": other["method"]}
+    track = {**scores[2], "method": other["method"]}
     refuse_other_pictures([track], [CROSSING])
     fewer = {**other, "overall": {**other["overall"], "frames": 3}}
     for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
