@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from msgs.settings import read_toml
 from sim_replay.datasets import open_dataset
-from sim_replay.evaluation.judge import is_seen
+from sim_replay.evaluation.judge import is_seen, labels_sha256
 from sim_replay.offline import InputError
 from trainer.config import ConfigError, made_folder
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
@@ -47,7 +47,7 @@ CURVES = (
     "network's."
 )
 Cell = Callable[[Mapping[str, Any]], float | None]
-Pictures = tuple[str | int | None, ...]  # dataset, split, every, frames, targets, mode, own ship
+Pictures = tuple[str | int | None, ...]  # dataset, split, every, frames, targets, mode, own ship; hash of the labels
 
 
 def _at(*keys: str, scale: float = 1.0) -> Cell:
@@ -126,16 +126,18 @@ def read_beside(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def refuse_other_pictures(beside: Sequence[Mapping[str, Any]], datasets: Sequence[Path]) -> None:
     """Raises ConfigError if one of `beside` was not evaluated on exactly the images of one of the datasets."""
     known = {pictures for dataset in datasets for pictures in _to_judge(dataset)} if beside else set()
+    counted = {pictures[:-1] for pictures in known}
     for score in beside:
-        if _pictures(score) not in known:
+        *counts, labels = _pictures(score)
+        if (tuple(counts) not in counted) if labels is None else ((*counts, labels) not in known):
             raise ConfigError(f"{_called(score['method'])}: was evaluated on other images: {_pictures(score)}")
 
 
 def _pictures(score: Mapping[str, Any]) -> Pictures:
-    """Which images were evaluated, and how; older scores lack own_ship and every."""
+    """Which images were evaluated, and how; older scores lack own_ship, every and the hash."""
     overall = score["overall"]
     which = score["dataset"], score["split"], score.get("every", 1), overall["frames"], overall["targets"]
-    return *which, score["mode"], score.get("own_ship")
+    return *which, score["mode"], score.get("own_ship"), score.get("labels_sha256")
 
 
 def _to_judge(dataset: Path) -> list[Pictures]:
@@ -148,7 +150,7 @@ def _to_judge(dataset: Path) -> list[Pictures]:
     targets = sum(is_seen(target) for picture in pictures for target in picture.targets)
     own_ship = {"frames": None, "track": DatasetRequest().own_ship}
     which = dataset.name, opened.split, DatasetRequest().every, len(pictures), targets
-    return [(*which, mode, own_ship[mode]) for mode in _modes(dataset)]
+    return [(*which, mode, own_ship[mode], labels_sha256(pictures)) for mode in _modes(dataset)]
 
 
 def _split(dataset: Path) -> str | None:

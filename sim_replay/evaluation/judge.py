@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,6 +128,16 @@ def judge_frames(
     return judged
 
 
+def labels_sha256(pictures: Iterable[DatasetFrame]) -> str:
+    """Of the images and the targets in them: the same for a copy of a dataset, another for one of another seed."""
+    told = hashlib.sha256()
+    for picture in pictures:
+        told.update(f"{picture.scene_id}/{picture.image_id}".encode())
+        for target in picture.targets:
+            told.update(f" {target.object_id} {np.round(1e3 * target.t_cam_target_m).astype(int).tolist()}".encode())
+    return told.hexdigest()
+
+
 def _wanted(matches: Sequence[Match]) -> tuple[Match, ...]:
     return tuple(match for match in matches if match.truth.wanted)
 
@@ -141,6 +152,7 @@ def score_of(dataset: Dataset, method: dict[str, Any], judged: Sequence[JudgedFr
     return {
         "dataset": dataset.name,
         "split": dataset.split,
+        "labels_sha256": labels_sha256(frame.picture for frame in judged),
         "method": method,
         "time_ms": latency_statistics([frame.time_ms for frame in judged if frame.time_ms is not None]),
         **statistics(len(judged), matches, false_poses, [truth.frame for frame in judged for truth in frame.not_asked]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from sim_replay.datasets import DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, write_results
 from sim_replay.evaluation.consistency import bounds_95
 from sim_replay.evaluation.directions import directions
-from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, score_of
+from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, labels_sha256, score_of
 from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
 from tests.sim_replay.foreign import UNIT, write_json, write_models_info, write_scene
@@ -258,6 +259,16 @@ def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
     shown = console.file.getvalue()
     assert "m [a].csv on hawks [v2], 2 frames" in shown
     assert shown.count("cub [/red]") == 2
+
+
+def test_the_labels_hash_tells_another_seed_s_images_and_fewer_of_them_from_a_copy(root: Path) -> None:
+    copy = Path(shutil.copytree(root, root.parent / "elsewhere"))
+    pictures = open_dataset(root).labelled_frames()
+    assert labels_sha256(open_dataset(copy).labelled_frames()) == labels_sha256(pictures)
+    assert labels_sha256(pictures[:1]) != labels_sha256(pictures)
+    truth = copy / "test" / "000000" / "scene_gt.json"
+    truth.write_text(truth.read_text().replace("200000", "200001"))
+    assert labels_sha256(open_dataset(copy).labelled_frames()) != labels_sha256(pictures)
 
 
 def test_a_list_that_no_picture_is_on_is_told(root: Path) -> None:

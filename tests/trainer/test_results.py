@@ -154,8 +154,11 @@ def test_another_method_stands_beside_a_model_that_saw_the_same_pictures(
 
     track = {**scores[2], "method": other["method"]}
     refuse_other_pictures([track], [CROSSING])
-    fewer = {**other, "overall": {**other["overall"], "frames": 3}}
-    for unlike in (fewer, {**other, "every": 2}, {**track, "own_ship": "exact"}):
+    older = {key: value for key, value in other.items() if key != "labels_sha256"}
+    refuse_other_pictures([older], [CROSSING])
+    fewer = {**older, "overall": {**other["overall"], "frames": 3}}
+    another_seed = {**other, "labels_sha256": "0" * 64}
+    for unlike in (fewer, another_seed, {**other, "every": 2}, {**track, "own_ship": "exact"}):
         with pytest.raises(ConfigError, match="other images"):
             refuse_other_pictures([unlike], [CROSSING])
     for text in ("no json", "{}", "[]", json.dumps({**other, "method": "other_crossing-all.csv"})):
@@ -252,7 +255,7 @@ def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None
     assert replay(made) == 0
     assert {path.name for path in dataset.iterdir()} >= {"train", "test"}
     other = Path(shutil.copy(SHIPPED_MODEL, tmp_path / "other.onnx"))
-    score, of_other = measure([None, other], [dataset], lambda _: None)
+    score, _, of_other = measure([None, other], [dataset], lambda _: None)
     assert (score["method"]["file"], of_other["method"]["file"]) == (SHIPPED_MODEL.name, "other.onnx")
     assert score["overall"]["frames"] == len(list((dataset / "test").glob("*/rgb/*")))
     assert score["recipe"].endswith("--every 2 --split test")
@@ -294,7 +297,7 @@ def test_what_stands_beside_other_pictures_is_refused_before_the_hours_of_measur
     monkeypatch.setattr("trainer.results.measure", lambda *_: pytest.fail("it measured"))
     given = ["--benchmark", str(dataset.parent), "--beside", str(beside), "--out", str(tmp_path / "out")]
     assert main(["results", *given]) == 2
-    told = "other.csv: was evaluated on other images: ('crossing', None, 1, 150, 149, 'frames', None)"
+    told = "other.csv: was evaluated on other images: ('crossing', None, 1, 150, 149, 'frames', None, None)"
     assert told in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
