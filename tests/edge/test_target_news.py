@@ -22,6 +22,7 @@ from sim_replay.ports import free_port
 from .flying import flying, toml
 from .reports import make_report as report
 from .reports import make_track as track
+from .reports import rangeless
 from .toy_scene import K, draw
 
 FRAME_NS = 33_000_000
@@ -55,7 +56,7 @@ def test_a_number_that_is_used_again_is_another_target() -> None:
     ("scores", "calibrated", "chosen", "told"),
     [
         ((0.6, 0.6, 0.7), True, False, []),
-        ((0.6, 0.9, 0.6), True, False, ["target 0 acquired at 240 m", "target 0 lost: held for 0.0 s"]),
+        ((0.6, 0.9, 0.6, 0.6, 0.6), True, False, ["target 0 acquired at 240 m", "target 0 lost: held for 0.1 s"]),
         ((0.6, 0.6, 0.7), True, True, ["target 0 acquired at 240 m", "target 0 lost: held for 0.1 s"]),
         ((0.6, 0.6, 0.7), False, False, ["target 0 acquired at 240 m", "target 0 lost: held for 0.1 s"]),
     ],
@@ -79,6 +80,15 @@ def test_no_range_is_told_that_is_too_uncertain_to_be_sent() -> None:
         told.append([text for _, text in news.words(report(seen))])
     assert told == [["target 0 acquired, range unknown"], [], []]
     assert news.words(report())[0][1].endswith("last seen at 240 m")
+    news.words(report(rangeless(track(0))))
+    assert news.words(report()) == [(logging.WARNING, "target 0 lost: held for 0.0 s, range unknown")]
+
+
+def test_several_at_once_are_told_in_the_order_of_their_numbers() -> None:
+    news, both = TargetNews(), [track(0, track_id=number) for number in (8, 1)]
+    told = [text.partition(" at ")[0] for one in (report(*both), report()) for _, text in news.words(one)]
+    assert told[:2] == ["target 1 acquired", "target 8 acquired"]
+    assert [text.split(":")[0] for text in told[2:]] == ["target 1 lost", "target 8 lost"]
 
 
 def test_the_ground_hears_that_a_target_is_lost(tmp_path: Path, toy_model: Path) -> None:
