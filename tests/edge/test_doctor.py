@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
-import pwd
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +16,12 @@ import serial
 from edge.config import load_config
 from edge.doctor import camera_as_told
 from edge.doctor_links import link_findings
-from edge.doctor_machine import clock_finding, cpu_finding, disk_finding
 from edge.health import Health
 from edge.links.signing_key import write_new_key
 from edge.reload import load_configured
 from edge.status import ask
 from edge.status_board import StatusBoard
 from edge.types import CameraInfo
-from sim_replay.faults.rig import can_mount
 from sim_replay.ports import free_port
 from tests.waiting import until
 
@@ -132,36 +127,6 @@ def test_a_configuration_that_is_wrong_is_told_as_everywhere(cli: Cli, tmp_path:
     done = cli("doctor", "--config", "config.toml")
     assert done.returncode == 2
     assert "config.toml:1: [camera]: type must be one of" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("cpuinfo", "machine", "verdict"),
-    [
-        ("flags\t\t: fpu avx2 avx512_vnni\n", "x86_64", "good"),
-        ("flags\t\t: fpu avx2 avx_vnni\n", "x86_64", "good"),
-        ("flags\t\t: fpu avx2\n", "x86_64", "poor"),
-        ("Features\t: fp asimd asimddp\n", "aarch64", "good"),  # Cortex-A76, Raspberry Pi 5
-        ("Features\t: fp asimd\n", "aarch64", "poor"),  # Cortex-A72, Raspberry Pi 4
-        ("Features\t: fp asimd\n", "riscv64", "poor"),
-    ],
-)
-def test_the_processor_s_eight_bit_instructions_are_looked_for(cpuinfo: str, machine: str, verdict: str) -> None:
-    assert cpu_finding(cpuinfo, machine).verdict == verdict
-
-
-def test_the_clock_is_judged_by_what_the_kernel_says() -> None:
-    assert clock_finding(0).verdict == "good"
-    assert "chrony" in clock_finding(5).advice
-    assert clock_finding(-1).verdict == "poor"
-
-
-def test_a_disk_without_room_is_wrong(tmp_path: Path) -> None:
-    assert disk_finding(tmp_path / "not" / "yet", 0, from_start=True).verdict == "good"
-    assert "MB free" in disk_finding(tmp_path, 10**18, from_start=True).says
-    file = tmp_path / "file"
-    file.write_text("")
-    found = disk_finding(file / "folder", 0, from_start=True)
-    assert (found.verdict, "cannot be written" in found.says) == ("wrong", True)
 
 
 def test_a_disk_that_only_the_ground_s_command_would_write_to_is_looked_at_too(
@@ -272,84 +237,3 @@ def test_what_a_running_daemon_lacks_without_a_camera_is_told_too(
     assert {what for what, one in found.items() if one.verdict != "good"} == set(wrong)
     for what, words in wrong.items():
         assert (found[what].verdict, words in found[what].says) == ("wrong", True), found[what].says
-
-
-NO_ROOT_LOOKS = """
-import os
-from pathlib import Path
-from edge.doctor_machine import disk_finding
-from edge.findings import device_fault
-if os.geteuid() == 0:  # who may everything
-    os.setgroups([])
-    os.setgid(65534)
-    os.setuid(65534)
-print(*(device_fault(Path("{path}"), "video") or ["may be used"]), sep="\\n")
-print(disk_finding(Path("{path}"), 0, from_start=True).line())
-"""
-
-
-def nobody() -> str:
-    """Who looks in `looked_at_by_nobody`."""
-    return pwd.getpwuid(os.geteuid() or 65534).pw_name
-
-
-def looked_at_by_nobody(folder: Path, path: str) -> str:
-    """What is said of `path`, from `folder`, as a device and as a folder for recordings."""
-    folder.chmod(0o755)
-    command = [sys.executable, "-c", NO_ROOT_LOOKS.replace("{path}", path)]
-    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder).stdout
-
-
-@pytest.mark.parametrize(
-    ("mode", "words"),
-    [(0o000, "usermod -aG video {user},"), (0o444, "is not readable and writable"), (0o666, "may be used")],
-)
-def test_a_device_without_permission_names_the_group_and_who_lacks_it(tmp_path: Path, mode: int, words: str) -> None:
-    """With `sudo -u uavpose`, $USER of the person who follows the advice is another."""
-    device = tmp_path / "video0"
-    device.touch()
-    device.chmod(mode)
-    assert words.format(user=nobody()) in looked_at_by_nobody(tmp_path, "video0")
-
-
-@pytest.mark.parametrize("path", ["home/rec", "home/rec/deep", "home/none", "link"])
-def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_as_forbidden(tmp_path: Path, path: str) -> None:
-    (tmp_path / "home" / "rec").mkdir(parents=True)
-    (tmp_path / "link").symlink_to(tmp_path / "home" / "rec")
-    (tmp_path / "home").chmod(0o000)
-    said = looked_at_by_nobody(tmp_path, path)
-    (tmp_path / "home").chmod(0o755)  # or pytest, where it is not root, cannot remove it
-    assert f"{path} is not readable" in said
-    assert f"namei -l {path}" in said
-    assert f"WRONG  disk         {path} cannot be written by this user" in said
-
-
-ADVICE_FOLDER = "`sudo install -d -o {user} 'my rec'`"
-
-
-@pytest.mark.parametrize(("mode", "words"), [(0o777, "GB free"), (0o555, ADVICE_FOLDER), (0o333, ADVICE_FOLDER)])
-def test_a_recorder_s_folder_must_be_one_to_write_and_to_look_into(tmp_path: Path, mode: int, words: str) -> None:
-    folder = tmp_path / "my rec"
-    folder.mkdir()
-    folder.chmod(mode)
-    said = looked_at_by_nobody(tmp_path, "my rec")
-    folder.chmod(0o755)
-    assert words.format(user=nobody()) in said
-
-
-ON_A_READ_ONLY_DISK = 'mount -t tmpfs -o ro tmpfs "$1" && exec "$2" -c "$3" "$1"'
-LOOK_AT_DISK = """
-import sys
-from pathlib import Path
-from edge.doctor_machine import disk_finding
-print(disk_finding(Path(sys.argv[1]) / "rec", 0, from_start=True).line())
-"""
-
-
-def test_a_disk_that_is_mounted_read_only_is_not_taken_for_one_that_others_own(tmp_path: Path) -> None:
-    if not can_mount(tmp_path):
-        pytest.skip("this host does not let a user mount a file system (unshare --map-root-user --mount)")
-    mounting = ["unshare", "--map-root-user", "--mount", "sh", "-c", ON_A_READ_ONLY_DISK, "sh", str(tmp_path)]
-    said = subprocess.run([*mounting, sys.executable, LOOK_AT_DISK], capture_output=True, text=True, check=True).stdout
-    assert f"WRONG  disk         {tmp_path}/rec is on a disk that is mounted read-only" in said
-    assert "$USER" not in said
