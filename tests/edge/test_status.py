@@ -112,6 +112,22 @@ def test_of_several_vehicles_behind_one_router_status_wants_to_know_which(cli: C
     assert answers["model"]["sha256"] == "model of uav2"
 
 
+@pytest.mark.parametrize("info", [b"{}", b"not JSON", b"[]", None])
+def test_who_does_not_answer_like_a_daemon_is_none(info: bytes | None) -> None:
+    """`info` alone, as from a daemon that ends in between, or something else, or an error."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def reply(query: zenoh.Query) -> None:
+        if info is None:
+            query.reply_err(b"not now")
+        else:
+            query.reply(key_of("uav1", "info"), info)
+
+    with zenoh.open(router_config([endpoint])) as router:
+        router.declare_queryable(key_of("uav1", "info"), zenoh.handlers.Callback(reply, indirect=False))
+        assert ask(endpoint, "uav1") is None
+
+
 DROPS, SILENT = Reason("drops", "12 % of frames dropped"), Reason("no_frame", "no frame for 3 s")
 TRACKING = Condition(HealthState.TRACKING, Activity.TRACKING)
 
@@ -135,7 +151,7 @@ TRACKING = Condition(HealthState.TRACKING, Activity.TRACKING)
             f"fault: {SILENT.text}; {DROPS.text}",
             False,
         ),
-        (TRACKING, 4.0, "tracking", False),
+        (TRACKING, 3.0, "tracking", False),
     ],
 )
 def test_what_works_and_what_a_person_is_told_of_it(
@@ -156,7 +172,7 @@ def test_what_works_and_what_a_person_is_told_of_it(
         ["model", "toy", "fp32", board.model.sha256[:12], "on", "cpu"],
         ["config", str(tmp_path / "flight.toml")],
     ]
-    stalled = "; 4 s OLD: the main loop has stalled" if age_s == 4.0 else ""
+    stalled = "; 3 s OLD: the main loop has stalled" if age_s == 3.0 else ""
     figures = [
         *("  targets   2", f"  frames    30.0 a second{stalled}", ""),
         f"  {'stage':12} {'p50 ms':>8} {'p95 ms':>8} {'p99 ms':>8}",
@@ -164,6 +180,8 @@ def test_what_works_and_what_a_person_is_told_of_it(
         *("", f"  {'dropped':40} {3:>12}"),
     ]
     assert lines[5:] == ([] if condition is None else figures)
+    answer["model"]["fallback_reason"] = "no CUDA device"
+    assert for_a_person(answer).splitlines()[3] == f"{lines[3]} (no CUDA device)"
 
 
 def test_status_asks_on_loopback_where_the_daemon_listens_there(tmp_path: Path) -> None:
@@ -178,6 +196,8 @@ def test_status_asks_on_loopback_where_the_daemon_listens_there(tmp_path: Path) 
         config.write_text(f'[camera]\ntype = "sequence"\npath = "{tmp_path}"\n[zenoh]\n{zenoh_keys}\n')
         with pytest.raises(InputError, match=words):
             status(config, None, None, as_json=True)
+    with pytest.raises(InputError, match="a/b"):
+        status(None, None, "a/b", as_json=True)
 
 
 def test_status_refuses_what_is_no_address(cli: Cli) -> None:
@@ -187,11 +207,15 @@ def test_status_refuses_what_is_no_address(cli: Cli) -> None:
 
 
 @pytest.mark.usefixtures("daemon")
-def test_another_vehicle_s_name_is_not_answered(cli: Cli, ports: tuple[int, int]) -> None:
+def test_another_vehicle_s_name_is_not_answered(
+    folder: Path, ports: tuple[int, int], capsys: pytest.CaptureFixture[str]
+) -> None:
     """As of a daemon that was given another name and not restarted: it is there all the same."""
-    asked = cli("status", "--connect", f"tcp/127.0.0.1:{ports[0]}", "--vehicle", "merlin")
-    assert asked.returncode == 1
-    assert asked.stdout.startswith(f"kestrel and not merlin answers at tcp/127.0.0.1:{ports[0]}: ")
+    endpoint, words = f"tcp/127.0.0.1:{ports[0]}", f"kestrel and not merlin answers at tcp/127.0.0.1:{ports[0]}: "
+    assert status(None, endpoint, "merlin", as_json=False) == 1
+    assert capsys.readouterr().out.startswith(words)
+    assert status(folder / "config.toml", None, "merlin", as_json=True) == 1
+    assert json.loads(capsys.readouterr().out)["error"].startswith(words)
 
 
 @pytest.mark.usefixtures("daemon")
