@@ -16,7 +16,7 @@ import pytest
 from edge import calibrate
 from edge.calibrate import VIEWS_MAX, report, write_calibration
 from edge.calibrate_board import BoardSettings, View
-from edge.calibrate_fit import WITHOUT_RAY_MAX, Calibration, Coefficients, calibration_of, fit, reason_against
+from edge.calibrate_fit import WITHOUT_RAY_MAX, Calibration, Coefficients, Fit, calibration_of, fit, reason_against
 from edge.cameras.intrinsics import load_intrinsics
 from edge.config_camera import IntrinsicsSettings
 from edge.estimator.lens import Lens
@@ -208,3 +208,62 @@ def test_views_that_do_not_settle_so_many_coefficients_are_told_as_that() -> Non
     assert str(reason_against(8, lost, used, SIZE_WH)).endswith("not a fisheye. Or use fewer: --coefficients 5")
     # What is not settled is no reason to refuse what is.
     assert reason_against(4, {**loose, 8: replace(loose[8], rms_px=0.0)}, used, SIZE_WH) is None
+
+
+ALIKE = "the views are too similar to separate focal length and distance"
+NONE_DESCRIBES = r"check that the board is flat, --squares correct, and the lens not a fisheye"
+ENOUGH = (15.1, 15.1, 15.1, 14.9, 0.0)  # degrees: three tilted views are needed
+TILTED, SETTLED = (ENOUGH,) * 3, (0.005,) * 3
+
+
+def described(
+    rms_px: tuple[float, float, float],
+    focal_sigma: tuple[float, float, float],
+    tilts_deg: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]],
+) -> dict[Coefficients, Fit]:
+    """Fits of 4, 5 and 8 coefficients, of a lens that bends nothing."""
+    K = np.array([[1640.0, 0, 963], [0, 1640, 536], [0, 0, 1]])
+    numbers: tuple[Coefficients, ...] = (4, 5, 8)
+    return {
+        n: Fit(n, K, (0.0,) * max(n, 5), rms, sigma, np.full(len(tilts), rms), np.radians(tilts))
+        for n, rms, sigma, tilts in zip(numbers, rms_px, focal_sigma, tilts_deg, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("chosen", "rms_px", "focal_sigma", "tilts_deg", "cells", "said"),
+    [
+        (4, (1.5, 1.5, 1.5), SETTLED, TILTED, 8, "None"),
+        (4, (1.51, 1.51, 1.51), SETTLED, TILTED, 8, f".* is 1.51 px; {NONE_DESCRIBES}"),
+        (4, (0.1, 0.1, 0.1), SETTLED, TILTED, 7, "the views cover only 44 % of the image; .*"),
+        (4, (0.1, 0.1, 0.1), SETTLED, (ENOUGH[1:],) * 3, 8, rf"{ALIKE} \(2 of 4 are tilted\): .*"),
+        (4, (0.1, 0.1, 0.1), (0.0061,) * 3, TILTED, 8, rf"{ALIKE} \(1 sigma 0.6 %\): .*"),
+        # Of models that describe the views alike, the one with the fewest tilted; not one that describes them worse.
+        (4, (0.1, 0.1, 0.1), SETTLED, (ENOUGH, ENOUGH[2:], ENOUGH), 8, rf"{ALIKE} \(1 of 5 are .*"),
+        (8, (1.0, 0.1, 0.1), SETTLED, (ENOUGH[2:], ENOUGH, ENOUGH), 8, "None"),
+        # A quarter less, and at least 0.02 px.
+        (4, (1.0, 0.76, 0.76), SETTLED, TILTED, 8, "None"),
+        (4, (1.0, 0.75, 0.74), SETTLED, TILTED, 8, ".* 1.00 px with 4 .* 0.75 px with 5: .* 5"),
+        (4, (1.0, 0.75, 0.5), SETTLED, TILTED, 8, ".* 1.00 px with 4 .* 0.50 px with 8: .* 8"),
+        (4, (0.06, 0.041, 0.041), SETTLED, TILTED, 8, "None"),
+        (4, (0.06, 0.039, 0.039), SETTLED, TILTED, 8, ".* 0.06 px with 4 .* 0.04 px with 5: .* 5"),
+        # No advice: what is as wrong, what is not settled, and fewer coefficients that describe the views worse.
+        (4, (4.0, 1.6, 1.6), SETTLED, TILTED, 8, f".* 4.00 px; {NONE_DESCRIBES}"),
+        (4, (1.0, 0.5, 0.5), (0.005, 0.0051, np.inf), TILTED, 8, "None"),
+        (8, (1.0, 1.6, np.inf), SETTLED, TILTED, 8, f"the fit failed; {NONE_DESCRIBES}. .* fewer: .* 4"),
+        (8, (1.0, 1.0, 0.9), (0.005, 0.0051, np.inf), TILTED, 8, ".* determine 8 .*; .*. Or .*: .* 4"),
+        (8, (1.0, 1.0, 0.9), (np.inf, np.inf, np.inf), TILTED, 8, ".* 8 coeff.*; show .* in more places"),
+    ],
+)
+def test_each_fault_has_its_limit_and_advice_that_helps(
+    chosen: Coefficients,
+    rms_px: tuple[float, float, float],
+    focal_sigma: tuple[float, float, float],
+    tilts_deg: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]],
+    cells: int,
+    said: str,
+) -> None:
+    """`cells`: how many of the image's 16 the board was seen in."""
+    corners = np.array([[480.0 * (k % 4) + 1.0, 270.0 * (k // 4) + 1.0] for k in range(cells)])
+    seen = [View(np.arange(cells), BOARD[:cells], corners)] * len(tilts_deg[0])
+    assert re.fullmatch(said, str(reason_against(chosen, described(rms_px, focal_sigma, tilts_deg), seen, SIZE_WH)))
