@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import platform
 import subprocess
 import sys
 from dataclasses import replace
@@ -184,9 +186,28 @@ def test_threads_without_cores_of_their_own_have_no_peak(tmp_path: Path, monkeyp
 
 def test_as_many_threads_as_cores_have_a_peak() -> None:
     one = Peak(1, 200.0, 40.0)
-    assert not Peak(2, 390.0, 70.0).beside(one).shared
-    assert Peak(2, 390.0, 45.0).beside(one).limit_ms(10**9, 10**9) is None
+    assert Peak(2, 260.0, 52.0).beside(one).limit_ms(26 * 10**7, 52 * 10**7) == pytest.approx(1.0 + 10.0)
+    assert Peak(2, 390.0, 51.9).beside(one).limit_ms(10**9, 10**9) is None
+    assert Peak(2, 259.9, 70.0).beside(one).limit_ms(10**9, 10**9) is None
     assert not one.beside(one).shared
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "name"),
+    [
+        ("processor\t: 0\nmodel name\t: A CPU: 2 GHz\n\nprocessor\t: 1\nmodel name\t: another\n", "A CPU: 2 GHz"),
+        ("processor\t: 0\nBogoMIPS\t: 108.00\n", platform.machine()),  # as of Arm's kernels
+        (None, platform.machine()),
+    ],
+)
+def test_the_processor_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, toy_model: Path, cpuinfo: str | None, name: str
+) -> None:
+    monkeypatch.setattr("edge.bench.measure.CPU_INFO", tmp_path / "cpuinfo")
+    if cpuinfo is not None:
+        (tmp_path / "cpuinfo").write_text(cpuinfo)
+    measured = measure([toy_model], [1], spinning=False, rounds=1, others=False, on_round=lambda _: None)
+    assert table(measured).startswith(f"{name}, {len(os.sched_getaffinity(0))} cores, ONNX Runtime ")
 
 
 def test_files_of_one_name_are_told_apart(cli: Cli, tmp_path: Path) -> None:
@@ -209,14 +230,33 @@ def test_signals_to_the_pipeline_reach_the_harness(tmp_path: Path) -> None:
             bench.kill()
 
 
+def test_the_pipeline_is_given_what_bench_was(tmp_path: Path) -> None:
+    """By a harness that says what it was given, beside a Python in a folder of its own."""
+    python = tmp_path / "python"
+    python.symlink_to(sys.executable)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+
+    def piped(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [python, "-m", "edge.cli", "bench", "--pipeline", *arguments]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+    missing = piped()
+    assert (missing.returncode, f"is not installed beside {python}" in missing.stderr) == (2, True), missing.stderr
+    (tmp_path / "uavpose-replay").write_text('#!/bin/sh\necho "$@"\n')
+    (tmp_path / "uavpose-replay").chmod(0o755)
+    assert piped().stdout == "bench-pipeline\n"
+    told = piped("a.onnx", "--sequence", "scene", "--minutes", "0.5", "--fps", "20", "--json").stdout
+    assert told == "bench-pipeline --sequence scene --minutes 0.5 --fps 20.0 --model a.onnx --json\n"
+
+
 def test_the_report_holds_its_ratios(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     int8 = write_toy_model(tmp_path / "int8.onnx", precision="int8")
     paper = write_toy_model(tmp_path / "paper.onnx", configuration="paper", track_size_wh=None)
-    done = cli("bench", toy_model, int8, paper, "--runs", "5", "--threads", "1,2", "--alone", "--json")
+    done = cli("bench", toy_model, int8, paper, "--runs", "5", "--threads", "2,1,2", "--alone", "--json")
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     rows = {(Path(r["file"]).stem, r["stage"], r["threads"]): r for r in result["rows"]}
-    assert len(rows) == 2 * (2 + 2 + 1)
+    assert len(rows) == len(result["rows"]) == 2 * (2 + 2 + 1)
     p10 = {key: row["ms"]["p10"] for key, row in rows.items()}
     ratios = result["ratios"]
     assert ratios["int8_over_fp32"] == pytest.approx(p10["int8", "track", 2] / p10["toy", "track", 2])
@@ -327,12 +367,17 @@ def test_the_shipped_model_is_held_to_the_machine(cli: Cli) -> None:
     [
         (["--threads", "two"], "--threads two"),
         (["--threads", "0"], "--threads 0"),
+        (["--threads", "65"], "integers from 1 to 64"),
         (["--threads", "1,99999999999999999999"], "integers from 1 to 64"),
         (["--runs", "0"], "--runs 0"),
         (["none.onnx", "--alone"], "none.onnx"),
         (["--minutes", "1"], "--minutes needs --pipeline"),
         (["--pipeline", "--threads", "1"], "--threads cannot be combined with --pipeline"),
+        (["--sequence", "scene"], "--sequence needs --pipeline"),
+        (["--fps", "20"], "--fps needs --pipeline"),
         (["--pipeline", "--alone"], "--alone cannot be combined with --pipeline"),
+        (["--pipeline", "--spinning"], "--spinning cannot be combined with --pipeline"),
+        (["--pipeline", "--runs", "9"], "--runs cannot be combined with --pipeline"),
         (["--pipeline", "a.onnx", "b.onnx"], "--pipeline takes one model, not 2"),
     ],
 )
