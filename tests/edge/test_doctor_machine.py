@@ -68,6 +68,23 @@ def test_the_clock_is_judged_by_what_the_kernel_says() -> None:
     assert clock_finding(-1).verdict == "poor"
 
 
+@pytest.mark.parametrize(
+    ("recorder", "zenoh", "looked_at"),
+    [
+        ({"enabled": True}, {"enabled": False}, True),
+        ({"enabled": True}, {"commands": False}, True),
+        ({}, {}, True),  # the ground may start recordings
+        ({}, {"commands": False}, False),
+        ({}, {"enabled": False}, False),
+    ],
+)
+def test_the_disk_is_looked_at_where_something_may_be_recorded(
+    recorder: dict[str, bool], zenoh: dict[str, bool], looked_at: bool
+) -> None:
+    found = machine_findings(configured(recorder=recorder, zenoh=zenoh))
+    assert ("disk" in {one.what for one in found}) == looked_at
+
+
 def test_a_disk_without_room_is_wrong(tmp_path: Path) -> None:
     enough = disk_finding(tmp_path / "not" / "yet", 0, from_start=True)
     recorder = {"enabled": True, "folder": tmp_path, "free_min_mb": 1e9}
