@@ -125,8 +125,8 @@ class Pictures:
 
 
 def jpeg(image_bgr: NDArray[np.uint8], quality: int, tight: bool = False) -> bytes | None:
-    """[H, W, 3] as JPEG, with optimised Huffman tables if `tight`; None if it cannot be encoded (JPEG is limited to
-    65,535 pixels per side)."""
+    """[H, W, 3] as JPEG, with optimised Huffman tables if `tight`; None if it cannot be encoded (libjpeg takes at
+    most 65,500 pixels per side)."""
     try:
         settings = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, int(tight)]
         done, data = cv2.imencode(".jpg", image_bgr, settings)

@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from edge.config import RecorderSettings, ZenohSettings
 from edge.config_ground import ZenohTlsSettings
 from edge.links.zenoh_link import ZenohLink
-from edge.pictures import LIVE_BYTES_MAX, Pictures, Rate
+from edge.pictures import LIVE_BYTES_MAX, RECORDED_QUALITY, WAITING_MAX, Picture, Pictures, Rate, jpeg, small_jpeg
 from edge.types import Frame, FrameMeta, Mount
 from msgs.cdr import CompressedImage, PoseWithCovarianceStamped
 from msgs.client import connect
@@ -161,6 +161,61 @@ def test_a_recording_holds_as_many_pictures_a_second_as_was_asked_for(tmp_path: 
     assert [int(np.median(image)) for _, image in kept] == pytest.approx([0, 120, 0, 120], abs=2)
     stamps_s = np.array([message.stamp_ns - kept[0][0].stamp_ns for message, _ in kept]) * 1e-9
     np.testing.assert_allclose(stamps_s, [0.0, 0.2, 0.4, 0.6], atol=0.002)
+
+
+class Album:
+    """A link that looks and records, and keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.kept: list[Picture] = []
+
+    def wants_picture(self) -> bool:
+        return True
+
+    def records_picture(self) -> bool:
+        return True
+
+    def publish_picture(self, picture: Picture) -> None:
+        self.kept.append(picture)
+
+
+def test_what_waits_at_the_end_is_handed_over_and_what_was_replaced_is_counted() -> None:
+    album, more = Album(), 2
+    pictures = Pictures(album, live_max_hz=30.0, recorded_max_hz=30.0)
+    frames = [frame(k, k * 10**9) for k in range(1, WAITING_MAX + more + 1)]
+    for one in frames:
+        pictures.show(one)
+    pictures.start()
+    for _ in range(2):
+        pictures.stop()
+    assert pictures.counters() == {"replaced": more}
+    kept = [(one.capture_ns, one.live, one.recorded) for one in album.kept]
+    times_ns = [one.meta.capture_ns for one in frames[more:]]
+    assert kept == [(t_ns, live, not live) for t_ns in times_ns for live in (False, True)]
+    assert album.kept[0].jpeg == jpeg(frames[more].image_bgr, RECORDED_QUALITY)
+    assert album.kept[1].jpeg == small_jpeg(frames[more].image_bgr)
+
+
+@pytest.mark.parametrize(
+    ("side", "settings"),
+    [(400, (80, False)), (500, (60, False)), (600, (40, False)), (750, (20, False)), (900, (20, True)),
+     (1100, (10, True)), (1600, (5, True)), (2400, None)],
+)  # fmt: skip
+def test_who_looks_has_the_best_quality_that_fits(side: int, settings: tuple[int, bool] | None) -> None:
+    """Of noise: one quality less is half a picture's side more."""
+    image = np.random.default_rng(0).integers(0, 256, (side, side, 3), dtype=np.uint8)
+    assert small_jpeg(image) == (None if settings is None else jpeg(image, *settings))
+
+
+def test_a_picture_longer_than_jpeg_can_tell_is_none() -> None:
+    assert jpeg(np.zeros((1, 65_500, 3), np.uint8), 90) is not None
+    assert jpeg(np.zeros((1, 65_536, 3), np.uint8), 90) is None
+
+
+def test_a_pause_is_not_made_up_for() -> None:
+    rate, times_s = Rate(10.0), (0.0, 0.09, 0.1, 5.03, 5.04, 5.06, 5.12, 5.13, 5.19, 5.21)
+    assert [t for t in times_s if rate.due(round(t * 1e9))] == [0.0, 0.1, 5.03, 5.04, 5.13]
+    assert not any(Rate(0.0).due(t) for t in (0, 10**9, 10**12))
 
 
 @pytest.mark.parametrize("hz", [1.0, 7.0, 30.0])
