@@ -110,6 +110,12 @@ def test_the_peak_is_of_a_valid_graph_that_multiplies(op: str, types: tuple[int,
     np.testing.assert_allclose(product, left.astype(np.int64) @ weight.astype(np.int64), rtol=1e-5, atol=1.0)
 
 
+@pytest.mark.parametrize(("precision", "kind"), [("int8", np.int32), ("fp32", np.float32)])
+def test_each_precision_has_a_peak_of_its_own_over_the_products_that_are_counted(precision: str, kind: type) -> None:
+    (product,) = peak.product(precision, 1)()  # type: ignore[misc]
+    assert (product.dtype, product.size * peak.INNER) == (kind, peak.MACS)
+
+
 def test_cases_take_turns() -> None:
     order: list[str] = []
     ms = time_in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, lambda _: None)
