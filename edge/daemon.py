@@ -165,9 +165,9 @@ class Pipeline:
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
         estimates = self._estimate(frame, expected, pointed_at, clock)
-        self._size_watch.seen(capture_ns, estimates)
         chosen_id = self._by_hand.chosen_id
         doubtful_below = self._estimator.model.doubtful_below
+        self._size_watch.seen(capture_ns, estimates, doubtful_below)
         tracks = self._tracker.update(
             capture_ns, estimates, own_ship, frame.K, size_wh, frame.distortion, chosen_id, doubtful_below
         )
@@ -271,6 +271,8 @@ class Pipeline:
         new = self._reloader.take(self._board.file, self._estimator, self._board.camera, self._outlets.event)
         if new is None:
             return
+        if new.file.config.target != self._board.file.config.target:
+            self._size_watch = SizeWatch()
         replaced = new.estimator is not self._estimator
         if replaced:
             new.estimator.refused.update(self._estimator.refused)

@@ -8,10 +8,13 @@ from collections.abc import Sequence
 from statistics import median
 
 from edge.health import Reason
-from edge.types import PROBABLE_SCORE, Estimate
+from edge.types import Estimate
 
 RECENT_NS = 3_000_000_000
 SIGHTS_LEAST = 5  # in that time, for a judgement
+# Shares of them that contradict the size: what is told of from the one on is told of down to the other, so that a share
+# in between does not come and go.
+TOLD_ABOVE, OVER_BELOW = 0.5, 0.25
 
 
 class SizeWatch:
@@ -19,18 +22,22 @@ class SizeWatch:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, float]] = deque()  # capture_ns, times as large as given; 1: no contradiction
+        self._told = False
 
-    def seen(self, capture_ns: int, estimates: Sequence[Estimate]) -> None:
+    def seen(self, capture_ns: int, estimates: Sequence[Estimate], doubtful_below: float) -> None:
+        """Add a frame; estimates of a lower score than `doubtful_below` do not count."""
         for estimate in estimates:
-            if estimate.score >= PROBABLE_SCORE:
+            if estimate.score >= doubtful_below:
                 self._recent.append((capture_ns, 1.0 if estimate.oversize is None else estimate.oversize))
 
     def reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        """One if more than half of what was seen lately contradicts the given size."""
+        """One if most of what was seen lately contradicts the given size, until little of it does."""
         while self._recent and self._recent[0][0] < now_ns - RECENT_NS:
             self._recent.popleft()
         against = [oversize for _, oversize in self._recent if oversize != 1.0]
-        if len(self._recent) < SIGHTS_LEAST or 2 * len(against) <= len(self._recent):
+        most = (OVER_BELOW if self._told else TOLD_ABOVE) * len(self._recent)
+        self._told = len(self._recent) >= SIGHTS_LEAST and len(against) > most
+        if not self._told:
             return ()
         times = math.exp(median(math.log(oversize) for oversize in against))
         return (Reason("target_size", f"the target appears to be {times:.2g} times as large as [target] says"),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from edge.estimator.decode import decode
 from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
-from edge.size_watch import SizeWatch
 from edge.types import Estimate
 from msgs.contract import ModelContract
 from sim_replay.airframes import AIRFRAMES
@@ -189,19 +187,3 @@ def test_a_score_that_may_be_of_none_makes_its_size_doubtful_too() -> None:
     peaks.R_cam_target[0, 0], peaks.sigma[0, 0, 2] = FROM_BEHIND, 0.4
     (e,) = decode(peaks, 0, WHOLE, contract, "track", 0.5, Counter(), SIZE)
     assert np.sqrt(e.covariance[2, 2]) / e.t_cam_target_m[2] > 0.2
-
-
-def sights(watch: SizeWatch, oversizes: list[float | None], score: float = 0.9) -> list[str]:
-    estimate = replace(told(None), score=score)
-    for index, oversize in enumerate(oversizes):
-        watch.seen(index * 100_000_000, [replace(estimate, oversize=oversize)])
-    return [reason.text for reason in watch.reasons(len(oversizes) * 100_000_000)]
-
-
-def test_a_size_that_most_of_what_is_seen_contradicts_is_told_of_until_it_is_over() -> None:
-    watch = SizeWatch()
-    assert sights(watch, [0.31] * 6 + [None] * 4) == ["the target appears to be 0.31 times as large as [target] says"]
-    assert watch.reasons(4_000_000_000) == (), "not seen for three seconds"
-    assert sights(SizeWatch(), [0.31] * 5 + [None] * 5) == [], "one of two aircraft is of another type"
-    assert sights(SizeWatch(), [3.0] * 4) == [], "too few to say"
-    assert sights(SizeWatch(), [3.0] * 10, score=0.5) == [], "birds"
