@@ -39,13 +39,25 @@ def depth_m(
     return float(np.exp(depth_by_size(size, R, at, box, sigma_rad).log_z))
 
 
-def test_worked_out_by_hand() -> None:
-    """From above 0.98 of the wingspan is seen across and 1.02 of the length along the image: 110 and 80 pixels of a
-    lens of 2000 are 196 and 204 m, and the logarithms count as the squares of these sides."""
+SLANTED = FROM_BEHIND @ Rotation.from_euler("z", 45, degrees=True).as_matrix()
+
+
+@pytest.mark.parametrize(
+    ("R", "across_m", "along_m"),
+    [
+        (FROM_ABOVE, 0.98 * 11.0, 1.02 * 8.0),
+        (FROM_BEHIND, 0.98 * 11.0, 0.25 * 8.0),
+        (SLANTED, np.sqrt(0.5) * ((0.98 * 11.0) ** 2.5 + (1.02 * 8.0) ** 2.5) ** 0.4, 0.25 * 8.0),
+    ],
+    ids=["above", "behind", "slanted"],
+)
+def test_worked_out_by_hand(R: np.ndarray, across_m: float, along_m: float) -> None:
+    """0.98 of the wingspan, 1.02 of the length and a height of a quarter of it are seen; the logarithms of the two
+    depths that the sides tell count as the squares of these."""
     box = np.array([110.0, 80.0]) / FOCAL_PX
-    across, along = 0.98 * 11.0, 1.02 * 8.0
-    expected = (across**2 * np.log(196.0) + along**2 * np.log(204.0)) / (across**2 + along**2)
-    assert depth_m(SIZE, FROM_ABOVE, box) == pytest.approx(np.exp(expected), rel=1e-9)
+    log_z = np.log([across_m / box[0], along_m / box[1]])
+    expected = np.average(log_z, weights=[across_m**2, along_m**2])
+    assert depth_m(SIZE, R, box) == pytest.approx(np.exp(expected), rel=1e-9)
 
 
 @given(rotations, sides, planes, st.floats(0.2, 5.0))
@@ -58,12 +70,15 @@ def test_twice_the_size_or_half_the_image_is_twice_the_depth(
     assert depth_m(SIZE, R, box / factor, at) == pytest.approx(factor * once, rel=1e-9)
 
 
-@given(rotations, sides)
-def test_a_camera_on_its_side_and_a_mirror_tell_the_same(R: np.ndarray, box: np.ndarray) -> None:
+@given(rotations, sides, planes)
+def test_a_camera_on_its_side_and_a_mirror_tell_the_same(R: np.ndarray, box: np.ndarray, at: np.ndarray) -> None:
+    sigma_rad, mirror = np.array([0.3, 0.2, 0.1]), np.diag([-1.0, 1.0, 1.0])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    once = depth_m(SIZE, R, box)
-    assert depth_m(SIZE, quarter @ R, box[::-1]) == pytest.approx(once, rel=1e-9)
-    assert depth_m(SIZE, np.diag([-1.0, 1.0, 1.0]) @ R @ np.diag([1.0, -1.0, 1.0]), box) == pytest.approx(once)
+    once = depth_by_size(SIZE, R, at, box, sigma_rad)
+    turned = depth_by_size(SIZE, quarter @ R, np.array([-at[1], at[0]]), box[::-1], sigma_rad[[1, 0, 2]])
+    mirrored = depth_by_size(SIZE, mirror @ R @ np.diag([1.0, -1.0, 1.0]), at * [-1.0, 1.0], box, sigma_rad)
+    assert turned == pytest.approx(once, rel=1e-9)
+    assert mirrored == pytest.approx(once, rel=1e-9)
 
 
 @given(rotations, sides)
@@ -100,15 +115,24 @@ def test_an_unsure_rotation_makes_the_depth_unsure_by_what_it_changes() -> None:
     """Turned by s about the vertical, the wings of an aircraft seen from behind shrink by its cosine, to second order;
     one that is seen at 45 degrees changes in the first."""
     box = np.array([0.05, 0.01])
-    slanted = FROM_BEHIND @ Rotation.from_euler("z", 45, degrees=True).as_matrix()
     yaw = np.array([0.0, 0.1, 0.0])
     level, aslant, sure = (
         depth_by_size(TargetSize(11.0, 1.0), R, AHEAD, box, sigma).variance
-        for R, sigma in ((FROM_BEHIND, yaw), (slanted, yaw), (slanted, SURE))
+        for R, sigma in ((FROM_BEHIND, yaw), (SLANTED, yaw), (SLANTED, SURE))
     )
     assert sure == pytest.approx(0.07**2)
     assert np.sqrt(aslant - sure) == pytest.approx(0.1, rel=0.15)
     assert level - sure < 0.1 * (aslant - sure)
+
+
+@given(rotations, planes)
+def test_what_the_rotation_is_unsure_of_about_each_axis_adds_up(R: np.ndarray, at: np.ndarray) -> None:
+    box, sigma_rad = np.array([0.05, 0.02]), np.array([0.1, 0.2, 0.3])
+    sure, *alone, all_three = (
+        depth_by_size(SIZE, R, at, box, sigma_rad * about).variance
+        for about in np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
+    )
+    assert all_three - sure == pytest.approx(sum(alone) - 3.0 * sure)
 
 
 @given(st.floats(-1.5, 1.5), st.floats(0.02, 1.0), st.floats(0.07, 0.4))
