@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,11 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from edge.estimator.decode import decode
 from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
+from edge.tracking.tracker import Tracker
 from edge.types import Estimate
 from msgs.contract import ModelContract
 from sim_replay.airframes import AIRFRAMES
 from sim_replay.airframes.mesh import Mesh
 
+from .noisy_flights import BEARING_STD_PX, FORWARD, Instant, flight, update
 from .test_decode import WHOLE, peaks_of
 from .toy_model import CONTRACT
 from .toy_scene import FOCAL_PX, K
@@ -211,3 +214,35 @@ def test_a_score_that_may_be_of_none_makes_its_size_doubtful_too() -> None:
     peaks.R_cam_target[0, 0], peaks.sigma[0, 0, 2] = FROM_BEHIND, 0.4
     (e,) = decode(peaks, 0, WHOLE, contract, "track", 0.5, Counter(), SIZE)
     assert np.sqrt(e.covariance[2, 2]) / e.t_cam_target_m[2] > 0.2
+
+
+def ranged(now: Instant, log_factor: float, variance: float) -> Estimate:
+    """The flight's estimate at that many times the true range, and with this variance of its logarithm."""
+    t_m = now.t_cam_target_m * np.exp(log_factor)
+    along = np.outer(t_m, t_m)
+    covariance = now.estimate.covariance.copy()
+    covariance[:3, :3] = (BEARING_STD_PX / K[0, 0]) ** 2 * (t_m @ t_m * np.eye(3) - along) + variance * along
+    return replace(now.estimate, t_cam_target_m=t_m, covariance=covariance)
+
+
+@pytest.mark.parametrize("kind", ["ned", "ned_relative", "cam"])
+@pytest.mark.parametrize("given_first", [False, True], ids=["given", "taken back"])
+def test_a_track_outlives_a_size_that_is_given_or_taken_back_in_flight(kind: str, given_first: bool) -> None:
+    """Its range is then another, by a factor of 1.6; nobody flies that far in the second that this takes."""
+    rng, tracker = np.random.default_rng(1), Tracker(4, FORWARD)
+    by_size = Depth(0.04, 0.08**2)
+    for index, now in enumerate(flight(3, frames=180)):
+        told = Depth(-0.5 + 0.04 * rng.normal(), 0.3**2)
+        if (index < 90) == given_first:
+            told = combined(told, by_size).depth
+        (track,) = update(tracker, now, kind, [ranged(now, *told)])
+        off_m = track.t_cam_target_m - now.t_cam_target_m
+        if kind == "ned" and index > 30:
+            assert track.v_ned_target_mps is not None
+            assert np.linalg.norm(track.v_ned_target_mps - now.v_ned_target_mps) < 30.0
+        if index in (89, 179):
+            log_off = np.log(np.linalg.norm(track.t_cam_target_m) / np.linalg.norm(now.t_cam_target_m))
+            assert log_off == pytest.approx(0.0 if (index < 90) == given_first else -0.5, abs=0.1)
+        if given_first == (index < 90) and index % 90 > 60:
+            assert off_m @ np.linalg.solve(track.covariance[:3, :3], off_m) < 16.3
+    assert track.born_ns == 1
