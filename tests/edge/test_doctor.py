@@ -6,22 +6,25 @@ import json
 import os
 import pty
 import socket
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import serial
+import zenoh
 
-from edge.config import load_config
+from edge.config import Config, load_config
 from edge.doctor import camera_as_told
-from edge.doctor_links import link_findings
-from edge.health import Health
+from edge.doctor_links import link_findings, running_daemon
+from edge.health import Activity, Condition, Health, HealthSnapshot, HealthState, Reason
 from edge.links.signing_key import write_new_key
 from edge.reload import load_configured
 from edge.status import ask
-from edge.status_board import StatusBoard
+from edge.status_board import StatusBoard, key_of
 from edge.types import CameraInfo
+from msgs.session import router_config
 from sim_replay.ports import free_port
 from tests.waiting import until
 
@@ -213,6 +216,62 @@ def test_a_daemon_that_is_starting_is_not_told_as_well(tmp_path: Path, toy_model
     found = [*(one for one, _ in camera_as_told(running)), *link_findings(file.config, running)]
     told = ("poor", "the daemon is still starting", "run doctor again in a few seconds")
     assert [(one.what, one.verdict, one.says, one.advice) for one in found] == [("camera", *told), ("daemon", *told)]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "verdict", "advice"),
+    [
+        (("camera_frozen", "no_camera", "no_frame"), "good", ""),  # told of the camera
+        (("no_frame", "drops"), "poor", "`uavpose-edge status`"),
+        (("drops", "no_attitude"), "wrong", "check that the autopilot is on"),
+    ],
+)
+def test_what_a_running_daemon_says_of_itself_is_judged_by_its_kind(
+    tmp_path: Path, toy_model: Path, swaying: Path, kinds: tuple[str, ...], verdict: str, advice: str
+) -> None:
+    (tmp_path / "config.toml").write_text(toml(swaying, toy_model, free_port()))
+    file = load_config(tmp_path / "config.toml")
+    board = StatusBoard(file, load_configured(file), CameraInfo("nose", (320, 180), np.eye(3), None))
+    reasons = tuple(Reason(kind, f"{kind} is told") for kind in kinds)
+    board.snapshot = HealthSnapshot(1, Condition(HealthState.DEGRADED, Activity.SEARCHING, reasons), 0, 10.0, {}, {})
+    (found,) = link_findings(file.config, board.info())
+    assert (found.what, found.verdict, found.advice[: max(len(advice), 1)]) == ("daemon", verdict, advice)
+    told = "; ".join(reason.text for reason in reasons if "camera" not in reason.kind and "frame" not in reason.kind)
+    assert found.says.endswith(f"state degraded: {told}" if told else "; its links are not tested by this command")
+
+
+def test_links_that_work_are_told_as_good() -> None:
+    ground, metrics = f"tcp/127.0.0.1:{free_port()}", free_port()
+    links = {"listen": [f"tcp/127.0.0.1:{free_port()}"], "connect": [ground]}
+    tree: dict[str, Any] = {"zenoh": links, "mavlink": {"enabled": False}, "health": {"prometheus_port": metrics}}
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}, **tree})
+    with zenoh.open(router_config([ground])):
+        found = [(one.what, one.verdict, one.says) for one in link_findings(config, None)]
+    assert found == [
+        ("zenoh", "good", f"can listen on {links['listen'][0]}"),
+        ("ground", "good", f"{ground} answers"),
+        ("prometheus", "good", f"port {metrics} of 127.0.0.1 is free"),
+    ]
+
+
+def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_at() -> None:
+    """As where a router of the ground runs beside the daemon."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def answer(name: str) -> zenoh.handlers.Callback:
+        return zenoh.handlers.Callback(lambda query: query.reply(query.key_expr, f'{{"vehicle": "{name}"}}'), False)
+
+    tree = {"camera": {"type": "sequence", "path": "scene"}, "zenoh": {"listen": [endpoint]}}
+    with zenoh.open(router_config([endpoint])) as router:
+        for name, what in product(("uav1", "uav2"), ("info", "config", "model")):
+            router.declare_queryable(key_of(name, what), answer(name))
+        for name in ("uav1", "uav2"):
+            running = running_daemon(Config.model_validate({**tree, "vehicle": {"name": name}}))
+            assert running is not None
+            assert running["info"] == {"vehicle": name}
+        off = {"enabled": False, "listen": [endpoint]}
+        assert running_daemon(Config.model_validate({**tree, "zenoh": off})) is None
+    assert running_daemon(Config.model_validate(tree)) is None
 
 
 @pytest.mark.parametrize(
