@@ -16,11 +16,9 @@ from threading import Thread
 import numpy as np
 import onnx
 import onnx.parser
-import onnxruntime as ort
 import pytest
 from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
 
-from edge.bench import peak
 from edge.bench.macs import Macs, count_macs
 from edge.bench.measure import ORT, Case, Machine, Measured, Row, measure
 from edge.bench.peak import Peak
@@ -94,28 +92,6 @@ def test_quantised_work_is_counted_apart(network: Path, tmp_path: Path) -> None:
     assert count_macs(quantised.read_bytes(), (64, 96)) == Macs(convolutions, product)
 
 
-@pytest.mark.parametrize(("op", "types"), [("MatMul", (1, 1, 1)), ("MatMulInteger", (2, 3, 6))])
-def test_the_peak_is_of_a_valid_graph_that_multiplies(op: str, types: tuple[int, int, int]) -> None:
-    kind = onnx.helper.tensor_dtype_to_np_dtype(types[1])
-    weight = np.random.default_rng(2).integers(-127, 128, (300, 7)).astype(kind)
-    content = peak.matmul_model(op, *types, weight)
-    model = onnx.load_from_string(content)
-    onnx.checker.check_model(model, full_check=True)
-    left = (
-        np.random.default_rng(3)
-        .integers(0, 256, (peak.ROWS, 300))
-        .astype(onnx.helper.tensor_dtype_to_np_dtype(types[0]))
-    )
-    (product,) = ort.InferenceSession(content, providers=["CPUExecutionProvider"]).run(None, {"left": left})
-    np.testing.assert_allclose(product, left.astype(np.int64) @ weight.astype(np.int64), rtol=1e-5, atol=1.0)
-
-
-@pytest.mark.parametrize(("precision", "kind"), [("int8", np.int32), ("fp32", np.float32)])
-def test_each_precision_has_a_peak_of_its_own_over_the_products_that_are_counted(precision: str, kind: type) -> None:
-    (product,) = peak.product(precision, 1)()  # type: ignore[misc]
-    assert (product.dtype, product.size * peak.INNER) == (kind, peak.MACS)
-
-
 def test_cases_take_turns() -> None:
     order: list[str] = []
     ms = time_in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3, lambda _: None)
@@ -176,26 +152,6 @@ def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
 
     ms = time_in_turns({"work": work, "leaves": leaves_a_thread, "next": lambda: left[-1].join()}, 2, lambda _: None)
     assert ms["next"].cpu < ms["work"].cpu / 5
-
-
-def test_threads_without_cores_of_their_own_have_no_peak(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edge.bench.peak.MORE_THAN_ONE", 100.0)  # no machine's two threads are so much faster
-    model = write_toy_model(tmp_path / "int8.onnx", precision="int8")
-    measured = measure([model], [2], spinning=False, rounds=3, others=False, on_round=lambda _: None)
-    tree, told = to_tree(measured), table(measured).splitlines()
-    assert [(peak["threads"], peak["shared"]) for peak in tree["peaks"]] == [(1, False), (2, True)]
-    assert {row["limit_ms"] for row in tree["rows"]} == {None}
-    assert tree["ratios"]["over_vnni_limit"] is None
-    assert told[-1].startswith("  2 threads: ")
-    assert "hardly more than one" in told[-1]
-
-
-def test_as_many_threads_as_cores_have_a_peak() -> None:
-    one = Peak(1, 200.0, 40.0)
-    assert Peak(2, 260.0, 52.0).beside(one).limit_ms(26 * 10**7, 52 * 10**7) == pytest.approx(1.0 + 10.0)
-    assert Peak(2, 390.0, 51.9).beside(one).limit_ms(10**9, 10**9) is None
-    assert Peak(2, 259.9, 70.0).beside(one).limit_ms(10**9, 10**9) is None
-    assert not one.beside(one).shared
 
 
 @pytest.mark.parametrize(
