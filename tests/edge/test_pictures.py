@@ -181,10 +181,11 @@ class Album:
 
 def test_what_waits_at_the_end_is_handed_over_and_what_was_replaced_is_counted() -> None:
     album, more = Album(), 2
-    pictures = Pictures(album, live_max_hz=30.0, recorded_max_hz=30.0)
-    frames = [frame(k, k * 10**9) for k in range(1, WAITING_MAX + more + 1)]
+    pictures = Pictures(album, live_max_hz=10.0, recorded_max_hz=10.0)
+    frames = [frame(k, k * 10**8) for k in range(1, WAITING_MAX + more + 1)]
     for one in frames:
         pictures.show(one)
+        pictures.show(frame(0, one.meta.capture_ns + 10**6))  # not due, so it takes no place
     pictures.start()
     for _ in range(2):
         pictures.stop()

@@ -22,7 +22,7 @@ from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.estimator.model import load_model
 from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles, Reason
-from edge.prometheus import RETRY_S, MetricsServer
+from edge.prometheus import RETRY_S, MetricsServer, metrics
 from edge.stages import STAGES
 from edge.status import ask, for_a_person, loopback_endpoints, status, works
 from edge.status_board import StatusBoard, key_of
@@ -238,6 +238,37 @@ def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
         urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/etc/passwd", timeout=10)
     with pytest.raises(urllib.error.URLError, match="refused"):  # who listens everywhere listens there too
         urllib.request.urlopen(f"http://127.0.0.2:{ports[1]}/metrics", timeout=10)
+
+
+def test_the_metrics_are_those_of_the_status_in_seconds(tmp_path: Path, toy_model: Path, stepped: int) -> None:
+    config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}, "vehicle": {"name": "kestrel"}})
+    camera = CameraInfo("nose", (320, 180), np.eye(3), None)
+    board = StatusBoard(ConfigFile(tmp_path / "flight.toml", "", config), load_model(toy_model, 1), camera)
+    facts = board.facts()
+    start = [
+        f'uavpose_info{{vehicle="kestrel",version="{facts["version"]}",model_sha256="{facts["model_sha256"]}"}} 1',
+        "uavpose_uptime_seconds 0.0",
+    ]
+    assert [line for line in metrics(board).splitlines() if line[0] != "#"] == start
+    condition = Condition(HealthState.DEGRADED, Activity.COASTING, (DROPS, SILENT))
+    counters, latency_ms = {"dropped": 3, 'a "\\\n': 1}, {"total": Percentiles(11.0, 12.5, 40.25)}
+    board.snapshot = HealthSnapshot(stepped - 250_000_000, condition, 2, 29.97, counters, latency_ms)
+    lines = metrics(board).splitlines()
+    assert [line for line in lines if line[0] != "#"] == [
+        *start,
+        *(f'uavpose_state{{state="{state.value}"}} {int(state.value == "degraded")}' for state in HealthState),
+        *(f'uavpose_activity{{activity="{one.value}"}} {int(one.value == "coasting")}' for one in Activity),
+        *("uavpose_reasons 2", 'uavpose_reason{kind="drops"} 1', 'uavpose_reason{kind="no_frame"} 1'),
+        *("uavpose_tracks 2", "uavpose_frame_rate_hertz 29.97", "uavpose_snapshot_age_seconds 0.25"),
+        *('uavpose_count{name="dropped"} 3', r'uavpose_count{name="a \"\\\n"} 1'),
+        'uavpose_stage_seconds{stage="total",quantile="0.5"} 0.011000',
+        'uavpose_stage_seconds{stage="total",quantile="0.95"} 0.012500',
+        'uavpose_stage_seconds{stage="total",quantile="0.99"} 0.040250',
+    ]
+    families = list(dict.fromkeys(re.split(r"[{ ]", line)[0] for line in lines if line[0] != "#"))
+    kinds = [f"# TYPE {name} {'untyped' if name == 'uavpose_count' else 'gauge'}" for name in families]
+    assert [line for line in lines if line.startswith("# TYPE")] == kinds
+    assert [line.split()[2] for line in lines if re.match(r"# HELP \w+ \w+", line)] == families
 
 
 @pytest.fixture
