@@ -162,14 +162,19 @@ def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
         (None, platform.machine()),
     ],
 )
-def test_the_processor_is_named(
+def test_the_processor_is_named_and_its_cores_that_may_be_used_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, toy_model: Path, cpuinfo: str | None, name: str
 ) -> None:
     monkeypatch.setattr("edge.bench.measure.CPU_INFO", tmp_path / "cpuinfo")
     if cpuinfo is not None:
         (tmp_path / "cpuinfo").write_text(cpuinfo)
-    measured = measure([toy_model], [1], spinning=False, rounds=1, others=False, on_round=lambda _: None)
-    assert table(measured).startswith(f"{name}, {len(os.sched_getaffinity(0))} cores, ONNX Runtime ")
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        measured = measure([toy_model], [1], spinning=False, rounds=1, others=False, on_round=lambda _: None)
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert table(measured).startswith(f"{name}, 1 cores, ONNX Runtime ")
 
 
 def test_files_of_one_name_are_told_apart(cli: Cli, tmp_path: Path) -> None:
