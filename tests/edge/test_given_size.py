@@ -23,7 +23,7 @@ from sim_replay.airframes.mesh import Mesh
 from .noisy_flights import BEARING_STD_PX, FORWARD, Instant, flight, update
 from .test_decode import WHOLE, peaks_of
 from .toy_model import CONTRACT
-from .toy_scene import FOCAL_PX, K
+from .toy_scene import FOCAL_PX, SIZE_WH, K
 
 SIZE = TargetSize(wingspan_m=11.0, length_m=8.0)
 FROM_BEHIND = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -179,17 +179,33 @@ def test_a_size_in_feet_for_a_known_aircraft_is_not_believed() -> None:
     assert np.sqrt(variance) > 0.3
 
 
-def told(size: TargetSize | None, *, box_px: tuple[float, float] = (110.0, 40.0), at_px: float = 300.0) -> Estimate:
-    """Of an aircraft seen from behind that the network takes to be at 300 m, and of which it is not sure."""
-    peaks = peaks_of(score=1.0)
-    peaks.size_px[0, 0] = box_px
-    peaks.center_px[0, 0] = peaks.origin_px[0, 0] = [at_px, 400.0]
+def told(
+    size: TargetSize | None, *, box_px: tuple[float, float] = (110.0, 40.0), at_px: float = 300.0, high: float = 1.0
+) -> Estimate:
+    """Of an aircraft seen from behind that the network takes to be at 300 m, and of which it is not sure, by pixels so
+    many times as high as wide."""
+    peaks, flat = peaks_of(score=1.0), np.diag([1.0, 1.0 / high, 1.0])
+    peaks.size_px[0, 0] = np.array(box_px) / [1.0, high]
+    peaks.center_px[0, 0] = peaks.origin_px[0, 0] = [at_px, 400.0 / high]
     peaks.t_cam_target_m[0, 0] = 300.0 * np.linalg.solve(K, [at_px, 400.0, 1.0])
     peaks.R_cam_target[0, 0] = FROM_BEHIND
     peaks.sigma[0, 0, 2] = 0.4
     contract = ModelContract(**CONTRACT)
-    (estimate,) = decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, Counter(), size)
+    where = WHOLE._replace(K=flat @ K, frame_wh=(SIZE_WH[0], round(SIZE_WH[1] / high)))
+    (estimate,) = decode(peaks, 0, where, contract, "track", contract.track_score_min, Counter(), size)
     return estimate
+
+
+@pytest.mark.parametrize("high", [1.0, 0.5])
+def test_the_depth_is_that_of_the_rays_through_the_box_s_sides(high: float) -> None:
+    """At the right of the picture a long aircraft flying straight ahead shows its flank."""
+    size, at_px = TargetSize(wingspan_m=6.0, length_m=16.0), 1700.0
+    at = (np.array([at_px, 400.0]) - K[:2, 2]) / FOCAL_PX
+    by_size = depth_by_size(size, FROM_BEHIND, at, np.array([110.0, 40.0]) / FOCAL_PX, np.full(3, 0.05))
+    expected = combined(Depth(np.log(300.0), 0.4**2), by_size).depth
+    found = told(size, at_px=at_px, high=high)
+    assert np.log(found.t_cam_target_m[2]) == pytest.approx(expected.log_z, abs=1e-3)
+    assert np.sqrt(found.covariance[2, 2]) / found.t_cam_target_m[2] == pytest.approx(np.sqrt(expected.variance), 1e-2)
 
 
 def test_a_given_size_moves_the_target_along_its_ray_and_makes_it_surer() -> None:
