@@ -92,8 +92,9 @@ def test_a_new_model_takes_over_between_frames_and_the_track_lives_on(
 def test_the_target_s_size_is_flown_by_from_the_start_and_when_it_changes(
     tmp_path: Path, swaying: Path, toy_model: Path, port: int
 ) -> None:
-    """The toy's aircraft, seen from behind, is 120 pixels wide for a lens of 2000, and 235.7 m away by the toy's word. It
-    is so sure that wings of 14 or 16 m, which would be at 221 and 254 m, move it little, and 60 m are not believed."""
+    """The toy's aircraft, seen from behind, is 120 pixels wide for a lens of 2000, and 235.7 m away by the toy's word.
+    It is so sure that wings of 14 or 16 m, which would be at 221 and 254 m, move it little, and 60 m are not believed.
+    """
     config = tmp_path / "config.toml"
     told_m = {}
     text = toml(swaying, toy_model, port, fps=11)
