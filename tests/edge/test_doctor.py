@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import socket
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -258,13 +259,14 @@ def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_
     """As where a router of the ground runs beside the daemon."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
 
-    def answer(name: str) -> zenoh.handlers.Callback:
-        return zenoh.handlers.Callback(lambda query: query.reply(query.key_expr, f'{{"vehicle": "{name}"}}'), False)
+    def answer(name: str, what: str) -> Callable[[zenoh.Query], None]:
+        return lambda query: query.reply(key_of(name, what), json.dumps({"vehicle": name}))
 
     tree = {"camera": {"type": "sequence", "path": "scene"}, "zenoh": {"listen": [endpoint]}}
     with zenoh.open(router_config([endpoint])) as router:
         for name, what in product(("uav1", "uav2"), ("info", "config", "model")):
-            router.declare_queryable(key_of(name, what), answer(name))
+            handler = zenoh.handlers.Callback(answer(name, what), indirect=False)
+            router.declare_queryable(key_of(name, what), handler)
         for name in ("uav1", "uav2"):
             running = running_daemon(Config.model_validate({**tree, "vehicle": {"name": name}}))
             assert running is not None
