@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cache
 
-import numpy as np
-
 from edge.estimator.given_size import TargetSize
 from sim_replay.bop import BopScene, Model
 
@@ -25,9 +23,9 @@ def sizes_of(models: Mapping[int, Model]) -> SizeOf:
     def size_of(scene: BopScene) -> TargetSize | None:
         objects = {target.object_id for frame in scene.frames for target in frame.targets}
         model = models.get(objects.pop()) if len(objects) == 1 else None
-        size_m = None if model is None else model.size_m
-        if model is not None and size_m is None and model.points_m is not None:
-            size_m = np.ptp(model.points_m, axis=0)
-        return None if size_m is None else TargetSize(wingspan_m=float(size_m[1]), length_m=float(size_m[0]))
+        if model is None or model.size_m is None or min(model.size_m[:2]) <= 0.0:
+            return None
+        length_m, wingspan_m, _ = model.size_m
+        return TargetSize(wingspan_m, length_m)
 
     return size_of

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from edge.errors import InputError
 from edge.estimator.decode import Shown
 from edge.estimator.estimator import Estimator
+from edge.estimator.given_size import TargetSize
 from edge.estimator.model import Peaks, load_model
 from edge.estimator.window import PixelMap, cut, fit_frame, pixel_aspect, window_around
 from edge.types import Frame, FrameMeta
@@ -193,6 +194,9 @@ def test_a_model_without_track_stage_estimates_on_the_whole_frame(tmp_path: Path
     (estimate,) = estimator.acquire(frame_of(draw((700.5, 300.5))))
     assert estimate.stage == "acquire"
     np.testing.assert_allclose(estimate.t_cam_target_m, true_t_cam_target_m((700.5, 300.5)), rtol=0.03, atol=0.5)
+    estimator.target_size = TargetSize(wingspan_m=16.0, length_m=10.0)
+    (sized,) = estimator.acquire(frame_of(draw((700.5, 300.5))))
+    assert sized.t_cam_target_m[2] > estimate.t_cam_target_m[2] + 0.5
 
 
 @pytest.mark.parametrize(

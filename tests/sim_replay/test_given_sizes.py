@@ -20,6 +20,7 @@ from sim_replay.render.placing import frame_scene
 
 GLIDER = Model(18.0, low_m=(-3.0, -9.0, -1.0), size_m=(7.0, 18.0, 1.5))
 BARE = Model(18.0)
+POINT = Model(18.0, low_m=(0.0, 0.0, 0.0), size_m=(0.0, 0.0, 0.0))
 
 
 def scene(*objects: int) -> BopScene:
@@ -30,10 +31,10 @@ def scene(*objects: int) -> BopScene:
 
 
 def test_a_scene_of_one_type_has_its_model_s_size() -> None:
-    size_of = sizes_of({1: GLIDER, 2: BARE, 3: GLIDER})
+    size_of = sizes_of({1: GLIDER, 2: BARE, 3: GLIDER, 5: POINT})
     assert size_of(scene(1)) == size_of(scene(1, 1)) == TargetSize(wingspan_m=18.0, length_m=7.0)
     assert size_of(scene(1, 3)) is None, "of two types"
-    assert size_of(scene(2)) is size_of(scene(4)) is size_of(scene()) is None
+    assert [size_of(scene(*objects)) for objects in ((2,), (4,), (5,), ())] == [None] * 4
 
 
 @pytest.mark.parametrize("airframe", ["jet_trainer", "hybrid_quadplane"])
