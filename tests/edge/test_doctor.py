@@ -241,18 +241,23 @@ def test_what_a_running_daemon_says_of_itself_is_judged_by_its_kind(
     assert found.says.endswith(f"state degraded: {told}" if told else "; its links are not tested by this command")
 
 
-def test_links_that_work_are_told_as_good() -> None:
-    ground, metrics = f"tcp/127.0.0.1:{free_port()}", free_port()
-    links = {"listen": [f"tcp/127.0.0.1:{free_port()}"], "connect": [ground]}
-    tree: dict[str, Any] = {"zenoh": links, "mavlink": {"enabled": False}, "health": {"prometheus_port": metrics}}
-    config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}, **tree})
+def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all() -> None:
+    ground, listen, metrics = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}", free_port()
+
+    def found(**sections: Any) -> list[tuple[str, str, str]]:
+        tree = {"camera": {"type": "sequence", "path": "scene"}, "mavlink": {"enabled": False}, **sections}
+        return [(one.what, one.verdict, one.says) for one in link_findings(Config.model_validate(tree), None)]
+
     with zenoh.open(router_config([ground])):
-        found = [(one.what, one.verdict, one.says) for one in link_findings(config, None)]
-    assert found == [
-        ("zenoh", "good", f"can listen on {links['listen'][0]}"),
+        both = found(zenoh={"listen": [listen], "connect": [ground]}, health={"prometheus_port": metrics})
+        alone = found(zenoh={"listen": [], "connect": [ground]})
+    assert both == [
+        ("zenoh", "good", f"can listen on {listen}"),
         ("ground", "good", f"{ground} answers"),
         ("prometheus", "good", f"port {metrics} of 127.0.0.1 is free"),
     ]
+    assert alone == [("zenoh", "good", "no address to listen on"), both[1]]
+    assert found(zenoh={"enabled": False}) == []
 
 
 def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_at() -> None:
