@@ -179,10 +179,13 @@ class Album:
         self.kept.append(picture)
 
 
-def test_what_waits_at_the_end_is_handed_over_and_what_was_replaced_is_counted() -> None:
+@pytest.mark.parametrize(("live_hz", "recorded_hz"), [(5.0, 10.0), (10.0, 5.0)])
+def test_what_waits_at_the_end_is_handed_over_and_what_was_replaced_is_counted(
+    live_hz: float, recorded_hz: float
+) -> None:
     album, more = Album(), 2
-    pictures = Pictures(album, live_max_hz=10.0, recorded_max_hz=10.0)
-    frames = [frame(k, k * 10**8) for k in range(1, WAITING_MAX + more + 1)]
+    pictures = Pictures(album, live_hz, recorded_hz)
+    frames = [frame(k, k * 10**8) for k in range(WAITING_MAX + more)]
     for one in frames:
         pictures.show(one)
         pictures.show(frame(0, one.meta.capture_ns + 10**6))  # not due, so it takes no place
@@ -190,11 +193,12 @@ def test_what_waits_at_the_end_is_handed_over_and_what_was_replaced_is_counted()
     for _ in range(2):
         pictures.stop()
     assert pictures.counters() == {"replaced": more}
-    kept = [(one.capture_ns, one.live, one.recorded) for one in album.kept]
-    times_ns = [one.meta.capture_ns for one in frames[more:]]
-    assert kept == [(t_ns, live, not live) for t_ns in times_ns for live in (False, True)]
-    assert album.kept[0].jpeg == jpeg(frames[more].image_bgr, RECORDED_QUALITY)
-    assert album.kept[1].jpeg == small_jpeg(frames[more].image_bgr)
+    for hz, live in ((live_hz, True), (recorded_hz, False)):
+        due = frames[more :: round(10 / hz)]
+        kept = [one for one in album.kept if one.live == live]
+        assert [(one.capture_ns, one.recorded) for one in kept] == [(one.meta.capture_ns, not live) for one in due]
+        encoded = [small_jpeg(one.image_bgr) if live else jpeg(one.image_bgr, RECORDED_QUALITY) for one in due]
+        assert [one.jpeg for one in kept] == encoded
 
 
 @pytest.mark.parametrize(

@@ -27,28 +27,37 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     folder.mkdir()
     recorder = Recorder(folder, "uav1", ROOM, lambda *event: told.append(event))
     recorder.start()
-    record_some(recorder, [b"before"])
-    until(lambda: recorder.counters()["recorded"] == 1)
+    sent: list[bytes] = []
+
+    def put(payload: bytes) -> None:
+        sent.append(payload)
+        record_some(recorder, sent[-1:])
+
+    put(b"before")
+    recorder.record(topics.CAMERA_INFO, "uav1", None, b"camera", 1)  # each file repeats it
+    until(lambda: recorder.counters()["recorded"] == 2)
     full = os.open("/dev/full", os.O_WRONLY)
     real_write = os.write
     monkeypatch.setattr(os, "write", lambda _, data: real_write(full, data))
-    until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
+    until(lambda: told != [], lambda: put(b"lost"))
     assert not recorder.recording
     until(lambda: recorder.counters().get("failures", 0) >= 3)
     assert recorder.counters()["stopped"] == 1
     assert told == [(40, "recording stopped: No space left on device")]
     monkeypatch.setattr(os, "write", real_write)
     os.close(full)
-    until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]))
+    until(lambda: len(told) == 2, lambda: put(b"after"))
     assert told[1] == (20, "recording again")
     assert recorder.counters()["stopped"] == 0
     recorded = recorder.counters()["recorded"]
-    until(lambda: recorder.counters()["recorded"] > recorded, lambda: record_some(recorder, [b"after"]))
+    until(lambda: recorder.counters()["recorded"] > recorded, lambda: put(b"after"))
     recorder.stop()
     assert len(told) == 2, "it was told once"
-    kept = [data for path in sorted(folder.iterdir()) for *_, data, _ in read(path)]
-    assert (kept[0], kept[-1]) == (b"before", b"after")
-    assert b"lost" not in kept
+    first, *_, last = ([data for *_, data, _ in read(path)] for path in sorted(folder.iterdir()))
+    assert (sorted(first), last[0], last[-1]) == ([b"before", b"camera"], b"camera", b"after")
+    assert b"lost" not in last
+    counters = recorder.counters()
+    assert counters["recorded"] + counters["lost"] == len(sent) + 1
 
 
 def test_recording_goes_on_where_its_messages_reach_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
