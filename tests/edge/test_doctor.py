@@ -7,6 +7,7 @@ import os
 import pty
 import socket
 from collections.abc import Callable
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from tests.waiting import until
 from .conftest import Cli
 from .flying import flying, toml
 from .test_cameras_stream import UdpCamera
+from .test_zenoh_config import make_keys
 
 
 def findings(cli: Cli, tmp_path: Path, text: str) -> tuple[int, dict[str, dict[str, Any]]]:
@@ -241,16 +243,19 @@ def test_what_a_running_daemon_says_of_itself_is_judged_by_its_kind(
     assert found.says.endswith(f"state degraded: {told}" if told else "; its links are not tested by this command")
 
 
-def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all() -> None:
-    ground, listen, metrics = f"tcp/127.0.0.1:{free_port()}", f"tcp/127.0.0.1:{free_port()}", free_port()
+@pytest.mark.parametrize("secure", [False, True], ids=["tcp", "tls"])
+def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all(tmp_path: Path, secure: bool) -> None:
+    files, metrics = make_keys(tmp_path) if secure else None, free_port()
+    ground, listen = (f"{'tls' if secure else 'tcp'}/127.0.0.1:{free_port()}" for _ in range(2))
+    tls = {"tls": asdict(files)} if files is not None else {}
 
     def found(**sections: Any) -> list[tuple[str, str, str]]:
         tree = {"camera": {"type": "sequence", "path": "scene"}, "mavlink": {"enabled": False}, **sections}
         return [(one.what, one.verdict, one.says) for one in link_findings(Config.model_validate(tree), None)]
 
-    with zenoh.open(router_config([ground])):
-        both = found(zenoh={"listen": [listen], "connect": [ground]}, health={"prometheus_port": metrics})
-        alone = found(zenoh={"listen": [], "connect": [ground]})
+    with zenoh.open(router_config([ground], tls=files)):
+        both = found(zenoh={"listen": [listen], "connect": [ground], **tls}, health={"prometheus_port": metrics})
+        alone = found(zenoh={"listen": [], "connect": [ground], **tls})
     assert both == [
         ("zenoh", "good", f"can listen on {listen}"),
         ("ground", "good", f"{ground} answers"),
@@ -260,15 +265,20 @@ def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all() ->
     assert found(zenoh={"enabled": False}) == []
 
 
-def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_at() -> None:
+@pytest.mark.parametrize("secure", [False, True], ids=["tcp", "tls"])
+def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_at(
+    tmp_path: Path, secure: bool
+) -> None:
     """As where a router of the ground runs beside the daemon."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = f"{'tls' if secure else 'tcp'}/127.0.0.1:{free_port()}"
+    files = make_keys(tmp_path) if secure else None
 
     def answer(name: str, what: str) -> Callable[[zenoh.Query], None]:
         return lambda query: query.reply(key_of(name, what), json.dumps({"vehicle": name}))
 
-    tree = {"camera": {"type": "sequence", "path": "scene"}, "zenoh": {"listen": [endpoint]}}
-    with zenoh.open(router_config([endpoint])) as router:
+    links: dict[str, Any] = {"listen": [endpoint], **({"tls": asdict(files)} if files is not None else {})}
+    tree = {"camera": {"type": "sequence", "path": "scene"}, "zenoh": links}
+    with zenoh.open(router_config([endpoint], tls=files)) as router:
         for name, what in product(("uav1", "uav2"), ("info", "config", "model")):
             handler = zenoh.handlers.Callback(answer(name, what), indirect=False)
             router.declare_queryable(key_of(name, what), handler)
@@ -276,8 +286,7 @@ def test_of_several_daemons_that_answer_the_one_of_this_configuration_is_looked_
             running = running_daemon(Config.model_validate({**tree, "vehicle": {"name": name}}))
             assert running is not None
             assert running["info"] == {"vehicle": name}
-        off = {"enabled": False, "listen": [endpoint]}
-        assert running_daemon(Config.model_validate({**tree, "zenoh": off})) is None
+        assert running_daemon(Config.model_validate({**tree, "zenoh": {**links, "enabled": False}})) is None
     assert running_daemon(Config.model_validate(tree)) is None
 
 
