@@ -1,15 +1,25 @@
-"""What `uavpose-edge doctor` says of the file that keeps the newest signing timestamp."""
+"""What `uavpose-edge doctor` says of the file that keeps the newest signing timestamp, and of who does not sign."""
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
+
+from edge import doctor_links
+from edge.config import MavlinkSettings
 from edge.doctor_links import signing_finding
 from edge.links.signing import timestamp_of
+from edge.links.signing_key import write_new_key
+from msgs.mavlink import MAVLink, dialect
+
+from .mavlink_peer import DEADLINE_S
 
 NO_ROOT_KEEPS = """
 import encodings.utf_8_sig
@@ -52,3 +62,21 @@ def test_a_signing_timestamp_that_cannot_be_kept_is_a_fault(tmp_path: Path) -> N
     kept.write_text(str(timestamp_of(time.time_ns() + 3 * 86400 * 10**9)))
     found = signing_finding(kept)
     assert (found.verdict, "3.0 days ahead" in found.says, "clock" in found.advice) == ("poor", True, True)
+
+
+def test_refusals_are_told_where_no_heartbeat_is_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an autopilot that does not sign; it is listened to until the first refusal, not for four seconds."""
+    wait = doctor_links._wait
+    monkeypatch.setattr(doctor_links, "_wait", lambda look, _: wait(look, lambda told: "refused_unsigned" in told))
+    monkeypatch.setattr(doctor_links, "HEARING_S", DEADLINE_S)
+    write_new_key(tmp_path / "key")
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3).pack(MAVLink(None, 1, 1))
+    with socket.socket(type=socket.SOCK_DGRAM) as autopilot, ThreadPoolExecutor() as pool:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(DEADLINE_S)
+        pool.submit(lambda: autopilot.sendto(beat, autopilot.recvfrom(300)[1]))
+        endpoints = [f"udpout:127.0.0.1:{autopilot.getsockname()[1]}"]
+        keys = {"signing_key": tmp_path / "key", "signing_state": tmp_path / "mavlink.timestamp"}
+        (found,) = doctor_links._mavlink(MavlinkSettings(endpoints=endpoints, **keys))
+    assert found.verdict == "wrong"
+    assert found.says == f"{endpoints[0]}: no heartbeat within {DEADLINE_S:.0f} s (refused_unsigned 1)"
