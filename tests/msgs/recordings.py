@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 
-from msgs import topics
-from msgs.recording import Recorder
+from msgs import recording, topics
+from msgs.recording import Recorder, Sample
 from msgs.recording_store import RecordingLimits
 
 ROOM = RecordingLimits(free_bytes_min=0)
@@ -39,3 +40,15 @@ def standing(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threadin
 
     monkeypatch.setattr(os, "fdatasync", sync)
     return stands, goes_on
+
+
+def turns(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by one each time that a recorder's writer looks for samples."""
+    looks, split = list[int](), recording._between_clock_steps
+
+    def looked(samples: Iterable[Sample]) -> list[list[Sample]]:
+        looks.append(len(looks))
+        return split(samples)
+
+    monkeypatch.setattr(recording, "_between_clock_steps", looked)
+    return looks

@@ -14,7 +14,7 @@ from msgs.recording import Recorder
 from msgs.recording_store import RecordingLimits
 from tests.waiting import until
 
-from .recordings import ROOM, read, record_some, standing
+from .recordings import ROOM, read, record_some, standing, turns
 
 
 def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
@@ -103,16 +103,75 @@ def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is
     assert kept == {b"before": 1, b"kept": 50, b"after": 1}
 
 
-def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_waits_when_the_disk_fails_is_lost_and_counted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.02)
+    stands, goes_on = standing(monkeypatch)
+    sync, broken = os.fdatasync, [True]
+
+    def fail(descriptor: int) -> None:
+        sync(descriptor)
+        if broken:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    try:
+        record_some(recorder, [b"in hand"])
+        stands.wait()
+        record_some(recorder, [b"waiting"] * 3)
+    finally:
+        goes_on.set()
+    until(lambda: told == [(40, "recording stopped: Input/output error")])
+    broken.clear()
+    until(lambda: recorder.recording)
+    record_some(recorder, [b"after"])
+    recorder.stop()
+    assert [data for path in tmp_path.iterdir() for *_, data, _ in read(path)] == [b"after"]
+    assert (recorder.counters()["recorded"], recorder.counters()["lost"]) == (1, 4)
+
+
+def test_when_room_runs_out_and_nothing_may_go_recording_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the last turn, too, what is lost is counted once."""
+    monkeypatch.setattr(recording, "FLUSH_S", 3600.0)
     told: list[tuple[int, str]] = []
     limits = RecordingLimits(free_bytes_min=2**62, when_full="stop")
     recorder = Recorder(tmp_path, "uav1", limits, lambda *event: told.append(event))
     recorder.start()
     record_some(recorder, [b"one"])
-    until(lambda: told == [(40, "recording stopped: no room left for recordings")])
     recorder.stop()
+    assert told == [(40, "recording stopped: no room left for recordings")]
     assert recorder.counters()["lost"] == 1
+
+
+def test_a_disk_that_failed_is_tried_again_after_a_while_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 3600.0)
+    looks = turns(monkeypatch)
+    recorder = Recorder(tmp_path, "uav1", RecordingLimits(free_bytes_min=2**62), print)
+    recorder.start()
+    record_some(recorder, [b"one"])
+    until(lambda: not recorder.recording)
+    since = len(looks)
+    until(lambda: len(looks) >= since + 3)
+    recorder.stop()
+    assert recorder.counters()["failures"] == 1
+
+
+def test_nothing_is_written_before_there_is_something_to_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    looks = turns(monkeypatch)
+    recorder = Recorder(tmp_path / "rec", "uav1", ROOM, print)
+    recorder.start()
+    until(lambda: len(looks) >= 3)
+    recorder.stop()
+    assert not list(tmp_path.rglob("*.mcap"))
 
 
 def test_what_a_disk_that_stands_still_has_not_taken_at_the_end_is_told_as_lost(
