@@ -158,6 +158,7 @@ def test_a_daemon_whose_camera_is_absent_starts_says_so_once_and_stops(tmp_path:
             assert daemon.wait(timeout=60) == 0
     assert any("init: waiting for the camera" in line for line in lines)
     assert sum("camera lost" in line and "WARNING" in line for line in lines) == 1
+    assert any("(waiting for the camera; camera lost: " in line for line in lines)  # its last words, with all reasons
     # What libraries write past the log would come with each try.
     assert [line for line in lines if not re.match(r"\d{4}-\d\d-\d\d .* (INFO|WARNING) edge\.", line)] == []
 
