@@ -107,7 +107,7 @@ def test_what_waits_when_the_disk_fails_is_lost_and_counted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    monkeypatch.setattr(recording, "RETRY_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.0)
     stands, goes_on = standing(monkeypatch)
     sync, broken = os.fdatasync, [True]
 
