@@ -54,8 +54,8 @@ class Estimate:
     t_cam_target_m: Array  # [3]
     covariance: Array  # [6, 6], (x, y, z m, rot x, y, z rad) in cam; rotation as R = exp(w) R_hat
     stage: Literal["acquire", "track"]
-    # How many times as large as the given size it appears to be, where that contradicts it: its depth is then by
-    # appearance. None: it does not, or no size is given.
+    # How many times as large as the given size it appears to be, where that contradicts it. None: it does not, or no
+    # size is given.
     oversize: float | None = None
 
 

@@ -32,6 +32,9 @@ STRANGE_SIGMA = 0.45
 # Probability that the given size is not this aircraft's, and the width of log depth that it then may lie in: a factor
 # of twenty.
 WRONG_SHARE, WRONG_WIDTH = 0.03, 3.0
+# Probability of that from which on it is told of: a size in feet then is in nine of ten frames of a known aircraft, the
+# right size of a strange one in one of a hundred.
+CONTRADICTED_FROM = 0.3
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Combined(NamedTuple):
     """Log Z by appearance and size together."""
 
     depth: Depth
-    contradicted: bool  # the aircraft is probably not of the given size: this is then by appearance
+    contradicted: bool  # the aircraft may well not be of the given size
 
 
 def depth_by_size(
@@ -96,4 +99,4 @@ def combined(appearance: Depth, by_size: Depth) -> Combined:
     means = np.array([*fused, appearance.log_z])
     spread = np.array([*(variances * by_size.variance / apart), appearance.variance])
     mean = float(weights @ means)
-    return Combined(Depth(mean, float(weights @ (spread + (means - mean) ** 2))), bool(weights[2] > 0.5))
+    return Combined(Depth(mean, float(weights @ (spread + (means - mean) ** 2))), bool(weights[2] > CONTRADICTED_FROM))
