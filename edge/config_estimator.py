@@ -34,8 +34,8 @@ class EstimatorSettings(Section):
 
 class TargetSettings(Section):
     """Size of the aircraft to be seen, from its data sheet. Without it, the range of an aircraft that the model was not
-    trained on is wrong by a third or more. With a wrong size, the range is wrong by as much: leave it out where aircraft
-    of different types may be in view."""
+    trained on is wrong by a third or more. With a wrong size, the range is wrong by as much: leave it out where
+    aircraft of different types may be in view."""
 
     wingspan_m: float | None = Field(default=None, ge=0.5, le=100, description="wingspan, metres; needs length_m")
     length_m: float | None = Field(
