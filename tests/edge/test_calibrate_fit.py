@@ -272,7 +272,7 @@ def test_each_fault_has_its_limit_and_advice_that_helps(
     cells: int,
     said: str,
 ) -> None:
-    """`cells`: how many of the image's 16 the board was seen in."""
-    corners = np.array([[480.0 * (k % 4) + 1.0, 270.0 * (k // 4) + 1.0] for k in range(cells)])
-    seen = [View(np.arange(cells), BOARD[:cells], corners)] * len(tilts_deg[0])
+    """`cells`: how many of the image's 16 the board was seen in, to both ends of each."""
+    corners = np.array([[480.0 * (k % 4) + x, 270.0 * (k // 4) + x] for k in range(cells) for x in (1.0, 268.0)])
+    seen = [View(np.arange(len(corners)), BOARD[: len(corners)], corners)] * len(tilts_deg[0])
     assert re.fullmatch(said, str(reason_against(chosen, described(rms_px, focal_sigma, tilts_deg), seen, SIZE_WH)))
