@@ -193,6 +193,14 @@ def test_a_view_that_does_not_agree_is_left_out_and_those_told_are_those_of_the_
     assert found.rms_px == pytest.approx(np.sqrt(2 * (3 * poor**2 + 18 * 0.05**2) / 21), rel=0.15)
 
 
+@pytest.mark.parametrize(("count", "used"), [(9, 9), (10, 8)])
+def test_no_view_is_left_out_where_fewer_than_eight_would_remain(count: int, used: int) -> None:
+    moved = 3.0
+    noises_px = (moved, moved, *[0.05] * (count - 2))
+    kept, _ = fit(views(plumb_bob(1640, (-0.21, 0.06, 0.0, 0.0)), 60, count, noises_px), SIZE_WH)
+    assert len(kept) == used
+
+
 def test_a_long_video_is_used_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """A board that is filmed in the middle first, in more places than are used, and then in the corners."""
     lens = plumb_bob(1500, (-0.2, 0.05, 0.001, -0.001))
