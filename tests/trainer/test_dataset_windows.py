@@ -361,6 +361,7 @@ def test_what_is_validated_on_is_not_trained_on_under_another_name(dataset: Path
     for sources in (
         [{"split": "train", "validation_split": "train_pbr"}],
         [{"split": "train", "validation_split": "val"}, {"split": "val"}],
+        [{"split": "val"}, {"split": "train", "validation_split": "val"}],
     ):
         datasets = [{"path": str(tmp_path / "own"), "share": 0.5} | source for source in sources]
         told = {"seed": 1, "validation_seed": 2, "batch_size": 8, "datasets": datasets}

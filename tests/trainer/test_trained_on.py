@@ -20,6 +20,7 @@ from trainer.data import training_batch
 from trainer.dataset_windows import DatasetSampler
 from trainer.export import export_models, make_contract
 from trainer.graph import read_contract
+from trainer.sources import refuse_unreadable
 from trainer.train import run_training
 
 ANY = Tolerance(180.0, 100.0, 100.0, 100.0, 100.0)
@@ -124,6 +125,8 @@ def test_pictures_that_show_no_target_are_refused_before_the_first_step(
     with pytest.raises(ConfigError, match=f"no image to {purpose} on shows a target"):
         run_training(parse_config(text, "own.toml"), text, tmp_path / "run", max_steps=1)
     assert not (tmp_path / "run").exists()
+    # Beside rendered windows, they show what is no aircraft.
+    refuse_unreadable(parse_config(text.replace("share = 1.0", "share = 0.5"), "own.toml").data)
 
 
 def test_a_range_that_runs_backwards_is_named_before_hours_of_training() -> None:
