@@ -272,14 +272,27 @@ def test_the_metrics_are_those_of_the_status_in_seconds(tmp_path: Path, toy_mode
 
 
 @pytest.fixture
-def metrics_port(tmp_path: Path, toy_model: Path) -> Iterator[int]:
+def board(tmp_path: Path, toy_model: Path) -> StatusBoard:
     config = Config.model_validate({"camera": {"type": "sequence", "path": "scene"}})
     camera = CameraInfo("camera", (320, 180), np.eye(3), None)
-    board = StatusBoard(ConfigFile(tmp_path / "config.toml", "", config), load_model(toy_model, 1), camera)
+    return StatusBoard(ConfigFile(tmp_path / "config.toml", "", config), load_model(toy_model, 1), camera)
+
+
+@pytest.fixture
+def metrics_port(board: StatusBoard) -> Iterator[int]:
     port = free_port()
     server = MetricsServer(board, port)
     yield port
     server.stop()
+
+
+def test_a_port_for_metrics_is_one_server_s_until_it_stops(board: StatusBoard) -> None:
+    port = free_port()
+    server = MetricsServer(board, port)
+    with pytest.raises(InputError, match=f"^port {port} of 127.0.0.1 cannot be served: Address already in use$"):
+        MetricsServer(board, port)
+    server.stop()
+    MetricsServer(board, port).stop()
 
 
 def test_a_reader_of_the_metrics_that_breaks_off_leaves_no_traceback_in_the_log(
