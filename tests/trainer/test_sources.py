@@ -15,7 +15,7 @@ from tests.sim_replay.test_flown import fly
 from trainer.config import ConfigError, DataConfig, DatasetSource
 from trainer.data import TrainingBatch
 from trainer.refine import fleet_size
-from trainer.sources import refinement_sampler, window_sampler
+from trainer.sources import refinement_sampler, refuse_unreadable, window_sampler
 
 DATA = tiny.config().data.model_copy(update={"empty_share": 0.0})
 
@@ -81,6 +81,7 @@ def test_who_trains_on_datasets_alone_and_validates_on_none_validates_on_rendere
     write_scene(tmp_path / "train" / "000000")
     source = DatasetSource(path=tmp_path, share=1.0)
     data = DataConfig(seed=1, validation_seed=2, batch_size=8, acquire_share=0.0, empty_share=0.0, datasets=[source])
+    refuse_unreadable(data)
     for seed, of_dataset in ((1, True), (2, False)):
         labels = window_sampler(data, seed, 64)().batch(0, 8).noc
         assert (np.isnan(labels).all(axis=(1, 2, 3)) == of_dataset).all()
