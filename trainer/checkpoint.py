@@ -21,6 +21,7 @@ from trainer.model import PoseNet
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
 TRAINING_ONLY_PREFIX = "head_dense."
+PRESENCE_PREFIX = "head_presence."
 _log = logging.getLogger(__name__)
 
 
@@ -53,6 +54,11 @@ def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """Weights without the training-only heads. Continued training needs those too: with new random ones, the other
     weights deteriorate."""
     return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
+
+
+def has_presence(state: dict[str, Tensor]) -> bool:
+    """Whether these are weights of a network with a presence head."""
+    return any(key.startswith(PRESENCE_PREFIX) for key in state)
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:
@@ -108,8 +114,8 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
     if not {"weights", "config", "training"} <= content.keys():
         raise ConfigError(f"{path}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
-    model = PoseNet(config.model.deployed())
     weights = deployed_weights(content["weights"])
+    model = PoseNet(config.model.deployed(), presence=has_presence(weights))
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
     except RuntimeError:  # its message has a line for each of some hundred tensors

@@ -89,6 +89,7 @@ def _refine(arguments: argparse.Namespace) -> None:
         datasets=tuple(arguments.dataset),
         split=arguments.split,
         dataset_share=arguments.dataset_share,
+        presence_alone=arguments.presence_alone,
     )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")
@@ -137,9 +138,10 @@ def _parser() -> argparse.ArgumentParser:
 def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine = commands.add_parser(
         "refine",
-        help="train the uncertainty and range correction of a trained network",
-        description="Run a trained network on windows and train only its refinement head on the outputs: it predicts a "
-        "correction of the range, and sigma. All other weights are unchanged. Writes weights.pt to --out.",
+        help="train the uncertainty, range correction and score of a trained network",
+        description="Run a trained network on windows and train only two heads on the outputs: the refinement head "
+        "predicts a correction of the range, and sigma; the presence head whether a peak is a target, hence the score. "
+        "All other weights are unchanged. Writes weights.pt to --out.",
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="output folder for the weights")
@@ -172,6 +174,9 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
     )
     refine.add_argument(
         "--dataset-share", type=share, default=0.5, help="share of windows from --dataset (default %(default)s)"
+    )
+    refine.add_argument(
+        "--presence-alone", action="store_true", help="keep the refinement head as it is, train the presence head"
     )
     refine.set_defaults(run=_refine)
 

@@ -34,7 +34,14 @@ THREADS = 2
 ORT_WARNING, ORT_ERROR = 2, 3  # severities of its log; the first is its default
 QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
 # Soft-argmax, ray, sampling, depth and rotation remain in float, and so does the last layer of each head.
-QUANTISED_PARTS = ("/backbone/", "/neck/", "/head_hm/head_hm.0/", "/dts/convs/", "/head_refine/convs/")
+QUANTISED_PARTS = (
+    "/backbone/",
+    "/neck/",
+    "/head_hm/head_hm.0/",
+    "/dts/convs/",
+    "/head_refine/convs/",
+    "/head_presence/convs/",
+)
 
 
 def write_graph(model: PoseNet, path: Path) -> None:

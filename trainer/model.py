@@ -18,6 +18,7 @@ from trainer.backbones import build_backbone
 from trainer.config import Z_RANGE_M, ModelConfig
 from trainer.layers import conv_bn_relu, mlp
 from trainer.neck import AlignFuseNeck
+from trainer.presence import PresenceHead
 from trainer.refinement import SIGMAS, Evidence, Refined, RefinementHead, answers_of
 
 OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
@@ -116,7 +117,8 @@ class PoseNet(nn.Module):
     """The network. `forward` is the exported graph (see msgs.contract); a training step calls `perceive`, `dense` and
     `decode`."""
 
-    def __init__(self, config: ModelConfig) -> None:
+    def __init__(self, config: ModelConfig, presence: bool = False) -> None:
+        """`presence`: with the head that `trainer.refine` adds."""
         super().__init__()
         self.config = config
         C, hidden = config.channels, config.hidden
@@ -137,6 +139,7 @@ class PoseNet(nn.Module):
         self.head_hypothesis = nn.Linear(hidden, config.hypotheses) if config.hypotheses > 1 else None
         self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
         self.head_refine = RefinementHead(C, hidden, config.hypotheses) if config.uncertainty else None
+        self.head_presence = PresenceHead(C, hidden, config.hypotheses) if presence else None
         # Shallow on purpose, so that F_global itself must encode the object coordinates.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
         self._init_priors()
@@ -176,7 +179,13 @@ class PoseNet(nn.Module):
 
     def decode(self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None) -> Decoded:
         """Each peak [N, M, 2] (cells) to a pose. K [N, 3, 3]; `guide_size_px` [N, M, 2], where positive, replaces the
-        predicted box size in DTS.
+        predicted box size in DTS."""
+        return self.decode_with_evidence(seen, K, peaks_xy, guide_size_px)[0]
+
+    def decode_with_evidence(
+        self, seen: Perception, K: Tensor, peaks_xy: Tensor, guide_size_px: Tensor | None = None
+    ) -> tuple[Decoded, Evidence]:
+        """As `decode`, with what the refinement head reads of the N M peaks.
 
         Internally the peaks of all images are the rows of one matrix: a linear layer over two dimensions exports as
         one node, over three as several.
@@ -217,8 +226,9 @@ class PoseNet(nn.Module):
         R_ego = R_ray @ R_allo
         log_f = torch.log(eq.focal_length(K, self.config.focal))
         answers = answers_of(log_size, log_f, log_Z, plane_xy, logits, R_ego)
-        refined = self._refined(Evidence(grid, f_trans, f_rot, answers))
-        return Decoded(
+        evidence = Evidence(grid, f_trans, f_rot, answers)
+        refined = self._refined(evidence)
+        decoded = Decoded(
             center_px.reshape(-1, M, 2),
             log_size.reshape(-1, M, 2),
             origin_px.reshape(-1, M, 2),
@@ -230,6 +240,7 @@ class PoseNet(nn.Module):
             refined.correction.reshape(-1, M),
             refined.log_sigma.reshape(-1, M, SIGMAS),
         )
+        return decoded, evidence
 
     def _anchor_of(self, F_global: Tensor, log_P: Tensor, peaks_xy: Tensor) -> tuple[Tensor, Tensor]:
         """Features [N M, C] and centre [N M, 2] px of each peak, or of the whole image if centres are regressed."""
@@ -271,7 +282,9 @@ class PoseNet(nn.Module):
         seen = self.perceive(image)
         seen = Perception(seen.F_global.float(), seen.heat_logits.float())
         score, peaks_xy = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), self.config.max_peaks)
-        out = self.decode(seen, K, peaks_xy)
+        out, evidence = self.decode_with_evidence(seen, K, peaks_xy)
+        if self.head_presence is not None:
+            score = self.head_presence(evidence, score.flatten()).reshape(-1, self.config.max_peaks)
         size_px = torch.exp(out.log_size)
         Z = torch.clamp(torch.exp(out.log_Z + out.correction), *Z_RANGE_M)
         t_cam_target_m = eq.back_project(eq.image_plane_point(out.origin_px, K[:, None]), Z)

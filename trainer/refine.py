@@ -1,6 +1,6 @@
-"""`uavpose-trainer refine`: train the refinement head of a trained network alone, all other weights fixed.
+"""`uavpose-trainer refine`: train two heads of a trained network alone, all other weights fixed.
 
-The head's inputs are cached: each window is rendered and evaluated once, and used in every epoch.
+The heads' inputs are cached: each window is rendered and evaluated once, and used in every epoch.
 """
 
 from __future__ import annotations
@@ -11,11 +11,19 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from sim_replay.bop import BopError, find_scenes, names_split
 from sim_replay.datasets import open_dataset
 from trainer import equations as eq
-from trainer.checkpoint import RESUME_NAME, TRAINING_ONLY_PREFIX, WEIGHTS_NAME, load_file, save_weights, weights_sha256
+from trainer.checkpoint import (
+    RESUME_NAME,
+    TRAINING_ONLY_PREFIX,
+    WEIGHTS_NAME,
+    load_file,
+    save_weights,
+    weights_sha256,
+)
 from trainer.config import (
     ConfigError,
     DataConfig,
@@ -28,6 +36,7 @@ from trainer.config import (
 from trainer.data import Feed, Sampler, TrainingBatch
 from trainer.losses import pose_residual, refinement_nll, to_tensors
 from trainer.model import Perception, PoseNet
+from trainer.presence import PresenceHead
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
 from trainer.sources import refinement_sampler
@@ -50,19 +59,22 @@ class RefinePlan(NamedTuple):
     datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
     split: str | None = None  # of each dataset; None: all that are there, as long as none is a test split
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
+    presence_alone: bool = False  # the refinement head stays as it is
 
 
 class Kept(NamedTuple):
-    """Training data: N targets that the network detected, in half precision except for the residual."""
+    """Training data: N peaks, of targets or not, the evidence in half precision."""
 
     evidence: Evidence
-    residual: Tensor  # [N, 6]
+    residual: Tensor  # [N, 6]; only those of targets count
     strange: Tensor  # [N], bool: a generated airframe, not one of the fleet
+    score: Tensor  # [N], the heatmap's
+    target: Tensor  # [N], bool: the peak is of the labelled target
 
     def rows(self, which: Tensor | slice) -> Kept:
         """The selected rows, in single precision."""
         evidence = Evidence(*(value[which].float() for value in self.evidence))
-        return Kept(evidence, self.residual[which], self.strange[which])
+        return Kept(evidence, *(value[which] for value in self[1:]))
 
 
 def refine(
@@ -75,7 +87,7 @@ def refine(
     ] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Write weights.pt with a newly trained refinement head into `out`; returns its path. Raises ConfigError."""
+    """Write weights.pt with newly trained heads into `out`; returns its path. Raises ConfigError."""
     content = load_file(checkpoint)
     if not {"weights", "config", "training"} <= content.keys():
         raise ConfigError(f"{checkpoint}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
@@ -88,25 +100,30 @@ def refine(
     torch.set_num_threads(config.run.threads)
     commit = provenance(config)["commit"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = network_without_head(config, content["weights"], checkpoint)
+    model = network_to_refine(config, content["weights"], checkpoint, keep=plan.presence_alone)
     torch.manual_seed(plan.seed)
-    head = RefinementHead(config.model.channels, config.model.hidden, config.model.hypotheses)
-    model.head_refine = head.eval()
+    shape = config.model.channels, config.model.hidden, config.model.hypotheses
+    if not plan.presence_alone:
+        model.head_refine = RefinementHead(*shape).eval()
+    model.head_presence = PresenceHead(*shape).eval()
     model.to(device)
     _refuse_datasets(plan, config.data)
     size_px = config.schedule.sizes[-1].size_px
     from_datasets = plan.datasets, plan.dataset_share, plan.split
     opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, *from_datasets)
     kept = look(model, config, opener, plan.windows, say)
-    fit(head, kept, int(len(kept.residual) * (1.0 - HELD_OUT_SHARE)), plan.epochs, say)
+    learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
+    heads = Heads(None if plan.presence_alone else model.head_refine, model.head_presence)
+    fit(heads, kept, learnt, plan.epochs, say)
+    what = "presence" if plan.presence_alone else "refined"
     training = content["training"] | {
-        "refined_from": weights_sha256(content["weights"])[:16],
-        "refined_windows": plan.windows,
-        "refined_epochs": plan.epochs,
-        "refined_seed": plan.seed,
-        "refined_strangers": plan.strangers,
-        "refined_dataset_share": plan.dataset_share if plan.datasets else 0.0,
-        "refined_commit": commit,
+        f"{what}_from": weights_sha256(content["weights"])[:16],
+        f"{what}_windows": plan.windows,
+        f"{what}_epochs": plan.epochs,
+        f"{what}_seed": plan.seed,
+        f"{what}_strangers": plan.strangers,
+        f"{what}_dataset_share": plan.dataset_share if plan.datasets else 0.0,
+        f"{what}_commit": commit,
     }
     made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
@@ -141,17 +158,20 @@ def _trained_scenes(source: DatasetSource) -> set[Path]:
     return {s.folder.resolve() for s in scenes if s.split and f"{s.split}_".startswith(f"{source.split}_")}
 
 
-def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: Path) -> PoseNet:
-    """The trained network with an untrained refinement head. Raises ConfigError if it has none, or lacks weights."""
+def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Path, keep: bool = False) -> PoseNet:
+    """The trained network, without a presence head; its refinement head is the trained one if `keep`, else untrained.
+
+    Raises ConfigError if it has none, or lacks weights.
+    """
     dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # deployed weights have none
     model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}))
     if model.head_refine is None:
         raise ConfigError(f"{named}: [model] uncertainty is false: the network has no refinement head")
     own = model.state_dict()
     for key in own:
-        if not key.startswith(PREFIX) and (key not in weights or weights[key].shape != own[key].shape):
+        if (keep or not key.startswith(PREFIX)) and (key not in weights or weights[key].shape != own[key].shape):
             raise ConfigError(f"{named}: its weights do not match the network that its [model] describes")
-    given = {key: value for key, value in weights.items() if key in own and not key.startswith(PREFIX)}
+    given = {key: value for key, value in weights.items() if key in own and (keep or not key.startswith(PREFIX))}
     model.load_state_dict(given, strict=False)
     return model.eval().requires_grad_(False)
 
@@ -159,50 +179,47 @@ def network_without_head(config: TrainerConfig, weights: dict[str, Any], named: 
 def look(
     model: PoseNet, config: TrainerConfig, opener: Callable[[], Sampler], windows: int, say: Callable[[str], None]
 ) -> Kept:
-    """Evaluate the network on windows, decode the highest peak as in flight, keep those whose peak hits the target."""
-    seen: list[Evidence] = []
-    assert model.head_refine is not None
-    handle = model.head_refine.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    """Evaluate the network on windows, decode the highest peak as in flight, keep it unless it may be an aircraft
+    without labels. Raises ConfigError if too few are of targets."""
     found: list[Tensor] = []  # the kept rows; allocated when the first batch gives their shapes
     count = 0
     starts = range(0, windows, RENDERED_AT_ONCE)
     workers, prefetch = config.data.workers, config.data.prefetch
-    try:
-        with Feed(opener, RENDERED_AT_ONCE, 0, workers, prefetch, batches=len(starts)) as feed, torch.no_grad():
-            for done in starts:
-                seen.clear()
-                part = _found(model, config, feed.next(), seen)
-                columns = [*part.evidence, part.residual, part.strange]
-                if not found:
-                    room = windows + RENDERED_AT_ONCE
-                    found = [one.new_empty((room, *one.shape[1:])) for one in columns]
-                for whole, one in zip(found, columns, strict=True):
-                    whole[count : count + len(one)] = one
-                count += len(part.residual)
-                if done % (100 * RENDERED_AT_ONCE) == 0:
-                    say(f"{done} of {windows} windows evaluated")
-    finally:
-        handle.remove()
-    if count < FEWEST:
-        raise ConfigError(f"the network detected {count} targets in {windows} windows: too few to train on")
-    *evidence, residual, strange = (whole[:count] for whole in found)
-    return Kept(Evidence(*evidence), residual, strange)
+    with Feed(opener, RENDERED_AT_ONCE, 0, workers, prefetch, batches=len(starts)) as feed, torch.no_grad():
+        for done in starts:
+            part = _found(model, config, feed.next())
+            columns = [*part.evidence, *part[1:]]
+            if not found:
+                room = windows + RENDERED_AT_ONCE
+                found = [one.new_empty((room, *one.shape[1:])) for one in columns]
+            for whole, one in zip(found, columns, strict=True):
+                whole[count : count + len(one)] = one
+            count += len(part.residual)
+            if done % (100 * RENDERED_AT_ONCE) == 0:
+                say(f"{done} of {windows} windows evaluated")
+    columns = [whole[:count] for whole in found]
+    kept = Kept(Evidence(*columns[: len(Evidence._fields)]), *columns[len(Evidence._fields) :])
+    if kept.target.sum() < FEWEST:
+        raise ConfigError(f"the network detected {kept.target.sum()} targets in {windows} windows: too few to train on")
+    return kept
 
 
-def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch, seen: list[Evidence]) -> Kept:
+def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch) -> Kept:
     device = next(model.parameters()).device
     image, labels = to_tensors(batch, device)
     with torch.autocast(device.type, torch.bfloat16, enabled=config.run.bf16):
         perceived = model.perceive(image)
     perceived = Perception(perceived.F_global.float(), perceived.heat_logits.float())
-    _, peaks_xy = eq.heatmap_peaks(torch.sigmoid(perceived.heat_logits), 1)
-    out = model.decode(perceived, labels.K, peaks_xy)
+    score, peaks_xy = eq.heatmap_peaks(torch.sigmoid(perceived.heat_logits), 1)
+    out, seen = model.decode_with_evidence(perceived, labels.K, peaks_xy)
     off_px = (out.center_px[:, 0] - labels.center_px).abs()
-    found = (labels.present > 0) & (off_px < 0.5 * labels.size_px).all(-1)
     residual = pose_residual(out, labels)
-    found &= residual.isfinite().all(-1)
-    evidence = Evidence(*(value[found].half() for value in seen[0]))
-    return Kept(evidence, residual[found], (labels.airframe_id >= fleet_size())[found])
+    hit = (labels.present > 0) & (off_px < 0.5 * labels.size_px).all(-1)
+    target = hit & residual.isfinite().all(-1)
+    kept = target | ~(hit | labels.others.any(-1).any(-1))
+    evidence = Evidence(*(value[kept].half() for value in seen))
+    strange = labels.airframe_id >= fleet_size()
+    return Kept(evidence, residual[kept], strange[kept], score[kept, 0], target[kept])
 
 
 def fleet_size() -> int:
@@ -212,41 +229,68 @@ def fleet_size() -> int:
     return len(AIRFRAMES)
 
 
-def fit(head: RefinementHead, kept: Kept, learnt: int, epochs: int, say: Callable[[str], None]) -> None:
-    """Train on the first `learnt` rows; report the loss on the others after each epoch."""
-    head.requires_grad_(True)
-    head.dropout.p = DROPOUT
-    optimizer = torch.optim.AdamW(head.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+class Heads(NamedTuple):
+    """What is trained; None: stays as it is."""
+
+    refine: RefinementHead | None
+    presence: PresenceHead
+
+    def loss(self, rows: Kept) -> Tensor:
+        """Mean over the rows of each head's negative log-likelihood; they share no weights."""
+        logits = self.presence.logits(rows.evidence, rows.score)
+        loss = F.binary_cross_entropy_with_logits(logits, rows.target.float())
+        if self.refine is not None:
+            of_targets = rows.rows(rows.target)
+            refined = self.refine(of_targets.evidence)
+            loss = loss + refinement_nll(of_targets.residual, refined.correction, refined.log_sigma).sum(-1).mean()
+        return loss
+
+
+def fit(heads: Heads, kept: Kept, learnt: int, epochs: int, say: Callable[[str], None]) -> None:
+    """Train on the first `learnt` rows; report the metrics on the others after each epoch."""
+    trained = [head for head in heads if head is not None]
+    for head in trained:
+        head.requires_grad_(True)
+        head.dropout.p = DROPOUT
+    parameters = [parameter for head in trained for parameter in head.parameters()]
+    optimizer = torch.optim.AdamW(parameters, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     batch = min(BATCH, learnt)
     steps = learnt // batch
     # OneCycleLR needs a minimum number of steps.
     total = max(epochs * steps + 1, 20)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=total, pct_start=0.1)
     for epoch in range(epochs):
-        head.train()
+        for head in trained:
+            head.train()
         order = torch.randperm(learnt)
         for step in range(steps):
-            rows = kept.rows(order[step * batch : (step + 1) * batch])
-            refined = head(rows.evidence)
-            loss = refinement_nll(rows.residual, refined.correction, refined.log_sigma).sum(-1).mean()
+            loss = heads.loss(kept.rows(order[step * batch : (step + 1) * batch]))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
             schedule.step()
-        say(f"epoch {epoch + 1} of {epochs}: training loss {loss.item():.3f}; held out: {told(head, kept, learnt)}")
-    head.dropout.p = 0.0
-    head.eval().requires_grad_(False)
+        for head in trained:
+            head.eval()
+        say(f"epoch {epoch + 1} of {epochs}: training loss {loss.item():.3f}; held out: {told(heads, kept, learnt)}")
+    for head in trained:
+        head.dropout.p = 0.0
+        head.requires_grad_(False)
 
 
 @torch.no_grad()
-def told(head: RefinementHead, kept: Kept, first: int) -> str:
-    """Metrics of the head on the rows from `first` on, as text."""
-    head.eval()
-    refined, residual, strange = [], kept.residual[first:], kept.strange[first:]
-    for start in range(first, len(kept.residual), BATCH):
-        refined.append(head(kept.rows(slice(start, start + BATCH)).evidence))
-    if not refined:
+def told(heads: Heads, kept: Kept, first: int) -> str:
+    """Metrics of the heads on the rows from `first` on, as text."""
+    last = kept.rows(slice(first, None))
+    if not len(last.residual):
         return "no windows"
+    of_targets = last.rows(last.target)
+    words = [] if heads.refine is None or not len(of_targets.score) else _told_of_range(heads.refine, of_targets)
+    return "; ".join([*words, *_told_of_presence(heads.presence, last)])
+
+
+def _told_of_range(head: RefinementHead, of_targets: Kept) -> list[str]:
+    residual, strange = of_targets.residual, of_targets.strange
+    refined = [head(of_targets.rows(rows).evidence) for rows in _by_batch(len(residual))]
     correction, log_sigma = (torch.cat(values) for values in zip(*refined, strict=True))
     nll = refinement_nll(residual, correction, log_sigma).sum(-1).mean()
     left = (residual[:, RANGE] + correction).abs()
@@ -258,4 +302,22 @@ def told(head: RefinementHead, kept: Kept, first: int) -> str:
             words.append(
                 f"{name}: mean error of log range {before:.3f} before, {after:.3f} after, predicted scale {scale:.3f}"
             )
-    return "; ".join(words)
+    return words
+
+
+def _told_of_presence(head: PresenceHead, last: Kept) -> list[str]:
+    if last.target.all() or not last.target.any():
+        return []
+    parts = (last.rows(rows) for rows in _by_batch(len(last.score)))
+    score = torch.cat([head(part.evidence, part.score) for part in parts])
+    false = [_false_share(of, last.target) for of in (last.score, score)]
+    return ["peaks of no target, where 95 % of the targets are found: {:.2%} before, {:.2%} after".format(*false)]
+
+
+def _by_batch(count: int) -> list[slice]:
+    return [slice(start, start + BATCH) for start in range(0, count, BATCH)]
+
+
+def _false_share(score: Tensor, target: Tensor, found: float = 0.95) -> float:
+    """Share of the peaks of no target whose score exceeds the one that the share `found` of the targets exceeds."""
+    return float((score[~target] > torch.quantile(score[target], 1.0 - found)).float().mean())

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 RENDERED = "rendered"  # name of the renderer among the datasets
+REFINED_EMPTY_SHARE = 0.4  # of the rendered windows for `refine`: what the presence head tells targets from
 
 
 def _shares(config: DataConfig, judging: bool) -> list[tuple[DatasetSource | None, float]]:
@@ -150,7 +151,7 @@ def _open_refinement_sampler(
     invention = Invention(strangers, KEPT_BACK_VARIANTS)
     acquire = config.acquire_share
     drawn = invention, config.acquire_view, flown
-    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, 0.0, *drawn)
+    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, REFINED_EMPTY_SHARE, *drawn)
     if not datasets or dataset_share == 0.0:
         return rendered
     cut = [DatasetSampler(path, split, seed, size_px, acquire, config.acquire_view) for path in datasets]
@@ -167,8 +168,8 @@ def refinement_sampler(
     dataset_share: float = 0.0,
     split: str | None = None,
 ) -> Callable[[], Sampler]:
-    """Like `window_sampler`, for the refinement head. In each rendered window there is a target, a share of `strangers`
-    being generated aircraft that training never uses. The `datasets` must be others than those trained on, where the
+    """Like `window_sampler`, for `refine`. Of the targets in rendered windows, a share of `strangers` are generated
+    aircraft that training never uses. The `datasets` must be others than those trained on, where the
     network's errors are too small; an unreadable one raises ConfigError."""
     for path in datasets:
         DatasetSampler(path, split, seed, size_px, config.acquire_share, config.acquire_view)

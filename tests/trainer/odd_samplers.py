@@ -15,6 +15,7 @@ from synthetic_sampler import PlateSampler
 
 from sim_replay.airframes import AIRFRAMES
 from sim_replay.sample import SampleBatch
+from trainer.data import TrainingBatch, training_batch
 
 GOOD_SAMPLES = 8  # of a SpoiltSampler
 LARGE_PX = 256  # a batch of such pictures is far more than a pipe holds
@@ -28,6 +29,18 @@ class Filling(PlateSampler):
         box = np.tile(np.array([0, 0, self.size_px, self.size_px], np.float32), (count, 1))
         strange = np.where((first_index + np.arange(count)) % 3 == 0, len(AIRFRAMES) + 5, batch.airframe_id)
         return replace(batch, box_xyxy_px=box, airframe_id=strange.astype(np.int32))
+
+
+class PartlyEmpty:
+    """Of six windows the fifth is empty, and the sixth but for an aircraft that has no labels."""
+
+    def __init__(self, seed: int, size_px: int) -> None:
+        self.filled = Filling(seed, size_px, 0.0)
+
+    def batch(self, first_index: int, count: int) -> TrainingBatch:
+        batch = training_batch(self.filled.batch(first_index, count))
+        kind = (first_index + np.arange(count)) % 6
+        return batch._replace(present=kind < 4, others=batch.others | (kind == 5)[:, None, None])
 
 
 class NoTargets(PlateSampler):

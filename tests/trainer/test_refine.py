@@ -11,16 +11,19 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from odd_samplers import Filling, NoTargets
+from odd_samplers import Filling, NoTargets, PartlyEmpty
 
+from msgs.contract import OUTPUT_NAMES
 from sim_replay.airframes.invented import draw_invented
 from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.cli import main
 from trainer.config import ConfigError, DataConfig
 from trainer.equations import heatmap_peaks
-from trainer.losses import pose_residual
-from trainer.refine import Kept, RefinePlan, fit, fleet_size, look, refine
+from trainer.graph import open_session, write_graph
+from trainer.losses import pose_residual, to_tensors
+from trainer.presence import PresenceHead
+from trainer.refine import Heads, Kept, RefinePlan, fit, fleet_size, look, refine
 from trainer.refinement import Evidence, RefinementHead, answer_count
 from trainer.sources import refinement_sampler
 
@@ -29,6 +32,10 @@ PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
 
 def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], Filling]:
     assert (seed, size_px, strangers) == (PLAN.seed, tiny.config().schedule.sizes[-1].size_px, PLAN.strangers)
+    return partial(Filling, seed, size_px)
+
+
+def open_others(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], Filling]:
     return partial(Filling, seed, size_px)
 
 
@@ -50,7 +57,7 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     run = write_run(tmp_path / "run")
     one, again = (refine(run, tmp_path / n, PLAN, open_sampler=open_plates, say=silent) for n in ("one", "again"))
     before, after = load_file(run)["weights"], load_file(one)["weights"]
-    assert before.keys() == after.keys()
+    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"head_presence"}
     moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert moved == {"head_refine"}
     assert load_model(one)[3] == load_model(again)[3] != load_model(run)[3]
@@ -60,6 +67,18 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     of_plan = ("seed", "windows", "epochs", "strangers")
     assert {name: told[f"refined_{name}"] for name in of_plan} == {name: getattr(PLAN, name) for name in of_plan}
     assert told["refined_dataset_share"] == 0.0
+
+
+def test_the_presence_head_may_be_trained_alone_also_again(tmp_path: Path) -> None:
+    refined = refine(write_run(tmp_path / "run"), tmp_path / "refined", PLAN, open_sampler=open_plates, say=silent)
+    alone = PLAN._replace(seed=12, presence_alone=True)
+    again = refine(refined, tmp_path / "again", alone, open_sampler=open_others, say=silent)
+    before, after = load_file(refined)["weights"], load_file(again)["weights"]
+    assert before.keys() == after.keys()
+    assert {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])} == {"head_presence"}
+    told = load_model(again)[2]
+    assert (told["refined_seed"], told["presence_seed"]) == (PLAN.seed, 12)
+    assert told["presence_from"] == load_model(refined)[3][:16]
 
 
 def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_path: Path) -> None:
@@ -77,11 +96,11 @@ def test_flights_to_render_anew_that_are_not_there_are_told_before_anything_is_r
 
 
 def test_its_strangers_are_none_that_training_draws() -> None:
-    """Two of three are asked to be strangers, whatever share the run was trained with; each window shows a target."""
-    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.5)
-    batch = refinement_sampler(data, 12, 96, 2 / 3)().batch(0, 24)
+    """Two of three are asked to be strangers, two of five windows to be empty, whatever the run was trained with."""
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.9)
+    batch = refinement_sampler(data, 12, 96, 2 / 3)().batch(0, 40)
     strange = batch.airframe_id >= fleet_size()
-    assert batch.present.mean() > 0.8
+    assert 0.35 < batch.present.mean() < 0.8
     assert 0.4 < strange[batch.present].mean() < 0.9
     names = {int(number) for number in batch.airframe_id[strange]}
     of_training = {draw_invented(np.random.default_rng(k), data.airframe_ids or []) for k in range(400)}
@@ -173,6 +192,19 @@ def test_what_is_kept_tells_which_of_the_found_are_strangers() -> None:
     kept = look(tiny.network(3).eval(), tiny.config(), partial(Filling, 7, 96, 0.0), 96, silent)
     assert kept.residual.shape == (96, 6)
     assert kept.strange.tolist() == [index % 3 == 0 for index in range(96)]
+    assert kept.target.all()
+
+
+def test_peaks_of_no_target_are_kept_as_such_unless_they_may_be_another_aircraft() -> None:
+    """Of six windows four are targets, one is empty, and one is empty but for an aircraft without labels."""
+    network = tiny.network(3).eval()
+    kept = look(network, tiny.config(), partial(PartlyEmpty, 7, 96), 96, silent)
+    kinds = [index % 6 for index in range(96)]
+    assert kept.target.tolist() == [kind < 4 for kind in kinds if kind < 5]
+    image, _ = to_tensors(PartlyEmpty(7, 96).batch(0, 8), torch.device("cpu"))
+    with torch.no_grad():
+        score = network(image, torch.eye(3).repeat(8, 1, 1))[0][:, 0]
+    torch.testing.assert_close(kept.score[:7], score[[0, 1, 2, 3, 4, 6, 7]], rtol=0.05, atol=1e-3)
 
 
 def test_a_correction_by_what_an_answer_is_off_by_makes_the_truth() -> None:
@@ -219,22 +251,30 @@ def test_what_cannot_be_refined_is_a_sentence(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "weights.pt").exists()
 
 
+def made_up(count: int, strange: torch.Tensor, seed: int) -> Evidence:
+    """Noise, with strangers in brighter channels."""
+    generator = torch.Generator().manual_seed(seed)
+    grid = torch.randn(count, 16, 7, 7, generator=generator)
+    grid[:, 3:5] += 1.5 * strange[:, None, None, None]
+    rest = (torch.randn(count, width, generator=generator) for width in (32, 32, answer_count(4)))
+    return Evidence(*(part.half() for part in (grid, *rest)))
+
+
 def test_strangers_that_show_in_the_features_are_corrected_and_less_is_said_of_them() -> None:
     """Made up: known ones err by a Laplace law of scale 0.05; strangers, in brighter channels, 0.3 and 0.2 too far."""
     generator = torch.Generator().manual_seed(4)
     count = 6000
     strange = torch.rand(count, generator=generator) < 0.4
-    grid = torch.randn(count, 16, 7, 7, generator=generator)
-    grid[:, 3:5] += 1.5 * strange[:, None, None, None]
-    rest = (torch.randn(count, width, generator=generator) for width in (32, 32, answer_count(4)))
     scale = torch.where(strange, 0.3, 0.05)
     draw = torch.rand(count, 6, generator=generator) - 0.5
     residual = -scale[:, None] * draw.sign() * torch.log1p(-2 * draw.abs())
     residual[:, 2] += 0.2 * strange
-    kept = Kept(Evidence(*(part.half() for part in (grid, *rest))), residual, strange)
+    target = torch.rand(count, generator=generator) < 0.8
+    residual[~target] = torch.nan
+    kept = Kept(made_up(count, strange, 5), residual, strange, torch.full((count,), 0.5), target)
     torch.manual_seed(0)
     head = RefinementHead(16, 32, 4)
-    fit(head, kept, 5000, 12, silent)
+    fit(Heads(head, PresenceHead(16, 32, 4)), kept, 5000, 12, silent)
     with torch.no_grad():
         refined = head(kept.rows(slice(5000, None)).evidence)
     held_out = strange[5000:]
@@ -243,3 +283,54 @@ def test_strangers_that_show_in_the_features_are_corrected_and_less_is_said_of_t
     assert scale_of[held_out].median().item() == pytest.approx(0.3, rel=0.25)
     assert refined.correction[held_out].median().item() == pytest.approx(-0.2, abs=0.05)
     assert refined.correction[~held_out].abs().median().item() < 0.02
+
+
+def test_what_shows_in_the_features_and_what_the_heatmap_says_are_both_heard() -> None:
+    """Made up: one in three is no target, and shows in brighter channels; the heatmap alone is right in two of three.
+
+    What is said is a probability, and told of as what it is worth."""
+    generator = torch.Generator().manual_seed(6)
+    count = 6000
+    target = torch.rand(count, generator=generator) < 2 / 3
+    right = torch.rand(count, generator=generator) < 2 / 3
+    score = torch.where(target == right, 0.8, 0.2) + 0.1 * torch.rand(count, generator=generator)
+    kept = Kept(made_up(count, ~target, 7), torch.zeros(count, 6), target & False, score, target)
+    torch.manual_seed(0)
+    head, said = PresenceHead(16, 32, 4), list[str]()
+    fit(Heads(None, head), kept, 5000, 4, said.append)
+    held_out = kept.rows(slice(5000, None))
+    with torch.no_grad():
+        told = head(held_out.evidence, held_out.score)
+        of_no_evidence = head(held_out.evidence, torch.full_like(held_out.score, 0.5))
+    assert told[held_out.target].median() > 0.9
+    assert told[~held_out.target].median() < 0.1
+    assert told.mean().item() == pytest.approx(2 / 3, abs=0.04)
+    moved = told - of_no_evidence
+    assert moved[held_out.score > 0.6].mean() > 0.0 > moved[held_out.score < 0.4].mean()
+    limit = torch.quantile(told[held_out.target], 0.05)
+    after = (told[~held_out.target] > limit).float().mean().item()
+    assert said[-1].endswith(f"{after:.2%} after")
+    assert after < 0.3
+
+
+def test_a_refined_network_s_graph_says_the_presence_head_s_scores(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    refined = refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
+    network = load_model(refined)[0]
+    assert network.head_presence is not None
+    with torch.no_grad():
+        network.head_presence.gain.fill_(0.5)
+    image, labels = tiny.batch(3)
+    write_graph(network, tmp_path / "graph.onnx")
+    feeds = {"image": image.numpy(), "K": labels.K.numpy()}
+    ran = open_session(tmp_path / "graph.onnx").run(list(OUTPUT_NAMES), feeds)
+    outputs = dict(zip(OUTPUT_NAMES, ran, strict=True))
+    with torch.no_grad():
+        expected = dict(zip(OUTPUT_NAMES, network(image, labels.K), strict=True))
+        network.head_presence = None
+        plain = dict(zip(OUTPUT_NAMES, network(image, labels.K), strict=True))
+    for name in OUTPUT_NAMES:
+        np.testing.assert_allclose(outputs[name], expected[name].numpy(), rtol=1e-3, atol=1e-3)
+        if name != "score":
+            torch.testing.assert_close(expected[name], plain[name])
+    assert not torch.allclose(expected["score"], plain["score"], atol=1e-3)
