@@ -30,7 +30,7 @@ from sim_replay.matrix import command as matrix
 from sim_replay.matrix.verdict import wrong_poses
 from sim_replay.offline import DEFAULT_THREADS, estimator_answers, method_of
 from sim_replay.pipeline import command as pipeline
-from sim_replay.play import PlayError, PlaySettings
+from sim_replay.play import PlayError, PlaySettings, target_size
 from sim_replay.radio import run as radio
 from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
@@ -64,6 +64,13 @@ def _parser() -> argparse.ArgumentParser:
         "--record",
         action="store_true",
         help="have the daemon record images and outputs into OUT/recordings, for `uavpose-ground view` and `play`",
+    )
+    play.add_argument(
+        "--target-size",
+        type=float,
+        nargs=2,
+        metavar=("WINGSPAN", "LENGTH"),
+        help="of the aircraft to be seen, metres, given to the daemon as [target] (default: not given)",
     )
     link = play.add_argument_group("the simulated autopilot and its link, in real time")
     link.add_argument(
@@ -117,6 +124,7 @@ def _run(args: argparse.Namespace) -> int:
     settings = PlaySettings(open_sequence(folder, args.out, console), args.out, args.model)
     if args.command == "play":
         chosen = {"record": args.record, "firmware": args.autopilot, "link": bad_link.link_faults(args)}
+        chosen["target_size"] = target_size(args.target_size)
         settings = replace(settings, **chosen)
     recording = show(settings, args.model, console)
     wrong = wrong_poses(settings.sequence, judge(settings.sequence, recording))

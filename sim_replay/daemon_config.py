@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
+from edge.estimator.given_size import TargetSize
 from msgs.settings import toml_value
 from sim_replay.ground_truth import PlayedSequence
 from sim_replay.ports import LOOPBACK
@@ -22,6 +24,7 @@ def sequence_config(
     recordings: Path | None = None,
     *,
     to_px4: bool = False,
+    target_size: TargetSize | None = None,
 ) -> str:
     """The text of its TOML file.
 
@@ -30,6 +33,7 @@ def sequence_config(
         camera: Further keys of [camera]: when, how often or under whose control the sequence is played.
         recordings: Folder for the daemon's own recordings, including images; None: no recordings.
         to_px4: Also send TARGET_RELATIVE to PX4, which takes it for a landing target.
+        target_size: Of the aircraft to be seen; None: not given.
     """
     tables: dict[str, dict[str, object]] = {
         "vehicle": {"name": UAV},
@@ -50,6 +54,8 @@ def sequence_config(
     }
     if to_px4:
         tables["mavlink"]["target_relative_to_px4"] = True
+    if target_size is not None:
+        tables["target"] = asdict(target_size)
     if recordings is not None:
         recorder = {"enabled": True, "folder": str(recordings.resolve()), "image_max_hz": EVERY_IMAGE_HZ}
         tables["recorder"] = {**recorder, "free_min_mb": 0.0}

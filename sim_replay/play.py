@@ -16,13 +16,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from edge.errors import InputError
+from edge.estimator.given_size import TargetSize
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.bad_link import LinkFaults
 from sim_replay.daemon_config import UAV, sequence_config
@@ -97,6 +98,12 @@ class PlaySettings:
     record: bool = False  # into out/recordings, by the daemon
     firmware: str = "ardupilot"  # one of sim_replay.autopilot.FIRMWARES
     link: LinkFaults = field(default_factory=LinkFaults)  # between daemon and autopilot
+    target_size: TargetSize | None = None  # given to the daemon
+
+
+def target_size(wingspan_length_m: Sequence[float] | None) -> TargetSize | None:
+    """Of two numbers as the commands take them."""
+    return None if wingspan_length_m is None else TargetSize(*wingspan_length_m)
 
 
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:
@@ -127,6 +134,7 @@ def _attempt(settings: PlaySettings, lead_s: float, on_record: Callable[[Recordi
         {"start_at_ns": recording.start_at_ns},
         settings.out / RECORDINGS if settings.record else None,
         to_px4=settings.firmware == "px4",
+        target_size=settings.target_size,
     )
     config.write_text(text, encoding="utf-8")
     records: queue.SimpleQueue[tuple[str, Record]] = queue.SimpleQueue()

@@ -16,7 +16,7 @@ from sim_replay.ground_truth import PlayedSequence
 from sim_replay.lockstep.peers import Record
 from sim_replay.lockstep.player import POSES_JSONL, LockstepSettings, play_lockstep
 from sim_replay.offline import method_of
-from sim_replay.play import MESSAGES_JSONL
+from sim_replay.play import MESSAGES_JSONL, target_size
 from sim_replay.recorded.opened import open_sequence
 from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 
@@ -58,7 +58,13 @@ def asked_for(args: argparse.Namespace) -> bool:
 def run(args: argparse.Namespace, console: Console) -> int:
     """Play, and write the outputs. Raises InputError, PlayError."""
     sequence = open_sequence(args.sequence, args.out, console)
-    settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=_rounds(args.loop))
+    settings = LockstepSettings(
+        sequence,
+        args.model,
+        _start(args.start, sequence),
+        rounds=_rounds(args.loop),
+        target_size=target_size(args.target_size),
+    )
     if args.pause is not None and args.pause not in settings.frames:
         raise InputError(
             f"--pause {args.pause}: is not one of the frames {settings.frames[0]} to {settings.frames[-1]}"

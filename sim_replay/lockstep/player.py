@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edge.errors import InputError
+from edge.estimator.given_size import TargetSize
 from msgs.command_line import EXIT_BAD_INPUT
 from sim_replay.autopilot import BOOT_BEFORE_START_NS, Autopilot
 from sim_replay.daemon_config import UAV, sequence_config
@@ -47,6 +48,7 @@ class LockstepSettings:
     start: int = 0
     stop: int | None = None
     rounds: int = 1
+    target_size: TargetSize | None = None  # given to the daemon
 
     @property
     def frames(self) -> list[int]:
@@ -89,7 +91,9 @@ def play_lockstep(settings: LockstepSettings, before_frame: BeforeFrame, after_f
         mavlink_port, endpoint = free_port(socket.SOCK_DGRAM), free_endpoint()
         config = folder / "config.toml"
         camera = {"lockstep": control.address}
-        text = sequence_config(settings.sequence, settings.model, endpoint, mavlink_port, camera)
+        text = sequence_config(
+            settings.sequence, settings.model, endpoint, mavlink_port, camera, target_size=settings.target_size
+        )
         config.write_text(text, encoding="utf-8")
         command: list[str | Path] = [Path(sys.executable).parent / "uavpose-edge", "run", "--config", config]
         daemon = Process(command, lambda line, _: said.append(line))

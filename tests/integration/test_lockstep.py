@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sim_replay.cli import main
@@ -53,6 +54,19 @@ def test_the_same_frames_give_the_same_files_at_any_speed_and_by_hand(tmp_path: 
     assert [message["timestamp"] for message in told] == [pose["t_ns"] // 1000 for pose in poses]
 
 
+def test_a_target_that_is_given_as_larger_is_farther_away(tmp_path: Path) -> None:
+    """The aircraft of the bundled sequence has 12 m of wings and is 6.5 m long."""
+    away_m = []
+    for share in (0.9, 1.1):
+        size = [f"{share * side_m:.2f}" for side_m in (12.0, 6.5)]
+        out = tmp_path / f"{share}"
+        played = replay("play", "--lockstep", *LAST_FRAMES, "--target-size", *size, "--out", out)
+        assert played.returncode == 0, played.stderr
+        poses = [json.loads(line) for line in files(out)["poses.jsonl"].splitlines()]
+        away_m.append(np.mean([pose["t_cam_target_m"][2] for pose in poses]))
+    assert 1.01 * away_m[0] < away_m[1] < 1.22 * away_m[0]
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
     played = replay("golden", case, "--out", tmp_path)
@@ -79,6 +93,7 @@ def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
         (["play", "--loop", "0"], "--loop 0: must be at least 1"),
         (["play", "--pause", "150"], "--pause 150: is not one of the frames 0 to 149"),
         (["play", "--speed", "0.1"], "'0.1' is neither a number of at least 0.25 nor max"),
+        (["play", "--lockstep", "--target-size", "0", "9"], "[target] wingspan_m: must be at least 0.5"),
         (["golden", "crosing"], f"golden crosing: no such case; the cases are {', '.join(CASES)}"),
     ],
 )

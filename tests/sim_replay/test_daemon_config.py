@@ -10,6 +10,7 @@ import pytest
 
 from edge.config import load_config
 from edge.config_camera import SequenceCamera
+from edge.estimator.given_size import TargetSize
 from edge.pictures import Rate
 from sim_replay.daemon_config import sequence_config
 from sim_replay.demo import BUNDLED_SEQUENCE
@@ -24,12 +25,14 @@ def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     sequence = replace(bundled, scene=replace(bundled.scene, folder=folder))
     path = tmp_path / "config.toml"
     camera = {"start_at_ns": 12, "loop": True}
-    path.write_text(sequence_config(sequence, folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera), encoding="utf-8")
+    asked = (sequence, folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera)
+    path.write_text(sequence_config(*asked, target_size=TargetSize(11.0, 8.3)), encoding="utf-8")
     config = load_config(path).config
     assert isinstance(config.camera, SequenceCamera)
     assert (config.camera.path, config.camera.fps) == (folder, sequence.fps)
     assert (config.camera.start_at_ns, config.camera.loop) == (12, True)
     assert config.model.path == folder / "a.onnx"
+    assert (config.target.wingspan_m, config.target.length_m) == (11.0, 8.3)
     assert (config.vehicle.name, config.zenoh.listen) == ("uav1", ["tcp/127.0.0.1:7001"])
     assert config.mavlink.endpoints == ["udpin:127.0.0.1:14001"]
     np.testing.assert_allclose(config.mount.mount().R_body_cam, sequence.mount.R_body_cam, atol=1e-9)
