@@ -236,11 +236,12 @@ class Heads(NamedTuple):
     presence: PresenceHead
 
     def loss(self, rows: Kept) -> Tensor:
-        """Mean over the rows of each head's negative log-likelihood; they share no weights."""
+        """Mean over the rows of each head's negative log-likelihood; they share no weights. From fewer than two
+        targets, which have no statistics to normalise by, the refinement head learns nothing."""
         logits = self.presence.logits(rows.evidence, rows.score)
         loss = F.binary_cross_entropy_with_logits(logits, rows.target.float())
-        if self.refine is not None:
-            of_targets = rows.rows(rows.target)
+        of_targets = rows.rows(rows.target)
+        if self.refine is not None and len(of_targets.score) > 1:
             refined = self.refine(of_targets.evidence)
             loss = loss + refinement_nll(of_targets.residual, refined.correction, refined.log_sigma).sum(-1).mean()
         return loss

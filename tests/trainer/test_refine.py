@@ -313,6 +313,25 @@ def test_what_shows_in_the_features_and_what_the_heatmap_says_are_both_heard() -
     assert after < 0.3
 
 
+def test_batches_without_targets_spoil_no_head() -> None:
+    """Six targets in two thousand peaks: most batches have none or one."""
+    count = 2000
+    target = torch.arange(count) % 400 == 7
+    target[8] = True
+    kept = Kept(made_up(count, target, 8), torch.zeros(count, 6), target & False, torch.full((count,), 0.5), target)
+    heads = Heads(RefinementHead(16, 32, 4), PresenceHead(16, 32, 4))
+    torch.manual_seed(0)
+    for rows in (kept.rows(slice(100, 300)), kept.rows(slice(300, 500)), kept.rows(slice(0, 100))):
+        loss = heads.loss(rows)
+        loss.backward()
+        assert loss.isfinite()
+    for head in heads:
+        assert head is not None
+        assert all(weight.grad is None or weight.grad.isfinite().all() for weight in head.parameters())
+    fit(heads, kept, 1900, 1, silent)
+    assert all(value.isfinite().all() for head in heads if head is not None for value in head.state_dict().values())
+
+
 def test_a_refined_network_s_graph_says_the_presence_head_s_scores(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     refined = refine(run, tmp_path / "out", PLAN, open_sampler=open_plates, say=silent)
