@@ -29,9 +29,9 @@ class Estimator:
     """Poses of the targets in single frames. Between frames it keeps only whether the last windows were evaluated
     mirrored, and the counts of rejections. `target_size`, if known, may be changed between frames."""
 
-    def __init__(self, model: Model, max_targets: int = 4, target_size: TargetSize | None = None) -> None:
+    def __init__(self, model: Model, max_targets: int = 4) -> None:
         self.model = model
-        self.target_size = target_size
+        self.target_size: TargetSize | None = None
         self.refused: Counter[str] = Counter()
         self._max_targets = max_targets
         self._mirror = True

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -103,12 +105,29 @@ def test_a_disk_that_stands_still_holds_up_nobody_and_what_was_lost_meanwhile_is
     assert kept == {b"before": 1, b"kept": 50, b"after": 1}
 
 
+@contextmanager
+def one_in_hand_and_three_waiting(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[Recorder, list[tuple[int, str]]]]:
+    """A recorder before a disk that stands still, until the end, and what it tells."""
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    stands, goes_on = standing(monkeypatch)
+    told: list[tuple[int, str]] = []
+    recorder = Recorder(folder, "uav1", ROOM, lambda *event: told.append(event))
+    recorder.start()
+    try:
+        record_some(recorder, [b"in hand"])
+        stands.wait()
+        record_some(recorder, [b"waiting"] * 3)
+        yield recorder, told
+    finally:
+        goes_on.set()
+
+
 def test_what_waits_when_the_disk_fails_is_lost_and_counted_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     monkeypatch.setattr(recording, "RETRY_S", 0.0)
-    stands, goes_on = standing(monkeypatch)
     sync, broken = os.fdatasync, [True]
 
     def fail(descriptor: int) -> None:
@@ -117,15 +136,8 @@ def test_what_waits_when_the_disk_fails_is_lost_and_counted_once(
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fdatasync", fail)
-    told: list[tuple[int, str]] = []
-    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
-    recorder.start()
-    try:
-        record_some(recorder, [b"in hand"])
-        stands.wait()
-        record_some(recorder, [b"waiting"] * 3)
-    finally:
-        goes_on.set()
+    with one_in_hand_and_three_waiting(tmp_path, monkeypatch) as (recorder, told):
+        pass
     until(lambda: told == [(40, "recording stopped: Input/output error")])
     broken.clear()
     until(lambda: recorder.recording)
@@ -178,20 +190,10 @@ def test_what_a_disk_that_stands_still_has_not_taken_at_the_end_is_told_as_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording, "STOP_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
-    stands, goes_on = standing(monkeypatch)
-    told: list[tuple[int, str]] = []
-    recorder = Recorder(tmp_path, "uav1", ROOM, lambda *event: told.append(event))
-    recorder.start()
-    try:
-        record_some(recorder, [b"in hand"])
-        stands.wait()
-        record_some(recorder, [b"waiting"] * 3)
+    with one_in_hand_and_three_waiting(tmp_path, monkeypatch) as (recorder, told):
         recorder.stop()
         assert recorder.counters() == {"recorded": 0, "lost": 4}
         assert told == [(30, "recording ended before the disk had taken all: 4 messages may be lost")]
-    finally:
-        goes_on.set()
 
 
 def test_the_writer_does_not_wait_for_the_second_to_end_while_much_is_to_be_written(
