@@ -115,16 +115,17 @@ def refine(
     learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
     heads = Heads(None if plan.presence_alone else model.head_refine, model.head_presence)
     fit(heads, kept, learnt, plan.epochs, say)
-    what = "presence" if plan.presence_alone else "refined"
-    training = content["training"] | {
-        f"{what}_from": weights_sha256(content["weights"])[:16],
-        f"{what}_windows": plan.windows,
-        f"{what}_epochs": plan.epochs,
-        f"{what}_seed": plan.seed,
-        f"{what}_strangers": plan.strangers,
-        f"{what}_dataset_share": plan.dataset_share if plan.datasets else 0.0,
-        f"{what}_commit": commit,
+    said = {
+        "from": weights_sha256(content["weights"])[:16],
+        "windows": plan.windows,
+        "epochs": plan.epochs,
+        "seed": plan.seed,
+        "strangers": plan.strangers,
+        "dataset_share": plan.dataset_share if plan.datasets else 0.0,
+        "commit": commit,
     }
+    trained = ("presence",) if plan.presence_alone else ("refined", "presence")
+    training = content["training"] | {f"{head}_{key}": value for head in trained for key, value in said.items()}
     made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
     return out / WEIGHTS_NAME

@@ -268,13 +268,13 @@ def told(history: Sequence[Mapping[str, Any]], training: Mapping[str, str | int 
         f"Trained on {history[-1]['total_samples']:,} windows in {runs} runs, each initialised from the "
         "weights of earlier runs (those of the run before it, or a mean of several)."
     )
-    if "refined_windows" in training:
-        strangers = 100 * float(training["refined_strangers"])
-        words += (
-            f" The refinement head was then trained alone for {training['refined_epochs']} epochs on "
-            f"{training['refined_windows']:,} further windows (seed {training['refined_seed']}; {strangers:g} % of the "
-            "targets are randomly generated aircraft)."
-        )
+    for key, head in (("refined", "refinement head"), ("presence", "presence head")):
+        if f"{key}_windows" in training:
+            epochs, windows, seed = (training[f"{key}_{name}"] for name in ("epochs", "windows", "seed"))
+            words += (
+                f" The {head} was then trained alone for {epochs} epochs on {windows:,} further windows (seed {seed}; "
+                f"{100 * float(training[f'{key}_strangers']):g} % of the targets are randomly generated aircraft)."
+            )
     return words
 
 

@@ -65,7 +65,8 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     assert told["samples"] == 5
     assert told["refined_from"] == load_model(run)[3][:16]
     of_plan = ("seed", "windows", "epochs", "strangers")
-    assert {name: told[f"refined_{name}"] for name in of_plan} == {name: getattr(PLAN, name) for name in of_plan}
+    for head in ("refined", "presence"):
+        assert {name: told[f"{head}_{name}"] for name in of_plan} == {name: getattr(PLAN, name) for name in of_plan}
     assert told["refined_dataset_share"] == 0.0
 
 

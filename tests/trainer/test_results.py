@@ -64,7 +64,11 @@ def test_samples_of_runs_begun_from_each_other_add_up(tmp_path: Path) -> None:
     assert told(history, {}).startswith("Trained on 290 windows in 2 runs")
     refined = {"refined_windows": 1200, "refined_epochs": 3, "refined_seed": 7, "refined_strangers": 0.35}
     ending = "3 epochs on 1,200 further windows (seed 7; 35 % of the targets are randomly generated aircraft)."
-    assert told(history, refined).endswith(ending)
+    assert told(history, refined).endswith(f"The refinement head was then trained alone for {ending}")
+    presence = {f"presence_{key.removeprefix('refined_')}": value for key, value in refined.items()}
+    both = told(history, refined | presence | {"presence_seed": 8, "presence_strangers": 0.5})
+    of_presence = ending.replace("seed 7; 35 %", "seed 8; 50 %")
+    assert both.endswith(f" for {ending} The presence head was then trained alone for {of_presence}")
     draw_history(history, tmp_path / "learning.png")
     assert (tmp_path / "learning.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="no validation"):
