@@ -5,7 +5,7 @@ outputs and origin. The graph's interface:
 
     inputs   image  uint8   [N, H, W, 3]  BGR pixels, as OpenCV decodes them; normalisation is inside the graph
              K      float32 [N, 3, 3]     intrinsics of exactly these pixels (pixel centres at integers)
-    outputs  score        float32 [N, M]        heatmap peak, 0..1, descending
+    outputs  score        float32 [N, M]        that a peak is a target, 0..1; peaks in descending order of the heatmap
              center_px    float32 [N, M, 2]     centre of the visible box, pixels of `image`
              size_px      float32 [N, M, 2]     width and height of the visible box
              origin_px    float32 [N, M, 2]     projection of the target's body origin

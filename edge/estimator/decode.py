@@ -119,7 +119,8 @@ def decode(
             sides = peaks.size_px[image, peak] / np.diag(shown.K)[:2]
             t_m, sigma, oversize = _sized(size, R, t_m, sides, sigma, score)
         found.append(Estimate(score, on_frame, R, t_m, pose_covariance(t_m, sigma, shown.K), stage, oversize))
-    return distinct(sorted(found, key=lambda estimate: -estimate.score))
+    # Of several peaks on one target the heatmap's highest, the first, is where it is; another may have a higher score.
+    return sorted(distinct(found), key=lambda estimate: -estimate.score)
 
 
 def shown_size_px(size_px: ArrayLike, pixel_map: PixelMap) -> float:

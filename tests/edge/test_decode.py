@@ -184,10 +184,16 @@ def test_a_size_that_was_not_trained_is_less_sure() -> None:
 def test_two_peaks_on_one_aircraft_are_one_target_and_two_apart_are_two() -> None:
     assert accepted(peaks_of(n=2, apart_px=8.0))[0] == 1
     assert accepted(peaks_of(n=2, apart_px=60.0))[0] == 2
-    weaker_first = peaks_of(n=2, apart_px=8.0)
-    weaker_first.score[:] = weaker_first.score[:, ::-1].copy()
-    (kept,) = decode(weaker_first, 0, WHOLE, ModelContract(**CONTRACT), "track", 0.5, Counter())
-    assert kept.score == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(("apart_px", "scores"), [(8.0, [0.8]), (60.0, [0.9, 0.8])])
+def test_a_target_is_where_its_highest_peak_is_and_the_likeliest_target_comes_first(
+    apart_px: float, scores: list[float]
+) -> None:
+    peaks = peaks_of(n=2, apart_px=apart_px)
+    peaks.score[:] = peaks.score[:, ::-1].copy()
+    kept = decode(peaks, 0, WHOLE, ModelContract(**CONTRACT), "track", 0.5, Counter())
+    assert [estimate.score for estimate in kept] == pytest.approx(scores)
 
 
 def test_of_two_in_a_window_the_one_that_lies_where_the_target_should_be_is_taken() -> None:
