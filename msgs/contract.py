@@ -31,10 +31,10 @@ OUTPUT_NAMES = ("score", "center_px", "size_px", "origin_px", "t_cam_target_m", 
 
 
 class ScoreCalibration(BaseModel):
-    """Maps a heatmap peak to the probability that it is a target, which also depends on the target's apparent size.
+    """Maps a peak's score to the probability that it is a target, which also depends on the target's apparent size.
 
-    logit p = offset + slope logit(peak) + size_slope ln(min(shown, size_cap)), where `shown` is the geometric mean of
-    the box's sides, in pixels of the network or of the frame, whichever are fewer. The defaults leave the peak
+    logit p = offset + slope logit(score) + size_slope ln(min(shown, size_cap)), where `shown` is the geometric mean of
+    the box's sides, in pixels of the network or of the frame, whichever are fewer. The defaults leave the score
     unchanged.
     """
 
@@ -45,17 +45,17 @@ class ScoreCalibration(BaseModel):
     size_slope: float = 0.0
     size_cap_px: float = Field(default=1.0, gt=0)
 
-    def probability(self, peak: float, shown_px: float) -> float:
-        """Probability for a peak in 0..1 with a box of `shown_px`; 0 if either is not finite."""
-        if not (math.isfinite(peak) and math.isfinite(shown_px)):
+    def probability(self, score: float, shown_px: float) -> float:
+        """Probability for a score in 0..1 with a box of `shown_px`; 0 if either is not finite."""
+        if not (math.isfinite(score) and math.isfinite(shown_px)):
             return 0.0
-        peak = min(max(peak, _PEAK_LEAST), 1.0 - _PEAK_LEAST)
+        score = min(max(score, _SCORE_LEAST), 1.0 - _SCORE_LEAST)
         size = math.log(min(max(shown_px, 1.0), self.size_cap_px))
-        logit = self.offset + self.slope * math.log(peak / (1.0 - peak)) + self.size_slope * size
+        logit = self.offset + self.slope * math.log(score / (1.0 - score)) + self.size_slope * size
         return 1.0 / (1.0 + math.exp(-min(max(logit, -_LOGIT_MOST), _LOGIT_MOST)))
 
 
-_PEAK_LEAST = 1e-6
+_SCORE_LEAST = 1e-6
 _LOGIT_MOST = 30.0
 
 
@@ -123,6 +123,6 @@ class ModelContract(BaseModel):
 
     @property
     def scores_calibrated(self) -> bool:
-        """Whether the scores of tracks are probabilities; otherwise they are the heights of peaks in the heatmap."""
+        """Whether the scores of tracks are probabilities; otherwise they are the network's own."""
         stage = self.acquire_score if self.track_size_wh is None else self.track_score
         return stage != ScoreCalibration()

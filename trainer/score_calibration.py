@@ -1,4 +1,4 @@
-"""Calibrates heatmap peaks as probabilities: logistic regression on whole frames, separately for each stage. Pure."""
+"""Calibrates scores as probabilities: logistic regression on whole frames, separately for each stage. Pure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TooFewCandidates(ValueError):
 
 
 class ScoresTellNothing(ValueError):
-    """Higher peaks are not on targets more often than lower ones."""
+    """Higher scores are not of targets more often than lower ones."""
 
 
 def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
@@ -32,8 +32,8 @@ def fit(candidates: Iterable[Candidate]) -> ScoreCalibration:
         raise TooFewCandidates(
             f"{on.sum()} peaks on targets and {(~on).sum()} elsewhere: at least {LEAST_OF_EACH} of each are needed"
         )
-    peak = np.clip([candidate.peak for candidate in seen], 1e-6, 1.0 - 1e-6)
-    logit = np.log(peak / (1.0 - peak))
+    score = np.clip([candidate.score for candidate in seen], 1e-6, 1.0 - 1e-6)
+    logit = np.log(score / (1.0 - score))
     shown = np.maximum([candidate.shown_px for candidate in seen], 1.0)
     fits = []
     for cap in SIZE_CAPS_PX:
@@ -59,7 +59,7 @@ def _logistic(X: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[NDArray[np.
 
 def expected_calibration_error(calibration: ScoreCalibration, candidates: Sequence[Candidate], bins: int = 10) -> float:
     """Mean difference between predicted probability and share of actual targets, over bins of that probability."""
-    told = np.array([calibration.probability(one.peak, one.shown_px) for one in candidates])
+    told = np.array([calibration.probability(one.score, one.shown_px) for one in candidates])
     on = np.array([one.is_target for one in candidates], dtype=float)
     which = np.minimum((told * bins).astype(int), bins - 1)
     return float(sum(abs(np.sum(told[which == b] - on[which == b])) for b in range(bins)) / len(on))

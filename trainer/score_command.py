@@ -28,8 +28,8 @@ def register(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser(
         "calibrate-score",
         help="calibrate the score of a model file as a probability",
-        description="Run the model on the images of the datasets, fit for each stage the probability that a heatmap "
-        "peak is a target (logistic in the peak's height and its apparent size), and write it into the file with the "
+        description="Run the model on the images of the datasets, fit for each stage the probability that a peak "
+        "is a target (logistic in the network's score and the apparent size), and write it into the file with the "
         f"thresholds {ACQUIRE_PROBABILITY_MIN:g} (acquire) and {TRACK_PROBABILITY_MIN:g} (track). Use images that are "
         "in neither the training nor the test set, some of them without a target.",
     )

@@ -17,7 +17,7 @@ from edge.types import Array, Estimate, Frame, FrameMeta
 from msgs.contract import ScoreCalibration
 from sim_replay.datasets import DatasetFrame
 
-PEAK_LEAST = 0.08  # below it are the noise peaks
+SCORE_LEAST = 0.08  # below it are the noise peaks
 PEAKS_MOST = 8
 # Intersection over union with a true box. In between it counts as neither, nor on an aircraft that is not to be found.
 ON_TARGET, OFF_TARGET = 0.2, 0.05
@@ -27,7 +27,7 @@ class Candidate(NamedTuple):
     """One peak of one stage in one frame."""
 
     stage: Literal["acquire", "track"]
-    peak: float  # of the heatmap, 0..1
+    score: float  # the network's, 0..1
     shown_px: float  # see edge.estimator.decode.shown_size_px
     is_target: bool
 
@@ -55,7 +55,7 @@ def candidates(
 
 def _bare(model: Model) -> Model:
     as_it_is = {"acquire_score": ScoreCalibration(), "track_score": ScoreCalibration()}
-    least = {"acquire_score_min": PEAK_LEAST, "track_score_min": PEAK_LEAST}
+    least = {"acquire_score_min": SCORE_LEAST, "track_score_min": SCORE_LEAST}
     model.contract = model.contract.model_copy(update=as_it_is | least)
     return model
 
