@@ -66,9 +66,9 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         memory.start()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
-        # In lock-step mode start() waits for the player's first message; the player may disconnect before sending it.
+        # In lock-step mode start() waits for the first step, before which the player may disconnect or `stop` be set.
         with file.blame(*camera_key(config.camera)), suppress(EndOfStream):
-            capture.start(outlets.settle)
+            capture.start(outlets.settle, stop.is_set)
             pipeline.fly(stop)
     # The links have stopped, so their counters are final.
     log.info("stopped: %s", pipeline.supervisor.snapshot().line())

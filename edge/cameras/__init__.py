@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 class FrameSupply(Protocol):
     """Supplies the loop with frames."""
 
-    def start(self, settle: Callable[[], None]) -> None:
-        """Begin; `settle` makes the links send everything queued, for a supply that waits for that."""
+    def start(self, settle: Callable[[], None], stopped: Callable[[], bool]) -> None:
+        """Begin; `settle` makes the links send everything queued, and `stopped` tells whether the daemon is to end, for
+        a supply that waits. Raises EndOfStream if there is no first frame to wait for any more."""
 
     def newest(self, timeout_s: float) -> Frame | None:
         """The newest frame not yet taken, waiting up to `timeout_s`. Raises EndOfStream after the last."""

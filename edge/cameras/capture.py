@@ -48,8 +48,8 @@ class Capture:
         self._link = Reconnect()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
-    def start(self, _: Callable[[], None] = lambda: None) -> None:
-        """Begin to read; `settle` is not used."""
+    def start(self, _: Callable[[], None] = lambda: None, __: Callable[[], bool] = lambda: False) -> None:
+        """Begin to read; `settle` and `stopped` are not used."""
         self._thread.start()
 
     def newest(self, timeout_s: float) -> Frame | None:

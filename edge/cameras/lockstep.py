@@ -22,6 +22,7 @@ from edge.health import Reason
 from edge.types import Frame
 
 CONNECT_TIMEOUT_S = 10.0
+LOOK_EVERY_S = 0.1
 LINE_MAX = 64
 
 
@@ -45,14 +46,18 @@ class LockstepCapture:
         self._player.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         clock.step_to(0)
 
-    def start(self, settle: Callable[[], None]) -> None:
+    def start(self, settle: Callable[[], None], stopped: Callable[[], bool] = lambda: False) -> None:
         """Send `ready` and wait for the first step: before it the time is not set.
 
-        `settle` makes the links send everything queued.
+        `settle` makes the links send everything queued. Raises EndOfStream if the player has disconnected, or once
+        `stopped` tells that the daemon is to end.
         """
         self._settle = settle
         self._say("ready")
-        self._obey(self._line(None))
+        while (line := self._line(LOOK_EVERY_S)) is None:
+            if stopped():
+                raise EndOfStream
+        self._obey(line)
 
     def newest(self, timeout_s: float) -> Frame | None:
         """Execute the player's next step, waiting up to `timeout_s` for it; returns the frame, if it was one.
@@ -79,8 +84,8 @@ class LockstepCapture:
         self._player.close()
         self._source.close()
 
-    def _obey(self, line: str | None) -> Frame | None:
-        word, _, number = (line or "").partition(" ")
+    def _obey(self, line: str) -> Frame | None:
+        word, _, number = line.partition(" ")
         if not number.isdecimal() or word not in ("time", "frame"):
             raise InputError(f"the player said {line!r}, neither time NS nor frame INDEX", ("camera", "lockstep"))
         self._owes_answer = True
@@ -94,7 +99,7 @@ class LockstepCapture:
         self._frames += 1
         return frame
 
-    def _line(self, timeout_s: float | None) -> str | None:
+    def _line(self, timeout_s: float) -> str | None:
         """The player's next line; None if there is none in time. Raises EndOfStream if the player has disconnected."""
         while b"\n" not in self._unread:
             if not select.select([self._player], [], [], timeout_s)[0]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -102,9 +103,9 @@ def test_when_the_player_hangs_up_the_recording_is_over(player: Player) -> None:
         player.capture.newest(5.0)
 
 
-@pytest.mark.parametrize("heard", [False, True], ids=["at once", "after ready"])
-def test_a_daemon_whose_player_hangs_up_before_his_first_word_ends_as_after_a_recording(
-    tmp_path: Path, scene: Path, toy_model: Path, heard: bool
+@pytest.mark.parametrize("end", ["hangs up at once", "hangs up after ready", "is silent and the daemon told to stop"])
+def test_a_daemon_ends_before_the_player_s_first_word_as_after_a_recording(
+    tmp_path: Path, scene: Path, toy_model: Path, end: str
 ) -> None:
     config = tmp_path / "config.toml"
     with socket.create_server(("127.0.0.1", 0)) as listening:
@@ -118,7 +119,10 @@ def test_a_daemon_whose_player_hangs_up_before_his_first_word_ends_as_after_a_re
                 listening.settimeout(WITHIN_S)
                 ours, _ = listening.accept()
                 with ours, ours.makefile("r") as lines:
-                    assert not heard or lines.readline() == "ready\n"
+                    assert end == "hangs up at once" or lines.readline() == "ready\n"
+                    if end.endswith("told to stop"):
+                        daemon.send_signal(signal.SIGTERM)
+                        daemon.wait(WITHIN_S)
                 _, said = daemon.communicate(timeout=WITHIN_S)
             finally:
                 daemon.kill()
