@@ -28,7 +28,8 @@ BOX_MIN_PX = 8.0
 # A box this near to the frame's edge, as a share of its longer side plus pixels, may be cut by it.
 EDGE_SHARE, EDGE_PX = 0.05, 1.5
 # Of a cut target neither size nor centre is known: 1-sigma of log Z, and of the origin's pixels in units of the box's
-# longer side. They cover the shipped model's errors on targets of which half is outside.
+# longer side. They cover the shipped model's errors on targets of which half is outside. If less is left, the network
+# takes that for the whole and its box is too small: the longer side of the expected box then counts.
 CUT_SIGMA_LOG_Z, CUT_SIGMA_ORIGIN = 0.4, 0.25
 # The visible part does not show which end is the nose either: 1-sigma about each axis.
 CUT_SIGMA_ROTATION_RAD = 0.8
@@ -75,11 +76,13 @@ def decode(
     score_min: float,
     refused: Counter[str],
     size: TargetSize | None = None,
+    expected_xyxy_px: ArrayLike = (0.0, 0.0, 0.0, 0.0),
 ) -> list[Estimate]:
     """Accepted, distinct targets of one image of the batch, best score first.
 
     Rejected peaks are counted in `refused` by reason if their score reaches the contract's minimum. If the targets'
-    `size` is given, it goes into the depth of those that no edge cuts.
+    `size` is given, it goes into the depth of those that no edge cuts. `expected_xyxy_px` [4]: the box, on the frame or
+    beyond, of the target that the image was cut out for, if any.
 
     The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training,
     at a limit of depth, or seen from farther above or below than in training. A cut target with its origin off the
@@ -89,6 +92,7 @@ def decode(
     calibration = contract.acquire_score if acquiring else contract.track_score
     least = contract.acquire_score_min if acquiring else contract.track_score_min
     pixel_map = shown.pixel_map
+    expected_px = _longer_side_px(expected_xyxy_px, shown)
     found = []
     for peak in range(peaks.score.shape[1]):
         shown_px = shown_size_px(peaks.size_px[image, peak], pixel_map)
@@ -107,7 +111,9 @@ def decode(
             refused[reason] += score >= least
             continue
         longer_px = float(peaks.size_px[image, peak].max())
-        sigma = _widened(sigma, score, longer_px, cut, contract.trained_box_px)
+        sigma = _widened(sigma, score, longer_px, contract.trained_box_px)
+        if cut:
+            sigma = np.hypot(sigma, _cut_sigma(max(longer_px, expected_px)))
         nearest_m, farthest_m = contract.depth_limits_m
         if not nearest_m * (1.0 + LIMIT_TOLERANCE) < t_m[2] < farthest_m * (1.0 - LIMIT_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], LIMIT_SIGMA_LOG_Z)
@@ -227,17 +233,24 @@ def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int
     return None
 
 
-def _widened(sigma: Array, score: float, longer_px: float, cut: bool, trained_box_px: tuple[float, float]) -> Array:
-    """Sigma [6] of (u, v, log Z, rotation), enlarged for a low score and for what training did not contain: cut
-    targets, other sizes."""
+def _longer_side_px(box_xyxy_px: ArrayLike, shown: Shown) -> float:
+    """Longer side of a box on the frame in the network's pixels, at most the frame's: a prediction is unbounded."""
+    x0, y0, x1, y1 = np.asarray(box_xyxy_px, dtype=np.float64)
+    return float(np.max(np.minimum([x1 - x0, y1 - y0], max(shown.frame_wh)) * shown.pixel_map.scale_xy))
+
+
+def _cut_sigma(longer_px: float) -> Array:
+    """Sigma [6] of (u, v, log Z, rotation) of a cut target whose box is so long."""
+    origin_px = CUT_SIGMA_ORIGIN * longer_px
+    return np.array([origin_px, origin_px, CUT_SIGMA_LOG_Z, *[CUT_SIGMA_ROTATION_RAD] * 3])
+
+
+def _widened(sigma: Array, score: float, longer_px: float, trained_box_px: tuple[float, float]) -> Array:
+    """Sigma [6] of (u, v, log Z, rotation), enlarged for a low score and for sizes that training did not contain."""
     origin_px = DOUBT_SIGMA_ORIGIN * longer_px
     doubt = np.array([origin_px, origin_px, DOUBT_SIGMA_LOG_Z, *[DOUBT_SIGMA_ROTATION_RAD] * 3])
     wider = np.hypot(sigma, np.sqrt(1.0 - score) * doubt)
     wider[2] = np.hypot(wider[2], np.log(_excess(longer_px, trained_box_px)))
-    if cut:
-        wider[:2] = np.hypot(wider[:2], CUT_SIGMA_ORIGIN * longer_px)
-        wider[2] = np.hypot(wider[2], CUT_SIGMA_LOG_Z)
-        wider[3:] = np.hypot(wider[3:], CUT_SIGMA_ROTATION_RAD)
     return wider
 
 

@@ -158,8 +158,10 @@ class Estimator:
         score_min: float,
         mirrors: Sequence[bool] = (),
         looks_left: int = LOOKS_MOST,
+        expected: Sequence[Array] = (),
     ) -> list[Estimate | None]:
-        """For each box the target in the window around it; `mirrors`, if given: which windows are evaluated mirrored.
+        """For each box the target in the window around it; `mirrors`, if given: which windows are evaluated mirrored;
+        `expected`, if given: the targets' own boxes, where windows are larger.
 
         A target cut by a window's edge is evaluated again in a larger window; only that result counts, even if None.
         """
@@ -168,6 +170,7 @@ class Estimator:
             raise ValueError("this model has no track stage")
         if not boxes_xyxy_px:
             return []
+        expected = expected or boxes_xyxy_px
         size_wh = contract.track_size_wh
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         lens = lens_of(frame.K, frame.distortion)
@@ -182,8 +185,8 @@ class Estimator:
         peaks = unmirrored(self.model.run(*mirrored(images, K, flipped)), images.shape[2], flipped)
         peaks = turned_back(peaks, size_wh, turns)
         decoded = [
-            decode(peaks, i, one, contract, "track", score_min, self.refused, self.target_size)
-            for i, one in enumerate(shown)
+            decode(peaks, i, one, contract, "track", score_min, self.refused, self.target_size, box)
+            for i, (one, box) in enumerate(zip(shown, expected, strict=True))
         ]
         found = [nearest_expected(estimates, box) for estimates, box in zip(decoded, boxes_xyxy_px, strict=True)]
         beyond = {
@@ -192,7 +195,14 @@ class Estimator:
             if estimate is not None and (box := grown(estimate.box_xyxy_px, one)) is not None
         }
         if beyond and looks_left > 1:
-            again = self._look(frame, list(beyond.values()), score_min, flipped[list(beyond)].tolist(), looks_left - 1)
+            again = self._look(
+                frame,
+                list(beyond.values()),
+                score_min,
+                flipped[list(beyond)].tolist(),
+                looks_left - 1,
+                [expected[i] for i in beyond],
+            )
             for i, estimate in zip(beyond, again, strict=True):
                 found[i] = estimate
         return found

@@ -14,6 +14,9 @@ from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
 from edge.types import Estimate, Frame, FrameMeta
 from sim_replay import metrics
+from sim_replay.bop import BopScene
+from sim_replay.bop.scene import read_picture_bgr
+from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.render.frame import outline_px, render_frame
 from sim_replay.render.placing import frame_scene
 from sim_replay.render.projection import extents_px
@@ -105,6 +108,32 @@ def test_a_target_cut_by_the_edge_is_told_with_the_doubt_it_deserves_or_not_at_a
     assert position.max() < NEES_MAX
     # Half of them take nose for tail: as far as a turn can be, and told so.
     assert np.mean(rotation < NEES_MAX) > 0.9
+
+
+@pytest.mark.parametrize("left", [0.15, 0.2])
+def test_the_rest_of_a_target_that_leaves_the_frame_is_told_with_the_doubt_it_deserves_or_not_at_all(
+    estimator: Estimator, left: float
+) -> None:
+    """The network takes a wing's end for a small aircraft inside the frame; its track knows how large it is."""
+    scene = BopScene(BUNDLED_SEQUENCE)
+    off_sigmas = []
+    for shown in scene.frames[:80:4]:
+        (target,) = shown.targets
+        assert target.box_whole_xyxy_px is not None
+        x0, _, x1, _ = box = target.box_whole_xyxy_px
+        edge_px = round(x1 - left * (x1 - x0))
+        image_bgr = read_picture_bgr(scene.image_path(shown))[:, edge_px:]
+        K = shown.K - np.array([[0.0, 0.0, edge_px], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        for _ in range(2):  # plain and mirrored
+            (found,) = estimator.track(Frame(FrameMeta(0, 0, 0), image_bgr, K), [box - [edge_px, 0, edge_px, 0]])
+            if found is not None:
+                across = np.cross(found.t_cam_target_m, [0.0, 1.0, 0.0])
+                across /= np.linalg.norm(across)
+                sigma = np.sqrt(across @ found.covariance[:3, :3] @ across) / np.linalg.norm(found.t_cam_target_m)
+                off = across @ target.t_cam_target_m / np.linalg.norm(target.t_cam_target_m)
+                off_sigmas.append(abs(float(off / sigma)))
+    assert len(off_sigmas) >= 4
+    assert max(off_sigmas) < 3.0
 
 
 def test_a_picture_of_other_than_square_pixels_tells_the_same_pose(estimator: Estimator) -> None:
