@@ -18,6 +18,7 @@ from edge.tracking.association import Pair, associate, out_of_sight
 from edge.tracking.boxes import RANGE_MIN_M, SAME_BOX_IOU, BoxModel, inside, iou
 from edge.tracking.doubles import Doubles
 from edge.tracking.heading import Flight
+from edge.tracking.merged import less_sure, shown_at_once
 from edge.tracking.motion import Innovation, Motion
 from edge.tracking.rotation import Attitude
 from edge.tracking.view import NS_PER_S, View, between
@@ -130,10 +131,18 @@ class Tracker:
         lens = Lens(K, distortion)
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
+        boxes = [_box(target, view, lens) for target in self._targets]
+        merged = shown_at_once(finite, boxes)
+        for i, several in merged.items():
+            finite[i] = less_sure(finite[i], [boxes[k] for k in several], lens.K)
         held = [(target.motion, target.attitude, target.misses) for target in self._targets]
         pairs = associate(held, finite, lens.K, view)
         for pair in pairs:
-            _hit(self._targets[pair.target], finite[pair.estimate], pair.seen, lens, view)
+            target = self._targets[pair.target]
+            own_box = target.box  # not that of several targets
+            _hit(target, finite[pair.estimate], pair.seen, lens, view)
+            if pair.estimate in merged:
+                target.box = own_box
         used = {pair.estimate for pair in pairs}
         hit = {pair.target for pair in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]

@@ -132,3 +132,28 @@ def test_what_is_pointed_at_keeps_the_slot_that_was_made_for_it() -> None:
     flight.tracker.make_room(pointed_at)
     tracks = flight.frame(flight.sight(towards(-8.0, 200.0)), pointed_at, other, doubtful_below=0.8)
     assert sorted(track.score for track in tracks) == pytest.approx([0.6, 0.95])
+
+
+@pytest.mark.parametrize(
+    ("kind", "speed_mps"), [("ned", 3.0), ("ned", 6.0), ("ned", 12.0), ("ned_relative", 6.0), ("ned_relative", 12.0)]
+)
+def test_one_detection_of_two_aircraft_that_cross_is_taken_for_neither(kind: str, speed_mps: float) -> None:
+    """Where their outlines overlap, the network finds one aircraft between them, as wide as both."""
+    flight, nees = Flight(kind), []
+    for index in range(-90, 91):
+        way_m = speed_mps * index / flight.rate_hz
+        truth = np.array([[way_m, -0.7, 250.0], [-way_m, 0.7, 250.0]])
+        sights = [flight.sight(t_m) for t_m in truth]
+        if abs(way_m) < 3.0:
+            boxes = np.array([one.box_xyxy_px for one in sights])
+            union = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+            sights = [replace(flight.sight(truth.mean(axis=0)), box_xyxy_px=union)]
+        tracks = flight.frame(*sights)
+        if index > -60:
+            errors_m = [track.t_cam_target_m - truth[track.track_id] for track in tracks]
+            nees += [
+                error_m @ np.linalg.solve(track.covariance[:3, :3], error_m)
+                for error_m, track in zip(errors_m, tracks, strict=True)
+            ]
+    assert [track.track_id for track in tracks] == [0, 1]
+    assert max(nees) < 16.3
