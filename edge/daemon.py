@@ -271,9 +271,12 @@ class Pipeline:
         new = self._reloader.take(self._board.file, self._estimator, self._board.camera, self._outlets.event)
         if new is None:
             return
-        if new.file.config.target != self._board.file.config.target:
+        resized = new.file.config.target != self._board.file.config.target
+        if resized:
             self._size_watch = SizeWatch()
         replaced = new.estimator is not self._estimator
+        if resized or replaced:
+            self._tracker.doubt_ranges()
         if replaced:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file

@@ -51,6 +51,8 @@ MODEL_BEARING_PX = 1.0
 MODEL_LOG_RANGE = 0.01
 FIRST_SHARE = 0.2  # of the network's log-range variance, in P after a first frame
 
+UNKNOWN_LOG_RANGE_STD = 1.0
+
 # A change of frame uses the last known attitude; its standard deviation grows by this per second.
 STALE_ATTITUDE_RADPS = 0.5
 
@@ -97,7 +99,7 @@ class Innovation:
 def begin(estimate: Estimate, K: Array, view: View) -> Motion:
     """The state after a first measurement."""
     across, log_range_variance = _measurement_noise(estimate, K)
-    across += _by_attitude(estimate.t_cam_target_m, view)
+    across += view.aim_covariance(estimate.t_cam_target_m)
     R = view.R_frame_cam
     ray = R @ estimate.t_cam_target_m
     scale = RangeScale.begin(view.time_ns, 0.5 * float(np.log(ray @ ray)), log_range_variance)
@@ -114,6 +116,14 @@ def unknown_motion(motion: Motion, view: View) -> Motion:
     P[POSITION, POSITION] = motion.P[POSITION, POSITION]
     P = _unknown_velocity(P, motion.kind, float(np.linalg.norm(motion.t_m - view.t_frame_cam_m)))
     return replace(motion, v_mps=np.zeros(3), turn_rate_radps=0.0, P=P, scale=motion.scale.alone())
+
+
+def unknown_range(motion: Motion, view: View) -> Motion:
+    """The same direction at an unknown range; `view` is in the motion's frame."""
+    ray = motion.t_m - view.t_frame_cam_m
+    P = motion.P.copy()
+    P[POSITION, POSITION] += UNKNOWN_LOG_RANGE_STD**2 * np.outer(ray, ray)
+    return replace(motion, P=P, sight=None)
 
 
 def turning(motion: Motion, time_ns: int) -> Array:
@@ -210,7 +220,7 @@ def innovation(motion: Motion, estimate: Estimate, K: Array, view: View) -> Inno
     to_predicted = (range_m / measured_m) * so3.exp(-turned)
     across = symmetric(to_predicted @ across @ to_predicted.T)
     predicted_covariance = symmetric(R_cam_frame @ motion.P[POSITION, POSITION] @ R_cam_frame.T)
-    attitude = _by_attitude(predicted_m, view)
+    attitude = view.aim_covariance(predicted_m)
     return Innovation(residual_m, predicted_m, predicted_covariance, attitude, across, log_range_variance)
 
 
@@ -281,7 +291,7 @@ def covariance_in_cam(motion: Motion, view: View) -> Array:
         return symmetric(motion.sight.covariance + motion.scale.common_variance * np.outer(t_cam_m, t_cam_m))
     R = view.R_frame_cam.T
     inside = covariance(motion, view)[POSITION, POSITION]
-    return symmetric(R @ inside @ R.T + _by_attitude(t_cam_m, view))
+    return symmetric(R @ inside @ R.T + view.aim_covariance(t_cam_m))
 
 
 def symmetric(P: Array) -> Array:
@@ -329,12 +339,6 @@ def _sight(seen: Innovation, in_cam: Array, noise: Array) -> Sight:
     t_cam_m, turned, log_factor = corrected(seen.predicted_m, gain @ seen.residual_m)
     covariance = np.exp(2.0 * log_factor) * turned @ (keep @ in_cam @ keep.T + gain @ noise @ gain.T) @ turned.T
     return Sight(t_cam_m, symmetric(covariance))
-
-
-def _by_attitude(t_cam_m: Array, view: View) -> Array:
-    """Covariance [3, 3] of a position in `cam` due to the view's attitude error."""
-    across = so3.skew(t_cam_m)
-    return view.attitude_variance * across @ across.T
 
 
 def _measurement_noise(estimate: Estimate, K: Array) -> tuple[Array, float]:

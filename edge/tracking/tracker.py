@@ -48,6 +48,7 @@ class Target:
     hits: int = 1
     misses: int = 0
     position_disagreements: int = 0
+    range_doubted: bool = False  # its range and motion begin anew with the next detection
 
 
 @dataclass
@@ -93,6 +94,14 @@ class Tracker:
         timestamps they were estimated from, and the interval to the next frame, may be wrong."""
         self._motion_doubted = True
         self._forget_motion()
+
+    def doubt_ranges(self) -> None:
+        """Begin all ranges, and velocities with them, anew with the next detections: those so far were inferred by
+        another size or model, and the step between the two is no speed."""
+        for target in self._targets:
+            assert self._view is not None, "a target exists only after a frame"
+            target.motion = ekf.unknown_range(target.motion, self._view)
+            target.range_doubted = True
 
     def make_room(self, wanted: Estimate) -> None:
         """If there is no free slot, delete a target that was missed or is least certain; the slot is reserved for
@@ -231,7 +240,10 @@ class Tracker:
 
 def _hit(target: Target, estimate: Estimate, seen: Innovation, lens: Lens, view: View) -> None:
     dt_s = (view.time_ns - target.measured_ns) / NS_PER_S
-    target.motion = ekf.correct(target.motion, seen, view)
+    target.motion = (
+        ekf.begin(estimate, lens.K, view) if target.range_doubted else ekf.correct(target.motion, seen, view)
+    )
+    target.range_doubted = False
     attitude = rotation.correct(target.attitude, estimate, view, dt_s)
     settled = target.state is not TrackState.TENTATIVE
     target.attitude = rotation.weighed(

@@ -84,6 +84,11 @@ class View:
         by_clock_rad = self.clock_std_s * self.turning_radps
         return ATTITUDE_JITTER_RAD**2 + by_clock_rad**2 + self.attitude_std_rad**2
 
+    def aim_covariance(self, t_cam_m: Array) -> Array:
+        """[3, 3], of a position in `cam` due to the error of this frame's attitude."""
+        across = so3.skew(t_cam_m)
+        return self.attitude_variance * across @ across.T
+
     def moved_to(self, time_ns: int) -> View:
         """The same camera later, at constant velocity and attitude."""
         if self.v_frame_cam_mps is None:

@@ -32,9 +32,10 @@ def follow(
     opening_mps: float = 6.0,
     missed: range = range(0),
     doubted: int | None = None,
+    resized: int | None = None,
 ) -> list[tuple[Track, np.ndarray]]:
     """Tracks and truths of a target ahead that draws away, or closes, and to the right; `missed` frames show none, and
-    before frame `doubted` the camera's timestamps are found to have jumped."""
+    before frame `doubted` the camera's timestamps are found to have jumped, before `resized` another size is given."""
     tracker = Tracker(1, LOOKING_NORTH)
     flown = []
     for i, error in enumerate(log_range_errors):
@@ -45,6 +46,8 @@ def follow(
         found = [] if i in missed else [sight(t_cam, float(error))]
         if i == doubted:
             tracker.doubt_motion()
+        if i == resized:
+            tracker.doubt_ranges()
         (track,) = tracker.update(own.time_ns, found, own if own_ship_known else None, K, SIZE_WH)
         flown.append((track, t_cam))
     return flown
@@ -198,3 +201,22 @@ def test_where_frames_disagree_more_than_the_network_says_the_track_is_less_sure
     rng = np.random.default_rng(4)
     calm, torn = (range_std(follow(rng.normal(scale=scale, size=90), 30.0, True)[-1][0]) for scale in (0.03, 0.2))
     assert torn > 2.5 * calm
+
+
+@pytest.mark.parametrize("own_ship_known", [True, False], ids=["ned", "cam"])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_another_size_given_in_flight_holds_from_the_next_detection_and_is_no_speed(
+    factor: float, own_ship_known: bool
+) -> None:
+    errors = np.random.default_rng(2).normal(scale=0.02, size=120)
+    errors[:60] += np.log(factor)
+    flown = follow(errors, 30.0, own_ship_known, missed=range(60, 62), resized=60)
+    assert min(range_std(track) for track, _ in flown[60:62]) > 0.5, "missed, it is at no range that is known"
+    for track, truth in flown[62:]:
+        assert track.state is TrackState.CONFIRMED
+        assert np.linalg.norm(track.t_cam_target_m) == pytest.approx(np.linalg.norm(truth), rel=0.1)
+        if own_ship_known:
+            assert track.v_ned_target_mps is not None
+            assert track.covariance_ned is not None
+            off_mps = track.v_ned_target_mps - [26.0, 4.0, 0.0]
+            assert off_mps @ np.linalg.solve(track.covariance_ned[3:6, 3:6], off_mps) < 11.3

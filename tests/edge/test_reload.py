@@ -330,6 +330,8 @@ def test_what_is_taken_over_is_flown_by(tmp_path: Path, gated: Gated, stepped: i
         loop._process(frame(0, HELD))
         loop._reloader.ask()
         until(lambda: board.model.contract.name == "another", loop._take_reload)
+        (held,) = loop._tracker._targets
+        assert held.range_doubted, "what the other model said of its range"
         for index in range(1, 4):  # with 5, as it was, no search would begin
             loop._process(frame(index, HELD))
             until(lambda count=index: loop.search.counters()["searches"] == count, what="a search")
