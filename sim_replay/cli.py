@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import signal
 import sys
@@ -25,6 +26,7 @@ from sim_replay.evaluation.table import score_table, table_console
 from sim_replay.faults import run as faults
 from sim_replay.golden import run as golden
 from sim_replay.ground_truth import read_sequence
+from sim_replay.lock import alone_in
 from sim_replay.lockstep import command as lockstep
 from sim_replay.matrix import command as matrix
 from sim_replay.matrix.verdict import wrong_poses
@@ -36,6 +38,8 @@ from sim_replay.recorded.opened import WHAT, open_sequence
 from sim_replay.report.flight_files import read_flight
 from sim_replay.result import judge
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_ALONE = ("demo", "play", "golden", "faults", "matrix", "bench-pipeline", "soak")  # what writes a folder of its own
 _OF_A_FLIGHT, _OF_A_DATASET = ("sequence", "out"), ("model", "split", "every")  # options of `score`
 
 
@@ -108,6 +112,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(args: argparse.Namespace) -> int:
+    if args.command not in _ALONE:
+        return _act(args)
+    with alone_in(args.out, "replay"):
+        return _act(args)
+
+
+def _act(args: argparse.Namespace) -> int:
     if hasattr(args, "run"):
         return int(args.run(args))
     console = Console()
@@ -120,12 +131,12 @@ def _run(args: argparse.Namespace) -> int:
         if args.record or args.autopilot != "ardupilot" or bad_link.link_faults(args) != bad_link.LinkFaults():
             raise InputError("--record, --autopilot, --link-…: only in real time, not in lock-step")
         return lockstep.run(args, console)
+    size = target_size(args.target_size) if args.command == "play" else None
     folder = BUNDLED_SEQUENCE if args.command == "demo" else args.sequence
     settings = PlaySettings(open_sequence(folder, args.out, console), args.out, args.model)
     if args.command == "play":
         chosen = {"record": args.record, "firmware": args.autopilot, "link": bad_link.link_faults(args)}
-        chosen["target_size"] = target_size(args.target_size)
-        settings = replace(settings, **chosen)
+        settings = replace(settings, target_size=size, **chosen)
     recording = show(settings, args.model, console)
     wrong = wrong_poses(settings.sequence, judge(settings.sequence, recording))
     for told in wrong:
@@ -191,7 +202,10 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 1
     except OSError as error:
-        print(f"{error.filename}: {error.strerror}" if error.filename else error, file=sys.stderr)
+        # A write to a file that was opened before, as onto a full disk, does not tell its name.
+        folder = (getattr(args, "out", None) or getattr(args, "flight", None)) if error.errno in _NO_ROOM else None
+        place = error.filename2 or error.filename or folder  # of a copy the second is the one that is written
+        print(f"{place}: {error.strerror}" if place else error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

@@ -6,8 +6,7 @@ import argparse
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,13 +18,13 @@ from edge.errors import InputError
 from sim_replay.airframes import airframe_id, airframe_of
 from sim_replay.benchmark.crew import CrewError, available_cores, crew
 from sim_replay.benchmark.lenses import lenses_of
-from sim_replay.benchmark.manifest import LOCK_FILE, Recipe, claim, digests, write_manifest
+from sim_replay.benchmark.manifest import Recipe, claim, digests, write_manifest
 from sim_replay.benchmark.plan import SequencePlan, plan_dataset
 from sim_replay.benchmark.preset import Preset, parse_preset, preset_text
 from sim_replay.benchmark.progress import Report, flights_bar
 from sim_replay.benchmark.sequence_files import FrameNews, Job, make_sequence
 from sim_replay.bop import write_models
-from sim_replay.lock import take_lock
+from sim_replay.lock import alone_in
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     workers = available_cores() if args.workers is None else args.workers
     if workers < 1:
         raise InputError("--workers: must be at least 1")
-    with _alone_in(args.out):
+    with alone_in(args.out, "generate"):
         claim(args.out, recipe, text, args.resume)
         job = Job(preset, args.out, _command(args), {}, args.every, args.labels_only, args.undistorted, backdrops)
         try:
@@ -133,20 +132,3 @@ def _command(args: argparse.Namespace) -> str:
     words += [f"--{name.replace('_', '-')}" for name in ("labels_only", "undistorted") if getattr(args, name)]
     words += ["--backdrops", str(args.backdrops)] if args.backdrops else []
     return shlex.join(words)
-
-
-@contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    """Lock the folder against a second run. The lock ends with the process, however that ends."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        lock = take_lock(out / LOCK_FILE)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    if lock is None:
-        raise InputError(f"{out}: another generate is at work there")
-    with lock:
-        try:
-            yield
-        finally:
-            (out / LOCK_FILE).unlink(missing_ok=True)

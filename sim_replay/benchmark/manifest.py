@@ -13,11 +13,11 @@ from sim_replay.benchmark.plan import SequencePlan
 from sim_replay.benchmark.preset import SPLITS
 from sim_replay.benchmark.scene_store import is_finished, replace_text
 from sim_replay.benchmark.sequence_files import Job
+from sim_replay.lock import LOCK_FILE
 from sim_replay.packages import packages
 
 FILE = "dataset.toml"
 PRESET_FILE = "preset.toml"
-LOCK_FILE = ".lock"
 
 
 @dataclass(frozen=True)

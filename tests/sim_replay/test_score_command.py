@@ -95,5 +95,5 @@ def test_a_direction_that_is_none_is_told_with_its_line(flight: Path, change: di
 def test_where_a_flight_cannot_be_written_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     taken = tmp_path / "taken"
     taken.touch()
-    assert main(["demo", "--out", str(taken)]) == 1
-    assert capsys.readouterr().err.strip() == f"{taken}/flight.json: Not a directory"
+    assert main(["demo", "--out", str(taken)]) == 2
+    assert capsys.readouterr().err.strip() == f"{taken}: cannot be written: File exists"
