@@ -312,11 +312,14 @@ def _tell(message: Any, now_ns: int) -> None:
 
 
 def _writer(args: argparse.Namespace, stack: ExitStack) -> Callable[[Any, int], None]:
-    """Writes each message to --messages; `t_ns` is on the telemetry's clock."""
-    file = stack.enter_context(args.messages.open("w", encoding="utf-8"))
+    """Writes each message to --messages; `t_ns` is on the telemetry's clock. Raises InputError, as on a full disk."""
+    file = stack.enter_context(args.messages.open("wb", buffering=0))  # nothing is left to be written when it is closed
 
     def write(message: Any, now_ns: int) -> None:
-        file.write(json.dumps(message_record(message, now_ns - args.start_at_ns)) + "\n")
+        try:
+            file.write(json.dumps(message_record(message, now_ns - args.start_at_ns)).encode() + b"\n")
+        except OSError as error:
+            raise InputError(f"{args.messages}: cannot be written: {error.strerror}") from error
 
     return write
 
@@ -366,12 +369,16 @@ def main(argv: list[str] | None = None) -> int:
     stop = stop_on_signals()
     boot_at_ns = args.start_at_ns - BOOT_BEFORE_START_NS if args.boot_at_ns is None else args.boot_at_ns
     signing = None if key is None else Signing(key, 0, lambda _: None, time.time_ns)
-    with ExitStack() as stack:
-        write = _writer(args, stack) if args.messages else _tell if args.all else (lambda _message, _now_ns: None)
-        autopilot = Autopilot(
-            telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
-        )
-        _fly(autopilot, args.endpoint, link_faults(args), stop)
+    try:
+        with ExitStack() as stack:
+            write = _writer(args, stack) if args.messages else _tell if args.all else (lambda _message, _now_ns: None)
+            autopilot = Autopilot(
+                telemetry, args.start_at_ns, boot_at_ns, args.system_id, signing, gimbal, args.firmware, write
+            )
+            _fly(autopilot, args.endpoint, link_faults(args), stop)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
     _emit({"event": "summary", "received": dict(autopilot.received), "refused": dict(autopilot.refused)})
     return 0
 

@@ -22,9 +22,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
+from edge.config_estimator import TargetSettings
 from edge.errors import InputError
 from edge.estimator.given_size import TargetSize
 from msgs.command_line import EXIT_BAD_INPUT
+from msgs.settings import dotted, faults_of
 from sim_replay.bad_link import LinkFaults
 from sim_replay.daemon_config import UAV, sequence_config
 from sim_replay.faults.processes import ENDS_WITH_US
@@ -102,8 +106,15 @@ class PlaySettings:
 
 
 def target_size(wingspan_length_m: Sequence[float] | None) -> TargetSize | None:
-    """Of two numbers as the commands take them."""
-    return None if wingspan_length_m is None else TargetSize(*wingspan_length_m)
+    """Of two numbers as the commands take them. Raises InputError for what the daemon does not take."""
+    if wingspan_length_m is None:
+        return None
+    wingspan_m, length_m = wingspan_length_m
+    try:
+        return TargetSettings(wingspan_m=wingspan_m, length_m=length_m).size()
+    except ValidationError as error:
+        told = ", ".join(f"{dotted(fault.location)} {fault.reason}" for fault in faults_of(error))
+        raise InputError(f"--target-size {wingspan_m:g} {length_m:g}: {told}") from error
 
 
 def play(settings: PlaySettings, on_record: Callable[[Recording, Record], None]) -> Recording:

@@ -21,6 +21,7 @@ from sim_replay.recorded.opened import open_sequence
 from sim_replay.report.flight_files import RecordedFlight, remove_flight, write_flight
 
 SLOWEST = 0.25
+ROUNDS_MAX = 10_000
 GO_ON = "g"
 
 
@@ -57,14 +58,9 @@ def asked_for(args: argparse.Namespace) -> bool:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """Play, and write the outputs. Raises InputError, PlayError."""
+    rounds, size, method = _rounds(args.loop), target_size(args.target_size), method_of(load_model(args.model, 1))
     sequence = open_sequence(args.sequence, args.out, console)
-    settings = LockstepSettings(
-        sequence,
-        args.model,
-        _start(args.start, sequence),
-        rounds=_rounds(args.loop),
-        target_size=target_size(args.target_size),
-    )
+    settings = LockstepSettings(sequence, args.model, _start(args.start, sequence), rounds=rounds, target_size=size)
     if args.pause is not None and args.pause not in settings.frames:
         raise InputError(
             f"--pause {args.pause}: is not one of the frames {settings.frames[0]} to {settings.frames[-1]}"
@@ -86,7 +82,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     outputs.write(args.out)
     files = f"{POSES_JSONL}, {MESSAGES_JSONL}"
     if settings.frames == list(range(len(sequence.scene.images))):  # after a part only, the rest would count as missed
-        method = method_of(load_model(args.model, threads=1))
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
         files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.can_be_scored else ""
     text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.recording.directions)} directions"
@@ -159,6 +154,6 @@ def _start(seconds: float | None, sequence: PlayedSequence) -> int:
 
 
 def _rounds(times: int | None) -> int:
-    if times is not None and times < 1:
-        raise InputError(f"--loop {times}: must be at least 1")
+    if times is not None and not 1 <= times <= ROUNDS_MAX:
+        raise InputError(f"--loop {times}: must be from 1 to {ROUNDS_MAX}")
     return times or 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -86,7 +87,9 @@ def _draw(sequence: PlayedSequence, result: Result, out: Path, on_frame: Callabl
     size_wh = (first.shape[1], first.shape[0])
     overlay = Overlay(views, size_wh)
     shown = showcase_index(views)
-    cv2.imwrite(str(out / "overlay.png"), overlay.draw(shown, scene.undistorted_bgr(shown)))
+    picture = out / "overlay.png"
+    if not cv2.imwrite(str(picture), overlay.draw(shown, scene.undistorted_bgr(shown))):
+        raise OSError(errno.EIO, "cannot be written", str(picture))
 
     def frames() -> Iterator[Image]:
         for index in range(len(views)):

@@ -16,6 +16,7 @@ from sim_replay.cli import main
 from sim_replay.golden import run as golden
 from sim_replay.golden.run import CASES
 from sim_replay.ports import free_port
+from sim_replay.report.flight_files import FLIGHT_JSON
 
 BIN = Path(sys.executable).parent
 LAST_FRAMES = ["--start", "4.6"]  # of 150 at 30 Hz: the last twelve
@@ -90,23 +91,28 @@ def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
     ("arguments", "words"),
     [
         (["play", "--start", "9"], "--start 9.0: must be from 0 to 4.967 s, the times of the sequence's frames"),
-        (["play", "--loop", "0"], "--loop 0: must be at least 1"),
+        (["play", "--loop", "0"], "--loop 0: must be from 1 to 10000"),
+        (["play", "--loop", "1000000000", "--pause", "5"], "--loop 1000000000: must be from 1 to 10000"),
         (["play", "--pause", "150"], "--pause 150: is not one of the frames 0 to 149"),
         (["play", "--speed", "0.1"], "'0.1' is neither a number of at least 0.25 nor max"),
-        (["play", "--lockstep", "--target-size", "0", "9"], "[target] wingspan_m: must be at least 0.5"),
+        (["play", "--lockstep", "--target-size", "0", "9"], "--target-size 0 9: wingspan_m must be at least 0.5"),
+        (["play", "--target-size", "nan", "9"], "--target-size nan 9: wingspan_m must be at most 100"),
+        (["play", "--lockstep", "--model", "none.onnx"], "model none.onnx cannot be read"),
         (["golden", "crosing"], f"golden crosing: no such case; the cases are {', '.join(CASES)}"),
     ],
 )
-def test_what_cannot_be_played_is_said_in_a_sentence(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+def test_what_cannot_be_played_is_said_in_a_sentence_and_an_earlier_flight_stays(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / FLIGHT_JSON).write_text("{}")
     try:
-        code = main(arguments)
+        code = main([*arguments, "--out", str(tmp_path)])
     except SystemExit as refused:  # by argparse
         code = refused.code
     said = capsys.readouterr()
     assert (code, said.out) == (2, "")
     assert words in said.err
+    assert [path.name for path in tmp_path.iterdir()] == [FLIGHT_JSON]
 
 
 def test_without_a_player_the_daemon_says_so_and_names_the_key(small_scene: Path, tmp_path: Path) -> None:

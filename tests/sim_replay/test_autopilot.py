@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from msgs.mavlink import MAVLink, dialect, pack, target_relative
 from sim_replay.autopilot import COMPONENT_ID, SYSTEM_ID
 from sim_replay.telemetry import COLUMNS, Telemetry, TelemetryError, read_telemetry, write_telemetry
+from tests.waiting import WITHIN_S
 
 
 def turning_flight() -> Telemetry:
@@ -194,6 +195,22 @@ def test_it_records_valid_target_poses_and_refuses_the_rest_by_reason(daemon: Da
     assert refused["TARGET_RELATIVE is not finite"] == 1
     assert refused["sender is not the daemon"] == 1
     assert refused["not MAVLink"] >= 1
+
+
+def test_a_full_disk_is_told_in_a_sentence(tmp_path: Path) -> None:
+    write_telemetry(tmp_path / "telemetry.csv", turning_flight())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.bind(("127.0.0.1", 0))
+        arguments = ["--telemetry", str(tmp_path / "telemetry.csv"), "--endpoint", f"127.0.0.1:{link.getsockname()[1]}"]
+        arguments += ["--start-at-ns", "0", "--messages", "/dev/full"]
+        command = [sys.executable, "-m", "sim_replay.autopilot", *arguments]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as autopilot:
+            assert autopilot.stdout is not None
+            port = json.loads(autopilot.stdout.readline())["port"]
+            asked = pack(MAVLink(None, srcSystem=SYSTEM_ID), dialect.MAVLink_timesync_message(0, 1))
+            link.sendto(asked, ("127.0.0.1", port))
+            _, said = autopilot.communicate(timeout=WITHIN_S)
+    assert (autopilot.returncode, said) == (2, "/dev/full: cannot be written: No space left on device\n")
 
 
 def test_telemetry_survives_the_file_and_rests_outside_it(tmp_path: Path) -> None:

@@ -107,6 +107,18 @@ def test_the_command_scores_what_each_peer_received(flight: Path, capsys: pytest
     assert frames[4]["subscriber"]["targets"] == []
 
 
+@pytest.mark.parametrize(
+    ("full", "words"),
+    [("frames.jsonl", ": No space left on device"), ("overlay.png", "/overlay.png: cannot be written")],
+)
+def test_a_full_disk_is_told_with_the_place(
+    flight: Path, full: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (flight / full).symlink_to("/dev/full")
+    assert main(["score", str(flight)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == f"{flight}{words}"
+
+
 def test_a_new_flight_removes_what_is_left_of_the_last_and_nothing_else(flight: Path) -> None:
     assert main(["score", str(flight)]) == 0
     (flight / "recordings").mkdir()
