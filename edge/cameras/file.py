@@ -52,9 +52,10 @@ class FileSource:
         if not 0 < fps <= 1000:
             raise InputError(f"{path} does not say its frame rate")
         if not tells_times(path):
+            # Not `-c copy`: frames are copied in the order in which they are decoded, and would get each other's times.
             raise InputError(
                 f"{path} does not say when its frames were taken; put it into a file that does, "
-                f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -c copy {path.stem}.mp4"
+                f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -crf 12 {path.stem}.mp4"
             )
         self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less: unknown
         size_wh = (

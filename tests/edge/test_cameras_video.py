@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import shutil
 import struct
 import subprocess
 import threading
@@ -151,6 +153,29 @@ def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path:
     ):
         with closing(source_of(path)) as source, pytest.raises(InputError, match=f"when its frames.*{path.name}"):
             source.open()
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the program ffmpeg")
+def test_the_command_that_gives_a_video_times_gives_each_frame_its_own(tmp_path: Path) -> None:
+    """H.264 stores frames that were predicted from later ones after these."""
+    with av.open(str(tmp_path / "flight.h264"), "w") as out:
+        stream = out.add_stream("libx264", rate=30, options={"x264-params": "b-adapt=0"})
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
+        stream.codec_context.max_b_frames = 2
+        for index in range(12):
+            brighter = np.full((SIZE_WH[1], SIZE_WH[0], 3), 20 * index, np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(brighter, format="bgr24")))
+        out.mux(stream.encode(None))
+    with closing(source_of(tmp_path / "flight.h264")) as source, pytest.raises(InputError) as refused:
+        source.open()
+    command = str(refused.value).rpartition("filmed at: ")[2]
+    subprocess.run(shlex.split(command), cwd=tmp_path, check=True, capture_output=True)
+    with closing(source_of(tmp_path / "flight.mp4")) as source:
+        source.open()
+        frames = [source.read(threading.Event()) for _ in range(12)]
+    assert [round(frame.image_bgr.mean() / 20) for frame in frames] == list(range(12))
+    assert [frame.meta.sequence for frame in frames] == list(range(12))
 
 
 def test_a_video_that_ends_before_its_first_frame_is_no_flight_that_went_well(tmp_path: Path) -> None:
