@@ -17,6 +17,7 @@ from edge.types import Array
 INTRINSICS_KEY = ("camera", "intrinsics")
 DISTORTION_MODELS = ("", "plumb_bob", "rational_polynomial")  # OpenCV's own files name none
 FOCAL_RATIO_MAX = 2.0  # pixels are square, or nearly so in anamorphic video
+ACROSS_MAX_DEG = 150.0  # wider than any lens that is not a fisheye
 OUTSIDE_MAX_SHARE = 0.5  # how far, in its sides, the principal point may lie outside the image, which may be cropped
 CLEAR_SHARE = 0.5  # share of the sides, in the middle, in which the lens model must not fold
 ROUNDING = 1e-6  # tolerance for the zeros and the one of K, from tools that multiply matrices
@@ -60,6 +61,9 @@ def _no_camera(intrinsics: Intrinsics) -> str | None:
     K, sides = intrinsics.K, np.array(intrinsics.image_size_wh)
     if not 1 / FOCAL_RATIO_MAX <= K[0, 0] / K[1, 1] <= FOCAL_RATIO_MAX:
         return f"fx {K[0, 0]:g} and fy {K[1, 1]:g} cannot be of one camera"
+    across_deg = np.degrees(2.0 * np.arctan(0.5 * sides[0] / K[0, 0]))
+    if across_deg > ACROSS_MAX_DEG:
+        return f"fx {K[0, 0]:g} px shows {across_deg:.0f} degrees across {sides[0]} px: are these millimetres?"
     if (np.abs(K[:2, 2] - 0.5 * (sides - 1)) > (0.5 + OUTSIDE_MAX_SHARE) * sides).any():
         return f"the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is far outside the picture of {sides[0]}x{sides[1]}"
     if any(intrinsics.distortion):

@@ -276,6 +276,16 @@ def test_numbers_of_no_camera_are_told_before_a_flight(tmp_path: Path, written: 
     assert sound.image_size_wh == (1280, 720)
 
 
+@pytest.mark.parametrize(("focal_px", "fits"), [(8.0, False), (50.0, False), (480.0, True), (90_000.0, True)])
+def test_a_focal_length_in_millimetres_is_told_before_a_flight(focal_px: float, fits: bool) -> None:
+    numbers = {"fx": focal_px, "fy": focal_px, "cx": 959.5, "cy": 539.5, "width": 1920, "height": 1080}
+    if fits:
+        assert load_intrinsics(IntrinsicsSettings(**numbers)).K[0, 0] == focal_px
+    else:
+        with pytest.raises(InputError, match=rf"fx {focal_px:g} px shows 17[0-9] degrees across 1920 px"):
+            load_intrinsics(IntrinsicsSettings(**numbers))
+
+
 def test_a_lens_that_shows_nothing_in_the_corners_is_a_lens() -> None:
     numbers = {"fx": 1000.0, "fy": 1000.0, "cx": 959.5, "cy": 539.5, "width": 1920, "height": 1080}
     assert load_intrinsics(IntrinsicsSettings(distortion=[-0.3, 0.0, 0.0, 0.0], **numbers)).distortion[0] == -0.3
