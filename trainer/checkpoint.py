@@ -16,12 +16,11 @@ from torch import Tensor, nn
 
 from msgs.contract import samples_behind
 from trainer.config import ConfigError, TrainerConfig, parse_config
-from trainer.model import PoseNet
+from trainer.model import ADDED_HEADS, PoseNet
 
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
 TRAINING_ONLY_PREFIX = "head_dense."
-PRESENCE_PREFIX = "head_presence."
 _log = logging.getLogger(__name__)
 
 
@@ -56,9 +55,9 @@ def deployed_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:
     return {key: value for key, value in state.items() if not key.startswith(TRAINING_ONLY_PREFIX)}
 
 
-def has_presence(state: dict[str, Tensor]) -> bool:
-    """Whether these are weights of a network with a presence head."""
-    return any(key.startswith(PRESENCE_PREFIX) for key in state)
+def added_heads(state: dict[str, Tensor]) -> tuple[str, ...]:
+    """Which of ADDED_HEADS the network with these weights has."""
+    return tuple(head for head in ADDED_HEADS if any(key.startswith(f"{head}.") for key in state))
 
 
 def weights_sha256(state: dict[str, Tensor]) -> str:
@@ -115,7 +114,7 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
         raise ConfigError(f"{path}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
     weights = deployed_weights(content["weights"])
-    model = PoseNet(config.model.deployed(), presence=has_presence(weights))
+    model = PoseNet(config.model.deployed(), added_heads(weights))
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
     except RuntimeError:  # its message has a line for each of some hundred tensors

@@ -13,7 +13,7 @@ from msgs.command_line import EXIT_BAD_INPUT, EXIT_INTERRUPTED, exit_code
 from msgs.settings import read_text
 from trainer import evaluate_command, results, score_command
 from trainer.arguments import count, positive, share, whole
-from trainer.config import ConfigError, RenderingError, load_config, parse_config
+from trainer.config import REFINED_HEADS, ConfigError, RenderingError, load_config, parse_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
 
@@ -89,7 +89,9 @@ def _refine(arguments: argparse.Namespace) -> None:
         datasets=tuple(arguments.dataset),
         split=arguments.split,
         dataset_share=arguments.dataset_share,
-        presence_alone=arguments.presence_alone,
+        flown=tuple(arguments.flown),
+        flown_share=arguments.flown_share,
+        heads=tuple(arguments.heads),
     )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")
@@ -138,10 +140,11 @@ def _parser() -> argparse.ArgumentParser:
 def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine = commands.add_parser(
         "refine",
-        help="train the uncertainty, range correction and score of a trained network",
-        description="Run a trained network on windows and train only two heads on the outputs: the refinement head "
-        "predicts a correction of the range, and sigma; the presence head whether a peak is a target, hence the score. "
-        "All other weights are unchanged. Writes weights.pt to --out.",
+        help="train the uncertainty, range correction, score and choice of rotation of a trained network",
+        description="Run a trained network on windows and train only three heads on the outputs: the refinement head "
+        "predicts a correction of the range, and sigma; the presence head whether a peak is a target, hence the score; "
+        "the choice head which of the rotation hypotheses is likeliest. All other weights are unchanged. Writes "
+        "weights.pt to --out.",
     )
     refine.add_argument("--checkpoint", type=Path, required=True, help="run folder or its weights.pt")
     refine.add_argument("--out", type=Path, required=True, help="output folder for the weights")
@@ -176,7 +179,24 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "--dataset-share", type=share, default=0.5, help="share of windows from --dataset (default %(default)s)"
     )
     refine.add_argument(
-        "--presence-alone", action="store_true", help="keep the refinement head as it is, train the presence head"
+        "--flown",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DIR",
+        help="datasets whose poses and cameras are rendered anew, as in [data] flown (default: as the network was "
+        "trained)",
+    )
+    refine.add_argument(
+        "--flown-share", type=share, default=0.5, help="share of such targets if --flown is given (default %(default)s)"
+    )
+    refine.add_argument(
+        "--heads",
+        nargs="+",
+        choices=REFINED_HEADS,
+        default=list(REFINED_HEADS),
+        metavar="HEAD",
+        help="which to train: %(choices)s (default: all); the others stay as they are",
     )
     refine.set_defaults(run=_refine)
 

@@ -40,6 +40,7 @@ QUANTISED_PARTS = (
     "/head_hm/head_hm.0/",
     "/dts/convs/",
     "/head_refine/convs/",
+    "/head_choice/convs/",
     "/head_presence/convs/",
 )
 

@@ -47,7 +47,7 @@ class _Subject(NamedTuple):
 
 def _seeds(training: Mapping[str, object]) -> tuple[object, ...]:
     """Seeds of the last training run's windows and of those of the heads that were trained after it."""
-    return tuple(training[key] for key in ("seed", "refined_seed", "presence_seed") if key in training)
+    return tuple(training[key] for key in ("seed", "refined_seed", "presence_seed", "choice_seed") if key in training)
 
 
 def _checkpoint(path: Path) -> _Subject:

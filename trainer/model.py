@@ -7,6 +7,7 @@ modules in the paper's order. Training decodes one guided peak per image (traine
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 
 from trainer import equations as eq
 from trainer.backbones import build_backbone
+from trainer.choice import ChoiceHead, options_of
 from trainer.config import Z_RANGE_M, ModelConfig
 from trainer.layers import conv_bn_relu, mlp
 from trainer.neck import AlignFuseNeck
@@ -25,6 +27,9 @@ OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, 
 REGION = 7
 IMAGENET_MEAN_BGR = (103.53, 116.28, 123.675)
 IMAGENET_STD_BGR = (57.375, 57.12, 58.395)
+
+
+ADDED_HEADS = ("head_choice", "head_presence")  # those that `trainer.refine` adds to a trained network
 
 
 class Decoded(NamedTuple):
@@ -117,8 +122,8 @@ class PoseNet(nn.Module):
     """The network. `forward` is the exported graph (see msgs.contract); a training step calls `perceive`, `dense` and
     `decode`."""
 
-    def __init__(self, config: ModelConfig, presence: bool = False) -> None:
-        """`presence`: with the head that `trainer.refine` adds."""
+    def __init__(self, config: ModelConfig, added: Collection[str] = ()) -> None:
+        """`added`: which of ADDED_HEADS there are."""
         super().__init__()
         self.config = config
         C, hidden = config.channels, config.hidden
@@ -139,7 +144,9 @@ class PoseNet(nn.Module):
         self.head_hypothesis = nn.Linear(hidden, config.hypotheses) if config.hypotheses > 1 else None
         self.head_extents = nn.Linear(hidden, 3) if config.depth == "rotation_aware" else None
         self.head_refine = RefinementHead(C, hidden, config.hypotheses) if config.uncertainty else None
-        self.head_presence = PresenceHead(C, hidden, config.hypotheses) if presence else None
+        of_added = C, hidden, config.hypotheses
+        self.head_choice = ChoiceHead(*of_added) if "head_choice" in added else None
+        self.head_presence = PresenceHead(*of_added) if "head_presence" in added else None
         # Shallow on purpose, so that F_global itself must encode the object coordinates.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
         self._init_priors()
@@ -211,9 +218,15 @@ class PoseNet(nn.Module):
         count = self.config.hypotheses
         r_6d = self.head_rot(f_rot)
         R_allo_k = eq.gram_schmidt(r_6d.reshape(-1, count, 6))
-        logits, R_allo = self._likeliest(f_rot, r_6d)
         o_xy, s = self.head_trans(f_trans).split([2, 1], dim=-1)
         origin_px = center_px + self.config.origin_range * size_px * torch.tanh(o_xy)
+        plane_xy = eq.image_plane_point(origin_px, K)
+        log_f = torch.log(eq.focal_length(K, self.config.focal))
+        logits = self._own_logits(f_rot)
+        options = options_of(log_size, log_f, plane_xy, r_6d, logits)
+        if self.head_choice is not None:
+            logits = self.head_choice(grid, f_trans, f_rot, options)
+        R_allo = _likeliest(logits, r_6d)
         S = torch.exp(s[..., 0])
         if self.head_extents is not None:
             S = S * eq.seen_scale(torch.exp(self.head_extents(f_trans)), R_allo.detach())
@@ -221,12 +234,10 @@ class PoseNet(nn.Module):
             log_Z = s[..., 0]
         else:
             log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
-        plane_xy = eq.image_plane_point(origin_px, K)
         R_ray = eq.ray_rotation(eq.unit_ray(plane_xy if self.config.ray else torch.zeros_like(plane_xy)))
         R_ego = R_ray @ R_allo
-        log_f = torch.log(eq.focal_length(K, self.config.focal))
         answers = answers_of(log_size, log_f, log_Z, plane_xy, logits, R_ego)
-        evidence = Evidence(grid, f_trans, f_rot, answers)
+        evidence = Evidence(grid, f_trans, f_rot, answers, options)
         refined = self._refined(evidence)
         decoded = Decoded(
             center_px.reshape(-1, M, 2),
@@ -253,13 +264,9 @@ class PoseNet(nn.Module):
         extent_px = _extent_px(log_P)
         return f_c, 0.5 * (extent_px - 1) + 0.5 * extent_px * torch.tanh(self.head_center(f_c))
 
-    def _likeliest(self, f_rot: Tensor, r_6d: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits [P, K] and the rotation [P, 3, 3] of the highest: one mode, never the mean of several."""
-        if self.head_hypothesis is None:
-            return torch.zeros_like(r_6d[:, :1]), eq.gram_schmidt(r_6d)
-        logits = self.head_hypothesis(f_rot)
-        of_best = 6 * logits.argmax(-1, keepdim=True) + torch.arange(6, device=r_6d.device)
-        return logits, eq.gram_schmidt(torch.gather(r_6d, 1, of_best))
+    def _own_logits(self, f_rot: Tensor) -> Tensor:
+        """Logits [P, K] without the choice head."""
+        return torch.zeros_like(f_rot[:, :1]) if self.head_hypothesis is None else self.head_hypothesis(f_rot)
 
     def _refined(self, evidence: Evidence) -> Refined:
         if self.head_refine is None:
@@ -293,6 +300,14 @@ class PoseNet(nn.Module):
         sigma = math.sqrt(2.0) * torch.exp(out.log_sigma)
         sigma = torch.cat([sigma[..., :2] * side_px, sigma[..., 2:]], dim=-1)
         return score, out.center_px, size_px, out.origin_px, t_cam_target_m, out.R_ego, sigma
+
+
+def _likeliest(logits: Tensor, r_6d: Tensor) -> Tensor:
+    """The rotation [P, 3, 3] with the highest of the logits [P, K]: one mode, never the mean of several."""
+    if logits.shape[-1] == 1:
+        return eq.gram_schmidt(r_6d)
+    of_best = 6 * logits.argmax(-1, keepdim=True) + torch.arange(6, device=r_6d.device)
+    return eq.gram_schmidt(torch.gather(r_6d, 1, of_best))
 
 
 def _extent_px(log_P: Tensor) -> Tensor:

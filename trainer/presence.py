@@ -9,32 +9,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from trainer.layers import conv_bn_relu, mlp
+from trainer.layers import BoxReader, mlp
 from trainer.refinement import Evidence, answer_count
 
 # A peak's score in float32 is not exact enough to tell its odds beyond these.
 SCORE_MARGIN = 1e-6
 
 
-class PresenceHead(nn.Module):
+class PresenceHead(BoxReader):
     """Evidence and heatmap scores [P] to scores [P]: probabilities if targets are as frequent as in its training."""
 
     def __init__(self, channels: int, hidden: int, hypotheses: int) -> None:
-        super().__init__()
-        narrow = hidden // 8
-        self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, narrow, 3, stride=2))
-        told = 16 * narrow + 2 * hidden + answer_count(hypotheses)
-        self.norm = nn.BatchNorm1d(told)
-        # Non-zero only while trainer.refine trains this head alone.
-        self.dropout = nn.Dropout(0.0)
-        self.decide = nn.Sequential(mlp(told, hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 1))
+        super().__init__(channels, hidden // 8, 2 * hidden + answer_count(hypotheses))
+        self.decide = nn.Sequential(mlp(self.width, hidden, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, 1))
         self.gain = nn.Parameter(torch.ones(1))
 
     def logits(self, evidence: Evidence, score: Tensor) -> Tensor:
         """Log-odds [P] of a target."""
-        grid, *rest = (value.detach() for value in evidence)
-        seen = self.dropout(self.norm(torch.cat([self.convs(grid).flatten(1), *rest], dim=-1)))
-        return self.gain * torch.logit(score, eps=SCORE_MARGIN) + self.decide(seen)[:, 0]
+        read = self.read(evidence.grid, evidence.f_trans, evidence.f_rot, evidence.answers)
+        return self.gain * torch.logit(score, eps=SCORE_MARGIN) + self.decide(read)[:, 0]
 
     def forward(self, evidence: Evidence, score: Tensor) -> Tensor:
         return torch.sigmoid(self.logits(evidence, score))

@@ -1,11 +1,12 @@
-"""`uavpose-trainer refine`: train two heads of a trained network alone, all other weights fixed.
+"""`uavpose-trainer refine`: train up to three heads of a trained network alone, all other weights fixed.
 
 The heads' inputs are cached: each window is rendered and evaluated once, and used in every epoch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,11 +21,14 @@ from trainer.checkpoint import (
     RESUME_NAME,
     TRAINING_ONLY_PREFIX,
     WEIGHTS_NAME,
+    added_heads,
     load_file,
     save_weights,
     weights_sha256,
 )
+from trainer.choice import ChoiceHead, choice_nll
 from trainer.config import (
+    REFINED_HEADS,
     ConfigError,
     DataConfig,
     DatasetSource,
@@ -41,7 +45,13 @@ from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
 from trainer.sources import refinement_sampler
 
-PREFIX = "head_refine."
+# The module of each of REFINED_HEADS, and the prefix of what the weights tell of its training.
+HEADS = {
+    "refinement": ("head_refine", "refined"),
+    "presence": ("head_presence", "presence"),
+    "choice": ("head_choice", "choice"),
+}
+EMPTY_SHARE = 0.4  # of the rendered windows: what the presence head tells targets from
 RENDERED_AT_ONCE = 32
 BATCH = 512
 HELD_OUT_SHARE = 0.04
@@ -59,7 +69,9 @@ class RefinePlan(NamedTuple):
     datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
     split: str | None = None  # of each dataset; None: all that are there, as long as none is a test split
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
-    presence_alone: bool = False  # the refinement head stays as it is
+    flown: tuple[Path, ...] = ()  # datasets whose poses and cameras are rendered anew; none: the checkpoint's, if any
+    flown_share: float = 0.5  # of the rendered windows with a target, if any are flown
+    heads: tuple[str, ...] = REFINED_HEADS  # the others stay as they are
 
 
 class Kept(NamedTuple):
@@ -70,6 +82,7 @@ class Kept(NamedTuple):
     strange: Tensor  # [N], bool: a generated airframe, not one of the fleet
     score: Tensor  # [N], the heatmap's
     target: Tensor  # [N], bool: the peak is of the labelled target
+    angle_rad: Tensor  # [N, K], of each hypothesis to the truth; only those of targets count
 
     def rows(self, which: Tensor | slice) -> Kept:
         """The selected rows, in single precision."""
@@ -87,7 +100,10 @@ def refine(
     ] = refinement_sampler,
     say: Callable[[str], None] = print,
 ) -> Path:
-    """Write weights.pt with newly trained heads into `out`; returns its path. Raises ConfigError."""
+    """Write weights.pt with newly trained heads into `out`; returns its path. Raises ConfigError.
+
+    A choice is learnt only where there is one: from networks with several hypotheses.
+    """
     content = load_file(checkpoint)
     if not {"weights", "config", "training"} <= content.keys():
         raise ConfigError(f"{checkpoint}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
@@ -100,21 +116,31 @@ def refine(
     torch.set_num_threads(config.run.threads)
     commit = provenance(config)["commit"]
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = network_to_refine(config, content["weights"], checkpoint, keep=plan.presence_alone)
+    trained = [head for head in HEADS if head in plan.heads and (head != "choice" or config.model.hypotheses > 1)]
+    if not trained:
+        raise ConfigError(f"{checkpoint}: has one rotation hypothesis, so there is no choice to train")
+    model = network_to_refine(config, content["weights"], checkpoint, {HEADS[head][0] for head in trained})
     torch.manual_seed(plan.seed)
     shape = config.model.channels, config.model.hidden, config.model.hypotheses
-    if not plan.presence_alone:
-        model.head_refine = RefinementHead(*shape).eval()
-    model.head_presence = PresenceHead(*shape).eval()
+    heads = Heads(
+        RefinementHead(*shape).to(device).eval() if "refinement" in trained else None,
+        PresenceHead(*shape).to(device).eval() if "presence" in trained else None,
+        ChoiceHead(*shape).to(device).eval() if "choice" in trained else None,
+    )
     model.to(device)
     _refuse_datasets(plan, config.data)
     size_px = config.schedule.sizes[-1].size_px
     from_datasets = plan.datasets, plan.dataset_share, plan.split
-    opener = open_sampler(config.data, plan.seed, size_px, plan.strangers, *from_datasets)
+    data = config.data.model_copy(update={"empty_share": EMPTY_SHARE if "presence" in trained else 0.0})
+    if plan.flown:
+        data = data.model_copy(update={"flown": list(plan.flown), "flown_share": plan.flown_share})
+    opener = open_sampler(data, plan.seed, size_px, plan.strangers, *from_datasets)
     kept = look(model, config, opener, plan.windows, say)
     learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
-    heads = Heads(None if plan.presence_alone else model.head_refine, model.head_presence)
     fit(heads, kept, learnt, plan.epochs, say)
+    for head, module in zip(HEADS, heads, strict=True):
+        if module is not None:
+            setattr(model, HEADS[head][0], module)
     said = {
         "from": weights_sha256(content["weights"])[:16],
         "windows": plan.windows,
@@ -122,10 +148,11 @@ def refine(
         "seed": plan.seed,
         "strangers": plan.strangers,
         "dataset_share": plan.dataset_share if plan.datasets else 0.0,
+        "flown_share": data.flown_share if data.flown else 0.0,
         "commit": commit,
     }
-    trained = ("presence",) if plan.presence_alone else ("refined", "presence")
-    training = content["training"] | {f"{head}_{key}": value for head in trained for key, value in said.items()}
+    of_heads = {f"{HEADS[head][1]}_{key}": value for head in trained for key, value in said.items()}
+    training = content["training"] | of_heads
     made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
     return out / WEIGHTS_NAME
@@ -159,20 +186,20 @@ def _trained_scenes(source: DatasetSource) -> set[Path]:
     return {s.folder.resolve() for s in scenes if s.split and f"{s.split}_".startswith(f"{source.split}_")}
 
 
-def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Path, keep: bool = False) -> PoseNet:
-    """The trained network, without a presence head; its refinement head is the trained one if `keep`, else untrained.
-
-    Raises ConfigError if it has none, or lacks weights.
+def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Path, trained: Collection[str]) -> PoseNet:
+    """The trained network without what is to be trained: of the modules `trained`, a refinement head is untrained, the
+    others are missing. Raises ConfigError if the network has no refinement head, or lacks weights.
     """
     dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # deployed weights have none
-    model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}))
+    added = set(added_heads(weights)) - set(trained)
+    model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}), added)
     if model.head_refine is None:
         raise ConfigError(f"{named}: [model] uncertainty is false: the network has no refinement head")
-    own = model.state_dict()
+    own = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] not in trained}
     for key in own:
-        if (keep or not key.startswith(PREFIX)) and (key not in weights or weights[key].shape != own[key].shape):
+        if key not in weights or weights[key].shape != own[key].shape:
             raise ConfigError(f"{named}: its weights do not match the network that its [model] describes")
-    given = {key: value for key, value in weights.items() if key in own and (keep or not key.startswith(PREFIX))}
+    given = {key: value for key, value in weights.items() if key in own}
     model.load_state_dict(given, strict=False)
     return model.eval().requires_grad_(False)
 
@@ -220,7 +247,8 @@ def _found(model: PoseNet, config: TrainerConfig, batch: TrainingBatch) -> Kept:
     kept = target | ~(hit | labels.others.any(-1).any(-1))
     evidence = Evidence(*(value[kept].half() for value in seen))
     strange = labels.airframe_id >= fleet_size()
-    return Kept(evidence, residual[kept], strange[kept], score[kept, 0], target[kept])
+    angle_rad = eq.rotation_angle(out.R_ego_k[:, 0], labels.R_cam_target[:, None])
+    return Kept(evidence, residual[kept], strange[kept], score[kept, 0], target[kept], angle_rad[kept])
 
 
 def fleet_size() -> int:
@@ -234,18 +262,30 @@ class Heads(NamedTuple):
     """What is trained; None: stays as it is."""
 
     refine: RefinementHead | None
-    presence: PresenceHead
+    presence: PresenceHead | None
+    choice: ChoiceHead | None
 
     def loss(self, rows: Kept) -> Tensor:
-        """Mean over the rows of each head's negative log-likelihood; they share no weights. From fewer than two
-        targets, which have no statistics to normalise by, the refinement head learns nothing."""
-        logits = self.presence.logits(rows.evidence, rows.score)
-        loss = F.binary_cross_entropy_with_logits(logits, rows.target.float())
+        """Sum of each head's mean negative log-likelihood over the rows; they share no weights. From fewer than two
+        targets, which have no statistics to normalise by, only the presence head learns."""
+        loss = rows.score.new_zeros(()).requires_grad_()
+        if self.presence is not None:
+            logits = self.presence.logits(rows.evidence, rows.score)
+            loss = loss + F.binary_cross_entropy_with_logits(logits, rows.target.float())
         of_targets = rows.rows(rows.target)
-        if self.refine is not None and len(of_targets.score) > 1:
+        if len(of_targets.score) < 2:
+            return loss
+        if self.refine is not None:
             refined = self.refine(of_targets.evidence)
             loss = loss + refinement_nll(of_targets.residual, refined.correction, refined.log_sigma).sum(-1).mean()
+        if self.choice is not None:
+            loss = loss + choice_nll(chosen_by(self.choice, of_targets.evidence), of_targets.angle_rad).mean()
         return loss
+
+
+def chosen_by(head: ChoiceHead, evidence: Evidence) -> Tensor:
+    """The head's logits [P, K]."""
+    return head(evidence.grid, evidence.f_trans, evidence.f_rot, evidence.options)
 
 
 def fit(heads: Heads, kept: Kept, learnt: int, epochs: int, say: Callable[[str], None]) -> None:
@@ -287,7 +327,11 @@ def told(heads: Heads, kept: Kept, first: int) -> str:
         return "no windows"
     of_targets = last.rows(last.target)
     words = [] if heads.refine is None or not len(of_targets.score) else _told_of_range(heads.refine, of_targets)
-    return "; ".join([*words, *_told_of_presence(heads.presence, last)])
+    if heads.presence is not None:
+        words += _told_of_presence(heads.presence, last)
+    if heads.choice is not None and len(of_targets.score):
+        words.append(_told_of_choice(heads.choice, of_targets))
+    return "; ".join(words)
 
 
 def _told_of_range(head: RefinementHead, of_targets: Kept) -> list[str]:
@@ -314,6 +358,15 @@ def _told_of_presence(head: PresenceHead, last: Kept) -> list[str]:
     score = torch.cat([head(part.evidence, part.score) for part in parts])
     false = [_false_share(of, last.target) for of in (last.score, score)]
     return ["peaks of no target, where 95 % of the targets are found: {:.2%} before, {:.2%} after".format(*false)]
+
+
+def _told_of_choice(head: ChoiceHead, of_targets: Kept) -> str:
+    parts = [of_targets.rows(rows) for rows in _by_batch(len(of_targets.score))]
+    own = torch.cat([part.evidence.options[:, -head.hypotheses :] for part in parts])
+    chosen = torch.cat([chosen_by(head, part.evidence) for part in parts])
+    angles_rad = (of_targets.angle_rad.gather(1, logits.argmax(-1, keepdim=True)) for logits in (own, chosen))
+    rates = [float((angle < math.radians(10.0)).float().mean()) for angle in angles_rad]
+    return "rotations within 10 degrees: {:.1%} before, {:.1%} after".format(*rates)
 
 
 def _by_batch(count: int) -> list[slice]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from trainer.layers import conv_bn_relu, mlp
+from trainer.layers import BoxReader, mlp
 
 SIGMAS = 6  # origin u, v in box sides sqrt(w h), log Z, rotation x, y, z in `cam`, rad
 RANGE = 2  # of these
@@ -21,12 +21,13 @@ CORRECTION_MAX = 0.7
 
 
 class Evidence(NamedTuple):
-    """Inputs of the refinement head for P peaks."""
+    """Inputs of the heads that `trainer.refine` trains, for P peaks."""
 
     grid: Tensor  # [P, C, 7, 7], F_global over the box
     f_trans: Tensor  # [P, hidden]
     f_rot: Tensor  # [P, hidden]
     answers: Tensor  # [P, answer_count(K)], see `answers_of`
+    options: Tensor  # [P, option_count(K)], see `trainer.choice.options_of`
 
 
 class Refined(NamedTuple):
@@ -51,18 +52,12 @@ def answers_of(
     return torch.cat([*scalars, torch.softmax(hypothesis_logits, dim=-1), R_ego.flatten(1)], dim=-1)
 
 
-class RefinementHead(nn.Module):
+class RefinementHead(BoxReader):
     """Evidence to Refined."""
 
     def __init__(self, channels: int, hidden: int, hypotheses: int) -> None:
-        super().__init__()
-        narrow = hidden // 4
-        self.convs = nn.Sequential(conv_bn_relu(channels, narrow, 3), conv_bn_relu(narrow, narrow, 3, stride=2))
-        told = 2 * hidden + answer_count(hypotheses)
-        self.norm = nn.BatchNorm1d(16 * narrow + told)
-        # Non-zero only while trainer.refine trains this head alone.
-        self.dropout = nn.Dropout(0.0)
-        self.decide = nn.Sequential(mlp(16 * narrow + told, hidden, hidden), nn.ReLU(inplace=True))
+        super().__init__(channels, hidden // 4, 2 * hidden + answer_count(hypotheses))
+        self.decide = nn.Sequential(mlp(self.width, hidden, hidden), nn.ReLU(inplace=True))
         self.range = nn.Linear(hidden, 1)
         self.sigma = nn.Linear(hidden, SIGMAS)
         with torch.no_grad():
@@ -70,8 +65,6 @@ class RefinementHead(nn.Module):
             self.range.bias.zero_()
 
     def forward(self, evidence: Evidence) -> Refined:
-        grid, *rest = (value.detach() for value in evidence)
-        seen = self.dropout(self.norm(torch.cat([self.convs(grid).flatten(1), *rest], dim=-1)))
-        decided = self.decide(seen)
+        decided = self.decide(self.read(evidence.grid, evidence.f_trans, evidence.f_rot, evidence.answers))
         correction = torch.clamp(self.range(decided)[:, 0], -CORRECTION_MAX, CORRECTION_MAX)
         return Refined(correction, torch.clamp(self.sigma(decided) - 2.0, *LOG_SIGMA_RANGE))

@@ -268,7 +268,7 @@ def told(history: Sequence[Mapping[str, Any]], training: Mapping[str, str | int 
         f"Trained on {history[-1]['total_samples']:,} windows in {runs} runs, each initialised from the "
         "weights of earlier runs (those of the run before it, or a mean of several)."
     )
-    for key, head in (("refined", "refinement head"), ("presence", "presence head")):
+    for key, head in (("refined", "refinement head"), ("presence", "presence head"), ("choice", "choice head")):
         if f"{key}_windows" in training:
             epochs, windows, seed = (training[f"{key}_{name}"] for name in ("epochs", "windows", "seed"))
             words += (

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 
 RENDERED = "rendered"  # name of the renderer among the datasets
-REFINED_EMPTY_SHARE = 0.4  # of the rendered windows for `refine`: what the presence head tells targets from
 
 
 def _shares(config: DataConfig, judging: bool) -> list[tuple[DatasetSource | None, float]]:
@@ -151,7 +150,7 @@ def _open_refinement_sampler(
     invention = Invention(strangers, KEPT_BACK_VARIANTS)
     acquire = config.acquire_share
     drawn = invention, config.acquire_view, flown
-    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, REFINED_EMPTY_SHARE, *drawn)
+    rendered = WindowSampler(seed, size_px, config.airframe_ids, acquire, config.empty_share, *drawn)
     if not datasets or dataset_share == 0.0:
         return rendered
     cut = [DatasetSampler(path, split, seed, size_px, acquire, config.acquire_view) for path in datasets]

@@ -17,6 +17,7 @@ from msgs.contract import OUTPUT_NAMES
 from sim_replay.airframes.invented import draw_invented
 from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
+from trainer.choice import ChoiceHead, option_count
 from trainer.cli import main
 from trainer.config import ConfigError, DataConfig
 from trainer.equations import heatmap_peaks
@@ -27,6 +28,7 @@ from trainer.refine import Heads, Kept, RefinePlan, fit, fleet_size, look, refin
 from trainer.refinement import Evidence, RefinementHead, answer_count
 from trainer.sources import refinement_sampler
 
+NO_ANGLES = torch.zeros(6000, 4)
 PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
 
 
@@ -57,7 +59,7 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     run = write_run(tmp_path / "run")
     one, again = (refine(run, tmp_path / n, PLAN, open_sampler=open_plates, say=silent) for n in ("one", "again"))
     before, after = load_file(run)["weights"], load_file(one)["weights"]
-    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"head_presence"}
+    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"head_presence", "head_choice"}
     moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
     assert moved == {"head_refine"}
     assert load_model(one)[3] == load_model(again)[3] != load_model(run)[3]
@@ -65,21 +67,22 @@ def test_the_head_alone_is_another_and_the_same_seed_makes_the_same(tmp_path: Pa
     assert told["samples"] == 5
     assert told["refined_from"] == load_model(run)[3][:16]
     of_plan = ("seed", "windows", "epochs", "strangers")
-    for head in ("refined", "presence"):
+    for head in ("refined", "presence", "choice"):
         assert {name: told[f"{head}_{name}"] for name in of_plan} == {name: getattr(PLAN, name) for name in of_plan}
     assert told["refined_dataset_share"] == 0.0
 
 
-def test_the_presence_head_may_be_trained_alone_also_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("head", ["presence", "choice"])
+def test_an_added_head_may_be_trained_alone_also_again(tmp_path: Path, head: str) -> None:
     refined = refine(write_run(tmp_path / "run"), tmp_path / "refined", PLAN, open_sampler=open_plates, say=silent)
-    alone = PLAN._replace(seed=12, presence_alone=True)
+    alone = PLAN._replace(seed=12, heads=(head,))
     again = refine(refined, tmp_path / "again", alone, open_sampler=open_others, say=silent)
     before, after = load_file(refined)["weights"], load_file(again)["weights"]
     assert before.keys() == after.keys()
-    assert {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])} == {"head_presence"}
+    assert {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])} == {f"head_{head}"}
     told = load_model(again)[2]
-    assert (told["refined_seed"], told["presence_seed"]) == (PLAN.seed, 12)
-    assert told["presence_from"] == load_model(refined)[3][:16]
+    assert (told["refined_seed"], told[f"{head}_seed"]) == (PLAN.seed, 12)
+    assert told[f"{head}_from"] == load_model(refined)[3][:16]
 
 
 def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_path: Path) -> None:
@@ -97,8 +100,8 @@ def test_flights_to_render_anew_that_are_not_there_are_told_before_anything_is_r
 
 
 def test_its_strangers_are_none_that_training_draws() -> None:
-    """Two of three are asked to be strangers, two of five windows to be empty, whatever the run was trained with."""
-    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.9)
+    """Two of three are asked to be strangers, and two of five windows to be empty."""
+    data = DataConfig(seed=1, validation_seed=2, batch_size=8, airframe_ids=[0, 3, 6], empty_share=0.4)
     batch = refinement_sampler(data, 12, 96, 2 / 3)().batch(0, 40)
     strange = batch.airframe_id >= fleet_size()
     assert 0.35 < batch.present.mean() < 0.8
@@ -257,7 +260,8 @@ def made_up(count: int, strange: torch.Tensor, seed: int) -> Evidence:
     generator = torch.Generator().manual_seed(seed)
     grid = torch.randn(count, 16, 7, 7, generator=generator)
     grid[:, 3:5] += 1.5 * strange[:, None, None, None]
-    rest = (torch.randn(count, width, generator=generator) for width in (32, 32, answer_count(4)))
+    widths = (32, 32, answer_count(4), option_count(4))
+    rest = (torch.randn(count, width, generator=generator) for width in widths)
     return Evidence(*(part.half() for part in (grid, *rest)))
 
 
@@ -272,10 +276,10 @@ def test_strangers_that_show_in_the_features_are_corrected_and_less_is_said_of_t
     residual[:, 2] += 0.2 * strange
     target = torch.rand(count, generator=generator) < 0.8
     residual[~target] = torch.nan
-    kept = Kept(made_up(count, strange, 5), residual, strange, torch.full((count,), 0.5), target)
+    kept = Kept(made_up(count, strange, 5), residual, strange, torch.full((count,), 0.5), target, NO_ANGLES[:count])
     torch.manual_seed(0)
     head = RefinementHead(16, 32, 4)
-    fit(Heads(head, PresenceHead(16, 32, 4)), kept, 5000, 12, silent)
+    fit(Heads(head, PresenceHead(16, 32, 4), None), kept, 5000, 12, silent)
     with torch.no_grad():
         refined = head(kept.rows(slice(5000, None)).evidence)
     held_out = strange[5000:]
@@ -295,10 +299,10 @@ def test_what_shows_in_the_features_and_what_the_heatmap_says_are_both_heard() -
     target = torch.rand(count, generator=generator) < 2 / 3
     right = torch.rand(count, generator=generator) < 2 / 3
     score = torch.where(target == right, 0.8, 0.2) + 0.1 * torch.rand(count, generator=generator)
-    kept = Kept(made_up(count, ~target, 7), torch.zeros(count, 6), target & False, score, target)
+    kept = Kept(made_up(count, ~target, 7), torch.zeros(count, 6), target & False, score, target, NO_ANGLES[:count])
     torch.manual_seed(0)
     head, said = PresenceHead(16, 32, 4), list[str]()
-    fit(Heads(None, head), kept, 5000, 4, said.append)
+    fit(Heads(None, head, None), kept, 5000, 4, said.append)
     held_out = kept.rows(slice(5000, None))
     with torch.no_grad():
         told = head(held_out.evidence, held_out.score)
@@ -319,8 +323,9 @@ def test_batches_without_targets_spoil_no_head() -> None:
     count = 2000
     target = torch.arange(count) % 400 == 7
     target[8] = True
-    kept = Kept(made_up(count, target, 8), torch.zeros(count, 6), target & False, torch.full((count,), 0.5), target)
-    heads = Heads(RefinementHead(16, 32, 4), PresenceHead(16, 32, 4))
+    score = torch.full((count,), 0.5)
+    kept = Kept(made_up(count, target, 8), torch.zeros(count, 6), target & False, score, target, NO_ANGLES[:count])
+    heads = Heads(RefinementHead(16, 32, 4), PresenceHead(16, 32, 4), ChoiceHead(16, 32, 4))
     torch.manual_seed(0)
     for rows in (kept.rows(slice(100, 300)), kept.rows(slice(300, 500)), kept.rows(slice(0, 100))):
         loss = heads.loss(rows)
