@@ -13,20 +13,30 @@ from edge.types import Array, Estimate
 COVERED_SHARE = 0.25
 # Such a detection lies anywhere between its targets: variance along their distance, as a share of its square.
 BETWEEN = 1.0 / 3.0
+# How much longer than predicted, in width or height, a box is too large for one target.
+LONGER = 1.25
 
 
-def shown_at_once(estimates: Sequence[Estimate], boxes_xyxy_px: Sequence[Array]) -> dict[int, list[int]]:
+def shown_at_once(
+    estimates: Sequence[Estimate], boxes_xyxy_px: Sequence[Array], lately: Sequence[bool]
+) -> dict[int, list[int]]:
     """By index of the estimates that lie on several targets: the indices of these targets.
 
     `boxes_xyxy_px` [4] are the targets' predicted ones. A target counts for the estimate that covers most of it, so
-    nothing is said against one that is seen apart from its neighbour.
+    nothing is said against one that is seen apart from its neighbour. Of the two, the one that is not detected may soon
+    be predicted elsewhere: an estimate on one that was shown with another `lately` is listed while it is too large.
     """
     shown: dict[int, list[int]] = {}
     for target, box in enumerate(boxes_xyxy_px):
         shares = [_covered(estimate.box_xyxy_px, box) for estimate in estimates]
         if shares and max(shares) >= COVERED_SHARE:
             shown.setdefault(int(np.argmax(shares)), []).append(target)
-    return {estimate: targets for estimate, targets in shown.items() if len(targets) > 1}
+    return {
+        estimate: targets
+        for estimate, targets in shown.items()
+        if len(targets) > 1
+        or (lately[targets[0]] and _too_large(estimates[estimate].box_xyxy_px, boxes_xyxy_px[targets[0]]))
+    }
 
 
 def less_sure(estimate: Estimate, boxes_xyxy_px: Sequence[Array], K: Array) -> Estimate:
@@ -46,6 +56,10 @@ def less_sure(estimate: Estimate, boxes_xyxy_px: Sequence[Array], K: Array) -> E
     covariance = estimate.covariance.copy()
     covariance[:3, :3] += BETWEEN * across_m @ across_m.T
     return replace(estimate, covariance=covariance)
+
+
+def _too_large(box_xyxy_px: Array, predicted_xyxy_px: Array) -> bool:
+    return bool(np.any(box_xyxy_px[2:] - box_xyxy_px[:2] > LONGER * (predicted_xyxy_px[2:] - predicted_xyxy_px[:2])))
 
 
 def _covered(a_xyxy: Array, b_xyxy: Array) -> float:

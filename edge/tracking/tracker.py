@@ -29,6 +29,7 @@ TENTATIVE_MISSES = 2  # in a row: deleted
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
 SCORE_MEMORY_S = 1.0  # time constant of a track's score, the mean of its frames'
+LONG_AGO_NS = -(10**18)
 
 Size = tuple[int, int]
 
@@ -48,6 +49,7 @@ class Target:
     hits: int = 1
     misses: int = 0
     position_disagreements: int = 0
+    merged_ns: int = LONG_AGO_NS  # last time that one detection may have shown it and another
     range_doubted: bool = False  # its range and motion begin anew with the next detection
 
 
@@ -141,17 +143,21 @@ class Tracker:
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
         boxes = [_box(target, view, lens) for target in self._targets]
-        merged = shown_at_once(finite, boxes)
+        lately = [(capture_ns - target.merged_ns) / NS_PER_S <= COAST_MAX_S for target in self._targets]
+        merged = shown_at_once(finite, boxes, lately)
         for i, several in merged.items():
             finite[i] = less_sure(finite[i], [boxes[k] for k in several], lens.K)
+            if len(several) > 1:
+                for k in several:
+                    self._targets[k].merged_ns = capture_ns
         held = [(target.motion, target.attitude, target.misses) for target in self._targets]
         pairs = associate(held, finite, lens.K, view)
         for pair in pairs:
             target = self._targets[pair.target]
-            own_box = target.box  # not that of several targets
+            own_box = target.box
             _hit(target, finite[pair.estimate], pair.seen, lens, view)
-            if pair.estimate in merged:
-                target.box = own_box
+            if pair.estimate in merged or lately[pair.target]:
+                target.box = own_box  # as they part, that of both grows little by little
         used = {pair.estimate for pair in pairs}
         hit = {pair.target for pair in pairs}
         spare = [one for i, one in enumerate(finite) if i not in used]

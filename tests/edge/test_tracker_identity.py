@@ -135,7 +135,8 @@ def test_what_is_pointed_at_keeps_the_slot_that_was_made_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "speed_mps"), [("ned", 3.0), ("ned", 6.0), ("ned", 12.0), ("ned_relative", 6.0), ("ned_relative", 12.0)]
+    ("kind", "speed_mps"),
+    [*product(("cam", "ned"), (3.0, 6.0, 12.0)), *product(("ned_relative",), (6.0, 12.0))],
 )
 def test_one_detection_of_two_aircraft_that_cross_is_taken_for_neither(kind: str, speed_mps: float) -> None:
     """Where their outlines overlap, the network finds one aircraft between them, as wide as both."""
