@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
+import shutil
 import socket
 import subprocess
 import sys
@@ -24,6 +23,15 @@ _LOOK_EVERY_S = 0.05
 _LOOK_AGAIN_S = 0.5
 _SETTLE_S = 1.0  # a viewer without a display accepts connections for a moment before it exits
 _SERVER_MEMORY = "1GiB"  # kept for browsers that join later; the oldest data is dropped first
+# Told to stop (SIGTERM) when we have ended, also if we are killed: the page would go on showing what was drawn last,
+# and its ports would stay taken.
+_TIED = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+# Rerun's own command, which would start the server as a child that is not tied.
+_AS_SERVER = (
+    "import os, pathlib, sys, rerun_cli\n"
+    "server = str(pathlib.Path(rerun_cli.__file__).with_name('rerun'))\n"
+    "os.execv(server, [server, *sys.argv[1:]])"
+)
 _NO_WINDOW = "Rerun's viewer cannot open a window here: use --web for a browser, or --save for another machine"
 
 
@@ -74,19 +82,19 @@ def server(web_port: int) -> Iterator[subprocess.Popen[bytes]]:
     for port in ports:
         if answers(port):
             raise InputError(f"--web {web_port}: port {port} is already in use")
+    asked = ("--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY)
     process = subprocess.Popen(
-        _command(ports[1], "--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY),
+        [*_TIED, sys.executable, "-c", _AS_SERVER, *_options(ports[1], *asked)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # the command starts the server as its child: both must be terminated
+        start_new_session=True,  # a terminal's Ctrl-C is for us
     )
     try:
         if not _started(process, ports):
             raise InputError(f"--web {web_port}: Rerun's server does not start at this port")
         yield process
     finally:
-        with suppress(ProcessLookupError):  # both have already exited
-            os.killpg(process.pid, signal.SIGTERM)
+        process.terminate()
         process.wait()
 
 
@@ -163,8 +171,12 @@ def _ended(process: subprocess.Popen[bytes], within_s: float) -> bool:
 
 
 def _command(port: int, *options: str) -> list[str]:
+    return [sys.executable, "-m", "rerun", *_options(port, *options)]
+
+
+def _options(port: int, *options: str) -> list[str]:
     """Bound to loopback: anyone who can connect to a viewer can see its data and draw into it."""
-    return [sys.executable, "-m", "rerun", "--bind", _LOOPBACK, "--port", str(port), *options]
+    return ["--bind", _LOOPBACK, "--port", str(port), *options]
 
 
 def _address(port: int) -> str:

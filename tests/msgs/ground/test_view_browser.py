@@ -77,6 +77,14 @@ def test_the_page_is_served_until_told_to_stop_and_nothing_stays_behind(tmp_path
     assert not answers(port + 1)
 
 
+def test_nothing_is_served_any_more_when_the_view_was_killed(tmp_path: Path) -> None:
+    """As one that runs out of memory is."""
+    record(tmp_path / "flight.mcap", 5)
+    with served(tmp_path / "flight.mcap") as (port, _, view):
+        view.kill()
+        until(lambda: not answers(port) and not answers(port + 1), what="the end of the server")
+
+
 def test_a_server_that_ends_at_once_is_told_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     unwilling = shutil.which("false")
     assert unwilling is not None
