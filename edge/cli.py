@@ -13,7 +13,7 @@ from pathlib import Path
 from edge.bench import command as bench
 from edge.errors import InputError
 from edge.logs import set_up_logging
-from msgs.command_line import exit_code
+from msgs.command_line import exit_code, say_out
 from msgs.signals import on_signals
 
 
@@ -115,7 +115,7 @@ def _check(options: argparse.Namespace) -> int:
     from edge.check import check
     from edge.config import load_config
 
-    print("\n".join(check(load_config(options.config))))
+    say_out("\n".join(check(load_config(options.config))))
     return 0
 
 
@@ -146,7 +146,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     refuse_unwritable(options.out)
     found = calibrate(options.source, board, options.coefficients)
     write_calibration(found, options.name, options.out)
-    print(to_json(found) if options.json else "\n".join(report(found, options.out)))
+    say_out(to_json(found) if options.json else "\n".join(report(found, options.out)))
     return 0
 
 
@@ -154,7 +154,7 @@ def _keygen(options: argparse.Namespace) -> int:
     from edge.links.signing_key import write_new_key
 
     write_new_key(options.out)
-    print(f"{options.out}: 32 random bytes, readable by its owner only; the autopilot needs the same key")
+    say_out(f"{options.out}: 32 random bytes, readable by its owner only; the autopilot needs the same key")
     return 0
 
 

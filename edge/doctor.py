@@ -30,6 +30,7 @@ from edge.estimator.model import NOT_CALIBRATED, Model
 from edge.findings import Finding, device_fault, good, poor, wrong
 from edge.health import percentiles_ms
 from edge.reload import load_configured
+from msgs.command_line import say_out
 
 FRAME_S = 8.0
 TIMED_RUNS = 10
@@ -63,12 +64,12 @@ def doctor(file: ConfigFile, as_json: bool) -> int:
     for finding in findings(file):
         found.append(finding)
         if not as_json:
-            print(finding.line(), flush=True)
+            say_out(finding.line())
     failed = [finding for finding in found if finding.verdict == "wrong"]
     if as_json:
-        print(json.dumps({"well": not failed, "findings": [asdict(finding) for finding in found]}))
+        say_out(json.dumps({"well": not failed, "findings": [asdict(finding) for finding in found]}))
     else:
-        print(f"{len(failed)} failed" if failed else "no check failed")
+        say_out(f"{len(failed)} failed" if failed else "no check failed")
     return 1 if failed else 0
 
 

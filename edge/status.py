@@ -15,6 +15,7 @@ from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.health import HealthState
 from edge.status_board import key_of
+from msgs.command_line import say_out
 from msgs.session import TlsFiles, check_endpoint, client_config
 
 ANSWER_S = 5.0
@@ -34,9 +35,9 @@ def status(config: Path | None, connect: str | None, vehicle: str | None, as_jso
     answer = ask(endpoint, uav, tls)
     if answer is None:
         sentence = _unanswered(endpoint, uav, tls)
-        print(json.dumps({"error": sentence}) if as_json else sentence)
+        say_out(json.dumps({"error": sentence}) if as_json else sentence)
         return EXIT_NOT_WELL
-    print(json.dumps(answer) if as_json else for_a_person(answer))
+    say_out(json.dumps(answer) if as_json else for_a_person(answer))
     return 0 if works(answer["info"]) else EXIT_NOT_WELL
 
 

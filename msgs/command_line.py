@@ -69,6 +69,12 @@ def output() -> Iterator[None]:
         raise OutputError(f"standard output: cannot be written: {error.strerror}") from error
 
 
+def say_out(text: str, end: str = "\n") -> None:
+    """Print on standard output, at once. Raises as `output`."""
+    with output():
+        print(text, end=end, flush=True)
+
+
 def say_aside(text: str) -> None:
     """Print a message on standard error; it is lost if nobody reads it there, or its disk is full."""
     with suppress(OSError):

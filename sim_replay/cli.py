@@ -204,7 +204,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         # A write to a file that was opened before, as onto a full disk, does not tell its name.
         folder = (getattr(args, "out", None) or getattr(args, "flight", None)) if error.errno in _NO_ROOM else None
-        place = error.filename2 or error.filename or folder  # of a copy the second is the one that is written
+        place = error.filename2 or error.filename  # of a copy the second is the one that is written
+        place = place or (folder and f"{folder}, or standard output")
         print(f"{place}: {error.strerror}" if place else error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from edge.errors import InputError
+from msgs.command_line import say_out
 
 PIPELINE = "uavpose-replay"
 THREADS, RUNS = "1,2", 50
@@ -59,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
             print(f"\rround {done} of {runs + UNTIMED_ROUNDS}", end=end, file=sys.stderr, flush=True)
 
     measured = measure(options.models or [SHIPPED_MODEL], threads, options.spinning, runs, not options.alone, on_round)
-    print(json.dumps(to_tree(measured)) if options.json else table(measured))
+    say_out(json.dumps(to_tree(measured)) if options.json else table(measured))
     return 0
 
 

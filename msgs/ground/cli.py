@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 from typing import TypeAlias
 
-from msgs.command_line import exit_code, output, say_aside
+from msgs.command_line import exit_code, say_aside, say_out
 from msgs.ground.errors import InputError
 from msgs.session import CALLING, TlsFiles
 from msgs.signals import stop_on_signals
@@ -304,13 +304,12 @@ def _bench(options: argparse.Namespace) -> int:
     if options.calls < 1:
         raise InputError("--calls must be an integer of at least 1")
     timings = bench(options.calls)
-    print(to_json(timings) if options.json else table(timings))
+    say_out(to_json(timings) if options.json else table(timings))
     return 0
 
 
 def _topics(_: argparse.Namespace) -> int:
-    with output():
-        print(table_markdown(), end="")
+    say_out(table_markdown(), end="")
     return 0
 
 
@@ -334,14 +333,14 @@ def _keys_init(options: argparse.Namespace) -> int:
     from msgs.ground import keys
 
     for path in keys.init_authority(options.dir, options.days):
-        print(path)
+        say_out(str(path))
     return 0
 
 
 def _keys_list(options: argparse.Namespace) -> int:
     from msgs.ground.keys import listing
 
-    print("\n".join(listing(options.dir)))
+    say_out("\n".join(listing(options.dir)))
     return 0
 
 
@@ -349,7 +348,7 @@ def _keys_issue(options: argparse.Namespace) -> int:
     from msgs.ground import keys
 
     files = keys.issue(options.dir, options.name, options.host, options.days)
-    print(files.certificate, files.private_key, sep="\n")
+    say_out(f"{files.certificate}\n{files.private_key}")
     return 0
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
+from msgs.command_line import say_out
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.faults.actions import act
 from sim_replay.faults.expectations import Seen, Since, Unmet, expect
@@ -139,7 +140,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{on_volume[0]}: volume = true needs a host that lets a user mount (unshare --mount)")
     rig = Rig(RigSettings(args.out, args.scene, args.model, volume=bool(on_volume), signed=timelines[0].signed))
     with rig:
-        outcomes = [play_timeline(rig, timeline, print) for timeline in timelines]
+        outcomes = [play_timeline(rig, timeline, say_out) for timeline in timelines]
     wrong = [*(text for outcome in outcomes for text in outcome.wrong), *violations(rig.witness)]
     oldest_ms = {peer: max(ages_ms(rig.witness, peer), default=None) for peer in (AUTOPILOT, SUBSCRIBER)}
     report = {
@@ -151,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
     (args.out / REPORT).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     oldest = ", ".join(f"{peer} {'–' if ms is None else f'{ms:.0f}'}" for peer, ms in oldest_ms.items())
     for text in wrong:
-        print(f"FAILED: {text}")
-    print(f"{len(rig.witness.poses)} poses received, maximum age on receipt {oldest} ms; {len(wrong)} failures")
+        say_out(f"FAILED: {text}")
+    say_out(f"{len(rig.witness.poses)} poses received, maximum age on receipt {oldest} ms; {len(wrong)} failures")
     return EXIT_UNMET if wrong else 0
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from edge.config import SHIPPED_MODEL
 from edge.errors import InputError
 from edge.estimator.model import load_model
+from msgs.command_line import say_out
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.golden.compare import Difference, Record, counts, differences, reduced
 from sim_replay.ground_truth import read_sequence
@@ -110,19 +111,19 @@ def run(args: argparse.Namespace) -> int:
     differs = False
     for name in args.case or CASES:
         if not args.accept and read_golden(name)[0] != sha256:
-            print(f"{name}: accepted with a different model ({read_golden(name)[0][:8]}…, now {sha256[:8]}…)")
+            say_out(f"{name}: accepted with a different model ({read_golden(name)[0][:8]}…, now {sha256[:8]}…)")
         outputs = play_case(name, args.out / name, args.model)
         try:
             found = compare(name, outputs)
-            print(report(name, found), flush=True)
+            say_out(report(name, found))
         except InputError as error:
             if not args.accept:
                 raise
             found = []
-            print(f"{error}; writing a new one", flush=True)
+            say_out(f"{error}; writing a new one")
         differs |= bool(found)
         if args.accept:
             accept(name, outputs, args.model)
             kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(counts(reduced(outputs)).items()))
-            print(f"  accepted: {kinds}", flush=True)
+            say_out(f"  accepted: {kinds}")
     return EXIT_DIFFERS if differs and not args.accept else 0

@@ -236,6 +236,15 @@ def test_a_command_whose_words_nobody_reads_ends_without_a_traceback(tmp_path: P
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.parametrize("command", ["check", "doctor"])
+def test_output_that_a_full_disk_does_not_take_is_a_sentence(tmp_path: Path, text: str, command: str) -> None:
+    (tmp_path / "config.toml").write_text(text + OFF)
+    words = [sys.executable, "-u", "-m", "edge.cli", command, "--config", str(tmp_path / "config.toml")]
+    with open("/dev/full", "w") as full:
+        told = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (told.returncode, told.stderr) == (2, "standard output: cannot be written: No space left on device\n")
+
+
 def test_a_command_without_a_standard_output_does_its_work_all_the_same(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.toml").write_text(text + OFF)
     command = f"{shlex.quote(sys.executable)} -m edge.cli check --config config.toml >&-"  # as some supervisors do

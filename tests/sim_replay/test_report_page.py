@@ -109,7 +109,10 @@ def test_the_command_scores_what_each_peer_received(flight: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("full", "words"),
-    [("frames.jsonl", ": No space left on device"), ("overlay.png", "/overlay.png: cannot be written")],
+    [
+        ("frames.jsonl", ", or standard output: No space left on device"),
+        ("overlay.png", "/overlay.png: cannot be written"),
+    ],
 )
 def test_a_full_disk_is_told_with_the_place(
     flight: Path, full: str, words: str, capsys: pytest.CaptureFixture[str]

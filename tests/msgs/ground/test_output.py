@@ -22,11 +22,16 @@ GROUND = [sys.executable, "-m", "msgs.ground.cli"]
 FULL = "standard output: cannot be written: No space left on device\n"
 
 
-@pytest.mark.parametrize("words", [("topics",), ("watch",), ("watch", "--json")], ids=" ".join)
-def test_output_that_a_full_disk_does_not_take_is_a_sentence(words: tuple[str, ...], network: Network) -> None:
-    where = ["-e", network.endpoint, "--seconds", "0.1"] if words[0] == "watch" else []
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", [("topics",), ("watch",), ("watch", "--json"), ("keys", "init")], ids=" ".join)
+def test_output_that_a_full_disk_does_not_take_is_a_sentence(
+    words: tuple[str, ...], unbuffered: str, network: Network, tmp_path: Path
+) -> None:
+    where = {"watch": ["-e", network.endpoint, "--seconds", "0.1"], "keys": ["--dir", tmp_path / "keys"]}
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
-        told = subprocess.run([*GROUND, *words, *where], stdout=full, stderr=subprocess.PIPE, text=True)
+        command = [*GROUND, *words, *where.get(words[0], [])]
+        told = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
     assert (told.returncode, told.stderr) == (2, FULL)
 
 
