@@ -30,6 +30,7 @@ from typing import Any
 from edge.errors import InputError
 from edge.links.signing import Signing
 from edge.links.signing_key import load_key
+from msgs.command_line import exit_code
 from msgs.geometry import R_from_q_wxyz, euler_from_R
 from msgs.mavlink import MAVLink, dialect, pack
 from msgs.signals import stop_on_signals
@@ -384,4 +385,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main, InputError))

@@ -21,9 +21,11 @@ from typing import Any
 
 import zenoh
 
+from edge.errors import InputError
 from msgs import topics
 from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage, Vector3Stamped
 from msgs.client import connect, subscribe_all
+from msgs.command_line import exit_code
 from msgs.receive import TargetDirection, TargetPose
 from msgs.signals import stop_on_signals
 from msgs.wire import PayloadError
@@ -179,4 +181,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(exit_code(main, InputError))

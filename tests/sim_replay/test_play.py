@@ -7,17 +7,21 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from subprocess import PIPE
 
 import pytest
+import zenoh
 
 from edge.config import SHIPPED_MODEL
+from msgs.session import peer_config
 from sim_replay.bad_link import LinkFaults
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.ground_truth import read_sequence
 from sim_replay.play import PlayError, PlaySettings, Record, Recording, play
+from sim_replay.ports import free_endpoint
 from tests.edge.toy_model import write_toy_model
 from tests.sim_replay.toy_flight import write_toy_flight
-from tests.waiting import runs, until
+from tests.waiting import WITHIN_S, runs, until
 
 
 def peer_pid(name: str) -> int:
@@ -98,6 +102,26 @@ def test_what_a_command_has_started_ends_with_it_also_when_it_is_killed() -> Non
             process.kill()
             for pid in filter(runs, pids):
                 os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("name", ["autopilot", "subscriber"])
+def test_a_peer_whose_reader_was_killed_ends_without_a_traceback(name: str, tmp_path: Path) -> None:
+    endpoint, scene = free_endpoint(), write_toy_flight(tmp_path / "scene")
+    arguments = {
+        "autopilot": ["--telemetry", str(scene / "telemetry.csv"), "--endpoint", "127.0.0.1:9", "--start-at-ns", "0"],
+        "subscriber": ["--connect", endpoint],
+    }
+    command = [sys.executable, "-m", f"sim_replay.{name}", *arguments[name]]
+    with (
+        zenoh.open(peer_config([endpoint], [])),
+        subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True) as peer,
+    ):
+        assert peer.stdout is not None
+        assert peer.stderr is not None
+        assert '"ready"' in peer.stdout.readline()
+        peer.stdout.close()
+        peer.terminate()
+        assert (peer.stderr.read(), peer.wait(WITHIN_S)) == ("", 141)
 
 
 def test_what_a_slow_link_still_carries_when_the_daemon_has_ended_is_received(tmp_path: Path) -> None:
