@@ -16,6 +16,7 @@ from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.golden.compare import Difference, Record, counts, differences, reduced
 from sim_replay.ground_truth import read_sequence
 from sim_replay.lockstep.player import LockstepSettings, Outputs, play_lockstep
+from sim_replay.report.flight_files import remove_flight
 
 FOLDER = Path(__file__).parent.parent / "data" / "golden"
 SHOWN = 20  # differences of one sequence
@@ -44,9 +45,11 @@ def golden_file(name: str) -> Path:
 
 
 def play_case(name: str, out: Path, model: Path) -> Outputs:
-    """Play a case in lock-step; its outputs are also written to `out`. Raises InputError, PlayError."""
+    """Play a case in lock-step; its outputs are also written to `out`, from which those of an earlier play are removed
+    first. Raises InputError, PlayError."""
     case = CASES[name]
     settings = LockstepSettings(read_sequence(case.folder), model, stop=case.frames)
+    remove_flight(out)
     outputs = play_lockstep(settings, lambda _: None, lambda *_: None)
     outputs.write(out)
     return outputs

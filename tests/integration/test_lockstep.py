@@ -15,6 +15,7 @@ import pytest
 from sim_replay.cli import main
 from sim_replay.golden import run as golden
 from sim_replay.golden.run import CASES
+from sim_replay.lockstep.player import POSES_JSONL
 from sim_replay.ports import free_port
 from sim_replay.report.flight_files import FLIGHT_JSON
 
@@ -73,6 +74,21 @@ def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
     played = replay("golden", case, "--out", tmp_path)
     assert played.returncode == 0, f"{played.stdout}\n{played.stderr}\naccept it: uavpose-replay golden --accept"
     assert played.stdout.strip().endswith(f"{case}: no differences")
+
+
+def test_a_golden_run_that_fails_leaves_nothing_of_an_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "unknown_range"
+    folder.mkdir()
+    (folder / POSES_JSONL).write_text("of an earlier run\n")
+    daemon = tmp_path / "bin" / "uavpose-edge"
+    daemon.parent.mkdir()
+    daemon.symlink_to("/bin/false")
+    monkeypatch.setattr(sys, "executable", str(daemon.parent / "python"))
+    assert main(["golden", "unknown_range", "--out", str(tmp_path)]) == 1
+    assert "the daemon did not connect to the player" in capsys.readouterr().err
+    assert list(folder.iterdir()) == []
 
 
 def test_a_golden_file_that_cannot_be_read_is_written_anew_when_accepted(
