@@ -195,7 +195,8 @@ def declare_commands(session: zenoh.Session, uav: str, actions: Actions) -> zeno
         if "*" in key:
             # A single query must neither command several vehicles at once nor run every command.
             with query:
-                query.reply_err(b'{"ok": false, "error": "name one vehicle and one command"}')
+                refused = {"ok": False, "command": key.rpartition("/")[2], "error": "name one vehicle and one command"}
+                query.reply_err(json.dumps(refused), encoding=zenoh.Encoding.APPLICATION_JSON)
             return
 
         def reply(said: dict[str, Any]) -> None:

@@ -176,10 +176,12 @@ def test_the_ground_knows_the_rates_that_a_vehicle_takes() -> None:
 def test_a_command_names_one_vehicle_and_one_command(tmp_path: Path) -> None:
     with vehicle(tmp_path) as one:
         answered(one, "rate", {"max_hz": None})
-        for key in ("uavpose/@v1/*/cmd/stop", "uavpose/@v1/uav1/cmd/*"):
+        for key, command in (("uavpose/@v1/*/cmd/stop", "stop"), ("uavpose/@v1/uav1/cmd/*", "*")):
             (reply,) = one.session.get(key, timeout=5.0)
             assert reply.err is not None
-            assert b"name one vehicle and one command" in reply.err.payload.to_bytes()
+            assert reply.err.encoding == zenoh.Encoding.APPLICATION_JSON
+            told = {"ok": False, "command": command, "error": "name one vehicle and one command"}
+            assert json.loads(reply.err.payload.to_bytes()) == told
         assert one.requests.take() == []
 
 
