@@ -63,11 +63,14 @@ class Store:
                 log.warning("%s is left unfinished: %s", path, error)
 
     def new_file(self) -> McapFile:
-        files = self.files()
-        last = self._name.fullmatch(files[-1].name) if files else None
-        number = int(last[1]) + 1 if last is not None else 0
-        began = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-        return McapFile(self._folder / f"{self._stem}_{number:06d}_{began}.mcap")
+        """The next in number. Raises OSError."""
+        while True:
+            files = self.files()
+            last = self._name.fullmatch(files[-1].name) if files else None
+            number = int(last[1]) + 1 if last is not None else 0
+            began = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+            with suppress(FileExistsError):  # another recorder has just begun this one
+                return McapFile(self._folder / f"{self._stem}_{number:06d}_{began}.mcap")
 
     def make_room(self) -> None:
         """Enforce the limits, by removing the oldest files if allowed. Raises OSError if there is no room.

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 
+from msgs.mcap_file import McapFile
 from msgs.recording_store import RecordingLimits, Store
 
 FILE_BYTES = 25_000
@@ -62,6 +65,22 @@ def test_recordings_of_a_vehicle_whose_name_goes_on_like_ours_are_not_ours_to_re
     theirs.write_bytes(bytes(FILE_BYTES))
     Store(tmp_path, "uav1", RecordingLimits(total_bytes_max=1000, free_bytes_min=0), lambda *_: None).make_room()
     assert theirs.exists()
+
+
+def test_recorders_that_begin_at_the_same_time_write_a_file_each(tmp_path: Path) -> None:
+    """The number of a file is the next one for each of them."""
+    together = threading.Barrier(16)
+
+    def begin(_: int) -> McapFile:
+        store = Store(tmp_path, "ground", RecordingLimits(free_bytes_min=0), lambda *_: None)
+        together.wait()
+        return store.new_file()
+
+    with ThreadPoolExecutor(16) as recorders:
+        files = list(recorders.map(begin, range(16)))
+    for file in files:
+        file.close()
+    assert len({file.path for file in files}) == 16
 
 
 def test_a_disk_with_room_for_the_first_bytes_alone_is_told_once_and_leaves_no_empty_files(tmp_path: Path) -> None:
