@@ -41,11 +41,13 @@ NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = (
     "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
 )
+ADVICE_SIGNING = "give the autopilot the same key as [mavlink] signing_key, and the time (GPS), or leave the key out"
 ADVICE_RECORDER = (
     "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, and a restart "
     "if the disk was read-only when it started, docs/install.md"
 )
 ADVICE_CONFIG = "restart it (`sudo systemctl restart uavpose-edge`); SIGHUP is enough for [model]"
+UNPROVEN = ("refused_unsigned", "refused_signature", "refused_replay")  # counters: heard, but not believed
 STARTING = ("the daemon is still starting", "run doctor again in a few seconds")
 ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
 HEARING_S = 4.0
@@ -69,7 +71,10 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
             silent = f"no heartbeat of an autopilot received in {running['uptime_s']:.0f} s"
             others.setdefault(NO_AUTOPILOT, silent)  # without frames the daemon does not miss its attitude
         if NO_AUTOPILOT in others:
-            yield wrong("daemon", f"{said}: {'; '.join(others.values())}", ADVICE_AUTOPILOT)
+            unproven = any(counters.get(f"mavlink_{name}") for name in UNPROVEN)
+            deaf = unproven and not counters.get("mavlink_received_HEARTBEAT")
+            advice = ADVICE_SIGNING if deaf else ADVICE_AUTOPILOT
+            yield wrong("daemon", f"{said}: {'; '.join(others.values())}", advice)
         elif others:
             advice = "`uavpose-edge status` shows its counters, `journalctl -u uavpose-edge` its log"
             yield poor("daemon", f"{said}: {'; '.join(others.values())}", advice)
@@ -194,7 +199,8 @@ def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
         return
     refused = ", ".join(f"{name} {count}" for name, count in counters.items() if name.startswith("refused_") and count)
     counted = f" ({refused})" if refused else ""
-    yield wrong("mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{counted}", ADVICE_AUTOPILOT)
+    advice = ADVICE_SIGNING if any(counters.get(name) for name in UNPROVEN) else ADVICE_AUTOPILOT
+    yield wrong("mavlink", f"{where}: no heartbeat within {HEARING_S:.0f} s{counted}", advice)
 
 
 def _port_fault(endpoint: SerialEndpoint) -> tuple[str, str] | None:

@@ -15,6 +15,14 @@ from edge.links.mavlink_rivals import Rivals
 from edge.links.mavlink_vehicle import Contact, Vehicle
 from edge.links.signing import Signing
 
+# Why an autopilot that is heard is not believed, by the reason of refusal.
+UNBELIEVED = {
+    "unsigned": "an autopilot is heard that does not sign; nothing of it is used: give it the key of signing_key",
+    "signature": "an autopilot is heard that signs with another key than signing_key; nothing of it is used",
+    "replay": "an autopilot is heard that signs with a time of the past; nothing of it is used until it knows the time",
+}
+HEARD_OFTEN = 3  # its refused heartbeats until that is reported
+
 
 class Recognition:
     """Links are numbered in order of preference."""
@@ -29,6 +37,8 @@ class Recognition:
         self._rivals = Rivals()
         self._left = Rivals()  # autopilots received while our own is silent
         self._changes: list[str] = []
+        self._unbelieved: Counter[str] = Counter()  # an autopilot's heartbeats while none is received, by reason
+        self._untold = dict(UNBELIEVED)
 
     def authentic(self, messages: Iterable[Any]) -> list[Any]:
         """The messages with a valid signature; all of them without signing."""
@@ -41,6 +51,8 @@ class Recognition:
                 believed.append(message)
             else:
                 self._refused[reason] += 1
+                autopilot = is_autopilot_heartbeat(message) and self._named in (None, message.get_srcSystem())
+                self._unbelieved[reason] += autopilot and self._vehicle.contact is not Contact.HEARD
         return believed
 
     def introduces(self, message: Any, now_ns: int) -> bool:
@@ -103,7 +115,12 @@ class Recognition:
         return True
 
     def news(self) -> list[str]:
-        """Sentences, each once: other candidates for our own autopilot, and changes of it, if it is not configured."""
+        """Sentences, each once: why an autopilot is not believed while none is received; if our own is not configured,
+        other candidates for it, and changes of it."""
+        often = [reason for reason in self._untold if self._unbelieved[reason] >= HEARD_OFTEN]
+        return [*map(self._untold.pop, often), *self._candidates()]
+
+    def _candidates(self) -> list[str]:
         if self._named is not None or self._vehicle.contact is Contact.WAITING:
             return []
         if self._vehicle.contact is Contact.LOST:

@@ -80,3 +80,4 @@ def test_refusals_are_told_where_no_heartbeat_is_accepted(tmp_path: Path, monkey
         (found,) = doctor_links._mavlink(MavlinkSettings(endpoints=endpoints, **keys))
     assert found.verdict == "wrong"
     assert found.says == f"{endpoints[0]}: no heartbeat within {DEADLINE_S:.0f} s (refused_unsigned 1)"
+    assert "signing_key" in found.advice

@@ -83,6 +83,20 @@ def test_nothing_unsigned_or_signed_with_another_key_is_believed_or_answered() -
         assert own_ship.at(time.monotonic_ns()) is None
 
 
+@pytest.mark.parametrize(
+    ("key", "said"), [(None, "that does not sign"), (bytes(32), "that signs with another key")], ids=["none", "another"]
+)
+def test_why_an_autopilot_that_is_heard_is_not_believed_is_told(
+    caplog: pytest.LogCaptureFixture, key: bytes | None, said: str
+) -> None:
+    with linked(signing=signing()) as (link, _), Peer(link.ports[0], key=key) as peer:
+        for _ in range(4):
+            peer.heartbeat()
+        peer.settle(lambda: said in caplog.text, "the reason")
+        assert link.counters().get("received_HEARTBEAT", 0) == 0
+    assert caplog.text.count("an autopilot is heard") == 1
+
+
 def test_a_recorded_message_played_again_is_refused() -> None:
     with linked(signing=signing()) as (link, _), Peer(link.ports[0], key=KEY) as peer:
         meet(link, peer)
