@@ -39,7 +39,8 @@ from msgs.session import client_config, peer_config
 CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # prefixes of the kinds of edge.health.Reason about it
 NO_AUTOPILOT = "no_attitude"
 ADVICE_AUTOPILOT = (
-    "check that the autopilot is on, its port set to MAVLink 2 at this speed, and its stream sent to this address"
+    "check that the autopilot is on, its port set to MAVLink 2 at this speed, its stream sent to this address, "
+    "and its id that of [mavlink] system_id, if given"
 )
 ADVICE_SIGNING = "give the autopilot the same key as [mavlink] signing_key, and the time (GPS), or leave the key out"
 ADVICE_RECORDER = (

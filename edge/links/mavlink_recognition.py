@@ -115,13 +115,16 @@ class Recognition:
         return True
 
     def news(self) -> list[str]:
-        """Sentences, each once: why an autopilot is not believed while none is received; if our own is not configured,
-        other candidates for it, and changes of it."""
+        """Sentences, each once: why an autopilot is not believed while none is received; other candidates for our own,
+        and, if it is not configured, changes of it."""
         often = [reason for reason in self._untold if self._unbelieved[reason] >= HEARD_OFTEN]
         return [*map(self._untold.pop, often), *self._candidates()]
 
     def _candidates(self) -> list[str]:
-        if self._named is not None or self._vehicle.contact is Contact.WAITING:
+        if self._vehicle.contact is Contact.WAITING:
+            others = [] if self._named is None else self._rivals.news()
+            return [f"autopilot {system} is heard, but not {self._named}, which system_id names" for system in others]
+        if self._named is not None:
             return []
         if self._vehicle.contact is Contact.LOST:
             lost = self._vehicle.system_id
@@ -140,8 +143,9 @@ class Recognition:
         return self._named in (None, message.get_srcSystem()) and not self.is_stranger(message)
 
     def _notice(self, system_id: int, now_ns: int) -> None:
-        if self._named is None and self._vehicle.system_id not in (None, system_id):
-            self._vehicle.noticed(system_id, now_ns)
+        if self._vehicle.system_id not in (None, system_id):
+            if self._named is None:
+                self._vehicle.noticed(system_id, now_ns)
             self._heard_other(system_id, now_ns)
 
     def _heard_other(self, system_id: int, now_ns: int) -> None:

@@ -118,9 +118,9 @@ def test_ours_is_taken_again_when_it_is_heard_again_and_the_other_never_more() -
 class Port:
     """One udpin endpoint and its station, with what is sent to it from several addresses."""
 
-    def __init__(self) -> None:
+    def __init__(self, system_id: int | None = None) -> None:
         self.own_ship = OwnShipBuffer()
-        self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
+        self.station = Station(MavlinkSettings(system_id=system_id), self.own_ship, CAMERA, RequestQueue())
         self._transport = UdpTransport(NetworkEndpoint("udpin", "127.0.0.1", 0, "udpin:127.0.0.1:0"))
         self._endpoint = Endpoint(self._transport, [], Counter(), self.station.recognition, Packer(0, None))
         self._reader = FrameReader(datagram=True)
@@ -176,6 +176,25 @@ def test_at_a_port_that_nobody_is_heeded_at_it_is_told_who_is_held_for_anothers(
             told += port.station.recognition.news()
         assert port.heeded[50.0] is None
         assert told[-1] == "autopilot 2 is silent; 1, heard, is held for another's: set system_id if it is not"
+
+
+@pytest.mark.parametrize("accepted", [False, True], ids=["at a port", "on a line"])
+@pytest.mark.parametrize("ours_from_s", [5.0, 60.0], ids=["ours too", "ours never"])
+def test_it_is_told_who_is_heard_in_place_of_a_configured_id(ours_from_s: float, accepted: bool) -> None:
+    with contextlib.closing(Port(system_id=OURS)) as port:
+        told = []
+        for now_ns in range(BEGAN_NS, BEGAN_NS + 20 * S, 20 * MS):
+            port.tick(now_ns)
+            if now_ns - BEGAN_NS >= ours_from_s * S:
+                port.hear(said(OURS, LEVEL_DEG, now_ns), BEFORE, now_ns)
+            for frame in said(OTHER, UPSIDE_DOWN_DEG, now_ns):
+                if accepted:
+                    port.station.take(FrameReader(datagram=True).feed(frame), 1, now_ns)
+                else:
+                    port.hear([frame], OTHERS, now_ns)
+            told += port.station.recognition.news()
+        assert told == ([] if ours_from_s < 8.0 else ["autopilot 2 is heard, but not 1, which system_id names"])
+        assert port.tilt_deg(now_ns) == (LEVEL_DEG if ours_from_s < 8.0 else None)
 
 
 def test_who_speaks_for_another_aircraft_alone_does_not_keep_the_port() -> None:
