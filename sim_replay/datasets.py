@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -108,7 +109,7 @@ class Dataset:
         Raises BopError, naming file and key; also at the end if that file lists no existing image.
         """
         wanted = self._wanted
-        passed_over, met = 0, set[tuple[int, int]]()
+        passed_over, absent, met = 0, 0, set[tuple[int, int]]()
         for scene in self.scenes:
             frames = scene.pictured
             if len(frames) < len(scene.frames):
@@ -117,17 +118,22 @@ class Dataset:
                 told = "%s: %d pictures are left out: no file gives their camera matrix"
                 _log.warning(told, scene.folder, scene.pictures_without_camera)
             for frame in frames:
-                indices: Sequence[int] = range(len(frame.targets))
+                listed = None
                 if wanted is not None and _is_test(scene):
                     key = scene.scene_id, frame.image_id
                     if key not in wanted:
                         passed_over += 1
                         continue
                     met.add(key)
-                    indices = chosen_of(frame.targets, wanted[key])
-                yield self._frame(scene, frame, indices)
+                    listed = wanted[key]
+                    if frame.truth_known:
+                        absent += (listed - Counter(target.object_id for target in frame.targets)).total()
+                yield self._frame(scene, frame, listed)
         if passed_over and not met:
             raise BopError(f"{self.root / TARGETS_FILE}: lists none of the {passed_over} pictures of the test scenes")
+        if absent:
+            told = "%s: %d of the targets that it lists are not in the ground truth, and count nowhere"
+            _log.warning(told, self.root / TARGETS_FILE, absent)
         if met and wanted is not None:
             self._warn_of_missing(wanted.keys() - met)
 
@@ -143,7 +149,7 @@ class Dataset:
         """Every frame that has an image, whatever test_targets_bop19.json lists. Raises BopError."""
         for scene in self.scenes:
             for frame in scene.pictured:
-                yield self._frame(scene, frame, range(len(frame.targets)))
+                yield self._frame(scene, frame)
 
     def labelled_frames(self) -> list[DatasetFrame]:
         """The frames() with known ground truth: some datasets do not publish that of their test splits.
@@ -189,28 +195,29 @@ class Dataset:
     def _wanted(self) -> Wanted | None:
         return read_targets(self.root / TARGETS_FILE)
 
-    def _frame(self, scene: BopScene, frame: BopFrame, indices: Sequence[int]) -> DatasetFrame:
+    def _frame(self, scene: BopScene, frame: BopFrame, listed: Counter[int] | None = None) -> DatasetFrame:
+        """`listed`: how many instances of each object are to be found; None: all."""
         path = scene.image_path(frame)
         size_wh = header_size_wh(path)
-        unlisted = [index for index in range(len(frame.targets)) if index not in indices]
-        targets = [_with_box(scene, frame, index, size_wh) for index in (*indices, *unlisted)]
-        placed = tuple(
-            _with_projected_box(t, self.models.get(t.object_id), frame, picture_size_wh(path)) if _unseen(t) else t
+        targets = [_with_box(scene, frame, index, size_wh) for index in range(len(frame.targets))]
+        placed = [
+            _as_projected(t, self.models.get(t.object_id), frame, picture_size_wh(path)) if _unseen(t) else t
             for t in targets
-        )
+        ]
         if size_wh is not None:
             _refuse_boxes_outside(scene, frame, placed, size_wh)
+        indices = range(len(placed)) if listed is None else chosen_of(placed, listed)
         return DatasetFrame(
             scene.scene_id,
             frame.image_id,
             frame.K,
             frame.distortion,
             path,
-            placed[: len(indices)],
+            tuple(placed[index] for index in indices),
             scene,
             tuple(indices),
             frame.truth_known,
-            placed[len(indices) :],
+            tuple(target for index, target in enumerate(placed) if index not in indices),
         )
 
 
@@ -309,14 +316,25 @@ def _refuse_boxes_outside(
             )
 
 
-def _with_projected_box(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
-    """The target with boxes from its model's vertices, or its box's corners; unchanged if neither is known.
+def _as_projected(target: BopTarget, model: Model | None, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
+    """The target with boxes from its model's vertices, or its box's corners.
+
+    Of a model that only its diameter tells of, it is known whether the target is beside the image, but not its box.
+    """
+    if model is None:
+        return target
+    if model.points_m is not None:
+        return _with_projected_box(target, model.points_m, frame, size_wh)
+    around_m = model.diameter_m * np.array(list(product((-1.0, 1.0), repeat=3)))  # wherever in it the origin is
+    beside = _with_projected_box(target, around_m, frame, size_wh).visible_px == 0
+    return replace(target, visible_px=0) if beside else target
+
+
+def _with_projected_box(target: BopTarget, points: Array, frame: BopFrame, size_wh: tuple[int, int]) -> BopTarget:
+    """The target with boxes from points [N, 3] that bound it in body axes, metres.
 
     A target behind the camera is hidden; one that extends behind it is left unchanged.
     """
-    points = None if model is None else model.points_m
-    if points is None:
-        return target
     points_cam = points @ target.R_cam_target.T + target.t_cam_target_m
     if points_cam[:, 2].max() <= 0:
         return replace(target, visible_px=0)

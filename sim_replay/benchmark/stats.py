@@ -18,7 +18,7 @@ from rich.table import Table
 
 from edge.errors import InputError
 from msgs.settings import read_toml
-from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, find_scenes, object_names
+from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
 from sim_replay.bop.fields import integer, load_object
 from sim_replay.evaluation.judge import is_seen
 from sim_replay.label_fit import Labelled, lies_beside_its_box
@@ -99,7 +99,7 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
 def _take_frame(
     counts: _Counts, split: str, frame: BopFrame, area_px: int, names: Mapping[int, str], *, in_ned: bool
 ) -> None:
-    seen = [target for target in frame.targets if is_seen(target) or _is_uncounted(target)]  # BOP lists hidden ones too
+    seen = [target for target in frame.targets if is_seen(target)]  # BOP lists hidden ones too
     counts.targets_in_frame[len(seen)] += 1
     for k, target in enumerate(seen):
         counts.range_m.append(float(np.linalg.norm(target.t_cam_target_m)))
@@ -112,11 +112,6 @@ def _take_frame(
             # A target further down than the camera is seen against the ground.
             counts.below_camera.append(bool(frame.R_cam_world[:, 2] @ target.t_cam_target_m > 0.0))
         counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
-
-
-def _is_uncounted(target: BopTarget) -> bool:
-    """Whether it has a box, but its pixels were not counted: with labels only, all counts are 0."""
-    return target.box_visible_xyxy_px is not None and target.whole_px == 0
 
 
 def _picture_size(scene: BopScene) -> tuple[int, int]:

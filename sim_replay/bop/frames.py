@@ -77,6 +77,11 @@ def _targets(source: Source, key: str, poses: Any, info: Any) -> list[BopTarget]
                 f"{source.gt}: 'cam_t_m2c' of {key!r} puts obj_id {target.object_id} behind the camera, "
                 f"but {source.gt_info.name} has a 'bbox_visib' of it"
             )
+        if target.t_cam_target_m[2] > 0 and target.box_visible_xyxy_px is not None and target.visible_px == 0:
+            raise BopError(
+                f"{source.gt_info}: {key!r} has a 'bbox_visib' of obj_id {target.object_id}, but 'px_count_visib' says "
+                "that nothing of it is visible; leave out the count if nobody counted"
+            )
     return targets
 
 
@@ -89,6 +94,8 @@ def _seen(path: Path, key: str, entry: Any) -> dict[str, Any]:
         if name in entry:
             seen[field] = integer(path, key, entry, name)
     seen["box_visible_xyxy_px"] = _box(path, key, entry, "bbox_visib", seen.get("visible_px", 0))
+    if seen["box_visible_xyxy_px"] is not None and seen.get("visible_px") == seen.get("whole_px") == 0:
+        del seen["visible_px"], seen["whole_px"]  # a tool that draws no masks counts nothing
     if "bbox_obj" in entry:
         seen["box_whole_xyxy_px"] = _box(path, key, entry, "bbox_obj", seen.get("whole_px", 0))
     if seen["box_visible_xyxy_px"] is None:

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from sim_replay.bop.fields import integer, load_json
 from sim_replay.bop.records import BopError, BopTarget
 
@@ -30,11 +32,21 @@ def read_targets(path: Path) -> Wanted | None:
 
 
 def chosen_of(targets: Sequence[BopTarget], wanted: Counter[int]) -> list[int]:
-    """Indices of the wanted instances of each object; if there are too many, the most visible ones."""
-    by_visible = sorted(range(len(targets)), key=lambda index: -(targets[index].visible_px or 0))
+    """Indices of the wanted instances of each object; if there are too many, the most visible ones.
+
+    Where no pixels are counted, a target is as visible as its box is large.
+    """
+    by_visible = sorted(range(len(targets)), key=lambda index: -_visible_px(targets[index]))
     left, chosen = wanted.copy(), []
     for index in by_visible:
         if left[targets[index].object_id] > 0:
             left[targets[index].object_id] -= 1
             chosen.append(index)
     return sorted(chosen)
+
+
+def _visible_px(target: BopTarget) -> float:
+    box = target.box_visible_xyxy_px
+    if target.visible_px is not None or box is None:
+        return target.visible_px or 0.0
+    return float(np.prod(box[2:] - box[:2]))

@@ -322,7 +322,7 @@ def test_a_target_of_which_nothing_tells_where_it_is_seen_is_not_taken_for_backg
     models = tmp_path / "models" / "models_info.json"
     models.parent.mkdir()
     models.write_text(json.dumps({"7": {"diameter": 1e4}}))
-    with pytest.raises(ConfigError, match=r"000004: .* picture 0 .* obj_id 7: give scene_gt_info\.json, masks, or"):
+    with pytest.raises(ConfigError, match=r"000004: .* picture 1 .* obj_id 7: give scene_gt_info\.json, masks, or"):
         DatasetSampler(tmp_path, "train", 1, 64, 0.0)
     models.write_text(json.dumps({"7": {"diameter": 1e4} | box}))
     batch = DatasetSampler(tmp_path, "train", 1, 64, 0.0).batch(0, 16)
