@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import InputError
+
+_TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+_TIFF_ORIENTATION = 274
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any]:
@@ -23,6 +27,7 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     if _is_torn_jpeg(coded):
         raise InputError(f"{path} is cut short: what is missing would be read as gray")
+    coded = _with_tiff_unturned(coded)
     pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION) if coded else None
     if pixels is None:
         raise InputError(f"{path} is not a readable picture")
@@ -38,3 +43,20 @@ def _is_torn_jpeg(coded: bytes) -> bool:
     while at + 4 <= len(coded) and coded[at] == 0xFF and coded[at + 1] != 0xDA:  # to the scan; a thumbnail has its own
         at += 1 if coded[at + 1] == 0xFF else 2 + int.from_bytes(coded[at + 2 : at + 4], "big")
     return coded.find(b"\xff\xd9", at) < 0
+
+
+def _with_tiff_unturned(coded: bytes) -> bytes:
+    """A TIFF whose orientation tag says that its pixels are not turned: OpenCV obeys it whatever the flags. Others as
+    they are."""
+    order = _TIFF_ORDERS.get(coded[:4])
+    if order is None:
+        return coded
+    try:
+        (at,) = struct.unpack_from(f"{order}I", coded, 4)
+        (entries,) = struct.unpack_from(f"{order}H", coded, at)
+        for entry in range(at + 2, at + 2 + 12 * entries, 12):
+            if struct.unpack_from(f"{order}H", coded, entry)[0] == _TIFF_ORIENTATION:
+                return coded[: entry + 8] + struct.pack(f"{order}H", 1) + coded[entry + 10 :]
+    except struct.error:
+        pass  # cut short: OpenCV refuses it
+    return coded

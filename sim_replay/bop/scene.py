@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import PIL.Image
+import PIL.TiffImagePlugin
 from numpy.typing import NDArray
 
 from edge.cameras.picture_file import read_pixels
@@ -27,6 +28,7 @@ PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later one is used if a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  # how JPEG and PNG end, by how they begin
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TAIL_BYTES = 512  # of a file, where its end is, unless something follows it
 SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _log = logging.getLogger(__name__)
@@ -250,6 +252,8 @@ def header_size_wh(path: Path) -> tuple[int, int] | None:
     """The same if the header tells it; None: the whole image must be read, by OpenCV."""
     try:
         with PIL.Image.open(path) as picture:
+            if isinstance(picture, PIL.TiffImagePlugin.TiffImageFile):  # its size is that of the picture once turned
+                return picture.tag_v2[_TIFF_WIDTH], picture.tag_v2[_TIFF_HEIGHT]
             return picture.size
-    except (OSError, ValueError, PIL.Image.DecompressionBombError):
+    except (OSError, ValueError, KeyError, PIL.Image.DecompressionBombError):
         return None

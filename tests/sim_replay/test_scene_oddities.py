@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from sim_replay.bop import DISTORTION_KEY, BopError, find_scenes, read_scene
-from sim_replay.bop.scene import picture_size_wh
+from sim_replay.bop.scene import picture_size_wh, read_picture_bgr
 from sim_replay.cli import main
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import truths_of
@@ -158,6 +159,22 @@ def test_a_picture_lies_as_its_pixels_do_whatever_its_exif_says(scene: Path) -> 
     path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
     assert cv2.imread(str(path)).shape == (160, 120, 3)
     assert read_scene(scene).image_bgr(read_scene(scene).frames[0]).shape == (120, 160, 3)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_tiff_lies_as_its_pixels_do_whatever_its_orientation_tag_says(
+    tmp_path: Path, orientation: int, order: str
+) -> None:
+    pixels = np.arange(12 * 20, dtype=np.uint8).reshape(12, 20)
+    tags = {256: 20, 257: 12, 258: 8, 259: 1, 262: 1, 273: 200, 274: orientation, 277: 1, 278: 12, 279: pixels.size}
+    head = struct.pack(f"{order}HIH", 42, 8, len(tags))
+    for tag, value in tags.items():
+        head += struct.pack(f"{order}HHI", tag, 3, 1) + struct.pack(f"{order}HH", value, 0)
+    path = tmp_path / "000000.tif"
+    path.write_bytes(((b"II" if order == "<" else b"MM") + head).ljust(200, b"\0") + pixels.tobytes())
+    np.testing.assert_array_equal(read_picture_bgr(path)[..., 0], pixels)
+    assert picture_size_wh(path) == (20, 12)
 
 
 def test_each_picture_of_a_scene_cuts_its_targets_at_its_own_edge(scene: Path) -> None:
