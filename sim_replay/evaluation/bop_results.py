@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,6 +100,7 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
     known = {(scene.scene_id, frame.image_id) for scene in dataset.scenes for frame in scene.frames}
     if by_picture and not known & by_picture.keys():
         raise InputError(f"{path}: none of its scene_id and im_id is a picture of {dataset.name}")
+    _warn_of_other_pictures(path, by_picture, dataset, known)
     _warn_of_other_units(path, by_picture, dataset)
 
     def answer(index: int, picture: DatasetFrame) -> Answer:
@@ -115,6 +116,21 @@ def file_answers(path: Path, dataset: Dataset) -> Answerer:
         )
 
     return answer
+
+
+def _warn_of_other_pictures(
+    path: Path,
+    by_picture: Mapping[tuple[int, int], Sequence[ResultRow]],
+    dataset: Dataset,
+    known: Set[tuple[int, int]],
+) -> None:
+    """Of the opened scenes alone: a file may tell of more than are evaluated."""
+    numbers = {scene.scene_id for scene in dataset.scenes}
+    unknown = [key for key in sorted(by_picture) if key not in known and key[0] in numbers]
+    if unknown:
+        told = "%s: %d poses are of pictures that their scenes do not have, and count nowhere, such as %d of scene %d"
+        scene_id, image_id = unknown[0]
+        _log.warning(told, path, sum(len(by_picture[key]) for key in unknown), image_id, scene_id)
 
 
 def _warn_of_other_units(

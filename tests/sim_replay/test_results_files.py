@@ -97,6 +97,21 @@ def test_a_second_pose_of_one_aircraft_does_not_take_the_place_of_another(root: 
     assert len(frames[0].false_poses) == 1
 
 
+def test_poses_of_pictures_that_their_scene_does_not_have_are_told(
+    root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = results(root.parent, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)])
+    of_another_scene = path.read_text().splitlines()[-1].replace("0,0,1,", "7,0,1,", 1)
+    path.write_text(f"{path.read_text()}{of_another_scene}\n")
+    file_answers(path, open_dataset(root))
+    assert caplog.text == "", "a file may tell of more scenes than are evaluated"
+    path.write_text(path.read_text().replace("0,0,1,0.8", "0,2,1,0.8"))
+    file_answers(path, open_dataset(root))
+    assert (
+        "1 poses are of pictures that their scenes do not have, and count nowhere, such as 2 of scene 0" in caplog.text
+    )
+
+
 def test_poses_in_metres_are_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = results(root.parent, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, True)])
     file_answers(path, open_dataset(root))
