@@ -128,7 +128,7 @@ def refine(
         ChoiceHead(*shape).to(device).eval() if "choice" in trained else None,
     )
     model.to(device)
-    _refuse_datasets(plan, config.data)
+    images_of = _refined_on(plan, config.data)
     size_px = config.schedule.sizes[-1].size_px
     from_datasets = plan.datasets, plan.dataset_share, plan.split
     data = config.data.model_copy(update={"empty_share": EMPTY_SHARE if "presence" in trained else 0.0})
@@ -148,6 +148,7 @@ def refine(
         "seed": plan.seed,
         "strangers": plan.strangers,
         "dataset_share": plan.dataset_share if plan.datasets else 0.0,
+        "datasets": "; ".join(images_of),
         "flown_share": data.flown_share if data.flown else 0.0,
         "commit": commit,
     }
@@ -158,20 +159,27 @@ def refine(
     return out / WEIGHTS_NAME
 
 
-def _refuse_datasets(plan: RefinePlan, data: DataConfig) -> None:
-    """Raises ConfigError if a dataset has images on which the network was trained, or a test split that nobody named,
-    or is unreadable."""
+def _refined_on(plan: RefinePlan, data: DataConfig) -> list[str]:
+    """Whose images the heads learn from: "dataset, split name".
+
+    Raises ConfigError if a dataset has images on which the network was trained, or a test split that nobody named, or
+    is unreadable.
+    """
     trained_on = {folder for source in data.datasets for folder in _trained_scenes(source)}
+    told = []
     for path in plan.datasets:
         try:
-            scenes = open_dataset(path, plan.split).scenes
+            dataset = open_dataset(path, plan.split)
         except BopError as error:
             raise ConfigError(f"--dataset {error}") from error
+        scenes = dataset.scenes
         if trained_on & {scene.folder.resolve() for scene in scenes}:
             raise ConfigError(f"--dataset {path}: the network was trained on it; give another, or another --split")
         tests = [s.split for s in scenes if (s.split or "").startswith("test") and not names_split(path, s)]
         if plan.split is None and tests:
             raise ConfigError(f"--dataset {path}: contains the split {tests[0]!r}, for evaluation; choose by --split")
+        told += [f"{dataset.name}, split {split}" for split in sorted({s.split for s in scenes if s.split is not None})]
+    return told if plan.dataset_share > 0.0 else []
 
 
 def _trained_scenes(source: DatasetSource) -> set[Path]:

@@ -120,10 +120,13 @@ def calibrate_file(
 def warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
     """By name, as a model file knows no folders: a network is too sure of images that it was trained on."""
     splits = sorted({scene.split for scene in dataset.scenes if scene.split is not None})
+    heads = (str(contract.training.get(f"{head}_datasets", "")) for head in ("refined", "presence", "choice"))
+    refined_on = {source for told in heads for source in told.split("; ")}
     for split in splits:
         # Training on `train` takes in `train_pbr`, and may have been given the split's folder for the dataset's.
         asked = (split, split.partition("_")[0])
         names = tuple(f"{folder}, split {name}: " for folder in (dataset.name, split) for name in asked)
-        if any(source.startswith(names) for source in contract.data.split("; ")):
+        taught_heads = f"{dataset.name}, split {split}" in refined_on
+        if taught_heads or any(source.startswith(names) for source in contract.data.split("; ")):
             told = "%s: the model was trained on split %s of a dataset of this name; if it is this one, calibrated "
             _log.warning(told + "scores promise too much: give another --split, such as val", dataset.root, split)

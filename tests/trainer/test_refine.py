@@ -139,6 +139,8 @@ def test_images_that_the_network_was_trained_on_are_refused(tmp_path: Path) -> N
             refine_on(run, tmp_path / folder)
     refine_on(run, own / "val")
     refine_on(run, own, "val")
+    told = load_model(run.with_name("out"))[2]
+    assert {told[f"{head}_datasets"] for head in ("refined", "presence", "choice")} == {"own, split val"}
 
 
 def test_images_that_the_network_was_trained_on_are_refused_where_they_are_linked_or_lie_deeper(

@@ -192,6 +192,14 @@ def test_images_that_the_model_was_trained_on_are_warned_of(
     of_its_folder = read_contract(model).model_copy(update={"data": "train_pbr, split train: 40%"})
     warn_of_training_images(open_dataset(tmp_path / "dataset"), of_its_folder)
     assert "the model was trained on split train_pbr" in caplog.text
+    caplog.clear()
+    refined = read_contract(dark_spot_model).model_copy(
+        update={"training": {"presence_datasets": "dataset, split val"}}
+    )
+    warn_of_training_images(open_dataset(tmp_path / "dataset", "train_pbr"), refined)
+    assert caplog.text == ""
+    warn_of_training_images(open_dataset(tmp_path / "dataset", "val"), refined)
+    assert "the model was trained on split val" in caplog.text, "its heads were"
 
 
 def test_behind_a_lens_a_peak_on_the_target_counts_as_one(tmp_path: Path, dark_spot_model: Path) -> None:
