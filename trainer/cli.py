@@ -13,7 +13,7 @@ from msgs.command_line import EXIT_BAD_INPUT, EXIT_INTERRUPTED, exit_code
 from msgs.settings import read_text
 from trainer import evaluate_command, results, score_command
 from trainer.arguments import count, positive, share, whole
-from trainer.config import REFINED_HEADS, ConfigError, RenderingError, load_config, parse_config
+from trainer.config import REFINED_BY_DEFAULT, REFINED_HEADS, ConfigError, RenderingError, load_config, parse_config
 
 EDGE_CONFIG = Path(__file__).parent / "configs" / "edge.toml"
 
@@ -141,7 +141,7 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
     refine = commands.add_parser(
         "refine",
         help="train the uncertainty, range correction, score and choice of rotation of a trained network",
-        description="Run a trained network on windows and train only three heads on the outputs: the refinement head "
+        description="Run a trained network on windows and train only some heads on the outputs: the refinement head "
         "predicts a correction of the range, and sigma; the presence head whether a peak is a target, hence the score; "
         "the choice head which of the rotation hypotheses is likeliest. All other weights are unchanged. Writes "
         "weights.pt to --out.",
@@ -194,9 +194,9 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         "--heads",
         nargs="+",
         choices=REFINED_HEADS,
-        default=list(REFINED_HEADS),
+        default=list(REFINED_BY_DEFAULT),
         metavar="HEAD",
-        help="which to train: %(choices)s (default: all); the others stay as they are",
+        help="which to train, of %(choices)s (default: refinement presence); the others stay as they are",
     )
     refine.set_defaults(run=_refine)
 

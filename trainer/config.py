@@ -14,7 +14,8 @@ from sim_replay.sample import AcquireView
 
 Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a network input, pixels
 Z_RANGE_M = (50.0, 600.0)  # depths that a network can predict
-REFINED_HEADS = ("refinement", "presence", "choice")  # that `refine` trains, each alone
+REFINED_HEADS = ("refinement", "presence", "choice")  # that `refine` can train, each alone
+REFINED_BY_DEFAULT = REFINED_HEADS[:2]  # the third is not better everywhere (docs/ablation.md)
 BackboneName = Literal["efficientnet_lite0", "repvit_m0_9", "repvit_m0_9_relu", "repvit_small"]
 
 

@@ -28,7 +28,7 @@ from trainer.checkpoint import (
 )
 from trainer.choice import ChoiceHead, choice_nll
 from trainer.config import (
-    REFINED_HEADS,
+    REFINED_BY_DEFAULT,
     ConfigError,
     DataConfig,
     DatasetSource,
@@ -71,7 +71,7 @@ class RefinePlan(NamedTuple):
     dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
     flown: tuple[Path, ...] = ()  # datasets whose poses and cameras are rendered anew; none: the checkpoint's, if any
     flown_share: float = 0.5  # of the rendered windows with a target, if any are flown
-    heads: tuple[str, ...] = REFINED_HEADS  # the others stay as they are
+    heads: tuple[str, ...] = REFINED_BY_DEFAULT  # of REFINED_HEADS; the others stay as they are
 
 
 class Kept(NamedTuple):

@@ -19,7 +19,7 @@ from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.choice import ChoiceHead, option_count
 from trainer.cli import main
-from trainer.config import ConfigError, DataConfig
+from trainer.config import REFINED_HEADS, ConfigError, DataConfig
 from trainer.equations import heatmap_peaks
 from trainer.graph import open_session, write_graph
 from trainer.losses import pose_residual, to_tensors
@@ -29,7 +29,7 @@ from trainer.refinement import Evidence, RefinementHead, answer_count
 from trainer.sources import refinement_sampler
 
 NO_ANGLES = torch.zeros(6000, 4)
-PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5)
+PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5, heads=REFINED_HEADS)
 
 
 def open_plates(data: DataConfig, seed: int, size_px: int, strangers: float, *_: object) -> Callable[[], Filling]:
@@ -182,6 +182,16 @@ def test_the_command_takes_the_split_and_the_share_of_its_datasets(
     ):
         assert main(f"{asked} {more}".split()) == 2
         assert capsys.readouterr().err == f"uavpose-trainer: --dataset {own}: {told}\n"
+
+
+def test_the_command_takes_flights_and_the_heads_to_train(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = f"refine --checkpoint {write_run(tmp_path / 'run')} --out {tmp_path / 'out'} --seed 11"
+    nowhere = tmp_path / "nowhere"
+    assert main(f"{asked} --heads choice --flown {nowhere}".split()) == 2
+    assert str(nowhere) in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(f"{asked} --heads rotation".split())
+    assert "choose from refinement, presence, choice" in capsys.readouterr().err.replace("'", "")
 
 
 def test_windows_are_cut_from_the_split_that_is_named(tmp_path: Path) -> None:
