@@ -21,7 +21,6 @@ from typing import Any
 
 import zenoh
 
-from edge.errors import InputError
 from msgs import topics
 from msgs.cdr import Detection3DArray, DiagnosticArray, Odometry, TFMessage, Vector3Stamped
 from msgs.client import connect, subscribe_all
@@ -181,4 +180,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code(main, InputError))
+    sys.exit(exit_code(main, ()))
