@@ -69,6 +69,8 @@ if [ "$use" = dev ]; then
         apt_install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri
     # Certificates of the TLS tests.
     command -v openssl >/dev/null || apt_install openssl
+    # The command that we tell the user for a video without times is run.
+    command -v ffmpeg >/dev/null || apt_install ffmpeg
     # The flight report is looked at in a real browser.
     command -v chromium >/dev/null || command -v google-chrome >/dev/null || apt_install chromium
 fi

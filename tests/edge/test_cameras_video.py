@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import shutil
 import struct
 import subprocess
 import threading
@@ -155,7 +154,6 @@ def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path:
             source.open()
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs the program ffmpeg")
 def test_the_command_that_gives_a_video_times_gives_each_frame_its_own(tmp_path: Path) -> None:
     """H.264 stores frames that were predicted from later ones after these."""
     with av.open(str(tmp_path / "flight.h264"), "w") as out:
