@@ -24,12 +24,10 @@ from trainer.presence import PresenceHead
 from trainer.refinement import SIGMAS, Evidence, Refined, RefinementHead, answers_of
 
 OCT_OFFSETS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+ADDED_HEADS = ("head_choice", "head_presence")  # those that `trainer.refine` adds to a trained network
 REGION = 7
 IMAGENET_MEAN_BGR = (103.53, 116.28, 123.675)
 IMAGENET_STD_BGR = (57.375, 57.12, 58.395)
-
-
-ADDED_HEADS = ("head_choice", "head_presence")  # those that `trainer.refine` adds to a trained network
 
 
 class Decoded(NamedTuple):

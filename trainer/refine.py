@@ -138,9 +138,9 @@ def refine(
     kept = look(model, config, opener, plan.windows, say)
     learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
     fit(heads, kept, learnt, plan.epochs, say)
-    for head, module in zip(HEADS, heads, strict=True):
-        if module is not None:
-            setattr(model, HEADS[head][0], module)
+    for (module_name, _), head in zip(HEADS.values(), heads, strict=True):
+        if head is not None:
+            setattr(model, module_name, head)
     said = {
         "from": weights_sha256(content["weights"])[:16],
         "windows": plan.windows,
@@ -267,7 +267,7 @@ def fleet_size() -> int:
 
 
 class Heads(NamedTuple):
-    """What is trained; None: stays as it is."""
+    """What is trained, in the order of HEADS; None: stays as it is."""
 
     refine: RefinementHead | None
     presence: PresenceHead | None
