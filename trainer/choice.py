@@ -47,6 +47,13 @@ class ChoiceHead(BoxReader):
         read = self.read(grid, f_trans, f_rot, options)
         return self.gain * options[:, -self.hypotheses :].detach() + self.change(self.decide(read))
 
+    @torch.no_grad()
+    def lean(self, share: float) -> None:
+        """Return log-odds that are `share` of the way from the network's own to this head's, from now on."""
+        self.gain.copy_(1.0 + share * (self.gain - 1.0))
+        self.change.weight.mul_(share)
+        self.change.bias.mul_(share)
+
 
 def choice_nll(logits: Tensor, angle_rad: Tensor) -> Tensor:
     """Negative log-likelihood [N], up to a constant, of the true rotation under a mixture of the K hypotheses, from

@@ -56,7 +56,12 @@ RENDERED_AT_ONCE = 32
 BATCH = 512
 HELD_OUT_SHARE = 0.04
 FEWEST = 50  # targets
-LEARNING_RATE, WEIGHT_DECAY, DROPOUT = 2e-3, 0.2, 0.3
+LEARNING_RATE, WEIGHT_DECAY = 2e-3, 0.2
+# The choice is learnt from few windows in which the network errs, so it overfits sooner.
+DROPOUT, DROPOUT_OF_CHOICE = 0.3, 0.5
+# How far from the network's own log-odds towards those that the choice head has learnt: half the way, most is gained of
+# what it knows better, and little lost where only the network is sure (docs/ablation.md#choice).
+CHOICE_SHARE = 0.5
 
 
 class RefinePlan(NamedTuple):
@@ -269,9 +274,9 @@ def fleet_size() -> int:
 class Heads(NamedTuple):
     """What is trained, in the order of HEADS; None: stays as it is."""
 
-    refine: RefinementHead | None
-    presence: PresenceHead | None
-    choice: ChoiceHead | None
+    refine: RefinementHead | None = None
+    presence: PresenceHead | None = None
+    choice: ChoiceHead | None = None
 
     def loss(self, rows: Kept) -> Tensor:
         """Sum of each head's mean negative log-likelihood over the rows; they share no weights. From fewer than two
@@ -301,7 +306,7 @@ def fit(heads: Heads, kept: Kept, learnt: int, epochs: int, say: Callable[[str],
     trained = [head for head in heads if head is not None]
     for head in trained:
         head.requires_grad_(True)
-        head.dropout.p = DROPOUT
+        head.dropout.p = DROPOUT_OF_CHOICE if head is heads.choice else DROPOUT
     parameters = [parameter for head in trained for parameter in head.parameters()]
     optimizer = torch.optim.AdamW(parameters, lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     batch = min(BATCH, learnt)
@@ -325,6 +330,10 @@ def fit(heads: Heads, kept: Kept, learnt: int, epochs: int, say: Callable[[str],
     for head in trained:
         head.dropout.p = 0.0
         head.requires_grad_(False)
+    if heads.choice is not None:
+        heads.choice.lean(CHOICE_SHARE)
+        leant = told(Heads(choice=heads.choice), kept, learnt)
+        say(f"choice, {CHOICE_SHARE:.0%} of the way from the network's own: {leant}")
 
 
 @torch.no_grad()
