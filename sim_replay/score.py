@@ -18,6 +18,7 @@ from msgs.geometry import Array
 from sim_replay import metrics
 
 RANGE_BANDS_M = ((100.0, 200.0), (200.0, 300.0), (300.0, 400.0), (400.0, 500.0))  # the paper's
+_RANGE_DIGITS = 5  # of metres: the norm of a translation written in millimetres is no more exact
 ADD_FRACTIONS = {"add_0_5d": 0.5, "add_0_1d": 0.1}
 
 
@@ -230,7 +231,8 @@ def latency_statistics(latencies_ms: ArrayLike) -> dict[str, float | None]:
 
 
 def range_band(range_m: float) -> str:
-    """The band of a true range, metres; 500 m belongs to the last of the paper's."""
+    """The band of a true range, metres; 500 m, but for rounding, belongs to the last of the paper's."""
+    range_m = round(range_m, _RANGE_DIGITS)
     for low_m, high_m in RANGE_BANDS_M:
         if low_m <= range_m < high_m or range_m == high_m == RANGE_BANDS_M[-1][1]:
             return f"{low_m:.0f}-{high_m:.0f}"

@@ -1,7 +1,8 @@
 """BOP results files (bop_toolkit docs/bop_challenge_2019 format): reads any method's poses, writes those of a model.
 
-METHOD_DATASET-SPLIT.csv with a header and one pose per line: scene_id,im_id,obj_id,score,R,t,time. R is nine and t
-three numbers separated by spaces, of the dataset's model axes, t in millimetres; time in seconds, -1 if unknown.
+METHOD_DATASET-SPLIT.csv with a header, which may be missing as for bop_toolkit's reader, and one pose per line:
+scene_id,im_id,obj_id,score,R,t,time. R is nine and t three numbers separated by spaces, of the dataset's model axes, t
+in millimetres; time in seconds, -1 if unknown.
 """
 
 from __future__ import annotations
@@ -51,10 +52,14 @@ def read_results(path: Path) -> list[ResultRow]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark before UTF-8
             reader = csv.reader(file)
-            header = [name.strip() for name in next(reader, [])]
-            if tuple(header) != COLUMNS:
+            first = [cell.strip() for cell in next(reader, [])]
+            if tuple(first) == COLUMNS:
+                rows = []
+            elif len(first) == len(COLUMNS) and first[0].isdecimal():
+                rows = [_row(path, 1, first)]
+            else:
                 raise InputError(f"{path} line 1: its columns are not {','.join(COLUMNS)}")
-            return [_row(path, reader.line_num, cells) for cells in reader if cells]
+            return rows + [_row(path, reader.line_num, cells) for cells in reader if cells]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
 

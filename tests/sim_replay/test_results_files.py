@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from sim_replay.benchmark.stats import dataset_statistics, statistics_table
 from sim_replay.bop import BopError
 from sim_replay.datasets import DatasetFrame, open_dataset
-from sim_replay.evaluation.bop_results import file_answers, write_results
+from sim_replay.evaluation.bop_results import file_answers, read_results, write_results
 from sim_replay.evaluation.consistency import bounds_95
 from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, labels_sha256, score_of
@@ -71,6 +71,13 @@ def test_the_score_chooses_among_several_poses_of_one_aircraft_and_not_the_truth
         assert turns_deg(frames) == [180, 0]
         assert [pose.score for pose in frames[0].false_poses] == [0.1]
         assert frames[0].time_ms is None  # -1 in the file: not known
+
+
+def test_a_file_without_a_header_tells_the_same_as_with_one(root: Path) -> None:
+    path = results(root.parent, [(1, 0.9, LEFT, True), (1, 0.8, RIGHT, False)])
+    told = [(row.score, row.t_cam_model_m[0]) for row in read_results(path)]
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+    assert [(row.score, row.t_cam_model_m[0]) for row in read_results(path)] == told == [(0.9, LEFT), (0.8, RIGHT)]
 
 
 def test_of_equal_scores_the_first_count(root: Path) -> None:

@@ -212,5 +212,13 @@ def test_every_range_has_one_band() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("border_m", "band"), [(100.0, "100-200"), (200.0, "200-300"), (500.0, "400-500")])
+def test_a_target_on_a_border_is_in_one_band_from_wherever_it_is_seen(border_m: float, band: str) -> None:
+    """The norm of a slanted translation in rounded millimetres is not exactly the range that was meant."""
+    rays = np.random.default_rng(1).uniform((-0.3, -0.3, 1.0), (0.3, 0.3, 1.0), (50, 3))
+    t_m = np.round(1e3 * border_m * rays / np.linalg.norm(rays, axis=1, keepdims=True), 4) / 1e3
+    assert {range_band(float(r)) for r in np.linalg.norm(t_m, axis=1)} == {band}
+
+
 def test_latency_percentiles_of_a_ramp() -> None:
     assert latency_statistics(np.arange(101.0)) == {"p50": 50.0, "p95": 95.0, "p99": 99.0}
