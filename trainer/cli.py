@@ -70,6 +70,8 @@ def _ablate(arguments: argparse.Namespace) -> None:
     with contextlib.redirect_stdout(sys.stderr if arguments.json else sys.stdout):
         result = ablate(config, variants, scale, arguments.out, lambda text: print(text, flush=True))
     print(json.dumps(result, indent=2) if arguments.json else table(result))
+    if any(variant.name not in result["rows"] for variant in variants):
+        raise KeyboardInterrupt  # the exit code tells a script that rows are missing
 
 
 def _average(arguments: argparse.Namespace) -> None:

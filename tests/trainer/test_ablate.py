@@ -14,6 +14,7 @@ import synthetic_sampler
 import tiny
 import torch
 
+from msgs.command_line import EXIT_INTERRUPTED
 from trainer.ablate import FULL, VARIANTS, Scale, ablate, chosen, table, varied
 from trainer.checkpoint import load_file, write_atomic
 from trainer.cli import main
@@ -187,3 +188,21 @@ def test_as_json_standard_output_holds_the_result_alone(
     out, err = capsys.readouterr()
     assert json.loads(out) == json.loads((full / "ablation.json").read_text())
     assert "full: all of it" in err
+
+
+def test_the_exit_code_of_an_interrupted_call_tells_that_rows_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(data: DataConfig, seed: int, size_px: int) -> partial:
+        signal.raise_signal(signal.SIGINT)
+        return open_view(data, seed, size_px)
+
+    config = tmp_path / "tiny.toml"
+    config.write_text(tiny.TOML)
+    asked = ["--samples", "8", "--size", "64", "--windows", "16", "--variants", "full", "--json"]
+    command = ["ablate", "--config", str(config), "--out", str(tmp_path / "out"), *asked]
+    monkeypatch.setattr("trainer.ablate.ablate", partial(ablate, open_view=interrupted))
+    assert main(command) == EXIT_INTERRUPTED
+    assert json.loads(capsys.readouterr().out)["rows"] == {}
+    monkeypatch.setattr("trainer.ablate.ablate", partial(ablate, open_view=open_view))
+    assert main(command) == 0
