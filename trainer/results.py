@@ -97,7 +97,7 @@ def measure(
     for dataset in datasets:
         split, modes = _split(dataset), _modes(dataset)
         recipe = _manifest(dataset).get("command", "")
-        if recipe and split:
+        if recipe and split and f"--split {split}" not in recipe:
             recipe += f" --split {split}"
         for model in models:
             given = (False, True) if model is None else (False,)

@@ -76,7 +76,7 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
     """Write dataset.toml: recipe, packages, and which of the planned sequences are finished."""
     there = [plan for plan in plans if is_finished(job.folder(plan))]
     lines = [
-        f"command = {toml_value(job.command)}  # makes it again",
+        f"command = {toml_value(job.command + _only(plans, there))}  # makes it again",
         *recipe.lines(),
         f"complete = {str(len(there) == len(plans)).lower()}  # every sequence of the preset is there",
         f"sequences = {len(there)}",
@@ -92,6 +92,20 @@ def write_manifest(job: Job, recipe: Recipe, plans: Sequence[SequencePlan]) -> N
         lines += ["", "[backdrops]  # SHA-256 of the photographs offered", *offered]
     lines += ["", "[packages]", *(f"{name} = {toml_value(installed)}" for name, installed in packages().items()), ""]
     replace_text(job.out / FILE, "\n".join(lines))
+
+
+def _only(plans: Sequence[SequencePlan], there: Sequence[SequencePlan]) -> str:
+    """The options that limit `generate` to the sequences that are there; none if all are, or none yet."""
+    splits = {plan.split for plan in there}
+    if len(there) in (0, len(plans)):
+        return ""
+    if len(there) == sum(plan.split in splits for plan in plans):
+        return "".join(f" --split {name}" for name in SPLITS if name in splits)
+    numbers = sorted(plan.index for plan in there)
+    first = [number for number in numbers if number - 1 not in numbers]
+    last = [number for number in numbers if number + 1 not in numbers]
+    ranges = (str(a) if a == b else f"{a}-{b}" for a, b in zip(first, last, strict=True))
+    return f" --sequences {','.join(ranges)}"
 
 
 def digests(paths: Sequence[Path]) -> dict[str, str]:

@@ -43,6 +43,17 @@ def test_the_command_is_told_as_it_was_given(tmp_path: Path) -> None:
         assert shlex.split(told) == ["uavpose-replay", *words, "--labels-only"]
 
 
+def test_the_command_of_a_part_makes_that_part(tmp_path: Path) -> None:
+    preset, out = tmp_path / "mine.toml", tmp_path / "data"
+    splits = "val = { sequences = 2, frames = 4 }\ntest = { sequences = 3, frames = 6 }"
+    preset.write_text(PRESET.replace("test = { sequences = 1, frames = 2 }", splits))
+    words = ["generate", "--preset", str(preset), "--seed", "0", "--labels-only"]
+    for added, part in (("0-1", "--split val"), ("3", "--sequences 0-1,3")):
+        assert main([*words, "--out", str(out), "--workers", "1", "--resume", "--sequences", added]) == 0
+        told = tomllib.loads((out / "dataset.toml").read_text(encoding="utf-8"))["command"]
+        assert shlex.split(told) == ["uavpose-replay", *words, *part.split()]
+
+
 def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
