@@ -85,6 +85,8 @@ def _to_train_on(folder: Path) -> list[BopScene]:
 def _shown(folder: Path, scene: BopScene, airframe_ids: Sequence[int]) -> Iterator[BopFrame]:
     """The scene's frames whose first target is visible and one of those."""
     camera = load_object(scene.folder / "camera.json", optional=True)
+    if not camera:
+        raise BopError(f"{scene.folder}: has no camera.json, so `uavpose-replay generate` did not make it")
     size_wh = (camera.get("width"), camera.get("height"))
     if size_wh != (FRAME_WIDTH_PX, FRAME_HEIGHT_PX):
         told = f"{scene.folder / 'camera.json'}: its frames have {size_wh[0]} x {size_wh[1]} pixels"

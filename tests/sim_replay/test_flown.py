@@ -142,3 +142,7 @@ def test_what_cannot_be_drawn_anew_is_refused(flown: Path, tmp_path: Path) -> No
             path.write_text(re.sub(old, new, path.read_text()))
         with pytest.raises(BopError, match=f"{folder}.*{told}"):
             read_flown([folder], FLEET)
+    for path in folder.rglob("camera.json"):
+        path.unlink()
+    with pytest.raises(BopError, match=r"has no camera\.json"):  # some other tool's dataset
+        read_flown([folder], FLEET)
