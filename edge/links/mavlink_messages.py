@@ -23,6 +23,7 @@ IMAGE_STATUS_UNKNOWN = ("point_x", "point_y", "radius", "rec_top_x", "rec_top_y"
 GEO_STATUS_UNKNOWN = ("h_acc", "v_acc", "vel_n", "vel_e", "vel_d", "vel_acc", "hdg", "hdg_acc")
 CAMERA_INFORMATION_UNKNOWN = ("focal_length", "sensor_size_h", "sensor_size_v")
 STATUSTEXT_BYTES = 50
+CAMERA_NAME_BYTES = 32
 VENDOR = b"MF-UAVPose6D"
 CAMERA_ABILITIES = (
     dialect.CAMERA_CAP_FLAGS_HAS_TRACKING_POINT
@@ -133,11 +134,11 @@ def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_m
     """CAMERA_INFORMATION (259). The focal length in mm is computed from the sensor's width; NaN if that is unknown."""
     width_px, height_px = camera.image_size_wh
     mm_per_px = NAN if sensor_width_mm is None else sensor_width_mm / width_px
-    name = camera.name.encode()[:32]
+    name = camera.name.encode()[:CAMERA_NAME_BYTES].decode(errors="ignore").encode()  # whole characters
     return dialect.MAVLink_camera_information_message(
         boot_ms,
-        list(VENDOR.ljust(32, b"\0")),
-        list(name.ljust(32, b"\0")),
+        list(VENDOR.ljust(CAMERA_NAME_BYTES, b"\0")),
+        list(name.ljust(CAMERA_NAME_BYTES, b"\0")),
         0,
         float(camera.K[0, 0]) * mm_per_px,
         width_px * mm_per_px,

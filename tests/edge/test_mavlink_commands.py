@@ -179,6 +179,15 @@ def test_a_camera_that_opens_at_another_size_than_its_calibrations_is_told_as_it
         assert (information.resolution_h, information.resolution_v) == half
 
 
+def test_a_long_name_of_a_camera_is_cut_between_characters() -> None:
+    camera = replace(CAMERA, name="Flug über die Küste vor der Nähe.mp4")
+    station = Station(MavlinkSettings(system_id=SYSTEM_ID), OwnShipBuffer(), camera, RequestQueue())
+    request = dialect.MAVLink_command_long_message(SYSTEM_ID, CAMERA_COMPONENT, 512, 0, 259.0, 0, 0, 0, 0, 0, 0)
+    _, information = [letter.message for letter in station.take([request], 0, time.monotonic_ns())]
+    told = bytes(information.model_name).rstrip(b"\0").decode()
+    assert told == "Flug über die Küste vor der N"
+
+
 def told_beside_poses(peer: Peer, publish: Callable[[], None]) -> set[str]:
     """The names of what comes while 20 poses do."""
     peer.received.clear()
