@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edge.errors import InputError
 
+SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_ORIENTATION = 274
 

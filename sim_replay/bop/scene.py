@@ -15,7 +15,7 @@ import PIL.Image
 import PIL.TiffImagePlugin
 from numpy.typing import NDArray
 
-from edge.cameras.picture_file import read_pixels
+from edge.cameras.picture_file import SIXTEEN_BITS_LEAST, read_pixels
 from edge.errors import InputError
 from sim_replay.bop.fields import by_number, load_json, load_object, matrix
 from sim_replay.bop.frames import Source, frame_of
@@ -30,7 +30,6 @@ IMAGEWISE_CAMERA = ".camera.json"
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  # how JPEG and PNG end, by how they begin
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TAIL_BYTES = 512  # of a file, where its end is, unless something follows it
-SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _log = logging.getLogger(__name__)
 
 

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from edge.cameras.capture import Capture
+from edge.cameras.folder import FolderSource
 from edge.cameras.sequence import DISTORTION_KEY, SequenceSource
-from edge.config_camera import IntrinsicsSettings, SequenceCamera
+from edge.config_camera import FolderCamera, IntrinsicsSettings, SequenceCamera
 from edge.errors import InputError
 from edge.types import Frame
 from tests.waiting import until
@@ -74,6 +75,18 @@ def test_every_frame_is_as_on_disk_and_says_what_its_lens_does(scene: Path) -> N
         seen, _ = cv2.projectPoints(POINTS_CAM_M, np.zeros(3), np.zeros(3), frame.K, lens)
         for expected in seen.reshape(-1, 2):
             np.testing.assert_allclose(centroid(frame.image_bgr, expected), expected, atol=0.25)
+
+
+@pytest.mark.parametrize(("scale", "dark"), [(16, True), (257, False)])
+def test_pictures_of_a_deep_camera_that_were_not_scaled_are_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: int, dark: bool
+) -> None:
+    pixels = dots(camera(300.0), LENS)
+    cv2.imwrite(str(tmp_path / "0.png"), pixels.astype(np.uint16) * scale)
+    plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
+    (frame,) = play(FolderSource(FolderCamera(type="folder", path=tmp_path, fps=4, intrinsics=plain)))
+    np.testing.assert_array_equal(frame.image_bgr[:, :, 0], pixels.astype(np.uint16) * scale >> 8)
+    assert ("do not use the upper two" in caplog.text) == dark
 
 
 def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) -> None:
