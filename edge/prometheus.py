@@ -100,7 +100,7 @@ class MetricsServer:
             timeout = 5.0  # limits how long a silent client occupies its thread
 
             def do_GET(self) -> None:
-                if self.path != "/metrics":
+                if self.path.partition("?")[0] != "/metrics":  # a scrape may have parameters
                     self.send_error(404)
                     return
                 body = metrics(board).encode()

@@ -221,7 +221,7 @@ def test_another_vehicle_s_name_is_not_answered(
 @pytest.mark.usefixtures("daemon")
 def test_prometheus_reads_the_metrics(ports: tuple[int, int]) -> None:
     until(lambda: ask(f"tcp/127.0.0.1:{ports[0]}", "kestrel")["info"].get("state"), what="the first second's figures")
-    with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/metrics", timeout=10) as answer:
+    with urllib.request.urlopen(f"http://127.0.0.1:{ports[1]}/metrics?debug=0", timeout=10) as answer:
         assert answer.headers["Content-Type"].startswith("text/plain; version=0.0.4")
         lines = answer.read().decode().splitlines()
     samples = [line for line in lines if not line.startswith("#")]
