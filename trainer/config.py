@@ -6,13 +6,14 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, field_validator, model_validator
+from pydantic import ConfigDict, Field, Strict, field_validator, model_validator
 
 from msgs.contract import Span
 from msgs.settings import Pair, Section, WrittenPath, load_settings, parse_settings
 from sim_replay.sample import AcquireView
 
 Side = Annotated[int, Field(ge=32, multiple_of=32)]  # of a network input, pixels
+Seed = Annotated[int, Field(ge=0, lt=2**32)]  # torch takes 64 bits, of the seed times a million
 Z_RANGE_M = (50.0, 600.0)  # depths that a network can predict
 REFINED_HEADS = ("refinement", "presence", "choice")  # that `refine` can train, each alone
 REFINED_BY_DEFAULT = REFINED_HEADS[:2]  # the third is not better everywhere (docs/ablation.md)
@@ -46,7 +47,13 @@ def refuse_no_folder(path: Path) -> None:
         raise ConfigError(f"{path}: cannot be written: {there} is read-only, or belongs to another user")
 
 
-class ModelConfig(Section):
+class Table(Section):
+    """A section all of whose numbers are finite."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+
+class ModelConfig(Table):
     configuration: Literal["edge", "paper"] = Field(description="which of the two configurations this is")
     backbone: BackboneName
     pretrained: bool = Field(description="start from public ImageNet weights (efficientnet_lite0 only)")
@@ -82,7 +89,7 @@ class ModelConfig(Section):
         return self
 
 
-class LossConfig(Section):
+class LossConfig(Table):
     """Weights of the joint loss; `heatmap`, `size`, `translation`, `rotation` are the paper's lambda_1..4."""
 
     heatmap: float = Field(50.0, ge=0)
@@ -102,7 +109,7 @@ class LossConfig(Section):
     uncertainty: float = Field(0.0, ge=0)
 
 
-class DatasetSource(Section):
+class DatasetSource(Table):
     """A BOP dataset whose images are trained on in addition to rendered windows."""
 
     path: WrittenPath
@@ -111,9 +118,9 @@ class DatasetSource(Section):
     share: float = Field(gt=0, le=1, description="of every batch")
 
 
-class DataConfig(Section):
-    seed: int = Field(ge=0)
-    validation_seed: int = Field(ge=0)
+class DataConfig(Table):
+    seed: Seed
+    validation_seed: Seed
     airframe_ids: list[int] | None = Field(None, description="absent: the sampler's own choice")
     hard_airframe_ids: list[int] = Field([], description="of those, drawn twice as often in training as the others")
     acquire_share: float = Field(0.3, ge=0, le=1, description="share of views as the acquire stage sees them")
@@ -178,12 +185,12 @@ class DataConfig(Section):
         return self
 
 
-class SizeStage(Section):
+class SizeStage(Table):
     from_progress: float = Field(ge=0, lt=1, description="share of the run after which this size is used")
     size_px: Side
 
 
-class ScheduleConfig(Section):
+class ScheduleConfig(Table):
     samples: int = Field(ge=1, description="planned number of training samples")
     warmup_samples: int = Field(ge=0)
     lr: float = Field(5e-4, gt=0)
@@ -214,7 +221,7 @@ class ScheduleConfig(Section):
         return self
 
 
-class RunConfig(Section):
+class RunConfig(Table):
     threads: int = Field(2, ge=1, description="CPU threads of the training process")
     bf16: bool = Field(True, description="run the convolutions in bfloat16")
     log_every_steps: int = Field(25, ge=1)
@@ -222,7 +229,7 @@ class RunConfig(Section):
     checkpoint_every_s: float = Field(120.0, gt=0)
 
 
-class ContractConfig(Section):
+class ContractConfig(Table):
     """Parts of the model's contract that export cannot measure."""
 
     name: str
@@ -241,7 +248,7 @@ class ContractConfig(Section):
         return self
 
 
-class TrainerConfig(Section):
+class TrainerConfig(Table):
     model: ModelConfig
     loss: LossConfig
     data: DataConfig

@@ -37,6 +37,8 @@ def test_the_flights_continue_the_training_of_the_network_that_ships(name: str) 
         ("channels = 16", "chanels = 16", "model.chanels"),
         ("batch_size = 4", 'batch_size = "many"', "data.batch_size"),
         ("validation_seed = 4", "validation_seed = 3", "data: "),
+        ("seed = 3\n", "seed = 4294967296\n", "data.seed: must be less than 4294967296"),
+        ("mask = 1.0", "mask = inf", "loss.mask: must be a finite number"),
         ("size_px = 96", "size_px = 100", "schedule.sizes.1.size_px"),
         ("pretrained = false", "pretrained = true", "repvit_small"),
         ("[contract]", "[contract", "not valid TOML"),
