@@ -192,7 +192,9 @@ class MavlinkSettings(Section):
 
     @model_validator(mode="after")
     def _fits_together(self) -> MavlinkSettings:
-        twice = [text for text in self.endpoints if self.endpoints.count(text) > 1 and not text.endswith(":0")]
+        # A serial port can be opened once, whatever the speed.
+        places = [text.rpartition(":")[0] if text.startswith("serial:") else text for text in self.endpoints]
+        twice = [place for place in places if places.count(place) > 1 and not place.endswith(":0")]
         if twice:
             raise ValueError(f"endpoints: {twice[0]} is there twice")
         if self.component_id == self.camera_component_id:

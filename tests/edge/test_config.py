@@ -122,6 +122,9 @@ def test_a_path_that_leads_nowhere_is_told_with_file_line_and_key(tmp_path: Path
         ('[zenoh]\nlisten = ["tcp/0.0.0.0:0"]', '[mavlink]\nendpoints = ["tcpin:0.0.0.0:0"]', False),
         ("", '[mavlink]\nendpoints = ["tcpin:[::ffff:10.0.0.1]:5760", "tcpin:10.0.0.1:5760"]', True),
         ("", '[mavlink]\nendpoints = ["tcpin:10.0.0.1:5760", "tcpin:10.0.0.2:5760"]', False),
+        ("", '[mavlink]\nendpoints = ["udpin:[::]:14550", "udpin:127.0.0.1:14550"]', True),
+        ("", '[mavlink]\nendpoints = ["udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550"]', False),
+        ('[zenoh]\nlisten = ["quic/[::1]:7448"]\ntls = {tls}', '[mavlink]\nendpoints = ["udpin:[::1]:7448"]', True),
         ("", '[zenoh]\nlisten = ["tcp/127.0.0.1:7448", "tcp/0.0.0.0:7448"]', True),
     ],
 )
@@ -133,7 +136,7 @@ def test_two_listeners_that_cannot_both_open_are_refused(tmp_path: Path, one: st
     if not excluded:
         load_config(path)
         return
-    with pytest.raises(InputError, match=r"the file: \[.*\] .* and \[.*\] .* need the same TCP port; change"):
+    with pytest.raises(InputError, match=r"the file: \[.*\] .* and \[.*\] .* need the same (TCP|UDP) port; change"):
         load_config(path)
 
 

@@ -36,6 +36,10 @@ CAMERA = '[camera]\ntype = "sequence"\npath = "."\n'
             r":4: \[mavlink\]: endpoints: tcpout:10.0.0.1:5762 is there twice",
         ),
         (
+            '[mavlink]\nendpoints = ["serial:/dev/ttyS0:57600", "serial:/dev/ttyS0:115200"]\n',
+            r":4: \[mavlink\]: endpoints: serial:/dev/ttyS0 is there twice",
+        ),
+        (
             '[zenoh]\nlisten = ["tcp/127.0.0.1:7448", "tcp/127.0.0.1:7448"]\n',
             r":4: \[zenoh\]: listen: tcp/127.0.0.1:7448 is there twice",
         ),
