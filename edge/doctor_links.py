@@ -162,20 +162,25 @@ def metrics_finding(port: int) -> Finding:
 def _mavlink(settings: MavlinkSettings) -> Iterator[Finding]:
     """Speak and listen as the daemon does before its first frame, until a heartbeat is received: a router, or an
     autopilot, may send to nobody who has not spoken first."""
+    tried, unopenable = list(settings.endpoints), False
     for endpoint in settings.endpoints:
         named = parse_endpoint(endpoint)
         if isinstance(named, SerialEndpoint):
             if (fault := device_fault(Path(named.device), "dialout") or _port_fault(named)) is not None:
                 yield wrong("mavlink", *fault)
-                return
+                tried.remove(endpoint)  # the daemon retries it, and meanwhile flies with the others
             continue
         try:
             resolve(named, socket.SOCK_DGRAM)
         except InputError as error:
             if named.kind in ("udpin", "tcpin"):
                 yield wrong("mavlink", str(error), ADVICE_ADDRESS)
-                return
+                unopenable = True
+                continue
             yield poor("host", str(error), f"test it with `getent hosts {named.host}`, or use a numeric address")
+    if unopenable or not tried:
+        return
+    settings = settings.model_copy(update={"endpoints": tried})
     own_ship = OwnShipBuffer()
     camera = CameraInfo("doctor", (640, 480), np.eye(3), None)
     try:

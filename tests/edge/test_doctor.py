@@ -7,6 +7,7 @@ import os
 import pty
 import socket
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from itertools import product
 from pathlib import Path
@@ -26,12 +27,14 @@ from edge.reload import load_configured
 from edge.status import ask
 from edge.status_board import StatusBoard, key_of
 from edge.types import CameraInfo
+from msgs.mavlink import MAVLink, dialect
 from msgs.session import router_config
 from sim_replay.ports import free_port
 from tests.waiting import until
 
 from .conftest import Cli
 from .flying import flying, toml
+from .mavlink_peer import DEADLINE_S
 from .test_cameras_stream import UdpCamera
 from .test_zenoh_config import make_keys
 
@@ -94,6 +97,22 @@ def test_an_endpoint_that_another_holds_and_a_silent_autopilot_are_found(
     assert "host 'autopilot.invalid' cannot be resolved" in found["host"]["says"]
     assert "127.0.0.1 cannot be served: Address already in use" in found["prometheus"]["says"]
     assert "stop the program" in found["prometheus"]["advice"]
+
+
+def test_a_radio_that_is_unplugged_does_not_hide_whether_the_autopilot_is_heard(tmp_path: Path) -> None:
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3).pack(MAVLink(None, 1, 1))
+    with socket.socket(type=socket.SOCK_DGRAM) as autopilot, ThreadPoolExecutor() as pool:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(DEADLINE_S)
+        pool.submit(lambda: autopilot.sendto(beat, autopilot.recvfrom(300)[1]))
+        there = f"udpout:127.0.0.1:{autopilot.getsockname()[1]}"
+        tree = {
+            "camera": {"type": "sequence", "path": "scene"},
+            "zenoh": {"enabled": False},
+            "mavlink": {"endpoints": [f"serial:{tmp_path}/radio:57600", there]},
+        }
+        found = [(one.verdict, one.says) for one in link_findings(Config.model_validate(tree), None)]
+    assert found == [("wrong", f"{tmp_path}/radio does not exist"), ("good", f"{there}: heartbeat received")]
 
 
 @pytest.mark.parametrize(
