@@ -220,8 +220,8 @@ class PoseNet(nn.Module):
         origin_px = center_px + self.config.origin_range * size_px * torch.tanh(o_xy)
         plane_xy = eq.image_plane_point(origin_px, K)
         log_f = torch.log(eq.focal_length(K, self.config.focal))
-        logits = self._own_logits(f_rot)
-        options = options_of(log_size, log_f, plane_xy, r_6d, logits)
+        logits = own_logits = self._own_logits(f_rot)
+        options = options_of(log_size, log_f, plane_xy, r_6d, own_logits)
         if self.head_choice is not None:
             logits = self.head_choice(grid, f_trans, f_rot, options)
         R_allo = _likeliest(logits, r_6d)
@@ -234,7 +234,8 @@ class PoseNet(nn.Module):
             log_Z = torch.log(eq.apdd_depth(eq.focal_length(K, self.config.focal), S, size_px))
         R_ray = eq.ray_rotation(eq.unit_ray(plane_xy if self.config.ray else torch.zeros_like(plane_xy)))
         R_ego = R_ray @ R_allo
-        answers = answers_of(log_size, log_f, log_Z, plane_xy, logits, R_ego)
+        # The heads that read these must not depend on how sure the choice head is.
+        answers = answers_of(log_size, log_f, log_Z, plane_xy, own_logits, R_ego)
         evidence = Evidence(grid, f_trans, f_rot, answers, options)
         refined = self._refined(evidence)
         decoded = Decoded(

@@ -51,7 +51,8 @@ def test_half_the_way_is_the_geometric_mean_of_both_probabilities() -> None:
 
 
 def test_what_it_prefers_is_the_rotation_that_is_told_and_the_scale_that_the_depth_follows_from() -> None:
-    """Asked for the hypothesis that is least likely by the network's own logits, everything told is of that one."""
+    """Asked for the hypothesis that is least likely by the network's own logits, everything told is of that one; the
+    other heads hear the network's own probabilities."""
     network = PoseNet(tiny.network(3).config, ("head_choice",)).eval()
     image, labels = tiny.batch(8)
     assert network.head_choice is not None
@@ -59,7 +60,7 @@ def test_what_it_prefers_is_the_rotation_that_is_told_and_the_scale_that_the_dep
         network.head_choice.gain.fill_(-1.0)
         seen = network.perceive(image)
         peaks = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), 1)[1]
-        told = network.decode(seen, labels.K, peaks)
+        told, evidence = network.decode_with_evidence(seen, labels.K, peaks)
         own = PoseNet(network.config).eval()
         own.load_state_dict(network.state_dict(), strict=False)
         before = own.decode(seen, labels.K, peaks)
@@ -70,6 +71,8 @@ def test_what_it_prefers_is_the_rotation_that_is_told_and_the_scale_that_the_dep
         assert (angle > 0.1).all()
         assert not torch.allclose(told.log_Z, before.log_Z, atol=1e-5)
         torch.testing.assert_close(told.center_px, before.center_px)
+        own_probabilities = F.softmax(before.hypothesis_logits[:, 0], dim=-1)
+        torch.testing.assert_close(evidence.answers[:, 7 : 7 + own_probabilities.shape[1]], own_probabilities)
 
 
 def test_a_hint_in_the_features_is_learnt_and_the_network_s_own_choice_is_heard_where_there_is_none() -> None:
