@@ -37,22 +37,20 @@ class ChoiceHead(BoxReader):
         super().__init__(channels, hidden // 8, 2 * hidden + option_count(hypotheses))
         self.hypotheses = hypotheses
         self.decide = nn.Sequential(mlp(self.width, hidden, hidden), nn.ReLU(inplace=True))
-        self.change = nn.Linear(hidden, hypotheses)
-        self.gain = nn.Parameter(torch.ones(1))
-        with torch.no_grad():
-            self.change.weight.zero_()
-            self.change.bias.zero_()
+        # One layer of both: OpenVINO 2026.4 crashes on a sum of a layer's output and the logits times a learnt factor.
+        self.choose = nn.Linear(hidden + hypotheses, hypotheses)
+        self.lean(0.0)
 
     def forward(self, grid: Tensor, f_trans: Tensor, f_rot: Tensor, options: Tensor) -> Tensor:
-        read = self.read(grid, f_trans, f_rot, options)
-        return self.gain * options[:, -self.hypotheses :].detach() + self.change(self.decide(read))
+        decided = self.decide(self.read(grid, f_trans, f_rot, options))
+        return self.choose(torch.cat([decided, options[:, -self.hypotheses :].detach()], dim=-1))
 
     @torch.no_grad()
     def lean(self, share: float) -> None:
         """Return log-odds that are `share` of the way from the network's own to this head's, from now on."""
-        self.gain.copy_(1.0 + share * (self.gain - 1.0))
-        self.change.weight.mul_(share)
-        self.change.bias.mul_(share)
+        self.choose.weight.mul_(share)
+        self.choose.weight[:, -self.hypotheses :].diagonal().add_(1.0 - share)
+        self.choose.bias.mul_(share)
 
 
 def choice_nll(logits: Tensor, angle_rad: Tensor) -> Tensor:

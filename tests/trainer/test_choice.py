@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import tiny
@@ -11,11 +14,14 @@ from torch.nn import functional as F
 
 from trainer import equations as eq
 from trainer.choice import SPREAD_RAD, ChoiceHead, choice_nll, option_count, options_of
+from trainer.config import load_config
+from trainer.graph import write_graph
 from trainer.model import PoseNet
 from trainer.refine import Heads, Kept, chosen_by, fit
 from trainer.refinement import Evidence, answer_count
 
 K = 4
+EDGE = Path(__file__).parents[2] / "trainer" / "configs" / "edge.toml"
 
 
 def test_the_loss_is_the_mixture_s_likelihood_worked_out_by_hand() -> None:
@@ -38,8 +44,8 @@ def test_untrained_it_chooses_as_the_network_does() -> None:
 def test_half_the_way_is_the_geometric_mean_of_both_probabilities() -> None:
     torch.manual_seed(0)
     head = ChoiceHead(16, 32, K).eval()
-    torch.nn.init.normal_(head.change.weight)
-    torch.nn.init.constant_(head.gain, 0.3)
+    torch.nn.init.normal_(head.choose.weight)
+    torch.nn.init.normal_(head.choose.bias)
     own = torch.randn(5, K)
     options = options_of(torch.zeros(5, 2), torch.zeros(5), torch.zeros(5, 2), torch.randn(5, 6 * K), own)
     seen = torch.randn(5, 16, 7, 7), torch.randn(5, 32), torch.randn(5, 32), options
@@ -57,7 +63,7 @@ def test_what_it_prefers_is_the_rotation_that_is_told_and_the_scale_that_the_dep
     image, labels = tiny.batch(8)
     assert network.head_choice is not None
     with torch.no_grad():
-        network.head_choice.gain.fill_(-1.0)
+        network.head_choice.choose.weight.neg_()
         seen = network.perceive(image)
         peaks = eq.heatmap_peaks(torch.sigmoid(seen.heat_logits), 1)[1]
         told, evidence = network.decode_with_evidence(seen, labels.K, peaks)
@@ -73,6 +79,29 @@ def test_what_it_prefers_is_the_rotation_that_is_told_and_the_scale_that_the_dep
         torch.testing.assert_close(told.center_px, before.center_px)
         own_probabilities = F.softmax(before.hypothesis_logits[:, 0], dim=-1)
         torch.testing.assert_close(evidence.answers[:, 7 : 7 + own_probabilities.shape[1]], own_probabilities)
+
+
+IN_OPENVINO = """
+import sys, numpy as np, openvino
+given = {"image": np.zeros((1, 64, 64, 3), np.uint8), "K": np.diag([900.0, 900.0, 1.0]).astype(np.float32)[None]}
+network = openvino.Core().read_model(sys.argv[1])
+network.reshape({name: list(value.shape) for name, value in given.items()})
+run = openvino.Core().compile_model(network, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+assert all(np.isfinite(told).all() for told in run(given).values())
+"""
+
+
+def test_its_graph_runs_in_openvino_too(tmp_path: Path) -> None:
+    """In a process of its own: OpenVINO does not raise, it crashes, and only on a network of full size."""
+    network = PoseNet(load_config(EDGE).model.deployed(), ("head_choice",)).eval()
+    assert network.head_choice is not None
+    with torch.no_grad():
+        for parameter in network.head_choice.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    write_graph(network, tmp_path / "chosen.onnx")
+    asked = [sys.executable, "-c", IN_OPENVINO, tmp_path / "chosen.onnx"]
+    told = subprocess.run(asked, capture_output=True, text=True, check=False)
+    assert told.returncode == 0, told.stderr
 
 
 def test_a_hint_in_the_features_is_learnt_and_the_network_s_own_choice_is_heard_where_there_is_none() -> None:
