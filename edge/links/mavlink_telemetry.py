@@ -12,6 +12,7 @@ from edge.clock import UtcClock
 from edge.links.mavlink_daytime import Daytime
 from edge.links.mavlink_jumps import Jumps
 from edge.links.mavlink_receive import AUTOPILOT_COMPONENT
+from edge.links.mavlink_standstill import Standstill
 from edge.links.mavlink_table import (
     ATTITUDE,
     ATTITUDE_QUATERNION,
@@ -42,6 +43,14 @@ GIMBAL_FAILURES = (
     | dialect.GIMBAL_DEVICE_ERROR_FLAGS_COMMS_ERROR
     | dialect.GIMBAL_DEVICE_ERROR_FLAGS_CALIBRATION_RUNNING
 )
+# What counts as the same value, but for rounding, in a rotation matrix, a local position (m) and a global one (degrees
+# and m); and how far the vehicle has moved meanwhile by its own account: more than the errors that the tracker assumes.
+SAME_R, SAME_M, SAME_DEG_M = 1e-5, 1e-3, 5e-8
+TURNED_RAD, FLOWN_M = 0.05, 3.0
+STANDS = {
+    kind: f"the autopilot's {kind} stands still while its {rate} says that it moves: it is not used"
+    for kind, rate in {"attitude": "turn rate", "position": "velocity", "global position": "velocity"}.items()
+}
 SERVO_GIMBAL = "PX4 tells what it steers the gimbal's servos by, not where the camera looks: it is not used"
 
 
@@ -103,6 +112,9 @@ class Telemetry:
     def _forget(self) -> None:
         self._own_ship.clear()
         self._jumps = Jumps()
+        self._attitude_stands = Standstill(SAME_R, TURNED_RAD, STANDS["attitude"])
+        self._position_stands = Standstill(SAME_M, FLOWN_M, STANDS["position"])
+        self._global_stands = Standstill(SAME_DEG_M, FLOWN_M, STANDS["global position"])
         self.daytime = Daytime()
         self._boot_clock = BootClock(self._timesync)
         self._forget_gimbal_clock()
@@ -112,7 +124,9 @@ class Telemetry:
     def news(self, now_ns: int) -> list[str]:
         """Sentences, each once: problems that a person has to fix."""
         untold, self._servos_told = self._servos_heard and not self._servos_told, self._servos_heard
-        return self.daytime.news(now_ns) + ([SERVO_GIMBAL] if untold else [])
+        kinds = (self._attitude_stands, self._position_stands, self._global_stands)
+        stood = [sentence for kind in kinds for sentence in kind.news(now_ns)]
+        return self.daytime.news(now_ns) + stood + ([SERVO_GIMBAL] if untold else [])
 
     def take(self, message: Any, now_ns: int, autopilot: int | None = None) -> str | None:
         """Process a valid message of a MAV_AUTOPILOT or its gimbal; returns why it was rejected, or None."""
@@ -120,43 +134,61 @@ class Telemetry:
         if message_id == GIMBAL_ATTITUDE:
             return self._take_gimbal(message, now_ns, autopilot)
         time_ns = self._boot_clock.monotonic_ns(self._uptime_ns(message, now_ns), now_ns)
-        rising = True
+        reason = None
         if message_id == ATTITUDE_QUATERNION:
             self._quaternion_ns = time_ns
             q_wxyz = (message.q1, message.q2, message.q3, message.q4)
-            rising = self._add_attitude(time_ns, q_wxyz, message, now_ns)
+            reason = self._add_attitude(time_ns, q_wxyz, message, now_ns)
         elif message_id == ATTITUDE:
             if self._quaternion_ns is None or abs(time_ns - self._quaternion_ns) > QUATERNION_GAP_MAX_NS:
                 R_ned_body = R_from_euler(message.roll, message.pitch, message.yaw)
-                rising = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
+                reason = self._add_attitude(time_ns, q_wxyz_from_R(R_ned_body), message, now_ns)
         elif message_id == LOCAL_POSITION_NED:
-            rising = self._add_position(time_ns, message, now_ns)
+            reason = self._add_position(time_ns, message, now_ns)
         elif message_id == SYSTEM_TIME and not clock.stepped():  # in lock-step mode nothing gives the date
             self.daytime.compare(message.time_unix_usec, self._utc.utc_ns(time_ns))
         # 0, 0 means that the autopilot has no fix.
         elif message_id == GLOBAL_POSITION_INT and (message.lat, message.lon) != (0, 0):
-            place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
-            v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
-            rising = self._own_ship.add_global(time_ns, place, v_ned_mps)
-        return None if rising else "late"
+            reason = self._add_global(time_ns, message)
+        return reason
 
-    def _add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, message: Any, now_ns: int) -> bool:
+    def _add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, message: Any, now_ns: int) -> str | None:
         rates_radps = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        if self._jumps.attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps):
+        R_ned_body, stood = R_from_q_wxyz(q_ned_body_wxyz), self._attitude_stands.times
+        if self._attitude_stands.stands(time_ns, R_ned_body, rates_radps):
+            if self._attitude_stands.times != stood:
+                self._own_ship.clear(same_autopilot=True)
+            return "standstill"
+        if self._jumps.attitude(time_ns, R_ned_body, rates_radps):
             self.attitude_jumps += 1
             self._own_ship.clear(same_autopilot=True)
             self._attitudes_from_ns = now_ns + JUMP_REST_NS
         if now_ns < self._attitudes_from_ns:
-            return True
-        return self._own_ship.add_attitude(time_ns, q_ned_body_wxyz, rates_radps, self._boot_clock.std_s)
+            return None
+        added = self._own_ship.add_attitude(time_ns, q_ned_body_wxyz, rates_radps, self._boot_clock.std_s)
+        return None if added else "late"
 
-    def _add_position(self, time_ns: int, message: Any, now_ns: int) -> bool:
+    def _add_position(self, time_ns: int, message: Any, now_ns: int) -> str | None:
         t_ned_m, v_ned_mps = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
+        stood = self._position_stands.times
+        if self._position_stands.stands(time_ns, t_ned_m, v_ned_mps):
+            if self._position_stands.times != stood:
+                self._own_ship.clear(same_axes=True, same_autopilot=True)
+            return "standstill"
         if self._jumps.position(time_ns, t_ned_m, v_ned_mps):
             self.position_jumps += 1
             self._own_ship.clear(same_axes=True, same_autopilot=True)
             self._positions_from_ns = now_ns + JUMP_REST_NS
-        return now_ns < self._positions_from_ns or self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps)
+        if now_ns < self._positions_from_ns:
+            return None
+        return None if self._own_ship.add_position(time_ns, t_ned_m, v_ned_mps) else "late"
+
+    def _add_global(self, time_ns: int, message: Any) -> str | None:
+        place = (message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3)
+        v_ned_mps = (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2)
+        if self._global_stands.stands(time_ns, np.array(place), np.array(v_ned_mps)):
+            return "standstill"
+        return None if self._own_ship.add_global(time_ns, place, v_ned_mps) else "late"
 
     def _take_gimbal(self, message: Any, now_ns: int, autopilot: int | None) -> str | None:
         # A gimbal that the autopilot represents is identified by a number from 1 to 6.

@@ -39,6 +39,13 @@ class Autopilot:
 
     def turn(self, k_ms: int, t_ned_m: Array, v_ned_mps: Array, yaw_rad: float = 0.0, rate_radps: float = 0.0) -> None:
         """One millisecond: attitude at 50 Hz, position at 20 Hz, answers to TIMESYNC."""
+        self.attitude(k_ms, yaw_rad, rate_radps)
+        now_ns = BEGIN_NS + k_ms * MS
+        if k_ms % 50 == 7:
+            self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
+
+    def attitude(self, k_ms: int, yaw_rad: float = 0.0, rate_radps: float = 0.0) -> None:
+        """The same without position."""
         now_ns = BEGIN_NS + k_ms * MS
         if k_ms % 1000 == 0:
             beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
@@ -49,8 +56,6 @@ class Autopilot:
         if k_ms % 20 == 3:
             q_wxyz = (np.cos(0.5 * yaw_rad), 0.0, 0.0, np.sin(0.5 * yaw_rad))
             self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, *q_wxyz, 0, 0, rate_radps), now_ns)
-        if k_ms % 50 == 7:
-            self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
 
     def gimbal(self, k_ms: int, pan_rad: float, device_id: int = 0) -> None:
         """Level, in the earth's frame."""
