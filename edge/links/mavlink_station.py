@@ -264,6 +264,9 @@ class Station:
             if by_autopilot and self.vehicle.boot_time(up_ms):
                 self._telemetry.forget(now_ns)
                 self.timesync.clear()
+            elif by_autopilot and self.vehicle.clock_set_back(message_id, message.get_seq(), up_ms):
+                self._telemetry.clock_set_back()
+                self.timesync.jumped()
             reason = self._telemetry.take(message, now_ns, self.vehicle.autopilot)
             self.counters["position_jumps"] = self._telemetry.position_jumps
             self.counters["attitude_jumps"] = self._telemetry.attitude_jumps

@@ -21,7 +21,7 @@ from edge.links.mavlink_table import (
     LOCAL_POSITION_NED,
     SYSTEM_TIME,
 )
-from edge.tracking.clock import BootClock, RebootDetector, TimesyncEstimator
+from edge.tracking.clock import BootClock, RebootDetector, StepDetector, TimesyncEstimator
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from msgs.geometry import R_from_euler, R_from_q_wxyz, q_wxyz_from_R
 from msgs.mavlink import dialect
@@ -108,6 +108,10 @@ class Telemetry:
         """Discard all state: the autopilot has rebooted, or it is another one."""
         self._forget()
         self._positions_from_ns = now_ns + JUMP_REST_NS
+
+    def clock_set_back(self) -> None:
+        """The autopilot's clock was set back: what was received before keeps its time on our clock."""
+        self._boot_clock = BootClock(self._timesync)
 
     def _forget(self) -> None:
         self._own_ship.clear()
@@ -204,8 +208,10 @@ class Telemetry:
         frame = gimbal_frame(message.flags)
         if frame is None:
             return "gimbal_frame"
-        if component != AUTOPILOT_COMPONENT and self._gimbal_boot.rebooted(message.time_boot_ms):
-            self._forget_gimbal_clock()
+        if component != AUTOPILOT_COMPONENT:
+            back = self._gimbal_steps.set_back(GIMBAL_ATTITUDE, message.get_seq(), message.time_boot_ms)
+            if self._gimbal_boot.rebooted(message.time_boot_ms) or back:
+                self._forget_gimbal_clock()
         if self._gimbal is not None and self._gimbal[0] != gimbal_id:
             self._forget_gimbal_clock()
         self._gimbal = (gimbal_id, now_ns)
@@ -227,7 +233,8 @@ class Telemetry:
 
     def _forget_gimbal_clock(self) -> None:
         # A gimbal that is a separate device has its own boot time.
-        self._gimbal_clock, self._gimbal_boot = BootClock(TimesyncEstimator()), RebootDetector()
+        self._gimbal_clock = BootClock(TimesyncEstimator())
+        self._gimbal_boot, self._gimbal_steps = RebootDetector(), StepDetector()
 
     def _heeds(self, gimbal_id: int, now_ns: int) -> bool:
         if self._gimbal_id is not None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from edge.links.mavlink_succession import Succession
-from edge.tracking.clock import RebootDetector
+from edge.tracking.clock import RebootDetector, StepDetector
 
 LOST_NS = 5_000_000_000
 ACK_TIMEOUT_NS = 1_000_000_000
@@ -85,7 +85,7 @@ class Vehicle:
         self._succession = Succession()
         self._heartbeat_ns: int | None = None
         self._spoke_ns: int | None = None
-        self._boot = RebootDetector()
+        self._boot, self._steps = RebootDetector(), StepDetector()
         self._rates_hz = dict(rates_hz)
         self._stands_in = stands_in or {}
         self._streams = self._new_streams()
@@ -127,8 +127,14 @@ class Vehicle:
         if not self._boot.rebooted(boot_ms):
             return False
         self.reboots += 1
+        self._steps = StepDetector()
         self.ask_anew()
         return True
+
+    def clock_set_back(self, message_id: int, sequence: int, boot_ms: int) -> bool:
+        """The same timestamp, with its message's id and sequence number; True if the clock was set back without a
+        reboot."""
+        return self._steps.set_back(message_id, sequence, boot_ms)
 
     def arrived(self, message_id: int, now_ns: int) -> None:
         if message_id in self._streams:
@@ -178,7 +184,7 @@ class Vehicle:
         return quiet and self.contact is not Contact.HEARD
 
     def _forget(self) -> None:
-        self._boot = RebootDetector()
+        self._boot, self._steps = RebootDetector(), StepDetector()
         self.ask_anew()
 
     def _new_streams(self) -> dict[int, Stream]:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 SAMPLES = 32  # of which the one with the shortest round trip is used
 ASKED_KEPT = 16
 ROUND_TRIP_MAX_NS = 200_000_000
-JUMP_NS = 100_000_000
+JUMP_MIN_NS = 2_000_000  # beyond what round trips and drift explain
 JUMP_AGREEING = 3  # samples in a row that must agree on a jump
+STEP_MIN_MS = 5  # smaller ones are within the tracker's uncertainty of exposure times
 STAMP_FUTURE_MAX_NS = 20_000_000
 STAMP_AGE_MAX_NS = 1_000_000_000
 QUICKEST_NS = 30_000_000_000  # longer than any backlog of a link lasts
@@ -49,11 +50,13 @@ class TimesyncEstimator:
         return self._best().round_trip_ns // 2 if self._samples else None
 
     def std_s(self, now_ns: int) -> float | None:
-        """Standard deviation of the offset now: from the bound at the measurement, and the drift since."""
+        """Standard deviation of the offset now: from the bound at the measurement, the drift since, and how far the
+        last reply contradicts it."""
         if not self._samples:
             return None
         best = self._best()
-        return (BOUND_TO_STD * best.round_trip_ns / 2 + DRIFT * max(now_ns - best.time_ns, 0)) * 1e-9
+        doubt_ns = abs(self._suspects[-1].offset_ns - best.offset_ns) if self._suspects else 0
+        return (BOUND_TO_STD * best.round_trip_ns / 2 + DRIFT * max(now_ns - best.time_ns, 0) + doubt_ns) * 1e-9
 
     def request(self, now_ns: int) -> int:
         """The ts1 of a new request; its reply is recognised by it."""
@@ -69,12 +72,16 @@ class TimesyncEstimator:
         if not 0 <= round_trip_ns <= ROUND_TRIP_MAX_NS:
             return False
         sample = Sample(tc1_ns - (ts1_ns + now_ns) // 2, round_trip_ns, now_ns)
-        offset_ns = self.offset_ns
-        if offset_ns is not None and abs(sample.offset_ns - offset_ns) > JUMP_NS:
+        if self._samples and _contradict(sample, self._best()):
             return self._suspect(sample)
         self._suspects.clear()
         self._samples.append(sample)
         return True
+
+    def jumped(self) -> None:
+        """Discard all samples: the autopilot's clock is known to have jumped."""
+        self.jumps += 1
+        self.clear()
 
     def clear(self) -> None:
         """Discard all samples: the autopilot has rebooted."""
@@ -83,7 +90,7 @@ class TimesyncEstimator:
         self._suspects.clear()
 
     def _suspect(self, sample: Sample) -> bool:
-        if self._suspects and abs(sample.offset_ns - self._suspects[-1].offset_ns) > JUMP_NS:
+        if self._suspects and _contradict(sample, self._suspects[-1]):
             self._suspects.clear()
         self._suspects.append(sample)
         if len(self._suspects) < JUMP_AGREEING:
@@ -96,6 +103,12 @@ class TimesyncEstimator:
 
     def _best(self) -> Sample:
         return min(self._samples, key=lambda s: s.round_trip_ns)
+
+
+def _contradict(a: Sample, b: Sample) -> bool:
+    """Whether the offset has changed between two samples: neither is off by more than half its round trip."""
+    bound_ns = (a.round_trip_ns + b.round_trip_ns) / 2 + DRIFT * abs(a.time_ns - b.time_ns)
+    return abs(a.offset_ns - b.offset_ns) > bound_ns + JUMP_MIN_NS
 
 
 class BootClock:
@@ -149,3 +162,20 @@ class RebootDetector:
         if fell or self._latest_ms is None or boot_ms > self._latest_ms:
             self._latest_ms = boot_ms
         return fell
+
+
+class StepDetector:
+    """Whether the autopilot's clock was set back: of two messages of a kind, the one sent later has the earlier time.
+
+    Which one was sent later is told by the sequence numbers of MAVLink's headers: a late datagram has both earlier.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[int, tuple[int, int]] = {}  # by message id: sequence number, ms
+
+    def set_back(self, message_id: int, sequence: int, boot_ms: int) -> bool:
+        last, self._last[message_id] = self._last.get(message_id), (sequence, boot_ms)
+        back = last is not None and 0 < (sequence - last[0]) % 256 < 128 and boot_ms <= last[1] - STEP_MIN_MS
+        if back:
+            self._last = {message_id: (sequence, boot_ms)}  # the other kinds' are of the clock before: one step, once
+        return back

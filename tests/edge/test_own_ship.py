@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, TimesyncEstimator
+from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, StepDetector, TimesyncEstimator
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from edge.tracking.view import View
 from edge.types import Mount
@@ -321,3 +321,19 @@ def test_an_attitude_that_the_link_held_back_is_never_told_as_that_of_now(
 def test_a_boot_time_that_falls_is_a_reboot_and_a_late_datagram_is_not(stamps_ms: list[int], reboots: int) -> None:
     detector = RebootDetector()
     assert sum(detector.rebooted(stamp_ms) for stamp_ms in stamps_ms) == reboots
+
+
+@pytest.mark.parametrize(
+    ("numbers_and_stamps_ms", "steps"),
+    [
+        ([(254, 1_000), (1, 1_020), (255, 1_010), (4, 1_040)], 0),  # a late datagram
+        ([(254, 1_000), (254, 1_000), (1, 1_018), (3, 1_015)], 0),  # one that comes twice, and a rounding
+        ([(254, 1_000), (1, 990), (4, 1_010), (7, 1_030)], 1),
+        ([(5, 1_000), (5, 900), (5, 1_020)], 0),  # a sender that does not number its messages
+    ],
+)
+def test_a_clock_is_set_back_if_what_was_sent_later_is_stamped_earlier(
+    numbers_and_stamps_ms: list[tuple[int, int]], steps: int
+) -> None:
+    detector = StepDetector()
+    assert sum(detector.set_back(31, *message) for message in numbers_and_stamps_ms) == steps

@@ -32,30 +32,34 @@ class Autopilot:
     def __init__(self, gimballed: bool = False) -> None:
         self.own_ship = OwnShipBuffer(gimballed)
         self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
+        self.ahead_ms = 0  # of its clock
+        self.numbers = self.answers = True  # its messages, TIMESYNC
         self._mav = MAVLink(None, srcSystem=1, srcComponent=1)
 
     def tell(self, message: Any, now_ns: int) -> None:
         self.station.take(FrameReader(datagram=True).feed(message.pack(self._mav)), 0, now_ns)
+        self._mav.seq = (self._mav.seq + self.numbers) % 256
 
     def turn(self, k_ms: int, t_ned_m: Array, v_ned_mps: Array, yaw_rad: float = 0.0, rate_radps: float = 0.0) -> None:
         """One millisecond: attitude at 50 Hz, position at 20 Hz, answers to TIMESYNC."""
         self.attitude(k_ms, yaw_rad, rate_radps)
         now_ns = BEGIN_NS + k_ms * MS
         if k_ms % 50 == 7:
-            self.tell(dialect.MAVLink_local_position_ned_message(now_ns // MS, *t_ned_m, *v_ned_mps), now_ns)
+            boot_ms = now_ns // MS + self.ahead_ms
+            self.tell(dialect.MAVLink_local_position_ned_message(boot_ms, *t_ned_m, *v_ned_mps), now_ns)
 
     def attitude(self, k_ms: int, yaw_rad: float = 0.0, rate_radps: float = 0.0) -> None:
         """The same without position."""
-        now_ns = BEGIN_NS + k_ms * MS
+        now_ns, boot_ms = BEGIN_NS + k_ms * MS, BEGIN_NS // MS + k_ms + self.ahead_ms
         if k_ms % 1000 == 0:
             beat = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
             self.tell(dialect.MAVLink_heartbeat_message(*beat), now_ns)
         asked = on_the_wire(self.station.tick(now_ns).home)
-        for question in (m for m in asked if m.get_type() == "TIMESYNC"):
-            self.tell(dialect.MAVLink_timesync_message(now_ns, question.ts1), now_ns)
+        for question in (m for m in asked if m.get_type() == "TIMESYNC" and self.answers):
+            self.tell(dialect.MAVLink_timesync_message(boot_ms * MS, question.ts1), now_ns)
         if k_ms % 20 == 3:
             q_wxyz = (np.cos(0.5 * yaw_rad), 0.0, 0.0, np.sin(0.5 * yaw_rad))
-            self.tell(dialect.MAVLink_attitude_quaternion_message(now_ns // MS, *q_wxyz, 0, 0, rate_radps), now_ns)
+            self.tell(dialect.MAVLink_attitude_quaternion_message(boot_ms, *q_wxyz, 0, 0, rate_radps), now_ns)
 
     def gimbal(self, k_ms: int, pan_rad: float, device_id: int = 0) -> None:
         """Level, in the earth's frame."""
