@@ -41,9 +41,17 @@ RATED_NS = 1_000_000_000  # less says little about the rate
 RATE_SHARE_MIN, BAD_SHARE_MAX = 0.8, 0.1
 DAMAGED = "camera_damaged"
 STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
-USABLE = {STAMPS, UNSTAMPED, UNDECODABLE, SLOW}  # a busy machine may cause these too; there are images nevertheless
+LATE = "camera_late"
+USABLE = {
+    STAMPS,
+    LATE,
+    UNSTAMPED,
+    UNDECODABLE,
+    SLOW,
+}  # a busy machine may cause these too; there are images nevertheless
 ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     STAMPS: "see docs/cameras.md on timestamps; images that arrive in bursts also cause this",
+    LATE: "see docs/cameras.md on timestamps; if its clock is not this computer's, keep both together by PTP",
     UNSTAMPED: "see docs/cameras.md on timestamps; arrival is later than exposure, so measure [camera] latency_ms",
     UNDECODABLE: "check cable, USB port or radio link; zenoh: also that images are JPEG or PNG with 8 bits a channel",
     SLOW: "ask for a rate and a format that the camera has, give it more light, or stop other programs",

@@ -1,14 +1,16 @@
-"""Detects frozen cameras and jumping timestamps: repeated pictures look like frames, but are not new. Pure."""
+"""Detects frozen cameras and wrong timestamps: repeated pictures look like frames, but are not new. Pure."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.types import Frame
+from edge.health import Reason
+from edge.types import Frame, FrameMeta
 
 SAMPLED_EVERY_PX = 8  # enough to distinguish two pictures of a real sensor
 DELAY_JUMP_NS = 250_000_000
+STAMPS_TOLD_NS = 1_000_000_000
 
 
 class FrameWatch:
@@ -41,3 +43,41 @@ class FrameWatch:
         )
         self._capture_ns, self._delay_ns = capture_ns, delay_ns
         return jumped
+
+
+class StampWatch:
+    """Whether a camera's timestamps are worse than they were: older by DELAY_JUMP_NS at arrival, or unusable.
+
+    Then its clock was set, or the link to it has become slower. Which of both, and whether the clock was right before,
+    cannot be known here: stamps are used as they are, and a person is told for as long as it lasts.
+    """
+
+    def __init__(self) -> None:
+        self._least_ns: int | None = None  # delay from stamp to arrival; None: no frame was stamped yet
+        self._later_ns = 0
+        self._late_since_ns: int | None = None
+        self._unstamped_since_ns: int | None = None
+
+    def take(self, meta: FrameMeta, stamped: bool) -> None:
+        """Add a frame; `stamped`: it has the camera's own timestamp."""
+        delay_ns, late = meta.arrival_ns - meta.capture_ns, False
+        if stamped:
+            self._least_ns = delay_ns if self._least_ns is None else min(self._least_ns, delay_ns)
+            self._later_ns = delay_ns - self._least_ns
+            late = self._later_ns > DELAY_JUMP_NS
+        lost = not stamped and self._least_ns is not None
+        self._late_since_ns = (self._late_since_ns or meta.arrival_ns) if late else None
+        self._unstamped_since_ns = (self._unstamped_since_ns or meta.arrival_ns) if lost else None
+
+    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        """What has lasted for STAMPS_TOLD_NS."""
+        found = []
+        if self._late_since_ns is not None and now_ns - self._late_since_ns >= STAMPS_TOLD_NS:
+            text = (
+                f"camera: pictures are {self._later_ns / 1e9:.1f} s older than they were; its clock or link has changed"
+            )
+            found.append(Reason("camera_late", text))
+        if self._unstamped_since_ns is not None and now_ns - self._unstamped_since_ns >= STAMPS_TOLD_NS:
+            text = "camera timestamps have become unusable: times of arrival are used instead"
+            found.append(Reason("camera_unstamped", text))
+        return tuple(found)

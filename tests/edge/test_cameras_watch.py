@@ -18,7 +18,7 @@ import pytest
 from edge.cameras.capture import FROZEN_TOLD_NS, JUMPS_TOLD_S, Capture
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.source import EndOfStream
-from edge.cameras.watch import FrameWatch
+from edge.cameras.watch import FrameWatch, StampWatch
 from edge.config_camera import FolderCamera
 from edge.errors import InputError
 from edge.estimator.pace import Pace
@@ -78,10 +78,11 @@ class Numbered:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._shown: queue.Queue[tuple[int, int]] = queue.Queue()
+        self._shown: queue.Queue[tuple[int, int, float | None]] = queue.Queue()
 
-    def show(self, sequence: int, shade: int) -> None:
-        self._shown.put((sequence, shade))
+    def show(self, sequence: int, shade: int, delay_s: float | None = 0.0) -> None:
+        """`delay_s`: of the arrival after the stamp; None: it cannot be stamped."""
+        self._shown.put((sequence, shade, delay_s))
 
     def open(self) -> CameraInfo:
         return CameraInfo("numbered", (16, 16), np.eye(3), 30.0)
@@ -89,8 +90,10 @@ class Numbered:
     def read(self, stop: threading.Event) -> Frame:
         while not stop.is_set():
             with suppress(queue.Empty):
-                sequence, shade = self._shown.get(timeout=0.02)
-                meta = FrameMeta(sequence, sequence * PERIOD_NS, sequence * PERIOD_NS)
+                sequence, shade, delay_s = self._shown.get(timeout=0.02)
+                self.counts["unstamped"] += delay_s is None
+                arrival_ns = sequence * PERIOD_NS
+                meta = FrameMeta(sequence, arrival_ns - round((delay_s or 0.0) * 1e9), arrival_ns)
                 return Frame(meta, np.full((16, 16, 3), shade, np.uint8), np.eye(3))
         raise EndOfStream
 
@@ -189,6 +192,52 @@ def test_stamps_that_jump_are_noticed_and_those_that_jitter_are_not() -> None:
     assert not jumps(2033, 2933)
     assert [jumps(3000 + 500 * k, 3900 + 500 * k) for k in range(3)] == [False] * 3  # few frames a second
     assert [jumps(5000, 5005), jumps(5033, 5032)] == [True, True]  # newer of a sudden, and a little in the future
+
+
+def stamped_worse(delays_s: Iterable[float | None], at_s: float) -> list[str]:
+    """What is told at a time of ten frames a second that arrive so long after their stamps; None: without a stamp."""
+    watch = StampWatch()
+    for k, delay_s in enumerate(delays_s):
+        arrival_ns = 10**12 + k * 10**8
+        watch.take(FrameMeta(k, arrival_ns - round((delay_s or 0.0) * 1e9), arrival_ns), delay_s is not None)
+    return [reason.text for reason in watch.reasons(10**12 + round(at_s * 1e9))]
+
+
+LATE = "camera: pictures are 0.5 s older than they were; its clock or link has changed"
+UNSTAMPED = "camera timestamps have become unusable: times of arrival are used instead"
+
+
+@pytest.mark.parametrize(
+    ("delays_s", "told"),
+    [
+        ([0.02] * 10 + [0.5] * 100, [LATE]),  # its clock was set back by 0.48 s
+        ([0.5] * 110, []),  # it is slow, but was always
+        ([0.02] * 10 + [0.5, 0.5, 0.03] * 30, []),  # a link that holds up some
+        ([0.02] * 10 + [0.5] * 80 + [0.02] * 20, []),  # it is over
+        ([0.02] * 10 + [None] * 100, [UNSTAMPED]),  # its clock was set ahead: stamps in the future
+        ([None] * 110, []),  # it has none
+        ([0.4, None] * 55, []),  # one without a stamp makes those with one no older
+    ],
+)
+def test_stamps_that_have_become_worse_are_told_for_as_long_as_they_are(
+    delays_s: list[float | None], told: list[str]
+) -> None:
+    assert stamped_worse(delays_s, 11.0) == told
+
+
+@pytest.mark.parametrize(("delay_s", "kind"), [(0.5, "camera_late"), (None, "camera_unstamped")])
+def test_a_camera_whose_clock_is_set_is_told_of_while_it_gives_frames(delay_s: float | None, kind: str) -> None:
+    source = Numbered()
+    capture = Capture(source, True)
+    capture.start()
+    try:
+        for number in range(60):
+            source.show(number, number, 0.02 if number < 20 else delay_s)
+            assert capture.newest(60.0) is not None
+        kinds = {reason.kind for reason in capture.reasons(60 * PERIOD_NS)}
+    finally:
+        capture.stop()
+    assert kind in kinds
 
 
 class Jumping(FolderSource):
