@@ -31,11 +31,12 @@ def sights(
     score: float = 0.9,
     doubtful_below: float = PROBABLE_SCORE,
     first: int = 0,
+    period_ns: int = PERIOD_NS,
 ) -> list[str]:
     """What is told of after these sights, the first of which is in that frame."""
     for index, oversize in enumerate(oversizes, start=first):
-        watch.seen(index * PERIOD_NS, [estimate(oversize, score)], doubtful_below)
-    return [reason.text for reason in watch.reasons((first + len(oversizes)) * PERIOD_NS)]
+        watch.seen(index * period_ns, [estimate(oversize, score)], doubtful_below)
+    return [reason.text for reason in watch.reasons((first + len(oversizes)) * period_ns)]
 
 
 def test_a_size_that_most_of_what_is_seen_contradicts_is_told_of_until_it_is_over() -> None:
@@ -59,6 +60,15 @@ def test_a_size_contradicted_in_every_other_second_is_told_of_once() -> None:
     told = [sights(watch, oversizes, first=30 * second) != [] for second, oversizes in enumerate(seconds)]
     assert told == [False] * 3 + [True] * 17
     assert sights(watch, [3.0, None, None, None, None] * 18, first=600) == [], "one in five is no more than an outlier"
+
+
+@pytest.mark.parametrize("period_s", [0.7, 1.0, 1.9])
+def test_a_camera_of_rare_frames_tells_of_a_wrong_size_too(period_s: float) -> None:
+    watch, period_ns = SizeWatch(), round(period_s * 1e9)
+    assert sights(watch, [0.31] * 4, period_ns=period_ns) == [], "too few to say"
+    told = sights(watch, [0.31] * 3, first=4, period_ns=period_ns)
+    assert told == ["the target appears to be 0.31 times as large as [target] says"]
+    assert sights(watch, [None] * 6, first=7, period_ns=period_ns) == []
 
 
 TOO_LARGE = "[target]\nwingspan_m = 60.0\nlength_m = 40.0\n"
