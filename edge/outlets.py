@@ -126,11 +126,15 @@ def start_outlets(
         from edge.links.zenoh_link import ZenohLink
         from msgs.recording import Recorder
 
+        def tell(level: int, text: str) -> None:
+            log.log(level, "%s", text)
+            outlets.event(level, text)
+
         recorder = Recorder(
             config.recorder.folder,
             config.vehicle.name,
             config.recorder.limits(),
-            lambda level, text: outlets.event(level, text),
+            tell,
             on=config.recorder.enabled,
         )
         cleanup.callback(recorder.stop)

@@ -55,7 +55,8 @@ class Sample:
 class Recorder:
     """Writes `<stem>_<number>_<UTC>.mcap` files into a folder; thread-safe.
 
-    `tell(level, text)` receives messages for the operator (levels as in rcl_interfaces/Log), on the recorder's thread.
+    `tell(level, text)` receives messages for the operator (levels as in rcl_interfaces/Log), on the recorder's thread;
+    they are not logged here.
     """
 
     def __init__(self, folder: Path, stem: str, limits: RecordingLimits, tell: Tell, *, on: bool = True) -> None:
@@ -143,7 +144,6 @@ class Recorder:
                 self._counters["lost"] += lost
         if lost:
             text = f"recording ended before the disk had taken all: {lost} messages may be lost"
-            log.warning("%s", text)
             self._tell(logging.WARNING, text)
 
     def counters(self) -> dict[str, int]:
@@ -185,9 +185,7 @@ class Recorder:
                 return
             lost, self._overflowed = self._overflowed, 0
         self._gaps_due_s = now_s + GAPS_S
-        text = f"recording has gaps: the disk is too slow, {lost} messages were lost"
-        log.warning("%s", text)
-        self._tell(logging.WARNING, text)
+        self._tell(logging.WARNING, f"recording has gaps: the disk is too slow, {lost} messages were lost")
 
     def _turn(self, samples: list[Sample], go_on: bool) -> None:
         """Write the samples and flush them to disk, which removes them from the list: whatever fails afterwards, they
@@ -246,7 +244,6 @@ class Recorder:
         self._stopped = False
         with self._changed:
             self._counters["stopped"] = 0
-        log.info("recording again")
         self._tell(logging.INFO, "recording again")
 
     def _fail(self, error: Exception, lost: int) -> None:
@@ -262,7 +259,6 @@ class Recorder:
         reason = error.strerror if isinstance(error, OSError) else repr(error)
         self._set_failure(reason or str(error), lost)
         if first:
-            log.warning("recording stopped: %s", error)
             self._tell(logging.ERROR, f"recording stopped: {self._failure}")
 
     def _set_failure(self, failure: str | None, lost: int = 0) -> None:

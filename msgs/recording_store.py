@@ -93,7 +93,6 @@ class Store:
         finally:
             if removed:
                 text = f"old recordings removed to make room: {len(removed)}, up to {removed[-1]}"
-                log.info("%s", text)
                 self._tell(logging.INFO, text)
 
     def _removable(self) -> list[Path]:

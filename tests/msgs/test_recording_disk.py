@@ -20,7 +20,7 @@ from .recordings import ROOM, read, record_some, standing, turns
 
 
 def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
     monkeypatch.setattr(recording, "RETRY_S", 0.05)
@@ -46,6 +46,7 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     until(lambda: recorder.counters().get("failures", 0) >= 3)
     assert recorder.counters()["stopped"] == 1
     assert told == [(40, "recording stopped: No space left on device")]
+    assert caplog.messages == [], "on the ground's terminal, what is logged is printed too"
     monkeypatch.setattr(os, "write", real_write)
     os.close(full)
     until(lambda: len(told) == 2, lambda: put(b"after"))
