@@ -32,7 +32,7 @@ def check(file: ConfigFile) -> list[str]:
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
     if contract.track_size_wh is not None:
         stages += f", track {contract.track_size_wh[0]}x{contract.track_size_wh[1]}"
-    size = config.target.size()
+    size, unheard = config.target.size(), config.zenoh.unheard(config.vehicle.name)
     return [
         f"{file.path}: valid",
         f"vehicle  {config.vehicle.name}",
@@ -44,6 +44,7 @@ def check(file: ConfigFile) -> list[str]:
         + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
         + ("" if opened else "; not reachable now, the daemon will keep trying"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
+        *([] if unheard is None else [f"warning  {unheard}"]),
         f"recorder {config.recorder.folder if config.recorder.enabled else 'off'}",
         f"mavlink  {', '.join(config.mavlink.endpoints) if config.mavlink.enabled else 'off'}",
     ]

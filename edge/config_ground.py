@@ -83,6 +83,10 @@ class ZenohSettings(Section):
                     raise ValueError(f"{key}: {error}") from error
         return self
 
+    def unheard(self, vehicle: str) -> str | None:
+        """Why the ground may hear nothing of a vehicle of this name although the link is up, as a sentence."""
+        return self.tls.files().another_than(vehicle) if self.enabled and self.tls and self.connect else None
+
 
 class RecorderSettings(Section):
     """Records what is published to the ground, as MCAP on disk; also works with zenoh disabled."""

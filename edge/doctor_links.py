@@ -43,6 +43,7 @@ ADVICE_AUTOPILOT = (
     "and its id that of [mavlink] system_id, if given"
 )
 ADVICE_SIGNING = "give the autopilot the same key as [mavlink] signing_key, and the time (GPS), or leave the key out"
+ADVICE_NAME = "use the vehicle's own certificate, `uavpose-ground keys issue NAME`, or set [vehicle] name"
 ADVICE_RECORDER = (
     "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, and a restart "
     "if the disk was read-only when it started, docs/install.md"
@@ -59,6 +60,8 @@ def link_findings(config: Config, running: Mapping[str, Any] | None) -> Iterator
     """`running`: the running daemon's `info`, if any: its endpoints are then in use and not tried."""
     if config.mavlink.enabled and config.mavlink.signing_key is not None:
         yield signing_finding(signing_state_of(config.mavlink, config.mavlink.signing_key))
+    if (unheard := config.zenoh.unheard(config.vehicle.name)) is not None:
+        yield poor("certificate", unheard, ADVICE_NAME)
     if running is not None and is_starting(running):
         yield poor("daemon", *STARTING)
         return

@@ -142,6 +142,8 @@ def start_outlets(
             doubt = config.zenoh.tls.files().doubt()
             if doubt is not None:
                 log.warning("there may be no link over tls and quic: %s", doubt)
+        if (unheard := config.zenoh.unheard(config.vehicle.name)) is not None:
+            log.warning("the ground may hear nothing: %s", unheard)
         with file.blame("zenoh", "listen"):
             zenoh = ZenohLink(config.zenoh, config.vehicle.name, config.mount.mount(), recorder, requests, reload)
             cleanup.callback(zenoh.stop)

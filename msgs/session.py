@@ -93,6 +93,19 @@ class TlsFiles:
             return f"{self.certificate} expired on {_day(ends_s)}; today is {_day(now_s)}"
         return None
 
+    def another_than(self, name: str) -> str | None:
+        """Whose certificate it is, as a sentence, if its common name is not `name`: a router that goes by names then
+        drops, without a word, what is sent under this one."""
+        try:
+            subject = self._vouched_for().get("subject", ())
+        except ssl.SSLError:
+            return None  # which `doubt` tells
+        names = [value for part in subject for key, value in part if key == "commonName"]
+        if name in names:
+            return None
+        whose = f"that of {', '.join(names)}" if names else "nobody's"
+        return f"{self.certificate} is {whose}, not {name}'s: a router with [access] drops what {name} sends"
+
     def _vouched_for(self) -> Mapping[str, Any]:
         """The certificate as seen by a peer that trusts root_ca. Raises ssl.SSLError if that peer would accept it
         neither from a server nor from a client.

@@ -75,6 +75,21 @@ def test_a_certificate_of_another_day_is_told_by_check_and_keeps_nobody_from_fly
     assert "captured=" in flown.stderr.splitlines()[-1]
 
 
+def test_a_certificate_of_another_name_than_the_vehicle_s_is_told_of(cli: Cli, tmp_path: Path, text: str) -> None:
+    """The router drops all that comes under a name that is not the certificate's, and says nothing."""
+    init_authority(tmp_path)
+    issue(tmp_path, "uav2")
+    text += "[mavlink]\nenabled = false\n[zenoh]\nlisten = []\nconnect = ['tls/127.0.0.1:1']\n"
+    text += 'tls = { root_ca = "ca.pem", certificate = "uav2.pem", private_key = "uav2.key" }\n'
+    sentence = f"{tmp_path / 'uav2.pem'} is that of uav2, not uav1's: a router with [access] drops what uav1 sends"
+    (tmp_path / "config.toml").write_text(text)
+    checked, flown, looked = (cli(command, "--config", "config.toml") for command in ("check", "run", "doctor"))
+    assert (checked.returncode, flown.returncode) == (0, 0), checked.stderr + flown.stderr
+    assert all(sentence in told for told in (checked.stdout, flown.stderr, looked.stdout))
+    (tmp_path / "config.toml").write_text(text + "[vehicle]\nname = 'uav2'\n")
+    assert "certificate" not in cli("check", "--config", "config.toml").stdout.replace(str(tmp_path), "")
+
+
 def test_a_certificate_of_another_day_for_the_camera_is_told_by_check(
     cli: Cli, tmp_path: Path, toy_model: Path
 ) -> None:

@@ -28,7 +28,7 @@ from edge.status import ask
 from edge.status_board import StatusBoard, key_of
 from edge.types import CameraInfo
 from msgs.mavlink import MAVLink, dialect
-from msgs.session import router_config
+from msgs.session import TlsFiles, router_config
 from sim_replay.ports import free_port
 from tests.waiting import until
 
@@ -264,7 +264,8 @@ def test_what_a_running_daemon_says_of_itself_is_judged_by_its_kind(
 
 @pytest.mark.parametrize("secure", [False, True], ids=["tcp", "tls"])
 def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all(tmp_path: Path, secure: bool) -> None:
-    files, metrics = make_keys(tmp_path) if secure else None, free_port()
+    grounds, metrics = make_keys(tmp_path) if secure else None, free_port()
+    files = TlsFiles(tmp_path / "ca.pem", tmp_path / "uav1.pem", tmp_path / "uav1.key") if secure else None
     ground, listen = (f"{'tls' if secure else 'tcp'}/127.0.0.1:{free_port()}" for _ in range(2))
     tls = {"tls": asdict(files)} if files is not None else {}
 
@@ -272,7 +273,7 @@ def test_links_that_work_are_told_as_good_and_those_that_are_off_not_at_all(tmp_
         tree = {"camera": {"type": "sequence", "path": "scene"}, "mavlink": {"enabled": False}, **sections}
         return [(one.what, one.verdict, one.says) for one in link_findings(Config.model_validate(tree), None)]
 
-    with zenoh.open(router_config([ground], tls=files)):
+    with zenoh.open(router_config([ground], tls=grounds)):
         both = found(zenoh={"listen": [listen], "connect": [ground], **tls}, health={"prometheus_port": metrics})
         alone = found(zenoh={"listen": [], "connect": [ground], **tls})
     assert both == [
