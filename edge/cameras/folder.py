@@ -23,11 +23,15 @@ class FolderSource(SequenceSource):
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """The folder's pictures, `2.png` before `10.png`. Raises InputError when there are none."""
+    """The folder's pictures, `2.png` before `10.png`, but no hidden ones: macOS writes `._2.png` beside `2.png`.
+
+    Raises InputError when there are none.
+    """
     try:
-        paths = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+        files = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder} cannot be read: {error.strerror}") from error
+    paths = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not paths:
         raise InputError(f"{folder} has no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})")
     return sorted(paths, key=lambda path: [(int(n or 0), text) for n, text in re.findall(r"(\d*)(\D*)", path.name)])

@@ -116,7 +116,8 @@ def _backdrops(folder: Path | None) -> tuple[Path, ...]:
         return ()
     if not folder.is_dir():
         raise InputError(f"--backdrops: {folder} is not a folder")
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".hdr"))
+    shown = (p for p in folder.iterdir() if not p.name.startswith("."))  # macOS writes ._sky.jpg beside sky.jpg
+    found = sorted(p for p in shown if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".hdr"))
     if not found:
         raise InputError(f"--backdrops: {folder} holds no .jpg, .png or .hdr file")
     for path in found:  # now, and not hours later in the first sequence that uses it

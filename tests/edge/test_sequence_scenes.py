@@ -89,6 +89,13 @@ def test_pictures_of_a_deep_camera_that_were_not_scaled_are_warned_of(
     assert ("do not use the upper two" in caplog.text) == dark
 
 
+def test_what_macos_writes_beside_a_folder_s_pictures_is_none_of_them(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), dots(camera(300.0), LENS))
+    (tmp_path / "._0.png").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X        ")
+    plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
+    assert len(play(FolderSource(FolderCamera(type="folder", path=tmp_path, fps=4, intrinsics=plain)))) == 1
+
+
 def test_a_calibration_of_ones_own_takes_the_place_of_the_scenes(scene: Path) -> None:
     plain = IntrinsicsSettings(fx=310, fy=310, cx=159.5, cy=89.5, width=SIZE_WH[0], height=SIZE_WH[1])
     frames = frames_of(scene, plain)

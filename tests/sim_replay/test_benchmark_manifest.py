@@ -73,7 +73,11 @@ def test_a_photograph_that_a_worker_cannot_read_is_told_as_bad_input(
 
 @pytest.mark.parametrize(
     ("name", "told"),
-    [("page.jpg", r"page\.jpg is not a readable picture"), ("sky.exr", r"holds no \.jpg, \.png or \.hdr file")],
+    [
+        ("page.jpg", r"page\.jpg is not a readable picture"),
+        ("sky.exr", r"holds no \.jpg, \.png or \.hdr file"),
+        ("._sky.jpg", r"holds no \.jpg, \.png or \.hdr file"),  # macOS writes it beside sky.jpg
+    ],
 )
 def test_what_is_no_photograph_is_told_before_anything_is_flown(
     name: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
