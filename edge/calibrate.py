@@ -15,7 +15,7 @@ import numpy as np
 from edge.calibrate_board import BoardSettings, Gray, Size, View, detector_of
 from edge.calibrate_fit import VIEWS_MIN, Calibration, Coefficients, calibration_of
 from edge.cameras.folder import list_pictures
-from edge.cameras.picture_file import read_pixels
+from edge.cameras.picture_file import read_8_bits
 from edge.cameras.video import open_video
 from edge.errors import InputError
 from edge.types import Array
@@ -32,7 +32,7 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
     """Names and gray pictures of a folder, or of a video, evenly spaced. Raises InputError that names the file."""
     if os.path.isdir(source):  # Path.is_dir raises if a parent folder may not be entered
         for path in list_pictures(source):
-            yield path.name, np.asarray(read_pixels(path, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+            yield path.name, read_8_bits(path, cv2.IMREAD_GRAYSCALE)
         return
     if not os.path.isfile(source):
         raise InputError(f"{source} does not exist")

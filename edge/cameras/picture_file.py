@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,25 @@ from numpy.typing import NDArray
 
 from edge.errors import InputError
 
-SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
+_SIXTEEN_BITS_LEAST = 2**14  # data of 10- to 14-bit cameras stay below it, unless they were scaled
 _TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 _TIFF_ORIENTATION = 274
+log = logging.getLogger(__name__)
+
+
+def read_8_bits(path: Path, flags: int) -> NDArray[np.uint8]:
+    """As read_pixels; of 16 bits the upper eight. Warns, once for a folder, if these are next to nothing.
+
+    Raises InputError, also for pixels of neither 8 nor 16 bits.
+    """
+    pixels = read_pixels(path, flags | cv2.IMREAD_ANYDEPTH)
+    if pixels.dtype == np.uint16:
+        if pixels.max() < _SIXTEEN_BITS_LEAST:
+            _tell_once_of_dark_pictures(path.parent)
+        pixels >>= 8
+    elif pixels.dtype != np.uint8:
+        raise InputError(f"{path} has pixels of {pixels.dtype}, not of 8 or 16 bits")
+    return np.asarray(pixels, dtype=np.uint8)
 
 
 def read_pixels(path: Path, flags: int) -> NDArray[Any]:
@@ -33,6 +51,15 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
     if pixels is None:
         raise InputError(f"{path} is not a readable picture")
     return pixels
+
+
+@cache
+def _tell_once_of_dark_pictures(folder: Path) -> None:
+    log.warning(
+        "%s: holds pictures of 16 bits that do not use the upper two: unless it is dark there, "
+        "scale them, to 16 or to 8",
+        folder,
+    )
 
 
 def _is_torn_jpeg(coded: bytes) -> bool:

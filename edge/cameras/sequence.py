@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from edge import clock
 from edge.cameras.intrinsics import load_intrinsics, pinhole
-from edge.cameras.picture_file import SIXTEEN_BITS_LEAST, read_pixels
+from edge.cameras.picture_file import read_8_bits
 from edge.cameras.source import EndOfStream, wait_until
 from edge.config_camera import FolderCamera, SequenceCamera
 from edge.errors import InputError
@@ -68,12 +68,6 @@ class SequenceSource:
         folder = self._settings.path
         self._pictures = self._list(folder)
         first = _decode(self._pictures[0].path)
-        if first.max() < SIXTEEN_BITS_LEAST >> 8 and _is_deep(self._pictures[0].path):
-            log.warning(
-                "%s: holds pictures of 16 bits that do not use the upper two: unless it is dark there, "
-                "scale them, to 16 or to 8",
-                folder,
-            )
         self._image_size_wh = (first.shape[1], first.shape[0])
         if self._settings.intrinsics is not None:
             given = load_intrinsics(self._settings.intrinsics).scaled_to(self._image_size_wh)
@@ -229,9 +223,5 @@ def _flat(numbers: object) -> Array:
         return np.full(1, np.nan)
 
 
-def _is_deep(path: Path) -> bool:
-    return bool(read_pixels(path, cv2.IMREAD_UNCHANGED).dtype == np.uint16)
-
-
 def _decode(path: Path) -> NDArray[np.uint8]:
-    return np.asarray(read_pixels(path, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return read_8_bits(path, cv2.IMREAD_COLOR)

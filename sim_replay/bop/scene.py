@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import PIL.Image
 import PIL.TiffImagePlugin
 from numpy.typing import NDArray
 
-from edge.cameras.picture_file import SIXTEEN_BITS_LEAST, read_pixels
+from edge.cameras.picture_file import read_8_bits, read_pixels
 from edge.errors import InputError
 from sim_replay.bop.fields import by_number, load_json, load_object, matrix
 from sim_replay.bop.frames import Source, frame_of
@@ -30,7 +29,6 @@ IMAGEWISE_CAMERA = ".camera.json"
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  # how JPEG and PNG end, by how they begin
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TAIL_BYTES = 512  # of a file, where its end is, unless something follows it
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,10 @@ class BopScene:
         path = self._masks.get((kind, frame.image_id, target_index))
         if path is None:
             return None
-        values = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        try:
+            values = read_pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        except InputError as error:
+            raise BopError(str(error)) from error
         return values > values.max() // 2  # the format defines 255 as set; some datasets write 1
 
 
@@ -196,28 +197,8 @@ def _mask_of_runs(path: Path, target_index: int, entry: Any) -> Mask:
 
 def read_picture_bgr(path: Path) -> Image:
     """The image [H, W, 3]; of 16 bits the upper eight. Raises BopError."""
-    pixels = _pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if pixels.dtype == np.uint16:
-        if pixels.max() < SIXTEEN_BITS_LEAST:
-            _tell_once_of_dark_pictures(path.parent)
-        pixels >>= 8
-    elif pixels.dtype != np.uint8:
-        raise BopError(f"{path} has pixels of {pixels.dtype}, not of 8 or 16 bits")
-    return np.asarray(pixels, dtype=np.uint8)
-
-
-@cache
-def _tell_once_of_dark_pictures(folder: Path) -> None:
-    _log.warning(
-        "%s: holds pictures of 16 bits that do not use the upper two: unless it is dark there, "
-        "scale them, to 16 or to 8",
-        folder,
-    )
-
-
-def _pixels(path: Path, flags: int) -> NDArray[Any]:
     try:
-        return read_pixels(path, flags)  # never turned: labels refer to the pixels as stored
+        return read_8_bits(path, cv2.IMREAD_COLOR)  # never turned: labels refer to the pixels as stored
     except InputError as error:
         raise BopError(str(error)) from error
 

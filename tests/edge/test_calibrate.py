@@ -146,6 +146,15 @@ def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_without_a_traceba
     assert (done.returncode, done.stderr) == (2, said)
 
 
+def test_pictures_of_a_deep_camera_that_were_not_scaled_are_warned_of(cli: Cli, tmp_path: Path) -> None:
+    pictures = film(tmp_path / "board", "charuco", poses(0.55, 1.0)[:1])
+    (path,) = pictures.iterdir()
+    cv2.imwrite(str(path), cv2.imread(str(path)).astype(np.uint16) * 16)
+    done = cli("calibrate", "board", "--out", "nose.yaml")
+    assert done.returncode == 2
+    assert "board: holds pictures of 16 bits that do not use the upper two" in done.stderr
+
+
 def test_views_that_do_not_differ_are_refused_with_a_sentence(cli: Cli, tmp_path: Path) -> None:
     still = film(tmp_path / "still", "charuco", poses(0.5, 1.0)[:2] * 3)
     done = cli("calibrate", still)
