@@ -1,10 +1,10 @@
 """A simulated autopilot: tells own-ship state over MAVLink on UDP, and takes what the daemon sends.
 
 It sends a sequence's telemetry as ArduPilot or PX4 would on a plane, on a boot clock of its own: HEARTBEAT,
-ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, and GIMBAL_DEVICE_ATTITUDE_STATUS of its own
-gimbal; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. Where telemetry rows are missing, it sends no own-ship
-state. PX4 denies a command with unknown parameters, and sends TIMESYNC requests itself, ten times per second,
-accepting answers within 10 ms.
+ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT, SYSTEM_TIME, SYS_STATUS, and
+GIMBAL_DEVICE_ATTITUDE_STATUS of its own gimbal; it answers TIMESYNC and MAV_CMD_SET_MESSAGE_INTERVAL. Where telemetry
+rows are missing, it sends no own-ship state. PX4 denies a command with unknown parameters, and sends TIMESYNC requests
+itself, ten times per second, accepting answers within 10 ms.
 
     python -m sim_replay.autopilot --telemetry telemetry.csv --endpoint 127.0.0.1:14550 --start-at-ns 123456789
 
@@ -50,6 +50,7 @@ DEFAULT_RATES_HZ = {
     dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20.0,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10.0,
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+    dialect.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
 }
 GIMBAL_RATE_HZ = 10.0  # without a request
 FIRMWARES = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
@@ -167,6 +168,8 @@ class Autopilot:
             return dialect.MAVLink_heartbeat_message(kind, autopilot, armed, 0, dialect.MAV_STATE_ACTIVE, 3)
         if message_id == dialect.MAVLINK_MSG_ID_TIMESYNC:
             return dialect.MAVLink_timesync_message(0, now_ns - self._boot_at_ns)
+        if message_id == dialect.MAVLINK_MSG_ID_SYS_STATUS:
+            return dialect.MAVLink_sys_status_message(*[dialect.MAV_SYS_STATUS_AHRS] * 3, 0, 0, -1, -1, *[0] * 6)
         boot_ms = self._boot_ms(now_ns)
         if message_id == dialect.MAVLINK_MSG_ID_SYSTEM_TIME:
             return dialect.MAVLink_system_time_message(time.time_ns() // 1000, boot_ms)

@@ -14,13 +14,14 @@ from edge.links.mavlink_table import (
     GLOBAL_POSITION_INT,
     IMAGE_STATUS,
     LOCAL_POSITION_NED,
+    SYS_STATUS,
     SYSTEM_TIME,
     TARGET_RELATIVE,
 )
 from edge.tracking.own_ship import OwnShipBuffer
 
 GLOBAL_POSITION_HZ = 5.0
-SYSTEM_TIME_HZ = 1.0
+SYSTEM_TIME_HZ = SYS_STATUS_HZ = 1.0
 GIMBAL_HZ = 50.0
 FOLLOW_TARGET_HZ = 10.0
 ADSB_VEHICLE_HZ = 2.0
@@ -36,6 +37,7 @@ def wanted_rates_hz(settings: MavlinkSettings, own_ship: OwnShipBuffer) -> dict[
         LOCAL_POSITION_NED: settings.position_rate_hz,
         GLOBAL_POSITION_INT: GLOBAL_POSITION_HZ,
         SYSTEM_TIME: SYSTEM_TIME_HZ,
+        SYS_STATUS: SYS_STATUS_HZ,
         **gimbal,
     }
 

@@ -37,6 +37,7 @@ from edge.links.mavlink_table import (
     GEO_STATUS,
     HEARTBEAT,
     IMAGE_STATUS,
+    SYS_STATUS,
     TARGET_RELATIVE,
     TIMESYNC,
 )
@@ -52,10 +53,9 @@ from edge.types import CameraInfo, Report, Track
 from msgs.mavlink import dialect
 
 SYSTEM_ID_UNTIL_HEARD = 1  # MAVLink's default vehicle, so that a peer that waits for us receives our heartbeat
-HEARTBEAT_NS = 1_000_000_000
+HEARTBEAT_NS, TIMESYNC_NS = 1_000_000_000, 200_000_000
 HEALTH_AGE_MAX_NS = 3_000_000_000  # older: the loop is stuck, which no heartbeat may hide
 FRAMELESS_NS = 1_000_000_000  # no report for longer: the image status becomes idle, so that displays clear the box
-TIMESYNC_NS = 200_000_000
 TEXTS_HELD = 4
 NEWS_AT_ONCE, NEWS_NS = 32, 500_000_000
 STANDS_IN = {ATTITUDE: ATTITUDE_QUATERNION}
@@ -257,6 +257,8 @@ class Station:
                 self.vehicle.acknowledged(message.result == dialect.MAV_RESULT_ACCEPTED)
         elif message_id in COMMANDS:
             return self._obey(message, now_ns)
+        elif message_id == SYS_STATUS:
+            self._telemetry.take_health(message)
         elif message_id != HEARTBEAT:
             self.recognition.home.carries()
             by_autopilot = message.get_srcComponent() == AUTOPILOT_COMPONENT
@@ -268,9 +270,8 @@ class Station:
                 self._telemetry.clock_set_back()
                 self.timesync.jumped()
             reason = self._telemetry.take(message, now_ns, self.vehicle.autopilot)
-            self.counters["position_jumps"] = self._telemetry.position_jumps
-            self.counters["attitude_jumps"] = self._telemetry.attitude_jumps
-            self.counters["gimbal_jumps"] = self._telemetry.gimbal_jumps
+            for kind in ("position_jumps", "attitude_jumps", "gimbal_jumps"):
+                self.counters[kind] = getattr(self._telemetry, kind)
             if (ahead_ns := self._telemetry.daytime.ahead_ns) is not None:
                 self.counters["utc_ahead_ms"] = ahead_ns // 1_000_000
             else:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from msgs.mavlink import MAVLink_target_relative_message, dialect
 
 HEARTBEAT = dialect.MAVLINK_MSG_ID_HEARTBEAT
+SYS_STATUS = dialect.MAVLINK_MSG_ID_SYS_STATUS
 SYSTEM_TIME = dialect.MAVLINK_MSG_ID_SYSTEM_TIME
 ATTITUDE = dialect.MAVLINK_MSG_ID_ATTITUDE
 ATTITUDE_QUATERNION = dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
@@ -79,6 +80,7 @@ READ = (
     Read(GLOBAL_POSITION_INT, "GLOBAL_POSITION_INT", "5 Hz requested", "global position of the local frame"),
     Read(GIMBAL_ATTITUDE, "GIMBAL_DEVICE_ATTITUDE_STATUS", "50 Hz requested with a gimbal", "attitude of the camera"),
     Read(SYSTEM_TIME, "SYSTEM_TIME", "1 Hz requested", "boot time: a decrease means a reboot; UTC, compared with ours"),
+    Read(SYS_STATUS, "SYS_STATUS", "1 Hz requested", "whether the autopilot holds its attitude to be healthy"),
     Read(TIMESYNC, "TIMESYNC", "answers to ours", "the autopilot's clock"),
     Read(COMMAND_ACK, "COMMAND_ACK", "answers to ours", "whether a rate was granted"),
     Read(COMMAND_LONG, "COMMAND_LONG", "as received", "commands to us"),

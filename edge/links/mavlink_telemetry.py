@@ -51,6 +51,7 @@ STANDS = {
     kind: f"the autopilot's {kind} stands still while its {rate} says that it moves: it is not used"
     for kind, rate in {"attitude": "turn rate", "position": "velocity", "global position": "velocity"}.items()
 }
+UNHEALTHY = "the autopilot says that its attitude is not healthy: it is not used"
 SERVO_GIMBAL = "PX4 tells what it steers the gimbal's servos by, not where the camera looks: it is not used"
 
 
@@ -100,7 +101,7 @@ class Telemetry:
         self._utc = utc
         self._gimbal_id = gimbal_id
         self.attitude_jumps = self.position_jumps = self.gimbal_jumps = 0
-        self._servos_heard = self._servos_told = False
+        self._servos_heard = self._servos_told = self._unhealthy_told = False
         self._forget()
         self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
 
@@ -115,6 +116,7 @@ class Telemetry:
 
     def _forget(self) -> None:
         self._own_ship.clear()
+        self._unhealthy = False
         self._jumps = Jumps()
         self._attitude_stands = Standstill(SAME_R, TURNED_RAD, STANDS["attitude"])
         self._position_stands = Standstill(SAME_M, FLOWN_M, STANDS["position"])
@@ -130,7 +132,8 @@ class Telemetry:
         untold, self._servos_told = self._servos_heard and not self._servos_told, self._servos_heard
         kinds = (self._attitude_stands, self._position_stands, self._global_stands)
         stood = [sentence for kind in kinds for sentence in kind.news(now_ns)]
-        return self.daytime.news(now_ns) + stood + ([SERVO_GIMBAL] if untold else [])
+        unhealthy, self._unhealthy_told = self._unhealthy and not self._unhealthy_told, self._unhealthy
+        return self.daytime.news(now_ns) + stood + [UNHEALTHY] * unhealthy + [SERVO_GIMBAL] * untold
 
     def take(self, message: Any, now_ns: int, autopilot: int | None = None) -> str | None:
         """Process a valid message of a MAV_AUTOPILOT or its gimbal; returns why it was rejected, or None."""
@@ -156,7 +159,17 @@ class Telemetry:
             reason = self._add_global(time_ns, message)
         return reason
 
+    def take_health(self, message: Any) -> None:
+        """Process the autopilot's SYS_STATUS: while it holds its attitude to be unhealthy, that is not used."""
+        used = message.onboard_control_sensors_present & message.onboard_control_sensors_enabled
+        unhealthy = bool(used & ~message.onboard_control_sensors_health & dialect.MAV_SYS_STATUS_AHRS)
+        if unhealthy != self._unhealthy:
+            self._unhealthy = unhealthy
+            self._own_ship.clear(same_autopilot=True)
+
     def _add_attitude(self, time_ns: int, q_ned_body_wxyz: ArrayLike, message: Any, now_ns: int) -> str | None:
+        if self._unhealthy:
+            return "unhealthy"
         rates_radps = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         R_ned_body, stood = R_from_q_wxyz(q_ned_body_wxyz), self._attitude_stands.times
         if self._attitude_stands.stands(time_ns, R_ned_body, rates_radps):

@@ -249,3 +249,33 @@ def test_attitude_in_angles_is_asked_for_where_none_comes_as_a_quaternion(has_qu
             answer(question, now_ns)
     assert own_ship.at(1_014_990 * ms) is not None
     assert rates_hz.get(dialect.MAVLINK_MSG_ID_ATTITUDE) == (None if has_quaternion else 50.0)
+
+
+def test_an_attitude_that_the_autopilot_holds_to_be_unhealthy_is_not_used_until_it_is_well() -> None:
+    ahrs, gyro = dialect.MAV_SYS_STATUS_AHRS, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+
+    def status(health: int, enabled: int = ahrs | gyro) -> Any:
+        return dialect.MAVLink_sys_status_message(ahrs | gyro, enabled, health, 0, 0, -1, -1, *[0] * 6)
+
+    with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        hear(own_ship, peer, Rotation.identity())
+        peer.send(status(ahrs))  # another sensor's failure is the autopilot's affair
+        peer.send(status(gyro, enabled=gyro))  # it estimates none
+        hear(own_ship, peer, Rotation.identity())
+        assert "refused_unhealthy" not in link.counters()
+        peer.send(status(gyro))
+
+        def tell() -> None:
+            peer.attitude(Rotation.identity())
+
+        def says_so(message: Any) -> bool:
+            return message.get_type() == "STATUSTEXT" and message.text.startswith(
+                "the autopilot says that its attitude"
+            )
+
+        assert peer.until(says_so, "text", tell).severity == dialect.MAV_SEVERITY_WARNING
+        peer.settle(lambda: link.counters().get("refused_unhealthy", 0) >= 3, "refusals", tell)
+        assert own_ship.at(time.monotonic_ns()) is None
+        peer.send(status(ahrs | gyro))
+        hear(own_ship, peer, Rotation.identity())
