@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, requires
 
+from msgs.interrupts import raise_on_interrupt
+
 EXIT_BAD_INPUT = 2
 PROJECT = "mf-uavpose6d-edge"
 _DISTRIBUTIONS = {"rerun": "rerun-sdk", "PIL": "pillow"}  # where the distribution is not named like the package
@@ -28,6 +30,7 @@ def exit_code(
     """Run `act` and return its exit code; 2 if it raises `bad_input`, whose text names file and key, or OutputError, or
     needs a missing package that one of the `extras` installs; 130 after Ctrl-C; 141 if the output pipe was closed, as
     by `| head`."""
+    raise_on_interrupt()
     told: list[type[Exception]] = [OutputError, *(bad_input if isinstance(bad_input, tuple) else [bad_input])]
     if isinstance(sys.stdout, io.TextIOWrapper):
         # As on standard error, characters that the locale's encoding lacks, in paths or our own, are escaped.
