@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 
 import cv2
 
@@ -11,7 +12,7 @@ from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.live import LiveSource
 from edge.cameras.stamps import StampCheck
 from edge.config_camera import DeviceCamera
-from edge.types import CameraInfo
+from edge.types import CameraInfo, Frame
 
 log = logging.getLogger(__name__)
 
@@ -39,10 +40,20 @@ class DeviceSource(LiveSource):
         self._settings = settings
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
+        self._undated = False  # the last frame may have waited in the driver, for as long as the model was warmed up
+        self.counts["catching_up"] = 0
 
     def nominal(self) -> CameraInfo:
         """Properties before the camera answers: the requested picture."""
         return self._info(self._asked, None)
+
+    def read(self, stop: threading.Event) -> Frame:
+        """As in LiveSource, without frames that may have waited to be read; they use up sequence numbers too."""
+        while True:
+            frame = super().read(stop)
+            if not self._undated:
+                return frame
+            self.counts["catching_up"] += 1
 
     def _connect(self) -> cv2.VideoCapture:
         settings = self._settings
@@ -69,7 +80,9 @@ class DeviceSource(LiveSource):
         # OpenCV returns the V4L2 buffer's timestamp as CAP_PROP_POS_MSEC. It is on CLOCK_MONOTONIC if the driver sets
         # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC, which OpenCV does not report; a driver without timestamps gives 0.
         stamp_ns = round(position_ms * 1e6)
-        if not self._stamps.believes(stamp_ns, arrival_ns):
+        believed = self._stamps.believes(stamp_ns, arrival_ns)
+        self._undated = believed is None
+        if believed is False:
             self.counts["unstamped"] += 1
             stamp_ns = arrival_ns
         return stamp_ns - self._latency_ns

@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-DOUBTED_FRAMES = 100  # too old in a row: no backlog is that long, so they are of another clock
+DOUBTED_FRAMES = 100  # in a row, all about as old: no backlog is that long, so they are of another clock
+BACKLOG_MAX_NS = 30_000_000_000  # longer than a link holds frames back
 WINDOW_NS = 5_000_000_000
 DRIFT_PPM = 500  # upper limit for the drift between two quartz clocks
 # Encoders that count frames instead of time run slow by as much as the sensor does: 1000 ppm if 29.97 Hz is declared as
@@ -25,20 +26,38 @@ class StampCheck:
     """Judges whether timestamps are of our clock.
 
     A timestamp that is too old is not replaced by the arrival time: after a stall the first frames *are* old, and would
-    be wrong if treated as new. Only if timestamps never fitted, or no longer do for DOUBTED_FRAMES, is it the clock.
+    be wrong if treated as new. Only if frames stay as old is it the clock: those of a backlog arrive less and less late.
     """
 
     def __init__(self, age_max_ns: int) -> None:
         self._age_max_ns = age_max_ns
-        self._doubted = DOUBTED_FRAMES
+        self._fitted = self._foreign = False
+        self._least: tuple[int, int] | None = None  # of the too old: the least age, and when the first such arrived
+        self._doubted = 0  # too old ones since then
 
-    def believes(self, stamp_ns: int, arrival_ns: int) -> bool:
-        """Whether the timestamp is the exposure time of the frame that arrived at `arrival_ns` (monotonic)."""
+    def believes(self, stamp_ns: int, arrival_ns: int) -> bool | None:
+        """Whether the timestamp is the exposure time of the frame that arrived at `arrival_ns` (monotonic).
+
+        None: it may be that of an old frame, or of another clock: none has matched ours yet. Nothing else tells the
+        frame's age, so it must not be used."""
         age_ns = arrival_ns - stamp_ns
         if age_ns < 0:
             return False
-        self._doubted = 0 if age_ns <= self._age_max_ns else self._doubted + 1
-        return self._doubted < DOUBTED_FRAMES
+        if age_ns <= self._age_max_ns:
+            self._fitted, self._foreign, self._least = True, False, None
+            return True
+        self._foreign = self._foreign or self._is_foreign(age_ns, arrival_ns)
+        if self._foreign:
+            return False
+        return True if self._fitted else None
+
+    def _is_foreign(self, age_ns: int, arrival_ns: int) -> bool:
+        if self._least is None or age_ns < self._least[0] - CATCHING_UP_NS:
+            self._least, self._doubted = (age_ns, arrival_ns), 0
+        self._doubted += 1
+        if self._fitted:
+            return self._doubted > DOUBTED_FRAMES
+        return age_ns > BACKLOG_MAX_NS or arrival_ns - self._least[1] >= CAUGHT_UP_NS
 
 
 class SlowClock:

@@ -72,7 +72,9 @@ class ZenohSource:
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # publisher of the last picture, and its sequence number
         self._heeded: tuple[bytes, int] | None = None  # the publisher in use, and when its last picture arrived (ns)
-        self.counts: Counter[str] = Counter(unstamped=0, undecodable=0, misfit=0, other_publisher=0, other_topic=0)
+        self.counts: Counter[str] = Counter(
+            unstamped=0, catching_up=0, undecodable=0, misfit=0, other_publisher=0, other_topic=0
+        )
 
     def nominal(self) -> CameraInfo:
         lens = self._intrinsics
@@ -154,7 +156,10 @@ class ZenohSource:
             raise _UnusableError("undecodable", UNDECODABLE)
         fitted = self._fit((image_bgr.shape[1], image_bgr.shape[0]))
         stamp_ns = self._clock.monotonic_ns(message.stamp_ns)
-        if not self._stamps.believes(stamp_ns, arrival_ns):
+        believed = self._stamps.believes(stamp_ns, arrival_ns)
+        if believed is None:
+            raise _UnusableError("catching_up", "is old, or its clock differs from ours")
+        if not believed:
             self.counts["unstamped"] += 1
             stamp_ns = arrival_ns
         meta = FrameMeta(self._number(attachment), stamp_ns - self._latency_ns, arrival_ns)

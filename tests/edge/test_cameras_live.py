@@ -115,6 +115,23 @@ def test_a_zenoh_topic_is_a_camera_stamped_by_its_publisher() -> None:
         assert frame.K[0, 0] == 300
 
 
+def test_pictures_that_a_link_held_back_before_the_first_are_not_told_as_of_now() -> None:
+    """As where the daemon was stopped, or the link stood still, while the camera began."""
+    port = free_port()
+    with router(port) as publisher, closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        until(publisher.matching)
+        read: list[Frame] = []
+        reader = threading.Thread(target=lambda: read.append(source.read(threading.Event())))
+        reader.start()
+        for number, held_s in enumerate((4.0, 3.7, 3.3, 2.9, 2.4)):
+            publisher.put(message(number, stamp_ns=time.time_ns() - round(held_s * 1e9)))
+            until(lambda number=number: read or source.counts["catching_up"] > number)  # type: ignore[misc]
+        publisher.put(message(5))
+        reader.join()
+    assert number_of(read[0]) == 5
+
+
 def test_a_picture_is_taken_as_its_sensor_read_it_out_however_it_says_it_is_held() -> None:
     port = free_port()
     with router(port) as publisher, closing(ZenohSource(zenoh_camera(port))) as source:

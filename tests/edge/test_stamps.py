@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from edge.cameras.device import DeviceSource
 from edge.cameras.source import SourceLost
-from edge.cameras.stamps import DOUBTED_FRAMES, StampCheck, StreamClock
+from edge.cameras.stamps import BACKLOG_MAX_NS, DOUBTED_FRAMES, StampCheck, StreamClock
 from edge.cameras.stream import BEHIND_MAX_NS, StreamSource
 from edge.config_camera import DeviceCamera, IntrinsicsSettings, StreamCamera
 
@@ -203,7 +203,6 @@ def test_a_backlog_that_grows_step_by_step_is_not_taken_for_a_slow_clock(
 @given(st.integers(0, 10**15), st.integers(0, AGE_MAX_NS), st.integers(AGE_MAX_NS + 1, 10**12))
 def test_once_a_drivers_stamp_has_fitted_an_old_one_is_an_old_frame(boot_ns: int, fresh_ns: int, old_ns: int) -> None:
     stamps = StampCheck(AGE_MAX_NS)
-    assert not stamps.believes(boot_ns - old_ns, boot_ns)  # never seen to fit: another clock
     assert stamps.believes(boot_ns - fresh_ns, boot_ns)
     assert stamps.believes(boot_ns - old_ns, boot_ns)
     assert not stamps.believes(boot_ns + 1, boot_ns)  # of the future
@@ -211,6 +210,35 @@ def test_once_a_drivers_stamp_has_fitted_an_old_one_is_an_old_frame(boot_ns: int
     assert believed[0]
     assert not believed[-1]  # no backlog is that long
     assert stamps.believes(boot_ns - fresh_ns, boot_ns)
+
+
+@given(st.integers(AGE_MAX_NS + 1, 10**12), st.integers(0, 4_000_000))
+def test_stamps_of_a_clock_that_never_fitted_are_replaced_once_they_cannot_be_a_backlog(
+    old_ns: int, jitter_ns: int
+) -> None:
+    stamps = StampCheck(AGE_MAX_NS)
+    believed = [stamps.believes(k * PERIOD_NS - old_ns - k % 2 * jitter_ns, k * PERIOD_NS) for k in range(40)]
+    begins = believed.index(False)
+    assert begins == (0 if old_ns > BACKLOG_MAX_NS else 16)
+    assert set(believed[:begins]) <= {None}
+    assert set(believed[begins:]) == {False}
+
+
+@given(st.booleans(), st.floats(2.0, 9.0), st.integers(5, 240), st.floats(0.001, 0.9))
+def test_what_was_held_back_is_never_told_as_new(fitted: bool, stall_s: float, fps: int, drain_share: float) -> None:
+    """Whether the stall came before the first frame, and however many frames it held."""
+    stamps, period_ns, now_ns = StampCheck(AGE_MAX_NS), S // fps, 0
+    if fitted:
+        assert stamps.believes(0, 0)
+    for k in range(1, round(10 * stall_s * fps)):
+        exposed_ns = k * period_ns
+        now_ns = max(exposed_ns, round(stall_s * S), now_ns + round(drain_share * period_ns))
+        believed = stamps.believes(exposed_ns, now_ns)
+        assert believed is not False
+        assert fitted <= (believed is True)
+        if now_ns == exposed_ns:
+            assert believed
+            break
 
 
 class Fed:
