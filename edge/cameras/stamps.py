@@ -26,7 +26,7 @@ class StampCheck:
     """Judges whether timestamps are of our clock.
 
     A timestamp that is too old is not replaced by the arrival time: after a stall the first frames *are* old, and would
-    be wrong if treated as new. Only if frames stay as old is it the clock: those of a backlog arrive less and less late.
+    be wrong if treated as new. It is the clock only if frames stay as old: those of a backlog arrive ever less late.
     """
 
     def __init__(self, age_max_ns: int) -> None:
