@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from edge.config_camera import CameraSettings
+from edge.config_camera import CameraSettings, Finite
 from edge.config_camera import SequenceCamera as SequenceCamera
 from edge.config_camera import camera_key as camera_key
 from edge.config_estimator import SHIPPED_MODEL as SHIPPED_MODEL
@@ -64,7 +64,6 @@ def _endpoint(text: str) -> str:
 
 
 Endpoint = Annotated[str, AfterValidator(_endpoint)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 LeverM = Annotated[float, Field(ge=-50, le=50, allow_inf_nan=False)]  # larger values are surely millimetres
 
 

@@ -13,10 +13,10 @@ from edge.errors import InputError
 from msgs.settings import Pair, Section, parse_settings, read_text
 from sim_replay.airframes import AIRFRAMES, airframe_id
 from sim_replay.airframes.invented import dataset_names
+from sim_replay.render.environment import Weather
+from sim_replay.render.sensor import Quality
 
 Split = Literal["train", "val", "test"]
-Weather = Literal["clear", "haze", "overcast", "low_sun", "dusk", "fog", "glare", "broken_cloud"]
-Quality = Literal["good", "ordinary", "poor"]
 Gust = Literal["calm", "light", "moderate"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

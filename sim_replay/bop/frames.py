@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from edge.cameras.sequence import DISTORTION_KEY
 from sim_replay.bop.fields import integer, length_m, matrix, rotation
 from sim_replay.bop.model_frame import ModelFrames
-from sim_replay.bop.records import DISTORTION_KEY, Array, BopError, BopFrame, BopTarget, Distortion
+from sim_replay.bop.records import Array, BopError, BopFrame, BopTarget, Distortion
 
 ROUNDING = 1e-6  # of values in a camera matrix that must be 0 or 1
 

@@ -12,8 +12,6 @@ from edge.errors import InputError
 Array = NDArray[np.float64]
 Distortion = tuple[float, float, float, float, float]  # OpenCV's plumb bob: k1, k2, p1, p2, k3
 MM_PER_M = 1000.0
-# Not part of BOP, which only has pinhole cameras; omitted for images without distortion.
-DISTORTION_KEY = "dist_k1_k2_p1_p2_k3"
 
 
 class BopError(InputError, ValueError):

@@ -15,15 +15,15 @@ import PIL.TiffImagePlugin
 from numpy.typing import NDArray
 
 from edge.cameras.picture_file import read_8_bits, read_pixels
+from edge.cameras.sequence import DISTORTION_KEY, PICTURE_SUFFIXES
 from edge.errors import InputError
 from sim_replay.bop.fields import by_number, load_json, load_object, matrix
 from sim_replay.bop.frames import Source, frame_of
 from sim_replay.bop.model_frame import ModelFrames
-from sim_replay.bop.records import DISTORTION_KEY, BopError, BopFrame
+from sim_replay.bop.records import BopError, BopFrame
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 PICTURE_FOLDERS = ("gray", "rgb")  # the later one is used if a frame has both
 IMAGEWISE_CAMERA = ".camera.json"
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  # how JPEG and PNG end, by how they begin

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.cameras.sequence import DISTORTION_KEY
 from sim_replay.bop.models import largest_distance
 from sim_replay.bop.ply import write_ply
-from sim_replay.bop.records import DISTORTION_KEY, MM_PER_M, Array, BopFrame, BopTarget, Distortion
+from sim_replay.bop.records import MM_PER_M, Array, BopFrame, BopTarget, Distortion
 
 if TYPE_CHECKING:
     from sim_replay.airframes.mesh import Mesh

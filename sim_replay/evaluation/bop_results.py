@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import InputError
+from sim_replay.bop.fields import is_rotation
 from sim_replay.bop.records import MM_PER_M
 from sim_replay.datasets import Dataset, DatasetFrame
 from sim_replay.evaluation.judge import Answer, Answerer, JudgedFrame, is_hidden, is_seen
@@ -26,7 +27,6 @@ from sim_replay.score import TargetPose
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 NO_OBJECT = 0  # obj_id of a pose that belongs to no target: BOP counts from 1, though not every dataset does
 UNKNOWN_TIME_S = -1.0
-_ROTATION_TOLERANCE = 0.02
 _UNITS_REL = 100.0  # no method is off by so much, but metres for millimetres are
 _LARGEST = 1e15  # beyond it, squares and sums exceed what JSON can represent
 
@@ -78,7 +78,7 @@ def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
         if name.endswith("_id") and values[name][0] % 1:
             raise InputError(f"{path} line {line}: {name} is not a whole number: {cell!r}")
     R = values["R"].reshape(3, 3)
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    if not is_rotation(R):
         raise InputError(f"{path} line {line}: R is not a rotation")
     scene_id, image_id, object_id = (int(values[name][0]) for name in COLUMNS[:3])
     score, time_s = float(values["score"][0]), float(values["time"][0])

@@ -14,6 +14,7 @@ import numpy as np
 
 from msgs import topics
 from msgs.mavlink import dialect
+from msgs.receive import RAY_TOLERANCE
 
 AUTOPILOT, SUBSCRIBER = "autopilot", "subscriber"
 OWN_LAT_LON_ALT = (47.3977, 8.5456, 788.0)
@@ -21,7 +22,6 @@ OWN_UP_M = 300.0  # above the local origin
 METRES_A_DEGREE = 111_195.0
 RANGE_TOLERANCE = 0.02
 LEVEL_TOLERANCE = 1e-2
-RAY_TOLERANCE = 1e-3
 IDLE = dialect.CAMERA_TRACKING_STATUS_FLAGS_IDLE
 # Messages and topics about a target of known range, by name.
 KINDS = (

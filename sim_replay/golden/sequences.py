@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sim_replay.flight.encounter import ORIGIN_DEG_M
 from sim_replay.sequence import (
     AIRFRAME,
-    ORIGIN_DEG_M,
     R_BODY_CAM,
     T_BODY_CAM_M,
     Array,
