@@ -42,13 +42,8 @@ RATE_SHARE_MIN, BAD_SHARE_MAX = 0.8, 0.1
 DAMAGED = "camera_damaged"
 STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
 LATE = "camera_late"
-USABLE = {
-    STAMPS,
-    LATE,
-    UNSTAMPED,
-    UNDECODABLE,
-    SLOW,
-}  # a busy machine may cause these too; there are images nevertheless
+# A busy machine may cause these too; there are images nevertheless.
+USABLE = {STAMPS, LATE, UNSTAMPED, UNDECODABLE, SLOW}
 ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     STAMPS: "see docs/cameras.md on timestamps; images that arrive in bursts also cause this",
     LATE: "see docs/cameras.md on timestamps; if its clock is not this computer's, keep both together by PTP",

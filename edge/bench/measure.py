@@ -133,14 +133,14 @@ def _row(case: Case, model: Model, macs: Macs, ms: Milliseconds, peaks: dict[int
 
 def _machine() -> Machine:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Machine(_cpu_name(), cores, ort.__version__, openvino.version())
+    return Machine(cpu_name(), cores, ort.__version__, openvino.version())
 
 
-def _cpu_name() -> str:
-    """The CPU's name from the kernel; Arm kernels give none, then the architecture."""
+def cpu_name() -> str:
+    """The processor's name from the kernel. Arm kernels give the board's, if any; otherwise it is the architecture."""
     try:
         lines = CPU_INFO.read_text(encoding="utf-8").splitlines()
     except OSError:
         lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model"))]
     return names[0] if names else platform.machine()

@@ -60,7 +60,9 @@ def _add_watch(commands: Commands) -> None:
     watch = commands.add_parser("watch", help="show a live table of vehicles and their targets")
     _connection(watch)
     watch.add_argument(
-        "--json", action="store_true", help="print one JSON object per line: pose, health, event, vehicle, link"
+        "--json",
+        action="store_true",
+        help="print one JSON object per line: pose, direction, health, event, vehicle, link",
     )
     watch.add_argument(
         "--max-age", type=_not_negative, default=2.0, metavar="S", help="reject poses older than this (default 2)"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import platform
 import tempfile
 import time
 from collections.abc import Sequence
@@ -85,18 +84,10 @@ def _renderer_name() -> str:
     return name
 
 
-def cpu_name() -> str:
-    """The processor's model, as reported by Linux."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model"))]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
 def bench(seconds: float, workers: int) -> dict[str, Any]:
     """Rates of each worker and in total, all workers rendering at once. Raises CrewError."""
+    from edge.bench.measure import cpu_name  # loads ONNX Runtime, which workers do without
+
     out: dict[str, Any] = {"cpu": cpu_name(), "cores": available_cores(), "workers": workers, "seconds": seconds}
     for kind in ("frames", "windows"):
         results = _run_all(kind, seconds, workers)

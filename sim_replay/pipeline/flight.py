@@ -110,7 +110,7 @@ def fly(settings: FlightSettings, on_second: Callable[[float], None]) -> Flight:
 
 
 def looped(telemetry: Telemetry, frame0_ns: int, period_s: float, rounds: int) -> Telemetry:
-    """The part that belongs to the frames, repeated; t_ns is 0 at the exposure of the first frame."""
+    """What precedes the frames, then the part that belongs to them, repeated; t_ns is 0 at the first exposure."""
     t_ns = telemetry.t_ns - frame0_ns
     period_ns = round(period_s * 1e9)
     inside = (t_ns >= 0) & (t_ns < period_ns)

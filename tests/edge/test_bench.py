@@ -158,7 +158,8 @@ def test_no_thread_of_one_case_runs_while_the_next_is_timed() -> None:
     ("cpuinfo", "name"),
     [
         ("processor\t: 0\nmodel name\t: A CPU: 2 GHz\n\nprocessor\t: 1\nmodel name\t: another\n", "A CPU: 2 GHz"),
-        ("processor\t: 0\nBogoMIPS\t: 108.00\n", platform.machine()),  # as of Arm's kernels
+        ("processor\t: 0\nBogoMIPS\t: 108.00\n\nModel\t\t: A Board 5\n", "A Board 5"),  # as of Arm's kernels
+        ("processor\t: 0\nBogoMIPS\t: 108.00\n", platform.machine()),
         (None, platform.machine()),
     ],
 )
