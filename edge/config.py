@@ -28,8 +28,8 @@ from edge.config_ports import collision, mavlink_listener, metrics_listener, zen
 from edge.errors import InputError
 from edge.links.mavlink_endpoints import parse_endpoint, plain_host
 from edge.links.signing_key import load_key
-from edge.types import Array, Mount
-from msgs.geometry import R_from_euler
+from edge.types import Mount
+from msgs.geometry import R_from_euler, nearest_rotation
 from msgs.settings import Fault, Section, faults_of, parse_toml, read_text
 from msgs.topics import check_uav_name
 
@@ -102,8 +102,7 @@ class MountSettings(Section):
     def mount(self) -> Mount:
         """R_body_cam [3, 3], exactly orthonormal, and t_body_cam_m [3]."""
         if self.R_body_cam is not None:
-            u, _, vt = np.linalg.svd(np.array(self.R_body_cam))
-            R_body_cam: Array = u @ vt
+            R_body_cam = nearest_rotation(self.R_body_cam)
         else:
             angles_rad = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
             R_body_cam = R_from_euler(*angles_rad) @ R_BODY_CAM_FORWARD

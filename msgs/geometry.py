@@ -61,6 +61,13 @@ def rotation_angle(R_a: ArrayLike, R_b: ArrayLike) -> Array:
     return np.arctan2(sine, cosine)
 
 
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """The rotation nearest, in the sum of squares, to a matrix [3, 3]: to a mean of rotations, or a rounded one."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    R = u @ vt
+    return R if np.linalg.det(R) > 0.0 else u @ np.diag([1.0, 1.0, -1.0]) @ vt
+
+
 def q_wxyz_from_R(R: ArrayLike) -> Array:
     """Rotation matrices [..., 3, 3] to unit quaternions [..., 4], w >= 0 (Bar-Itzhack: largest diagonal first)."""
     m = np.asarray(R, dtype=np.float64)

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from msgs.contract import ScoreCalibration
+from msgs.geometry import nearest_rotation
 from sim_replay import metrics
 from trainer.data import TrainingBatch
 from trainer.model import PoseNet
@@ -158,8 +159,7 @@ def constant_guess(batches: list[TrainingBatch]) -> dict[str, float]:
     """Baseline errors of the best constant prediction: one rotation and one depth, fitted to these windows."""
     labels = TrainingBatch(*(np.concatenate(values) for values in zip(*batches, strict=True)))
     R, Z = labels.R_cam_target[labels.present].astype(np.float64), labels.t_cam_target_m[labels.present, 2]
-    u, _, vt = np.linalg.svd(R.mean(axis=0))
-    guess = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    guess = nearest_rotation(R.mean(axis=0))
     return {
         "constant_E_r_mean_deg": float(metrics.rotation_error_deg(np.broadcast_to(guess, R.shape), R).mean()),
         "constant_depth_rel_mean": float(np.mean(np.abs(np.median(Z) / Z - 1.0))),

@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
 from edge.estimator.model import Peaks
 from edge.estimator.window import PixelMap, whole_frame
+from edge.tracking.boxes import overlap
 from edge.types import Array, Estimate
 from msgs.contract import ModelContract
+from msgs.geometry import nearest_rotation
 
 # A depth outside the trained range, up to this factor, is accepted with a covariance that reaches back to the range.
 RANGE_EXCESS_MAX = 2.0
@@ -120,7 +122,7 @@ def decode(
         # Outside the trained range the depth may be as far off as its distance to it.
         sigma[2] = np.hypot(sigma[2], np.log(_excess(t_m[2], contract.trained_range_m)))
         sigma[3:] = np.hypot(sigma[3:], max(_steepness_rad(t_m, shown.up_cam) - TRAINED_STEEPNESS_RAD, 0.0))
-        R, oversize = _nearest_rotation(R), None
+        R, oversize = nearest_rotation(R), None
         if size is not None and not cut:
             sides = peaks.size_px[image, peak] / np.diag(shown.K)[:2]
             t_m, sigma, oversize = _sized(size, R, t_m, sides, sigma, score)
@@ -161,18 +163,9 @@ def distinct(estimates: Sequence[Estimate], known_boxes: Sequence[Array] = ()) -
     return kept
 
 
-def lies_on(box_xyxy: ArrayLike, known_boxes: Sequence[Array]) -> bool:
+def lies_on(box_xyxy: Array, known_boxes: Sequence[Array]) -> bool:
     """Whether a box overlaps one of `known_boxes` so much that both are of the same target."""
     return any(overlap(box_xyxy, known) >= SAME_TARGET_OVERLAP for known in known_boxes)
-
-
-def overlap(box_a_xyxy: ArrayLike, box_b_xyxy: ArrayLike) -> float:
-    """Intersection area over the smaller box's area, 0..1."""
-    a, b = np.asarray(box_a_xyxy, dtype=np.float64), np.asarray(box_b_xyxy, dtype=np.float64)
-    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    if sides.min() <= 0:
-        return 0.0
-    return float(np.prod(sides) / min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])))
 
 
 def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> Estimate | None:
@@ -281,8 +274,3 @@ def _excess(value: float, trained: tuple[float, float]) -> float:
 def _steepness_rad(t_m: Array, up_cam: Array | None) -> float:
     """Angle of the sight line to the horizon, 0 .. pi / 2; 0 if it is unknown where up is."""
     return 0.0 if up_cam is None else float(np.arcsin(min(abs(float(t_m @ up_cam)) / float(np.linalg.norm(t_m)), 1.0)))
-
-
-def _nearest_rotation(R: Array) -> Array:
-    u, _, vt = np.linalg.svd(R)
-    return np.asarray(u @ vt)

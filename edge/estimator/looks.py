@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge.estimator.decode import lies_on
 from edge.estimator.model import Peaks
 from edge.types import Array, Estimate
-from msgs.geometry import rotation_angle, so3_log
+from msgs.geometry import nearest_rotation, rotation_angle, so3_log
 
 # Mirroring negates cam x and target y; applied from both sides they keep a rotation a rotation.
 MIRROR_CAM, MIRROR_TARGET = np.diag([-1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0])
@@ -117,8 +117,7 @@ def _rotation_of(looks: Sequence[Estimate]) -> tuple[Array, Array]:
     middle = int(np.argmin(np.minimum(apart_rad, DISAGREEING_RAD) @ (1.0 / np.sqrt(variances))))
     agreeing = apart_rad[middle] < AGREEING_RAD
     shares = (1.0 / variances) / np.sum(1.0 / variances)
-    U, _, Vt = np.linalg.svd(np.einsum("n,nij->ij", shares * agreeing, R))
-    mean = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    mean = nearest_rotation(np.einsum("n,nij->ij", shares * agreeing, R))
     away = so3_log(R @ mean.T)
     spread = np.einsum("n,ni,nj->ij", shares, away, away)
     return mean, np.average(covariances[agreeing], axis=0, weights=shares[agreeing]) + spread

@@ -45,10 +45,18 @@ class BoxModel:
 
 def iou(a_xyxy: Array, b_xyxy: Array) -> float:
     """Intersection over union of two boxes [4]."""
-    overlap = np.clip(np.minimum(a_xyxy[2:], b_xyxy[2:]) - np.maximum(a_xyxy[:2], b_xyxy[:2]), 0.0, None)
-    intersection = float(overlap[0] * overlap[1])
+    sides = np.clip(np.minimum(a_xyxy[2:], b_xyxy[2:]) - np.maximum(a_xyxy[:2], b_xyxy[:2]), 0.0, None)
+    intersection = float(sides[0] * sides[1])
     union = float(np.prod(a_xyxy[2:] - a_xyxy[:2]) + np.prod(b_xyxy[2:] - b_xyxy[:2])) - intersection
     return intersection / union if union > 0.0 else 0.0
+
+
+def overlap(a_xyxy: Array, b_xyxy: Array) -> float:
+    """Share of the smaller of two boxes [4] that lies in the other, 0..1."""
+    sides = np.minimum(a_xyxy[2:], b_xyxy[2:]) - np.maximum(a_xyxy[:2], b_xyxy[:2])
+    if sides.min() <= 0.0:
+        return 0.0
+    return float(np.prod(sides) / min(np.prod(a_xyxy[2:] - a_xyxy[:2]), np.prod(b_xyxy[2:] - b_xyxy[:2])))
 
 
 def inside(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from edge.tracking.boxes import overlap
 from edge.types import Array, Estimate
 
 # A detection may show a target, too, of whose box, or of its own if that is smaller, it covers this share.
@@ -28,7 +29,7 @@ def shown_at_once(
     """
     shown: dict[int, list[int]] = {}
     for target, box in enumerate(boxes_xyxy_px):
-        shares = [_covered(estimate.box_xyxy_px, box) for estimate in estimates]
+        shares = [overlap(estimate.box_xyxy_px, box) for estimate in estimates]
         if shares and max(shares) >= COVERED_SHARE:
             shown.setdefault(int(np.argmax(shares)), []).append(target)
     return {
@@ -60,10 +61,3 @@ def less_sure(estimate: Estimate, boxes_xyxy_px: Sequence[Array], K: Array) -> E
 
 def _too_large(box_xyxy_px: Array, predicted_xyxy_px: Array) -> bool:
     return bool(np.any(box_xyxy_px[2:] - box_xyxy_px[:2] > LONGER * (predicted_xyxy_px[2:] - predicted_xyxy_px[:2])))
-
-
-def _covered(a_xyxy: Array, b_xyxy: Array) -> float:
-    """Share of the smaller of two boxes [4] that lies in the other."""
-    sides = np.clip(np.minimum(a_xyxy[2:], b_xyxy[2:]) - np.maximum(a_xyxy[:2], b_xyxy[:2]), 0.0, None)
-    smaller = min(float(np.prod(a_xyxy[2:] - a_xyxy[:2])), float(np.prod(b_xyxy[2:] - b_xyxy[:2])))
-    return float(np.prod(sides)) / smaller if smaller > 0.0 else 0.0

@@ -20,9 +20,10 @@ import numpy as np
 
 from edge.tracking import so3
 from edge.tracking.heading import Flight, flown_odds, network_opinion, reversal, reversed_covariance
-from edge.tracking.motion import STALE_ATTITUDE_RADPS, symmetric
+from edge.tracking.motion import SOFT_GATE, STALE_ATTITUDE_RADPS, symmetric
 from edge.tracking.view import View
 from edge.types import Array, Estimate
+from msgs.geometry import nearest_rotation
 
 ROTATION_WALK = np.array([0.5, 0.2, 0.2])  # rad/s^0.5 about the target's roll, pitch and yaw axes: it rolls fastest
 COMMON_SHARE = 0.6  # of the network's variance: the same error in all frames of the same view
@@ -33,7 +34,6 @@ NETWORK_LOG_ODDS_MAX = 3.0  # limit of the network's part, so that the evidence 
 SWITCH_LOG_ODDS = 1.0  # against the held rotation
 SWITCH_AFTER_S = 0.2
 
-SOFT_GATE = 11.34  # chi-square, 3 degrees of freedom, 99 %: beyond it a measurement's noise is inflated
 GATE_RAD = float(np.deg2rad(60.0))
 ODD_FRAMES = 6  # in a row that fit neither hypothesis ("odd"): the last one is accepted
 ODD_MEMORY = 30  # frames over which the share of odd ones is averaged
@@ -170,14 +170,9 @@ def _corrected(attitude: Attitude, w: Array, noise: Array) -> Attitude:
     gain = np.linalg.solve(attitude.P + white, attitude.P).T
     keep = so3.IDENTITY - gain
     P = symmetric(keep @ attitude.P @ keep.T + gain @ white @ gain.T)
-    return replace(attitude, R_frame_target=_orthonormal(so3.exp(gain @ w) @ attitude.R_frame_target), P=P)
+    return replace(attitude, R_frame_target=nearest_rotation(so3.exp(gain @ w) @ attitude.R_frame_target), P=P)
 
 
 def unit(vector: Array) -> Array:
     """The vector [3] scaled to length one."""
     return vector / np.linalg.norm(vector)
-
-
-def _orthonormal(R: Array) -> Array:
-    u, _, vt = np.linalg.svd(R)
-    return u @ vt

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import InputError
+from msgs.geometry import nearest_rotation
 from sim_replay.bop.fields import is_rotation
 from sim_replay.bop.records import MM_PER_M
 from sim_replay.datasets import Dataset, DatasetFrame
@@ -164,8 +165,8 @@ def _best(rows: Sequence[ResultRow], there: Sequence[int]) -> set[int]:
 
 def _pose(index: int, row: ResultRow, picture: DatasetFrame) -> TargetPose:
     """The pose of the body axes, from that of the row's model axes."""
-    u, _, vt = np.linalg.svd(row.R_cam_model)
-    R, t_m = picture.scene.models.of(row.object_id).pose_of_body(u @ vt, row.t_cam_model_m)
+    R_cam_model = nearest_rotation(row.R_cam_model)
+    R, t_m = picture.scene.models.of(row.object_id).pose_of_body(R_cam_model, row.t_cam_model_m)
     return TargetPose(index, R, t_m, score=row.score)
 
 

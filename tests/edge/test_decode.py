@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.estimator.decode import Shown, decode, nearest_expected, overlap, pose_covariance
+from edge.estimator.decode import Shown, decode, nearest_expected, pose_covariance
 from edge.estimator.model import Peaks
 from edge.estimator.window import PixelMap
+from edge.tracking.boxes import overlap
 from edge.types import Estimate
 from msgs.contract import ModelContract
 

@@ -131,3 +131,14 @@ def test_everything_broadcasts(seed: int) -> None:
     roll = rng.uniform(-1, 1, size=(4, 1))
     assert geometry.R_from_euler(roll, 0.1, np.zeros(5)).shape == (4, 5, 3, 3)
     assert geometry.rotation_angle(stacked, np.eye(3)).shape == (2, 3)
+
+
+@given(seeds)
+@SOME
+def test_the_nearest_rotation_to_a_matrix_is_nearer_than_any_other_also_to_a_reflection(seed: int) -> None:
+    matrix = np.random.default_rng(seed).normal(size=(3, 3))
+    nearest = geometry.nearest_rotation(matrix)
+    np.testing.assert_allclose(nearest @ nearest.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(nearest) == pytest.approx(1.0)
+    off = [np.linalg.norm(R - matrix) for R in random_rotations(seed, 20)]
+    assert np.linalg.norm(nearest - matrix) <= min(off) + 1e-12
