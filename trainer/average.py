@@ -7,17 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, load_file, load_model, write_atomic
+from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME, deployed_weights, load_file, load_model, write_atomic
 from trainer.config import ConfigError, made_folder
 
+# Cosine between the matrices of one part of two networks. It is about 0 if they began with different random weights,
+# however long they were trained, and far above this if they began alike, even millions of training windows ago.
+LEAST_ALIKE = 0.3
 _log = logging.getLogger(__name__)
 
 
 def average(runs: Sequence[Path], out: Path) -> Path:
     """Write weights.pt with the mean of the runs' weights into `out`; configuration and origin are the last run's.
 
-    Raises ConfigError for fewer than two runs, and for different network configurations.
+    Raises ConfigError for fewer than two runs, for different network configurations, and for unrelated weights.
     """
     if len(runs) < 2:
         raise ConfigError("average needs at least two runs")
@@ -28,6 +32,8 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     for run, config in zip(runs, configs, strict=True):
         if config.model.deployed() != configs[-1].model.deployed():
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
+    for run, content in zip(runs, contents, strict=True):
+        _refuse_unrelated(run, content["weights"], runs[-1], contents[-1]["weights"])
     known = {(source.path.resolve(), source.split) for source in configs[-1].data.datasets}
     for run, config in zip(runs, configs, strict=True):
         for source in config.data.datasets:
@@ -46,3 +52,28 @@ def average(runs: Sequence[Path], out: Path) -> Path:
     path = made_folder(out) / WEIGHTS_NAME
     write_atomic(path, last | {"weights": weights, "training": training})
     return path
+
+
+def _refuse_unrelated(run: Path, weights: dict[str, Tensor], last_run: Path, last: dict[str, Tensor]) -> None:
+    """Raises ConfigError naming the parts of the network, such as heads, that began with other random weights."""
+    mine, others = _matrices(weights), _matrices(last)
+    unrelated = [
+        part
+        for part in others
+        if part in mine and mine[part] @ others[part] < LEAST_ALIKE * mine[part].norm() * others[part].norm()
+    ]
+    if unrelated:
+        raise ConfigError(
+            f"{run}: has nothing in common with {last_run} in {', '.join(unrelated)}: a mean of unrelated weights is "
+            "of no use; give runs that started from the same weights, and refine only their mean"
+        )
+
+
+def _matrices(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """All matrices and kernels of each deployed part of the network, as one vector; the scales of norms are alike in
+    all networks."""
+    parts: dict[str, list[Tensor]] = {}
+    for name, value in sorted(deployed_weights(weights).items()):
+        if value.ndim > 1:
+            parts.setdefault(name.partition(".")[0], []).append(value.double().flatten())
+    return {part: torch.cat(values) for part, values in parts.items()}

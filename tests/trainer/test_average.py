@@ -15,9 +15,16 @@ from trainer.config import ConfigError, parse_config
 from trainer.model import PoseNet
 
 
-def write_run(folder: Path, seed: int, config: str = tiny.TOML) -> Path:
-    torch.manual_seed(seed)
+def write_run(folder: Path, seed: int, config: str = tiny.TOML, *, began_as: int = 0) -> Path:
+    """A run that began with the random weights of seed `began_as`, and has come half as far from them as they are
+    long."""
+    torch.manual_seed(began_as)
     network = PoseNet(parse_config(config, "tiny.toml").model)
+    torch.manual_seed(seed)
+    with torch.no_grad():
+        for weight in network.parameters():
+            step = torch.randn_like(weight)
+            weight += 0.5 * step * weight.norm() / step.norm()
     save_weights(folder / "weights.pt", network, config, {"samples": seed})
     return folder
 
@@ -74,3 +81,30 @@ def test_other_networks_and_single_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="at least two runs"):
         average([one], tmp_path / "mean")
     assert not (tmp_path / "mean").exists()
+
+
+def test_runs_that_began_with_other_weights_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = [write_run(tmp_path / "a", 1), write_run(tmp_path / "b", 2, began_as=5)]
+    assert main(["average", *map(str, runs), "--out", str(tmp_path / "mean")]) == 2
+    told = capsys.readouterr().err
+    assert f"{runs[0]}: has nothing in common with {runs[1]} in backbone, " in told
+    assert not (tmp_path / "mean").exists()
+
+
+def test_heads_that_each_run_was_refined_with_are_refused_and_training_only_ones_are_not(tmp_path: Path) -> None:
+    """`refine` begins with random heads, so two refined runs have unrelated ones on top of related networks."""
+    runs = [write_run(tmp_path / name, seed) for seed, name in enumerate("ab", start=1)]
+    other = load_file(write_run(tmp_path / "c", 3, began_as=5))["weights"]
+
+    def with_parts_of_another(part: str) -> None:
+        content = load_file(runs[0])
+        theirs = {name: value for name, value in other.items() if name.startswith(f"{part}.")}
+        write_atomic(runs[0] / "weights.pt", content | {"weights": content["weights"] | theirs})
+
+    with_parts_of_another("head_dense")
+    average(runs, tmp_path / "mean")
+    with_parts_of_another("head_refine")
+    with pytest.raises(
+        ConfigError, match=r"a: has nothing in common with \S+b in head_refine: .* refine only their mean"
+    ):
+        average(runs, tmp_path / "other")

@@ -85,7 +85,7 @@ def test_the_weights_of_a_run_whose_first_checkpoint_found_no_room_are_kept_and_
 def test_commands_that_write_networks_say_so_and_leave_no_torn_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    runs = [str(weights(tmp_path / name, seed)) for seed, name in enumerate(("one", "two"))]
+    runs = [str(weights(tmp_path / name, seed=0)) for name in ("one", "two")]
     commands = {
         "mean": ["average", *runs, "--out", str(tmp_path / "mean")],
         "models": ["export", "--unmeasured", "--checkpoint", runs[0], "--out", str(tmp_path / "models")],
