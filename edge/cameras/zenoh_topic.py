@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
-PUBLISHER_SILENT_NS = 1_000_000_000  # then another may replace it
+PUBLISHER_SILENT_NS = 1_000_000_000  # without a picture that can be used; then another may replace it
 # 200 MB when decoded, more than any camera's: a PNG of 200 kB may unpack to gigabytes, which end the process.
 PIXELS_MAX = 2**26
 PNG_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # then width and height
@@ -71,7 +71,7 @@ class ZenohSource:
         self._stamps = StampCheck(STAMP_AGE_MAX_NS)
         self._sequence = 0
         self._sent: tuple[bytes, int] | None = None  # publisher of the last picture, and its sequence number
-        self._heeded: tuple[bytes, int] | None = None  # the publisher in use, and when its last picture arrived (ns)
+        self._heeded: tuple[bytes, int] | None = None  # the publisher in use, and when its last usable picture came
         self.counts: Counter[str] = Counter(
             unstamped=0, catching_up=0, undecodable=0, misfit=0, other_publisher=0, other_topic=0
         )
@@ -133,15 +133,16 @@ class ZenohSource:
                 self.counts["other_topic"] += 1
             return
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        parsed, now_ns = parse_attachment(attachment), time.monotonic_ns()
-        publisher = b"" if parsed is None else parsed[2]
+        publisher, now_ns = _publisher(attachment), time.monotonic_ns()
         with self._arrived:
-            if self._heeded is not None and publisher != self._heeded[0]:
+            if self._heeded is None:
+                self._heeded = (publisher, now_ns)
+            elif publisher != self._heeded[0]:
                 if now_ns - self._heeded[1] <= PUBLISHER_SILENT_NS:
                     self.counts["other_publisher"] += 1
                     return
                 log.info("the camera's topic has another publisher")
-            self._heeded = (publisher, now_ns)
+                self._heeded = (publisher, now_ns)
             self._sample = (now_ns, sample.payload.to_bytes(), attachment)
             self._arrived.notify()
 
@@ -162,6 +163,9 @@ class ZenohSource:
         if not believed:
             self.counts["unstamped"] += 1
             stamp_ns = arrival_ns
+        with self._arrived:
+            if self._heeded is not None and self._heeded[0] == _publisher(attachment):
+                self._heeded = (self._heeded[0], arrival_ns)
         meta = FrameMeta(self._number(attachment), stamp_ns - self._latency_ns, arrival_ns)
         return Frame(meta, image_bgr, fitted.K, fitted.distortion)
 
@@ -183,6 +187,12 @@ class ZenohSource:
             self._sent = (publisher, sent)
         self._sequence += step
         return self._sequence - 1
+
+
+def _publisher(attachment: bytes) -> bytes:
+    """The gid of a sample's publisher; empty: not told."""
+    parsed = parse_attachment(attachment)
+    return b"" if parsed is None else parsed[2]
 
 
 def of_topic(key: str, stem: str) -> bool:

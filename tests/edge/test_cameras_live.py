@@ -229,6 +229,24 @@ def test_of_two_cameras_on_one_topic_one_alone_is_looked_through_until_it_is_gon
             assert other.K[0, 0] == 600
 
 
+def test_who_publishes_what_cannot_be_used_does_not_keep_the_camera_out() -> None:
+    port = free_port()
+    with router(port) as camera, zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+        thermal = Node(session, "nose", name="thermal").publisher(topics.IMAGE)
+        with closing(ZenohSource(zenoh_camera(port))) as source:
+            source.open()
+            read: list[Frame] = []
+            reader = threading.Thread(target=lambda: read.append(source.read(threading.Event())))
+            reader.start()
+            deep = CompressedImage(1, "", "png", deep_png()).encode()
+            until(lambda: source.counts["undecodable"] > 0, lambda: thermal.put(deep))
+            while reader.is_alive():
+                thermal.put(deep)
+                camera.put(message(7))
+                reader.join(0.05)
+            assert [number_of(frame) for frame in read] == [7]
+
+
 IMAGE_TYPE = "sensor_msgs::msg::dds_::CompressedImage_"
 
 
