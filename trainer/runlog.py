@@ -93,10 +93,11 @@ def starts_of(out: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
-        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return list(json.loads(path.read_text(encoding="utf-8"))["starts"])
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from None
-    return list(told.get("starts", [told]))  # older files contain the record of one start
+    except (KeyError, TypeError):
+        raise ConfigError(f"{path}: has no list of starts") from None
 
 
 def _write_whole(path: Path, text: str) -> None:

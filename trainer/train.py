@@ -44,7 +44,7 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     """
     path = out / RESUME_NAME
     state = load_file(path)
-    if not {"config", "trainer", "used_s"} <= state.keys():
+    if not {"config", "trainer", "used_s", "planned_samples", "budget_s"} <= state.keys():
         raise ConfigError(f"{path}: contains no run to resume")
     earlier = parse_config(state["config"], f"{path} (config)")
     for section in ("model", "loss", "data", "schedule"):
@@ -53,9 +53,7 @@ def resume_run(out: Path, trainer: Trainer) -> Plan:
     if earlier.run.bf16 != trainer.config.run.bf16:
         raise ConfigError(f"{path}: [run] bf16 differs from --config; give the same one or another --out")
     trainer.restore(state["trainer"])
-    # Older files lack the plan: theirs was the configuration's.
-    budget_s = state.get("budget_s")
-    return Plan(int(state.get("planned_samples", earlier.schedule.samples)), float(state["used_s"]), budget_s)
+    return Plan(int(state["planned_samples"]), float(state["used_s"]), state["budget_s"])
 
 
 def run_training(

@@ -185,7 +185,10 @@ def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) 
 
 
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
-    """Windows around the predicted boxes; the whole frame if they show nothing, and periodically for more targets."""
+    """Windows around the predicted boxes; the whole frame if they show nothing, and periodically for more targets.
+
+    In the daemon that search runs beside the loop, and its places are examined in a later frame.
+    """
     found: list[Estimate] = []
     unhurried = sequence.pace.unhurried(frame.meta)
     if expected and estimator.has_track_stage:

@@ -98,9 +98,10 @@ def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_p
     assert [event.step for event in board.Scalars("train/loss")] == [4, 8, 12, 16]
 
 
-def test_a_record_of_starts_that_was_damaged_is_named(tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text('{"starts": [')
-    with pytest.raises(ConfigError, match=r"run\.json: not JSON"):
+@pytest.mark.parametrize(("written", "told"), [('{"starts": [', "not JSON"), ("{}", "has no list of starts")])
+def test_a_record_of_starts_that_was_damaged_is_named(tmp_path: Path, written: str, told: str) -> None:
+    (tmp_path / "run.json").write_text(written)
+    with pytest.raises(ConfigError, match=rf"run\.json: {told}"):
         RunLog(tmp_path, tiny.TOML, {"from_samples": 0})
 
 
