@@ -13,7 +13,9 @@ from edge.types import Array
 from msgs.geometry import rotation_angle, so3_exp
 
 POSITION_MIN_M, ACCELERATION_MPS2, POSITION_GAP_MAX_NS = 3.0, 30.0, 2_000_000_000
-ATTITUDE_MIN_RAD, TURNING_RADPS2, ATTITUDE_GAP_MAX_NS = 0.1, 50.0, 500_000_000
+# Steps of the attitude below its minimum are within the errors that the tracker assumes. Rates that change by at most
+# the given acceleration deviate by a quarter of it times dt^2 from the mean of the two that are known.
+ATTITUDE_MIN_RAD, TURNING_RADPS2, ATTITUDE_GAP_MAX_NS = 0.05, 50.0, 500_000_000
 GIMBAL_MIN_RAD, GIMBAL_RADPS = 0.1, 12.0  # no gimbal turns faster
 NS_PER_S = 1e9
 
@@ -33,7 +35,7 @@ class Jumps:
             return False
         dt_s = (time_ns - last[0]) / NS_PER_S
         turned = last[1] @ so3_exp(0.5 * (last[2] + rates_radps) * dt_s)
-        return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.5 * TURNING_RADPS2 * dt_s**2
+        return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.25 * TURNING_RADPS2 * dt_s**2
 
     def gimbal(self, time_ns: int, R_frame_gimbal: Array, frame: GimbalFrame) -> bool:
         """Whether this attitude of the gimbal [3, 3] is not reachable from the last sample in the same frame."""

@@ -32,7 +32,7 @@ class Autopilot:
     def __init__(self, gimballed: bool = False) -> None:
         self.own_ship = OwnShipBuffer(gimballed)
         self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
-        self.ahead_ms = 0  # of its clock
+        self.ahead_ms, self.attitude_ms = 0, 20  # of its clock; between two attitudes
         self.numbers = self.answers = True  # its messages, TIMESYNC
         self._mav = MAVLink(None, srcSystem=1, srcComponent=1)
 
@@ -57,7 +57,7 @@ class Autopilot:
         asked = on_the_wire(self.station.tick(now_ns).home)
         for question in (m for m in asked if m.get_type() == "TIMESYNC" and self.answers):
             self.tell(dialect.MAVLink_timesync_message(boot_ms * MS, question.ts1), now_ns)
-        if k_ms % 20 == 3:
+        if k_ms % self.attitude_ms == 3:
             q_wxyz = (np.cos(0.5 * yaw_rad), 0.0, 0.0, np.sin(0.5 * yaw_rad))
             self.tell(dialect.MAVLink_attitude_quaternion_message(boot_ms, *q_wxyz, 0, 0, rate_radps), now_ns)
 
@@ -77,7 +77,9 @@ def seen(rng: np.random.Generator) -> Estimate:
 
 
 @pytest.mark.parametrize("frameless_ms", [0, 450])
-@pytest.mark.parametrize(("jump_m", "jump_deg"), [(10.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (0.0, 8.0), (0.0, -90.0)])
+@pytest.mark.parametrize(
+    ("jump_m", "jump_deg"), [(10.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (0.0, 4.0), (0.0, 8.0), (0.0, -90.0)]
+)
 def test_no_target_is_told_elsewhere_when_the_own_ship_jumps(jump_m: float, jump_deg: float, frameless_ms: int) -> None:
     autopilot, rng = Autopilot(), np.random.default_rng(0)
     tracker = Tracker(4, MountSettings().mount())
@@ -130,11 +132,29 @@ def test_hard_flying_is_no_jump(speed_mps: float, turn_radps: float) -> None:
         t_ned_m = speed_mps / turn_radps * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]) + 0.3 * rng.normal(
             size=3
         )
-        autopilot.turn(k_ms, t_ned_m, speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0]), angle)
+        autopilot.turn(k_ms, t_ned_m, speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0]), angle, turn_radps)
     assert autopilot.station.counters["position_jumps"] == autopilot.station.counters["attitude_jumps"] == 0
     now = autopilot.own_ship.at(BEGIN_NS + 3999 * MS)
     assert now is not None
     assert now.t_ned_body_m is not None
+
+
+@pytest.mark.parametrize(("attitude_ms", "jump_deg"), [(20, 4.0), (50, 5.0), (100, 11.0), (140, 18.0)])
+def test_turns_as_abrupt_as_an_aircraft_s_are_no_jump_and_a_step_in_between_is_one(
+    attitude_ms: int, jump_deg: float
+) -> None:
+    """Up to 5 rad/s and 50 rad/s^2, at a rate as slow as a link may have."""
+    autopilot, found = Autopilot(), []
+    autopilot.attitude_ms = attitude_ms
+    for k_ms in range(8000):
+        t_s = k_ms / 1000
+        jump_rad = np.deg2rad(jump_deg) * (k_ms > 6000)
+        turning = k_ms < 5000
+        autopilot.attitude(
+            k_ms, 0.5 - 0.5 * np.cos(10.0 * min(t_s, 5.0)) + jump_rad, 5.0 * np.sin(10.0 * t_s) * turning
+        )
+        found.append(autopilot.station.counters["attitude_jumps"])
+    assert (found[6000], found[-1]) == (0, 1)
 
 
 @pytest.mark.parametrize("lasts_ms", [20, 4000])
