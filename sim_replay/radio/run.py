@@ -43,11 +43,11 @@ def register(commands: Any) -> None:
         help="receiver on the ground: a program that takes poses only, or what `uavpose-ground watch` "
         "takes (default: both); may be repeated",
     )
-    radio.add_argument("--seconds", type=_seconds, default=30.0, help="duration of each trial (default 30)")
-    radio.add_argument("--fps", type=_seconds, default=20.0, help="poses per second (default 20)")
+    radio.add_argument("--seconds", type=_positive, default=30.0, help="duration of each trial (default 30)")
+    radio.add_argument("--fps", type=_positive, default=20.0, help="poses per second (default 20)")
     radio.add_argument(
         "--max-age",
-        type=_seconds,
+        type=_positive,
         default=1.0,
         metavar="S",
         help="the client refuses poses older than S seconds (default 1)",
@@ -68,8 +68,8 @@ def register(commands: Any) -> None:
         help=f"number of vehicles, up to {VEHICLES_MAX} (default 10)",
     )
     fleet.add_argument("--transport", choices=get_args(Transport), default="quic", help="transport (default quic)")
-    fleet.add_argument("--seconds", type=_seconds, default=30.0, help="duration (default 30)")
-    fleet.add_argument("--fps", type=_seconds, default=20.0, help="poses per second of each vehicle (default 20)")
+    fleet.add_argument("--seconds", type=_positive, default=30.0, help="duration (default 30)")
+    fleet.add_argument("--fps", type=_positive, default=20.0, help="poses per second of each vehicle (default 20)")
     fleet.add_argument("--json", action="store_true", help="print one JSON object instead of a line")
     fleet.set_defaults(run=run_fleet)
 
@@ -80,7 +80,7 @@ def _vehicles(text: str) -> int:
     return int(text)
 
 
-def _seconds(text: str) -> float:
+def _positive(text: str) -> float:
     with suppress(ValueError):
         if 0.0 < (value := float(text)) <= 3600.0:
             return value
