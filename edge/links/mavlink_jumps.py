@@ -10,7 +10,7 @@ import numpy as np
 
 from edge.tracking.own_ship import GimbalFrame
 from edge.types import Array
-from msgs.geometry import rotation_angle, so3_exp
+from msgs.geometry import rotation_angle, so3_exp, so3_log
 
 POSITION_MIN_M, ACCELERATION_MPS2, POSITION_GAP_MAX_NS = 3.0, 30.0, 2_000_000_000
 # Steps of the attitude below its minimum are within the errors that the tracker assumes. Rates that change by at most
@@ -36,6 +36,12 @@ class Jumps:
         dt_s = (time_ns - last[0]) / NS_PER_S
         turned = last[1] @ so3_exp(0.5 * (last[2] + rates_radps) * dt_s)
         return float(rotation_angle(turned, R_ned_body)) > ATTITUDE_MIN_RAD + 0.25 * TURNING_RADPS2 * dt_s**2
+
+    def turning_radps(self, time_ns: int, R_ned_body: Array) -> Array:
+        """Mean body rates [3] from the last sample to this one, which is not added; zeros after a gap."""
+        if self._attitude is None or not 0 < time_ns - self._attitude[0] <= ATTITUDE_GAP_MAX_NS:
+            return np.zeros(3)
+        return so3_log(self._attitude[1].T @ R_ned_body) / ((time_ns - self._attitude[0]) / NS_PER_S)
 
     def gimbal(self, time_ns: int, R_frame_gimbal: Array, frame: GimbalFrame) -> bool:
         """Whether this attitude of the gimbal [3, 3] is not reachable from the last sample in the same frame."""

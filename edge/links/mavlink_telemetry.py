@@ -176,13 +176,15 @@ class Telemetry:
             if self._attitude_stands.times != stood:
                 self._own_ship.clear(same_autopilot=True)
             return "standstill"
+        # Some autopilots report zeros instead of rates; measured ones are never exactly zero.
+        turning_radps = rates_radps if rates_radps.any() else self._jumps.turning_radps(time_ns, R_ned_body)
         if self._jumps.attitude(time_ns, R_ned_body, rates_radps):
             self.attitude_jumps += 1
             self._own_ship.clear(same_autopilot=True)
             self._attitudes_from_ns = now_ns + JUMP_REST_NS
         if now_ns < self._attitudes_from_ns:
             return None
-        added = self._own_ship.add_attitude(time_ns, q_ned_body_wxyz, rates_radps, self._boot_clock.std_s)
+        added = self._own_ship.add_attitude(time_ns, q_ned_body_wxyz, turning_radps, self._boot_clock.std_s)
         return None if added else "late"
 
     def _add_position(self, time_ns: int, message: Any, now_ns: int) -> str | None:

@@ -43,6 +43,18 @@ def test_an_attitude_in_angles_is_rolled_pitched_and_yawed_and_goes_on_by_its_ra
     np.testing.assert_allclose(told(messages, 1_080).R_ned_body, later.as_matrix(), atol=1e-6)
 
 
+def test_an_attitude_without_rates_goes_on_as_it_turned_last() -> None:
+    """As some autopilots send it: ten a second, all rates zero."""
+    turned = [
+        Rotation.from_euler("ZYX", [YAW, PITCH, ROLL]) * Rotation.from_rotvec(0.1 * k * RATES_RADPS) for k in range(5)
+    ]
+    messages = [
+        dialect.MAVLink_attitude_message(1_000 + 100 * k, *one.as_euler("ZYX")[::-1], 0.0, 0.0, 0.0)
+        for k, one in enumerate(turned[:4])
+    ]
+    np.testing.assert_allclose(told(messages, 1_400).R_ned_body, turned[4].as_matrix(), atol=1e-6)
+
+
 def test_the_place_on_the_globe_is_above_mean_sea_level_and_climbs_as_told() -> None:
     """Above home it is 37 m, which is no place on the globe; the vertical speed is told in cm/s, down."""
     place = dialect.MAVLink_global_position_int_message(
