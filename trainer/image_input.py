@@ -30,7 +30,7 @@ def fold_normalisation(graph: onnx.GraphProto, image: str) -> str:
     Returns the name of the convolution's input. Raises ValueError if the graph does not start with these nodes.
     """
     constants = {tensor.name: tensor for tensor in graph.initializer}
-    entry = _entry(graph, image, constants)
+    entry = _entry(graph, image)
     sub, div = (next(node for node in entry.before if node.op_type == kind) for kind in ("Sub", "Div"))
     mean, std = (_per_channel(numpy_helper.to_array(constants[node.input[1]])) for node in (sub, div))
     weight, bias = (numpy_helper.to_array(constants[name]) for name in entry.conv.input[1:3])
@@ -80,7 +80,7 @@ def drop_unread(graph: onnx.GraphProto) -> None:
         graph.initializer.remove(tensor)
 
 
-def _entry(graph: onnx.GraphProto, image: str, constants: dict[str, onnx.TensorProto]) -> _Entry:
+def _entry(graph: onnx.GraphProto, image: str) -> _Entry:
     before: list[onnx.NodeProto] = []
     node = reader(graph, image)
     while node.op_type in ("Cast", "Transpose", "Sub", "Div"):

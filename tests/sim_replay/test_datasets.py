@@ -209,7 +209,7 @@ def test_listed_test_pictures_that_there_are_not_are_told(root: Path, caplog: py
     assert "1 of the pictures that it lists are missing" in caplog.text  # those of other scenes were not asked for
 
 
-def test_labels_of_another_picture_size_are_refused(root: Path, tmp_path: Path) -> None:
+def test_labels_of_another_picture_size_are_refused(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "masks" / "train" / "000000")
     cv2.imwrite(str(scene / "mask_visib" / "000000_000000.png"), np.kron(silhouette(), np.ones((2, 2), np.uint8)))
     with pytest.raises(BopError, match="picture 0 has 160 x 120 pixels, but its mask has 320 x 240"):

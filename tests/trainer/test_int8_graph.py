@@ -65,7 +65,7 @@ def test_the_pictures_bytes_go_into_the_first_convolution_as_they_are(graph: Gra
     assert next(list(a.ints) for a in conv.attribute if a.name == "strides") == [2, 1], "four pixels at a time"
 
 
-def test_it_says_what_it_was_made_from(graph: Graph) -> None:
+def test_it_says_what_it_was_made_from() -> None:
     contract = read_contract(SHIPPED_MODEL)
     assert contract.precision == "int8"
     assert contract.training["seed"] not in (CALIBRATION_SEED, COMPARISON_SEED)
