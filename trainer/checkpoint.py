@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from msgs.contract import samples_behind
 from trainer.config import ConfigError, TrainerConfig, parse_config
 from trainer.model import ADDED_HEADS, PoseNet
+from trainer.unfinished import unfinished
 
 WEIGHTS_NAME = "weights.pt"
 RESUME_NAME = "resume.pt"
@@ -26,22 +27,18 @@ _log = logging.getLogger(__name__)
 
 def write_atomic(path: Path, content: dict[str, Any]) -> None:
     """torch.save to a temporary file, flush to disk, rename. Raises ConfigError on failure, the old file unchanged."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
+        with unfinished(path) as part, part.open("wb") as file:
             torch.save(content, file)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
     except (OSError, RuntimeError) as error:
         # torch's own error does not give the reason; the OSError behind it does.
         why = error if isinstance(error, OSError) else error.__context__
         if not isinstance(why, OSError):
             raise
         raise ConfigError(f"{path}: cannot be written: {why.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def half_weights(state: dict[str, Tensor]) -> dict[str, Tensor]:

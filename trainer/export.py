@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +27,7 @@ from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_
 from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, PoseNet
 from trainer.sources import window_sampler
 from trainer.tally import Tally, windows_in
+from trainer.unfinished import unfinished
 
 CALIBRATION_SEED = 910_001
 COMPARISON_SEED = 920_001
@@ -230,25 +233,27 @@ def export_models(
     comparison = render_views(config, COMPARISON_SEED, samples, held_out, tally)
     _refuse_without_targets(comparison)
 
-    unmeasured = float_path.with_suffix(".part")
-    try:
-        write_graph(model, unmeasured)
-        floats = _predict(onnx_predictor(unmeasured), comparison, "FP32", say)
+    with tempfile.TemporaryDirectory() as folder:
+        exact = Path(folder) / float_path.name  # until the end: another export may replace the one in `out`
+        write_graph(model, exact)
+        floats = _predict(onnx_predictor(exact), comparison, "FP32", say)
         acquire_min = choose_threshold(floats.acquire, comparison.acquire)
         track_min = choose_threshold(floats.track, comparison.track) if floats.track else acquire_min
         thresholds = (acquire_min, track_min)
         promise = make_contract(config, training, sha256, calibration, thresholds)
         metrics = _metrics(floats, comparison, thresholds)
-        write_contract(unmeasured, promise.model_copy(update={"metrics": metrics}))
-        unmeasured.replace(float_path)
-    finally:
-        unmeasured.unlink(missing_ok=True)
-    by_torch = _predict(torch_predictor(model), comparison, "PyTorch", say)
-    say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch, thresholds)[0])
-    for warning in too_blind(metrics):
-        say(warning)
+        write_contract(exact, promise.model_copy(update={"metrics": metrics}))
+        try:
+            with unfinished(float_path) as part:
+                shutil.copyfile(exact, part)
+        except OSError as error:
+            raise ConfigError(f"{float_path}: cannot be written: {error.strerror}") from error
+        by_torch = _predict(torch_predictor(model), comparison, "PyTorch", say)
+        say(comparison_table(comparison, "FP32 vs. PyTorch", floats, by_torch, thresholds)[0])
+        for warning in too_blind(metrics):
+            say(warning)
 
-    write_int8(float_path, int8_path, promise, calibration, comparison, floats, tolerance, say)
+        write_int8(exact, int8_path, promise, calibration, comparison, floats, tolerance, say)
     say(f"wrote {float_path} and {int8_path}")
     return float_path, int8_path
 
@@ -278,15 +283,11 @@ def export_unmeasured(
         config = _with_contract(config, contract)
     made_folder(out)
     path = out / f"{config.contract.name}-unmeasured-fp32.onnx"
-    part = path.with_suffix(".part")
     range_m = config.contract.trained_range_m or (Z_RANGE_M if config.data.datasets else RENDERED_RANGE_M)
     spans = (range_m, ANY_SIZE_PX, ANY_SIZE_PX)
-    try:
+    with unfinished(path) as part:
         write_graph(model, part)
         write_contract(part, _contract(config, training, sha256, (score_min, score_min), *spans))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
     return path
 
 
@@ -313,8 +314,7 @@ def write_int8(
 
     `promise` is the FP32 file's contract, `floats` its predictions. Raises ConfigError if INT8 deviates too far.
     """
-    unproved = int8_path.with_suffix(".part")
-    try:
+    with unfinished(int8_path) as unproved:
         quantise_graph(float_path, unproved, [*calibration.track, *calibration.acquire], say)
         int8 = _predict(onnx_predictor(unproved), comparison, "INT8", say)
         thresholds = (promise.acquire_score_min, promise.track_score_min)
@@ -325,6 +325,3 @@ def write_int8(
             raise ConfigError(f"{int8_path}: not written: {refusal}")
         measured = {"precision": "int8", "metrics": _metrics(int8, comparison, thresholds)}
         write_contract(unproved, promise.model_copy(update=measured))
-        unproved.replace(int8_path)
-    finally:
-        unproved.unlink(missing_ok=True)

@@ -28,6 +28,7 @@ from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, qu
 from trainer.model import PoseNet
 from trainer.pixel_quads import take_quads
 from trainer.tally import Tally, windows_in
+from trainer.unfinished import unfinished
 
 OPSET = 17
 THREADS = 2
@@ -158,18 +159,15 @@ def write_contract(path: Path, contract: ModelContract) -> None:
     path = path.resolve()  # replaces the target of a symbolic link, not the link
     model = onnx.load(str(path))
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
-    part = path.with_name(f"{path.name}.part")
     try:
-        with part.open("wb") as file:
-            file.write(model.SerializeToString())
-            file.flush()
-            os.fsync(file.fileno())
-        part.chmod(path.stat().st_mode)
-        part.replace(path)
+        with unfinished(path) as part:
+            with part.open("wb") as file:
+                file.write(model.SerializeToString())
+                file.flush()
+                os.fsync(file.fileno())
+            part.chmod(path.stat().st_mode)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_contract(path: Path) -> ModelContract:

@@ -22,6 +22,7 @@ from sim_replay.packages import packages
 from trainer.checkpoint import RESUME_NAME, WEIGHTS_NAME
 from trainer.config import ConfigError, TrainerConfig, made_folder
 from trainer.evaluate import null_where_unknown
+from trainer.unfinished import unfinished
 
 RUN_NAME = "run.json"
 LOCK_NAME = ".lock"
@@ -105,12 +106,10 @@ def _write_whole(path: Path, text: str) -> None:
 
     Raises ConfigError.
     """
-    part = path.with_suffix(".part")
     try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        with unfinished(path) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -190,6 +191,32 @@ def test_an_int8_file_that_is_refused_is_not_written(exported: Exported, views: 
             exported.said.append,
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_of_two_exports_into_one_folder_at_the_same_time_neither_uses_a_file_of_the_other(
+    exported: Exported, views: Views, tmp_path: Path
+) -> None:
+    other_floats = measured(exported.fp32, views)
+    save_weights(tmp_path / "run" / "weights.pt", tiny.network(1), tiny.TOML, {"seed": 3, "samples": 0})
+    fp32, int8 = (tmp_path / "models" / path.name for path in (exported.fp32, exported.int8))
+
+    def meanwhile(text: str) -> None:
+        if "FP32 vs. PyTorch" in text:
+            shutil.copyfile(exported.fp32, fp32)
+        if text == "evaluating INT8: 32 of 32 windows":
+            write_int8(
+                exported.fp32, int8, read_contract(exported.fp32), views, views, other_floats, ANY, lambda _: None
+            )
+
+    export_models(tmp_path / "run", tmp_path / "models", samples=16, tolerance=ANY, open_view=open_view, say=meanwhile)
+    assert set((tmp_path / "models").iterdir()) == {fp32, int8}
+    network, *_, sha256 = load_model(tmp_path / "run")
+    assert read_contract(int8).weights_sha256 == sha256 != read_contract(fp32).weights_sha256
+    image, K = inputs(2, 96, 96)
+    with torch.no_grad():
+        t_m = network(torch.from_numpy(image), torch.from_numpy(K))[OUTPUT_NAMES.index("t_cam_target_m")][:, 0]
+    Z_m, other_Z_m = (onnx_predictor(path)(image, K).t_cam_target_m[:, 2] for path in (int8, fp32))
+    assert np.all(np.abs(Z_m - t_m[:, 2].numpy()) < np.abs(other_Z_m - t_m[:, 2].numpy()) / 3)
 
 
 def test_a_file_that_detects_nothing_is_refused_however_right_its_highest_peaks_are() -> None:
