@@ -29,7 +29,11 @@ class ModelSettings(Section):
 
 class EstimatorSettings(Section):
     max_targets: int = Field(default=4, ge=1, le=4, description="maximum number of simultaneously tracked targets")
-    acquire_every_n: int = Field(default=30, ge=1, description="while tracking, search the whole frame every N frames")
+    acquire_every_n: int = Field(
+        default=15,
+        ge=1,
+        description="while tracking, search every N frames: the whole frame and, if it is large, its tiles in turn",
+    )
 
 
 class TargetSettings(Section):

@@ -20,6 +20,7 @@ from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import PLACES_MOST, Estimator
 from edge.estimator.pace import Pace, looked_at_twice
+from edge.estimator.regions import Sweep
 from edge.estimator.upright import up_in_cam
 from edge.health import Reason
 from edge.memory import MemoryKeeper
@@ -99,6 +100,7 @@ class Pipeline:
         self._by_hand = ByHand()
         self._acquire_every_n = config.estimator.acquire_every_n
         self._pace = Pace()
+        self._sweep = Sweep()
         self._sleep = SleepWatch()
         self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
@@ -217,8 +219,10 @@ class Pipeline:
         if not searches:
             return found
         if not found:
-            # Unsuccessful track windows plus the whole frame leave no time for finer ones; the next frame makes them.
-            found = self._estimator.acquire(frame, thrice=unhurried and not expected)
+            # Unsuccessful track windows plus a search leave no time for finer ones; the next frame makes them.
+            # A target that has just left its window is most likely to be found in the whole frame.
+            regions = () if expected else self._sweep.next(self._estimator.regions(frame), self._pace.regions())
+            found = self._estimator.acquire(frame, thrice=unhurried and not expected, regions=regions)
             self._since_acquire = 0
             clock.estimated(self._estimator.model.take_runs_ns())
         elif (

@@ -1,4 +1,4 @@
-"""Search of the whole frame parallel to the loop, so that looking for more targets does not delay the tracked ones.
+"""Search of the frame parallel to the loop, so that looking for more targets does not delay the tracked ones.
 
 It only proposes places. The loop evaluates each in a window of the next frame, as it does for a place that the operator
 selects; only what is detected there counts as a target.
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from edge import clock
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
+from edge.estimator.regions import Region, Sweep
 from edge.threads import yield_to_the_loop
 from edge.types import Array, Estimate, Frame
 
@@ -33,6 +34,7 @@ class _Asked:
     estimator: Estimator
     frame: Frame
     known_boxes: tuple[Array, ...]
+    region: Region
 
 
 class Search:
@@ -42,6 +44,7 @@ class Search:
         self._changed = threading.Condition()
         self._asked: _Asked | None = None
         self._busy = False
+        self._sweep = Sweep()
         self._places: list[Estimate] = []
         self._seen_ns = 0  # exposure time of the frame that the places were found in
         self._asked_for_ns = 0  # exposure time of the last frame that the places were requested for
@@ -63,12 +66,14 @@ class Search:
             self._thread.join(STOP_TIMEOUT_S)
 
     def begin(self, estimator: Estimator, frame: Frame, known_boxes: Sequence[Array]) -> bool:
-        """Search for targets that overlap none of `known_boxes` [4] px; False while another search is in progress."""
+        """Search the frame's next region for targets that overlap none of `known_boxes` [4] px; False while another
+        search is in progress."""
         with self._changed:
             if self._busy:
                 return False
             self._busy = True
-            self._asked = _Asked(estimator, frame, tuple(known_boxes))
+            (region,) = self._sweep.next(estimator.regions(frame))
+            self._asked = _Asked(estimator, frame, tuple(known_boxes), region)
             self._changed.notify()
         if self._thread is None:
             self._look()
@@ -107,11 +112,11 @@ class Search:
         places: list[Estimate] = []
         failed = False
         try:
-            places = asked.estimator.anywhere(asked.frame, asked.known_boxes, refused)
+            places = asked.estimator.anywhere(asked.frame, asked.known_boxes, refused, asked.region)
         except Exception:
             # Only this search is lost: tracking continues, and the next search may succeed.
             failed = True
-            log.exception("a search of the whole frame failed")
+            log.exception("a search of the frame failed")
         with self._changed:
             self._counts.update(searches=1, search_failed=int(failed))
             self._counts.update({f"refused_{reason}": n for reason, n in refused.items()})

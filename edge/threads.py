@@ -7,7 +7,7 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 
-YIELDS = 10  # niceness of the threads that search whole frames, relative to the loop's
+YIELDS = 10  # niceness of the threads that search the frame, relative to the loop's
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,12 @@ THREADS = (
     ThreadRow("main", "the loop of `edge/daemon.py`", "links, camera"),
     ThreadRow("capture", "reads the camera, keeps the newest frame", "the loop"),
     ThreadRow("decode", "reads a sequence's pictures ahead", "the loop"),
-    ThreadRow("search", "looks over the whole frame for more targets, at a lower priority", "the loop", watched=True),
+    ThreadRow(
+        "search",
+        "looks for more targets, in the whole frame or a tile of it, at a lower priority",
+        "the loop",
+        watched=True,
+    ),
     ThreadRow("zenoh", "sends the newest report, events, diagnostics, pictures", "the loop", watched=True),
     ThreadRow("closing", "when the daemon stops: closes the zenoh session, or is left with it", "anybody"),
     ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),

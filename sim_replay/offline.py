@@ -31,7 +31,8 @@ DEFAULT_THREADS = 2
 
 
 def estimator_answers(model: Model, size_of: SizeOf = no_size) -> Answerer:
-    """Acquire and track stage on each image alone, as in the daemon on a frame without known targets.
+    """Acquire and track stage on each image alone, as in the daemon on a frame without known targets, of a camera so
+    slow that there is time to search every region.
 
     `size_of`: what [target] says in each scene. Raises InputError if the model does not run.
     """
@@ -42,7 +43,8 @@ def estimator_answers(model: Model, size_of: SizeOf = no_size) -> Answerer:
         image_bgr = picture.undistorted_bgr()
         estimator.target_size = size_of(picture.scene)
         started_ns = time.monotonic_ns()
-        found = estimator.acquire(Frame(FrameMeta(index, started_ns, started_ns), image_bgr, picture.K))
+        frame = Frame(FrameMeta(index, started_ns, started_ns), image_bgr, picture.K)
+        found = estimator.acquire(frame, regions=estimator.regions(frame))
         time_ms = (time.monotonic_ns() - started_ns) * 1e-6
         poses = (
             TargetPose(index, e.R_cam_target, e.t_cam_target_m, score=e.score, covariance=e.covariance) for e in found

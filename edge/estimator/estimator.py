@@ -1,9 +1,10 @@
-"""The estimator's two stages: acquire on the downscaled whole frame, track in windows of its native pixels."""
+"""The estimator's two stages: acquire on the downscaled frame or its tiles, track in windows of its native pixels."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,13 @@ from edge.estimator.given_size import TargetSize
 from edge.estimator.lens import lens_of
 from edge.estimator.looks import confirmed, mirrored, of_looks, of_one_target, unmirrored
 from edge.estimator.model import Model, Peaks
+from edge.estimator.regions import Region, tiles, whole
 from edge.estimator.upright import quarter_turns, turned, turned_back
 from edge.estimator.window import cut, fit_frame, pixel_aspect, window_around
 from edge.types import Array, Estimate, Frame
 
-WORTH_A_LOOK = 0.1  # a place of the whole frame with a lower probability is not examined in a window
-FAINTEST = 0.02  # lowest score of a window at a place of the whole frame, also if it detects nothing
+WORTH_A_LOOK = 0.02  # a place with a lower probability is not examined in a window
+FAINTEST = 0.02  # lowest score of a window at a place, also if it detects nothing
 # Places and targets examined in one frame, even if there is room for fewer targets: the likeliest place may turn out to
 # be false in frame after frame.
 PLACES_MOST = 4
@@ -51,18 +53,39 @@ class Estimator:
             self._look_both_ways(frame, [box], FAINTEST)
         self.refused.clear()
 
-    def acquire(self, frame: Frame, known_boxes: Sequence[Array] = (), thrice: bool = True) -> list[Estimate]:
-        """Targets anywhere in the frame that overlap none of `known_boxes` (box_xyxy_px), best first.
+    def regions(self, frame: Frame) -> tuple[Region, ...]:
+        """What there is to search in a frame: first the whole of it, then tiles, if there is a track stage that can
+        confirm what they show."""
+        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        lens = lens_of(frame.K, frame.distortion)
+        finer = tiles(frame_wh, self.model.contract.acquire_size_wh, lens, pixel_aspect(frame.K))
+        return whole(frame_wh, lens), *(finer if self.has_track_stage else ())
 
-        Each is evaluated in a track window of the same frame, placed by the coarse detection in the whole frame; if
-        `thrice`, twice more in a window placed by the first result, plain and mirrored. A detection that the windows do
-        not show, or do not confirm together, is dropped.
+    def acquire(
+        self,
+        frame: Frame,
+        known_boxes: Sequence[Array] = (),
+        thrice: bool = True,
+        regions: Sequence[Region] = (),
+    ) -> list[Estimate]:
+        """Targets in the whole frame, or in the first of some `regions` that shows any, best first, without those that
+        overlap one of `known_boxes` (box_xyxy_px).
+
+        Each is evaluated in a track window of the same frame, placed by the coarse detection; if `thrice`, twice more
+        in a window placed by the first result, plain and mirrored. A detection that the windows do not show, or do not
+        confirm together, is dropped.
         """
+        for region in regions or self.regions(frame)[:1]:
+            if found := self._acquire_in(region, frame, known_boxes, thrice):
+                return found
+        return []
+
+    def _acquire_in(self, region: Region, frame: Frame, known_boxes: Sequence[Array], thrice: bool) -> list[Estimate]:
         room = max(self._max_targets - len(known_boxes), 0)
         if not self.has_track_stage:
             least = self.model.contract.acquire_score_min
-            return self._whole(frame, known_boxes, least, self.model.run, self.refused)[:room]
-        places = self._whole(frame, known_boxes, self._worth_a_look, self.model.run, self.refused)
+            return self._search(region, frame, known_boxes, least, self.model.run, self.refused)[:room]
+        places = self._search(region, frame, known_boxes, self._worth_a_look, self.model.run, self.refused)
         faintest = min(FAINTEST, self.model.contract.track_score_min)
         firsts = _each_once(self._look(frame, [place.box_xyxy_px for place in places], faintest))
         seen = [
@@ -82,7 +105,7 @@ class Estimator:
         return distinct(sorted(found, key=lambda estimate: -estimate.score), known_boxes)[:room]
 
     def _together(self, seen: tuple[Estimate, Estimate], *finer: Estimate | None) -> Estimate | None:
-        """Combine a place of the whole frame, its first window and two finer ones; None: no target."""
+        """Combine a place, its first window and two finer ones; None: no target."""
         place, first = seen
         looks = [look for look in finer if look is not None and of_one_target(look, first)]
         if not looks or not self.confirms(place, [first, *looks], missed=len(finer) - len(looks)):
@@ -90,24 +113,29 @@ class Estimator:
         return of_looks(looks, [first])
 
     def confirms(self, place: Estimate, looks: Sequence[Estimate], missed: int = 0) -> bool:
-        """Whether windows confirm a place proposed by the whole frame, this one or an earlier one; `missed`: number of
-        windows without a detection."""
+        """Whether windows confirm a place found in this frame or an earlier one; `missed`: number of windows without a
+        detection."""
         scores = [*(look.score for look in looks), *[FAINTEST] * missed]
         return confirmed(place.score, scores) >= self.model.contract.acquire_score_min
 
-    def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
-        """Places worth examining in a window, from the whole frame alone; rejections are counted in `refused`.
+    def anywhere(
+        self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str], region: Region | None = None
+    ) -> list[Estimate]:
+        """Places worth examining in a window, from the whole frame, or a `region` of it, alone; rejections are counted
+        in `refused`.
 
         Changes no state of the estimator, so it may be called from a thread other than the loop's.
         """
-        return self._whole(frame, known_boxes, self._worth_a_look, self.model.infer, refused)
+        region = region or self.regions(frame)[0]
+        return self._search(region, frame, known_boxes, self._worth_a_look, self.model.infer, refused)
 
     @property
     def _worth_a_look(self) -> float:
         return min(WORTH_A_LOOK, self.model.contract.acquire_score_min)
 
-    def _whole(
+    def _search(
         self,
+        region: Region,
         frame: Frame,
         known_boxes: Sequence[Array],
         score_min: float,
@@ -115,15 +143,17 @@ class Estimator:
         refused: Counter[str],
     ) -> list[Estimate]:
         contract = self.model.contract
+        size_wh, fit = contract.acquire_size_wh, contract.acquire_fit
         lens = lens_of(frame.K, frame.distortion)
         frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
-        aspect = pixel_aspect(frame.K)
-        image, pixel_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, lens, aspect)
-        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), contract.acquire_size_wh, frame_wh, frame.up_cam)
+        image, pixel_map = fit_frame(frame.image_bgr, size_wh, fit, lens, pixel_aspect(frame.K), region.window)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam)
         turns = quarter_turns(frame.up_cam)
-        peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), contract.acquire_size_wh, turns)
-        found = decode(peaks, 0, shown, contract, "acquire", score_min, refused, self.target_size)
-        return distinct(found, known_boxes)[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 1)]
+        peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), size_wh, turns)
+        least = region.score_of(score_min)
+        found = decode(peaks, 0, shown, contract, "acquire", least, refused, self.target_size)
+        places = [replace(place, score=region.probability(place.score)) for place in distinct(found, known_boxes)]
+        return places[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 1)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
         """For each expected box the target in the window around it, or None. One inference for all windows.

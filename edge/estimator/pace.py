@@ -1,10 +1,11 @@
-"""How many evaluations per target the camera's frame interval allows."""
+"""How many evaluations per target, and of how many regions, the camera's frame interval allows."""
 
 from __future__ import annotations
 
 from edge.types import FrameMeta, TrackState
 
 UNHURRIED_NS = 60_000_000  # frame interval from which on there is time to evaluate each target more than once
+REGION_NS = 60_000_000  # frame interval per region of the frame that is searched in it
 
 
 class Pace:
@@ -12,11 +13,17 @@ class Pace:
 
     def __init__(self) -> None:
         self._before: FrameMeta | None = None
+        self._interval_ns = 0.0
 
     def unhurried(self, meta: FrameMeta) -> bool:
         """Whether there is time to evaluate each target more than once. To be called for every frame, in order."""
         before, self._before = self._before, meta
-        return before is not None and _interval_ns(before, meta) >= UNHURRIED_NS
+        self._interval_ns = 0.0 if before is None else _interval_ns(before, meta)
+        return self._interval_ns >= UNHURRIED_NS
+
+    def regions(self) -> int:
+        """How many regions of the last frame there is time to search."""
+        return max(1, int(self._interval_ns // REGION_NS))
 
 
 def looked_at_twice(state: TrackState, unhurried: bool) -> bool:

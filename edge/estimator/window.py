@@ -107,12 +107,13 @@ def fit_frame(
     fit: Literal["letterbox", "squash"],
     lens: Lens | None = None,
     aspect: float = 1.0,
+    part: Window | None = None,
 ) -> tuple[Image, PixelMap]:
     """The whole frame [H, W, 3] as the network's image [h, w, 3]: letterboxed (square pixels, black bars) or squashed.
 
-    `aspect`: of the frame's pixels (pixel_aspect).
+    `aspect`: of the frame's pixels (pixel_aspect). `part`: of whole_frame, if only that is to be shown.
     """
-    seen = whole_frame((image_bgr.shape[1], image_bgr.shape[0]), lens)
+    seen = part or whole_frame((image_bgr.shape[1], image_bgr.shape[0]), lens)
     inner_wh = size_wh
     if fit == "letterbox":
         height = seen.height * aspect
@@ -120,7 +121,7 @@ def fit_frame(
         inner_wh = (max(round(seen.width * scale), 1), max(round(height * scale), 1))
     inner_map = seen.pixel_map(inner_wh, lens)
     if lens is None:
-        inner = _resize(image_bgr, inner_wh)
+        inner = _resize(image_bgr[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width], inner_wh)
     else:
         inner = _straightened(image_bgr, lens, inner_map, inner_wh, cv2.BORDER_CONSTANT)
     left, top = (size_wh[0] - inner_wh[0]) // 2, (size_wh[1] - inner_wh[1]) // 2

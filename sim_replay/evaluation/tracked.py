@@ -22,6 +22,7 @@ from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
 from edge.estimator.pace import Pace, looked_at_twice
+from edge.estimator.regions import Sweep
 from edge.estimator.upright import up_in_cam
 from edge.links.outgoing import rangeless, rotation_known, sendable
 from edge.tracking.tracker import Tracker
@@ -56,6 +57,8 @@ class _Sequence:
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
     since_acquire: int = 0
     pace: Pace = field(default_factory=Pace)
+    sweep: Sweep = field(default_factory=Sweep)  # while nothing is found
+    further_sweep: Sweep = field(default_factory=Sweep)  # for more targets
 
     @classmethod
     def of(cls, scene: BopScene, own_ship: OwnShipTold) -> _Sequence:
@@ -185,9 +188,9 @@ def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) 
 
 
 def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
-    """Windows around the predicted boxes; the whole frame if they show nothing, and periodically for more targets.
+    """Windows around the predicted boxes; a search if they show nothing, and periodically for more targets.
 
-    In the daemon that search runs beside the loop, and its places are examined in a later frame.
+    In the daemon the latter runs beside the loop, and its places are examined in a later frame.
     """
     found: list[Estimate] = []
     unhurried = sequence.pace.unhurried(frame.meta)
@@ -199,6 +202,13 @@ def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected:
     due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
     if not found or due:
         held = [estimate.box_xyxy_px for estimate in found]
-        found += estimator.acquire(frame, held, thrice=unhurried and not expected)
+        regions = list(estimator.regions(frame))
+        if found:
+            regions = sequence.further_sweep.next(regions)
+        elif not expected:
+            regions = sequence.sweep.next(regions, sequence.pace.regions())
+        else:
+            regions = regions[:1]
+        found += estimator.acquire(frame, held, thrice=unhurried and not expected, regions=regions)
         sequence.since_acquire = 0
     return found

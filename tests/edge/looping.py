@@ -14,6 +14,7 @@ import numpy as np
 from edge.config import Config, ConfigFile
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
+from edge.estimator.regions import Region
 from edge.health import Reason
 from edge.outlets import Outlets
 from edge.reload import Reloader
@@ -47,7 +48,9 @@ class Gated(Estimator):
         self.gate, self.begun = threading.Event(), threading.Event()
         self.sees: list[Estimate] | Exception = []
 
-    def anywhere(self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str]) -> list[Estimate]:
+    def anywhere(
+        self, frame: Frame, known_boxes: Sequence[Array], refused: Counter[str], region: Region | None = None
+    ) -> list[Estimate]:
         self.begun.set()
         assert self.gate.wait(60)
         if isinstance(self.sees, Exception):

@@ -127,6 +127,22 @@ def test_a_camera_of_few_frames_a_second_leaves_time_for_both() -> None:
     assert not pace.unhurried(FrameMeta(12, 1_233_000_000, 0))
 
 
+@pytest.mark.parametrize(("look", "in_whole", "in_tile"), [(0.75, 1, 0), (0.9, 1, 1), (0.5, 0, 0)])
+def test_what_one_of_many_tiles_shows_has_to_be_surer(look: float, in_whole: int, in_tile: int) -> None:
+    """Each tile may show something that is none: looking into four finds four times as much of that."""
+    for of, targets in ((0, in_whole), (1, in_tile)):
+        estimator, _, frame = scripted([answer(0.6)], [answer(look)], [answer(look)], acquire_size_wh=(768, 448))
+        assert len(estimator.regions(frame)) == 5
+        assert len(estimator.acquire(frame, regions=estimator.regions(frame)[of : of + 1])) == targets
+
+
+def test_regions_are_searched_until_one_shows_a_target() -> None:
+    estimator, model, frame = scripted([answer(0.01), answer(0.95)], [answer(0.99)], [answer(0.99)])
+    regions = estimator.regions(frame)
+    assert len(estimator.acquire(frame, regions=regions)) == 1
+    assert model.asked == ["whole", "whole", "plain", "plain", "mirrored"], "the second region does"
+
+
 @pytest.mark.parametrize("unhurried", [True, False])
 def test_what_few_frames_have_shown_is_looked_at_both_ways_at_any_rate(unhurried: bool) -> None:
     assert looked_at_twice(TrackState.TENTATIVE, unhurried)
@@ -141,7 +157,9 @@ def test_what_few_frames_have_shown_is_looked_at_both_ways_at_any_rate(unhurried
         (0.6, 0.5, 0, 0),
         (0.9, 0.25, 1, 0),  # less than a track needs, but the whole frame is sure
         (0.9, 0.15, 0, 1),  # the whole frame is sure, and wrong
-        (0.09, 1.0, 0, 0),  # nobody looks
+        (0.03, 0.999, 1, 0),  # hardly a hint in the whole frame, but the windows leave no doubt
+        (0.03, 0.98, 0, 0),
+        (0.015, 0.999, 0, 0),  # nobody looks
     ],
 )
 def test_the_whole_frame_and_its_windows_confirm_a_target_together(
@@ -153,7 +171,7 @@ def test_the_whole_frame_and_its_windows_confirm_a_target_together(
         assert len(found) == targets
         assert [estimate.score for estimate in found] == [pytest.approx(look)] * targets
         assert estimator.refused["unconfirmed"] == unconfirmed
-        assert ("plain" in model.asked) == (place > 0.1)
+        assert ("plain" in model.asked) == (place > 0.02)
 
 
 def test_what_the_finer_windows_do_not_show_is_no_target_however_sure_the_first_was() -> None:
