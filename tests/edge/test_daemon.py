@@ -295,6 +295,8 @@ def test_the_line_of_each_second_is_short_and_the_last_one_holds_every_counter()
 class FrozenStamp:
     """A camera whose driver's stamp stands still from the tenth frame on."""
 
+    live = False
+
     def __init__(self, scene: Path) -> None:
         self.counts: dict[str, int] = {}
         self._scene = SequenceSource(SequenceCamera(type="sequence", path=scene, fps=FPS))
