@@ -164,6 +164,7 @@ def judge(
     no_frame_ns: int = NO_FRAME_NS,
     faults: Sequence[Reason] = (),
     waited_ns: int = 0,
+    lost_position: bool = False,
 ) -> Condition:
     """Condition of the daemon. `frame_age_ns`: None before the first frame; `waited_ns`: time waited for that one;
     `faults`: further reasons. Pure."""
@@ -176,6 +177,8 @@ def judge(
     reasons = list(faults)
     if wants_attitude and not has_attitude:
         reasons.append(Reason("no_attitude", "no own attitude: poses in the camera frame only"))
+    elif lost_position:
+        reasons.append(Reason("no_position", "own position lost: targets relative to the own ship only"))
     if drops_share > DROPS_TOLERATED:
         reasons.append(Reason("drops", f"{100 * drops_share:.0f} % of frames dropped"))
     states = {track.state for track in tracks}
@@ -199,7 +202,7 @@ class Health:
         self._began_ns: int | None = None  # time of the first call
         self._done_ns: int | None = None
         self._tracks: tuple[Track, ...] = ()
-        self._has_attitude = False
+        self._has_attitude = self._has_position = self._had_position = False
         self._poses = 0
 
     def frame_done(
@@ -209,13 +212,15 @@ class Health:
         tracks: tuple[Track, ...],
         has_attitude: bool,
         now_ns: int,
+        has_position: bool = False,
     ) -> None:
         """Add one frame: its number (a gap is a drop), the times of its stages, and its results."""
         for stage, duration_ns in stages_ns.items():
             self._stages_ns.setdefault(stage, deque(maxlen=WINDOW_FRAMES)).append(duration_ns)
         self._done_ns = now_ns
         self._recent.append((now_ns, sequence, stages_ns["total"]))
-        self._tracks, self._has_attitude = tracks, has_attitude
+        self._tracks, self._has_attitude, self._has_position = tracks, has_attitude, has_position
+        self._had_position = self._had_position or has_position
         self._poses += sum(track.state is not TrackState.TENTATIVE for track in tracks)
 
     def assess(self, now_ns: int) -> Condition:
@@ -231,6 +236,7 @@ class Health:
             self.no_frame_ns,
             self.faults,
             now_ns - self._began_ns,
+            self._had_position and not self._has_position,
         )
 
     def snapshot(

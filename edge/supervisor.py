@@ -79,9 +79,9 @@ class Supervisor:
         # The true size may not be known earlier, for example over zenoh, and may change in flight.
         self._board.image_size_wh = report.image_size_wh
         tracks = tuple(track for track in report.tracks if probable(track, report))
-        self._health.frame_done(
-            report.meta.sequence, stages_ns, tracks, report.own_ship is not None, clock.monotonic_ns()
-        )
+        own = report.own_ship
+        placed = own is not None and (own.t_ned_body_m is not None or own.lat_lon_alt is not None)
+        self._health.frame_done(report.meta.sequence, stages_ns, tracks, own is not None, clock.monotonic_ns(), placed)
         for level, text in self._targets.words(report):
             log.info("%s", text)
             self._outlets.event(level, text)

@@ -217,6 +217,25 @@ def test_a_camera_that_is_gone_has_no_frame_rate() -> None:
     assert (gone.condition.state, gone.frame_rate_hz) == (HealthState.FAULT, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("placed", "told"),
+    [
+        ([False] * 5, []),  # no autopilot that has a position
+        ([True] * 5, []),
+        ([False, True, True, False], ["own position lost: targets relative to the own ship only"]),
+        ([True, False, True], []),
+    ],
+)
+def test_an_own_position_that_was_there_and_is_lost_is_told_of(placed: list[bool], told: list[str]) -> None:
+    health, period_ns = Health(wants_attitude=True), 100_000_000
+    for k, has_position in enumerate(placed):
+        health.frame_done(k, {"total": 1}, (), True, k * period_ns, has_position)
+    assert list(health.assess(len(placed) * period_ns).texts) == told
+    health.frame_done(len(placed), {"total": 1}, (), False, len(placed) * period_ns)
+    (without,) = health.assess(len(placed) * period_ns).reasons
+    assert without.kind == "no_attitude", "which says it all"
+
+
 def test_what_else_is_wrong_degrades_a_daemon_that_tracks() -> None:
     slow = Reason("slow", "slow: p95 90 ms from exposure to the links")
     searching = Condition(HealthState.DEGRADED, Activity.SEARCHING, (slow,))
