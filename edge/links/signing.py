@@ -25,10 +25,11 @@ EPOCH_S = 1_420_070_400  # 2015-01-01 UTC
 UNIT_NS = 10_000
 NEW_STREAM_BEHIND_MAX = 60 * 100_000  # one minute
 HELD_BACK_MAX_NS = 1_500_000_000
-RESERVED_AHEAD = 60 * 100_000  # reserved beyond the present by each save of the state; after a crash these are skipped
-# Reserved at least, for a start that is ahead of the present by those: enough for as many messages. Another minute each
-# time would, after a few crashes in a row, be so far ahead that an autopilot with the right time is rejected.
-RESERVED_MIN = 1 * 100_000
+RESERVED_AHEAD = 60 * 100_000  # reserved beyond the time by each save of the state; after a crash these are skipped
+# Reserved beyond the last one if that is ahead of the time already: by a crash, or as the autopilot's clock is ahead of
+# ours. Not a minute: autopilots count on from what they hear, so each crash would take both a minute further, until one
+# that starts anew with the right time is rejected.
+RESERVED_MIN = 10 * 100_000
 AHEAD_MAX_S = 600.0  # saved timestamp minus clock; beyond it one of the two is wrong
 
 
@@ -74,8 +75,7 @@ class Signing:
         now = timestamp_of(self._utc_ns())
         self._last = min(max(self._last + 1, now), TIMESTAMP_MAX)
         if self._last > self._reserved:
-            present = max(self._seen, now)
-            self._reserved = min(max(present + RESERVED_AHEAD, self._last + RESERVED_MIN), TIMESTAMP_MAX)
+            self._reserved = min(max(now + RESERVED_AHEAD, self._last + RESERVED_MIN), TIMESTAMP_MAX)
             self._save(self._reserved)
         return self._last
 

@@ -282,15 +282,19 @@ def test_an_autopilot_that_knows_the_time_is_believed_however_often_the_link_beg
 
 @pytest.mark.parametrize("clock_ns", [NOW_NS, 0], ids=["with the time", "without"])
 def test_crashes_in_a_row_neither_repeat_a_timestamp_nor_shut_out_an_autopilot(tmp_path: Path, clock_ns: int) -> None:
-    """Each crash leaves a minute of timestamps reserved; were they all skipped, the state would run ahead of time."""
+    """Each crash leaves a minute reserved, and an autopilot counts on from what it hears of us."""
     key, state = tmp_path / "key", tmp_path / "state"
     write_new_key(key)
-    used = open_signing(key, state, lambda: NOW_NS).next_timestamp()
-    for _ in range(6):
+    secret, used = load_key(key), open_signing(key, state, lambda: NOW_NS).next_timestamp()
+    for _ in range(5):
         one = open_signing(key, state, lambda: clock_ns)
-        assert one.next_timestamp() > used
-        assert one.refusal(parsed(signed_frame(timestamp_of(NOW_NS), key=load_key(key)))) is None
+        assert one.refusal(parsed(signed_frame(used + 1, key=secret))) is None
+        assert one.next_timestamp() > used + 1
         used = one.next_timestamp()
+    one = open_signing(key, state, lambda: clock_ns)
+    restarted = parsed(signed_frame(timestamp_of(NOW_NS), key=secret))
+    assert one.refusal(restarted) is None
+    assert one.next_timestamp() > used
 
 
 def test_a_state_from_a_time_to_come_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
