@@ -85,10 +85,10 @@ class Vehicle:
         self._succession = Succession()
         self._heartbeat_ns: int | None = None
         self._spoke_ns: int | None = None
-        self._boot, self._steps = RebootDetector(), StepDetector()
+        self._boot = RebootDetector()
         self._rates_hz = dict(rates_hz)
         self._stands_in = stands_in or {}
-        self._streams = self._new_streams()
+        self._streams, self._steps = self._new_streams(), StepDetector()
         self._in_flight: tuple[int, int] | None = None  # message id, asked ns
 
     def heartbeat(self, system_id: int, autopilot: int | None, now_ns: int) -> bool:
@@ -127,7 +127,6 @@ class Vehicle:
         if not self._boot.rebooted(boot_ms):
             return False
         self.reboots += 1
-        self._steps = StepDetector()
         self.ask_anew()
         return True
 
@@ -147,8 +146,9 @@ class Vehicle:
             self._in_flight = None
 
     def ask_anew(self) -> None:
-        """Request all rates again: the autopilot may have lost them, or is received on another link now."""
-        self._streams = self._new_streams()
+        """Request all rates again: the autopilot may have lost them, or is received on another link now, where its
+        messages have other numbers and delays."""
+        self._streams, self._steps = self._new_streams(), StepDetector()
         self._in_flight = None
 
     def tick(self, now_ns: int) -> None:
@@ -184,7 +184,7 @@ class Vehicle:
         return quiet and self.contact is not Contact.HEARD
 
     def _forget(self) -> None:
-        self._boot, self._steps = RebootDetector(), StepDetector()
+        self._boot = RebootDetector()
         self.ask_anew()
 
     def _new_streams(self) -> dict[int, Stream]:

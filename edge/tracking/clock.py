@@ -14,6 +14,7 @@ ASKED_KEPT = 16
 ROUND_TRIP_MAX_NS = 200_000_000
 JUMP_MIN_NS = 2_000_000  # beyond what round trips and drift explain
 JUMP_AGREEING = 3  # samples in a row that must agree on a jump
+STEPS_MAX = 3  # more are of a link that brings the autopilot's messages by two ways, with numbers of their own
 STEP_MIN_MS = 5  # smaller ones are within the tracker's uncertainty of exposure times
 STAMP_FUTURE_MAX_NS = 20_000_000
 STAMP_AGE_MAX_NS = 1_000_000_000
@@ -172,10 +173,12 @@ class StepDetector:
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[int, int]] = {}  # by message id: sequence number, ms
+        self._steps = 0
 
     def set_back(self, message_id: int, sequence: int, boot_ms: int) -> bool:
         last, self._last[message_id] = self._last.get(message_id), (sequence, boot_ms)
         back = last is not None and 0 < (sequence - last[0]) % 256 < 128 and boot_ms <= last[1] - STEP_MIN_MS
         if back:
+            self._steps += 1
             self._last = {message_id: (sequence, boot_ms)}  # the other kinds' are of the clock before: one step, once
-        return back
+        return back and self._steps <= STEPS_MAX

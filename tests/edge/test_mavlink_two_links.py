@@ -162,3 +162,25 @@ def test_our_clock_is_told_on_any_link_and_the_autopilots_is_believed_on_one() -
     assert air.station.timesync.offset_ns is None
     air.tell(dialect.MAVLink_timesync_message(10**15, question.ts1), HOME, BEGAN_NS + 3 * MS)
     assert air.station.timesync.offset_ns is not None
+
+
+def test_a_slower_link_that_is_preferred_makes_no_attitude_younger() -> None:
+    """What it brings first is stamped earlier than the last of the other link, each of which has numbers of its own."""
+    air, numbers, late_ms = Air(), {HOME: 200, OTHER: 0}, 150
+    for now_ns in range(BEGAN_NS, BEGAN_NS + 8_000 * MS, 20 * MS):
+        air.station.tick(now_ns)
+        for link in (HOME, OTHER):
+            if link == HOME and now_ns < BEGAN_NS + 2_000 * MS:
+                continue
+            air._mav.seq = numbers[link] = (numbers[link] + 1) % 256
+            if now_ns % (1_000 * MS) == 0:
+                air.beat(link, now_ns)
+            sent_ns = now_ns - late_ms * MS * (link == HOME)
+            q = np.roll(Rotation.from_euler("x", 0.5 * (sent_ns - BEGAN_NS) / 1e9).as_quat(), 1).tolist()
+            air.tell(dialect.MAVLink_attitude_quaternion_message(sent_ns // MS, *q, 0.5, 0.0, 0.0), link, now_ns)
+        exposed_ns = now_ns - 200 * MS
+        if exposed_ns > BEGAN_NS and (own := air.own_ship.at(exposed_ns)) is not None:
+            rolled = Rotation.from_euler("x", 0.5 * (exposed_ns - BEGAN_NS) / 1e9)
+            off = Rotation.from_matrix(own.R_ned_body) * rolled.inv()
+            assert off.magnitude() < 0.01, f"{off.magnitude():.3f} rad off at {(now_ns - BEGAN_NS) // MS} ms"
+    assert air.station.home == HOME

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from edge.tracking.clock import JUMP_AGREEING, BootClock, RebootDetector, StepDetector, TimesyncEstimator
+from edge.tracking.clock import JUMP_AGREEING, STEPS_MAX, BootClock, RebootDetector, StepDetector, TimesyncEstimator
 from edge.tracking.own_ship import GimbalFrame, OwnShipBuffer
 from edge.tracking.view import View
 from edge.types import Mount
@@ -330,6 +330,8 @@ def test_a_boot_time_that_falls_is_a_reboot_and_a_late_datagram_is_not(stamps_ms
         ([(254, 1_000), (254, 1_000), (1, 1_018), (3, 1_015)], 0),  # one that comes twice, and a rounding
         ([(254, 1_000), (1, 990), (4, 1_010), (7, 1_030)], 1),
         ([(5, 1_000), (5, 900), (5, 1_020)], 0),  # a sender that does not number its messages
+        # One whose messages come by two ways.
+        ([(k + 90 * late, 1_000 + 20 * k - 8 * late) for k in range(60) for late in (0, 1)], STEPS_MAX),
     ],
 )
 def test_a_clock_is_set_back_if_what_was_sent_later_is_stamped_earlier(
