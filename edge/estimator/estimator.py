@@ -68,17 +68,18 @@ class Estimator:
         thrice: bool = True,
         regions: Sequence[Region] = (),
     ) -> list[Estimate]:
-        """Targets in the whole frame, or in the first of some `regions` that shows any, best first, without those that
-        overlap one of `known_boxes` (box_xyxy_px).
+        """Targets in the whole frame, or in some `regions` of it, without those that overlap one of `known_boxes`
+        (box_xyxy_px) or one of a region before; best first in each.
 
         Each is evaluated in a track window of the same frame, placed by the coarse detection; if `thrice`, twice more
         in a window placed by the first result, plain and mirrored. A detection that the windows do not show, or do not
         confirm together, is dropped.
         """
+        found: list[Estimate] = []
         for region in regions or self.regions(frame)[:1]:
-            if found := self._acquire_in(region, frame, known_boxes, thrice):
-                return found
-        return []
+            known = [*known_boxes, *(estimate.box_xyxy_px for estimate in found)]
+            found += self._acquire_in(region, frame, known, thrice)
+        return found
 
     def _acquire_in(self, region: Region, frame: Frame, known_boxes: Sequence[Array], thrice: bool) -> list[Estimate]:
         room = max(self._max_targets - len(known_boxes), 0)
