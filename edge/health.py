@@ -172,7 +172,8 @@ def judge(
         state = HealthState.INIT if waited_ns <= max(no_frame_ns, FIRST_FRAME_NS) else HealthState.FAULT
         return Condition(state, Activity.WAITING, (Reason("no_camera", "waiting for the camera"), *faults))
     if frame_age_ns > no_frame_ns:
-        silent = Reason("no_frame", f"no frame for {frame_age_ns / 1e9:.0f} s")
+        silent_s = frame_age_ns / 1e9
+        silent = Reason("no_frame", f"no frame for {silent_s:.{0 if silent_s >= 1.0 else 1}f} s")
         return Condition(HealthState.FAULT, Activity.WAITING, (silent, *faults))
     reasons = list(faults)
     if wants_attitude and not has_attitude:

@@ -243,6 +243,8 @@ def test_what_else_is_wrong_degrades_a_daemon_that_tracks() -> None:
     assert str(searching) == "degraded, searching: slow: p95 90 ms from exposure to the links"
     assert judge([], 900_000_000, 0.0, True, True, no_frame_ns=500_000_000).state is HealthState.FAULT
     assert judge([], 3_000_000_000, 0.0, True, True).reasons == (Reason("no_frame", "no frame for 3 s"),)
+    (soon,) = judge([], 310_000_000, 0.0, True, True, no_frame_ns=300_000_000).reasons
+    assert soon.text == "no frame for 0.3 s"
     assert [reason.kind for reason in judge([], 0, 0.3, False, True).reasons] == ["no_attitude", "drops"]
 
 
