@@ -99,10 +99,13 @@ class ZenohSource:
         while time.monotonic_ns() < silent_ns:
             if stop.is_set():
                 raise EndOfStream
+            looked_ns = time.monotonic_ns()
             with self._arrived:
                 self._arrived.wait_for(lambda: self._sample is not None, LOOK_S)
                 sample, self._sample = self._sample, None
             if sample is None:
+                # Time during which this process stood still is no silence of the camera.
+                silent_ns += max(time.monotonic_ns() - looked_ns - round(LOOK_S * 1e9), 0)
                 continue
             try:
                 return self._frame(*sample)

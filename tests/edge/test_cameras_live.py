@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -245,6 +246,28 @@ def test_who_publishes_what_cannot_be_used_does_not_keep_the_camera_out() -> Non
                 camera.put(message(7))
                 reader.join(0.05)
             assert [number_of(frame) for frame in read] == [7]
+
+
+def test_while_the_process_itself_stood_still_the_camera_was_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    port, stood_still_ns, looks = free_port(), [0], []
+
+    def monotonic_ns() -> int:
+        looks.append(None)
+        return time.monotonic_ns() + stood_still_ns[0]
+
+    with router(port) as camera, closing(ZenohSource(zenoh_camera(port))) as source:
+        source.open()
+        put_until_read(source, camera, message(1))
+        monkeypatch.setattr(zenoh_topic, "time", SimpleNamespace(monotonic_ns=monotonic_ns))
+        read: list[Frame] = []
+        reader = threading.Thread(target=lambda: read.append(source.read(threading.Event())))
+        reader.start()
+        until(lambda: len(looks) > 2)
+        stood_still_ns[0] = 10_000_000_000
+        seen = len(looks)
+        until(lambda: len(looks) > seen + 2 or not reader.is_alive())
+        until(lambda: not reader.is_alive(), lambda: camera.put(message(7)))
+    assert [number_of(frame) for frame in read] == [7]
 
 
 IMAGE_TYPE = "sensor_msgs::msg::dds_::CompressedImage_"
