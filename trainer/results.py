@@ -218,7 +218,7 @@ def page(
 
 
 def _interval(score: Mapping[str, Any]) -> str:
-    intervals = score.get("intervals_95")  # missing in scores of a single flight, and in older ones
+    intervals = score.get("intervals_95")  # missing in older scores, and None for few flights
     return "{:.0f}–{:.0f}".format(*(100 * end for end in intervals["pose_10deg_5pct"])) if intervals else "–"
 
 

@@ -17,10 +17,13 @@ from sim_replay.score import Match, pose_statistics
 RATES = ("recall", "rot_10deg", "depth_5pct", "pose_10deg_5pct")
 DRAWS = 4000
 TAILS_PERCENT = (2.5, 97.5)
+# Of n flights, the lowest and the highest lie on one side of the median flight with probability 2 / 2^n: of fewer than
+# these, in more than 5 of 100 cases, and the bootstrap goes no farther than they do.
+FLIGHTS_LEAST = 6
 
 
 def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]] | None:
-    """95 % confidence interval of each rate over all targets; None for fewer than two flights.
+    """95 % confidence interval of each rate over all targets; None for fewer than FLIGHTS_LEAST flights with a target.
 
     The resampling is deterministic.
     """
@@ -29,7 +32,7 @@ def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]
         if frame.matches:
             scene = frame.picture.scene
             by_flight.setdefault((str(scene.folder), scene.scene_id), []).extend(frame.matches)
-    if len(by_flight) < 2:
+    if len(by_flight) < FLIGHTS_LEAST:
         return None
     groups = [pose_statistics(0, matches, None) for matches in by_flight.values()]
     targets = np.array([float(group["targets"]) for group in groups])

@@ -9,6 +9,8 @@ from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
 
+from sim_replay.evaluation.spread import FLIGHTS_LEAST
+
 WIDTH = 130  # of tables that are not written to a terminal
 _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "targets": lambda group: str(group["targets"]),
@@ -54,7 +56,7 @@ def score_table(score: dict[str, Any]) -> Group:
     if overall["rotations_not_known"]:
         not_known = overall["rotations_not_known"]
         caption += f"\nposes whose rotation is not known, excluded from E_r and counted as failures: {not_known}"
-    if score.get("intervals_95") is not None:
+    if "intervals_95" in score:
         caption += f"\n{_intervals(score['intervals_95'])}"
     if score.get("consistency") is not None:
         caption += f"\n{consistency_line(score['consistency'])}"
@@ -96,7 +98,9 @@ def consistency_line(found: dict[str, Any]) -> str:
     return f"NEES, mean over {found['flights']} flights (95 % bounds): {means}{left_out}"
 
 
-def _intervals(intervals: dict[str, tuple[float, float]]) -> str:
+def _intervals(intervals: dict[str, tuple[float, float]] | None) -> str:
+    if intervals is None:
+        return f"95 % confidence intervals not available: fewer than {FLIGHTS_LEAST} flights show a target"
     recall, pose = (
         "{:.0f} to {:.0f} %".format(*(100 * end for end in intervals[name])) for name in ("recall", "pose_10deg_5pct")
     )

@@ -22,6 +22,7 @@ from sim_replay.evaluation.bop_results import file_answers, read_results, write_
 from sim_replay.evaluation.consistency import bounds_95
 from sim_replay.evaluation.directions import directions
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames, labels_sha256, score_of
+from sim_replay.evaluation.spread import intervals_95
 from sim_replay.evaluation.table import consistency_line, score_table
 from sim_replay.score import TargetPose
 from tests.sim_replay.foreign import UNIT, write_json, write_models_info, write_scene
@@ -276,10 +277,13 @@ def test_names_with_brackets_are_shown_as_they_are(root: Path) -> None:
     write_json(root / "models" / "models_info.json", {"1": {"diameter": 6000.0, "name": "cub [/red]"}})
     dataset = open_dataset(root)
     console = Console(file=io.StringIO(), width=130)
-    console.print(score_table(score_of(dataset, {"file": "m [a].csv"}, judged(root, []))))
+    frames = judged(root, [])
+    score = score_of(dataset, {"file": "m [a].csv"}, frames)
+    console.print(score_table(score | {"intervals_95": intervals_95(frames)}))
     console.print(statistics_table(dataset_statistics(root)))
     shown = console.file.getvalue()
     assert "m [a].csv on hawks [v2], 2 frames" in shown
+    assert "95 % confidence intervals not available: fewer than 6 flights show a target" in " ".join(shown.split())
     assert shown.count("cub [/red]") == 2
 
 
