@@ -25,6 +25,8 @@ TRACK_SCALE = 1.8
 TRACK_JITTER = 0.15  # of the window's side
 TRACK_ZOOM = (0.75, 1.33)
 ACQUIRE_WIDTH_PX = (640.0, 1280.0)  # of the whole frame, 16:9, when the acquire stage sees it
+# Width by height of the acquire stage's image, of any network: a frame of another shape gets black bars in it.
+ACQUIRE_ASPECT = (4 / 3, 16 / 9)
 VISIBLE_MIN = 0.35  # least share of the box inside the window for the target to be trained on
 Array = NDArray[np.float64]
 _log = logging.getLogger(__name__)
@@ -105,10 +107,12 @@ class DatasetSampler:
         box = None if chosen is None else boxes[chosen]
         # If the image's pixels are not square, the window's are nevertheless, so that the aircraft is not distorted.
         aspect = np.array([1.0, frame.K[0, 0] / frame.K[1, 1]])
-        low, sides = self._cut(rng, None if box is None else box * np.tile(aspect, 2), np.array(frame_wh) * aspect)
+        low, sides, border = self._cut(
+            rng, None if box is None else box * np.tile(aspect, 2), np.array(frame_wh) * aspect
+        )
         low, scale = low / aspect, self.size_px * aspect / sides
         to_window = np.column_stack([np.diag(scale), (0.5 - low) * scale - 0.5])
-        image = _resampled(picture, to_window, self.size_px)
+        image = _resampled(picture, to_window, self.size_px, border)
         out = _blank(image, np.vstack([to_window, [0, 0, 1]]) @ frame.K)
         if chosen is not None and box is not None:
             mask = _mask(frame, chosen, frame_wh) if frame.distortion is None else None
@@ -118,15 +122,16 @@ class DatasetSampler:
                 _mark(out.others[0], other, to_window)
         return out
 
-    def _cut(self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array) -> tuple[Array, Array]:
-        """Position of the first pixel [2] and sides [2] of the window, in the units of the box and the frame."""
+    def _cut(self, rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array) -> tuple[Array, Array, int]:
+        """Position of the first pixel [2] and sides [2] of the window, in the units of the box and the frame, and
+        OpenCV's border mode, which says what is outside the frame."""
         if box_xyxy_px is not None and rng.random() >= self.acquire_share:
             low, side = _track_square(rng, box_xyxy_px)
-        elif self.acquire_view == "frame":
-            return np.zeros(2), frame_wh
-        else:
-            low, side = _acquire_square(rng, box_xyxy_px, frame_wh, self.size_px)
-        return low, np.full(2, side)
+            return low, np.full(2, side), cv2.BORDER_REPLICATE
+        if self.acquire_view == "frame":
+            return np.zeros(2), frame_wh, cv2.BORDER_REPLICATE
+        low, side = _acquire_square(rng, box_xyxy_px, frame_wh, self.size_px)
+        return low, np.full(2, side), cv2.BORDER_CONSTANT
 
     def _label(
         self,
@@ -186,17 +191,23 @@ def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, 
 def _acquire_square(
     rng: np.random.Generator, box_xyxy_px: Array | None, frame_wh: Array, size_px: int
 ) -> tuple[Array, float]:
-    """The same for a window of the reduced frame: at random around the box, or anywhere if there is none."""
+    """The same for a window of the reduced frame with its black bars: at random around the box, or anywhere if there is
+    none."""
     # A narrower frame is letterboxed: its height decides how much it is reduced.
     width = max(frame_wh[0], frame_wh[1] * 16 / 9)
     side = size_px * width / float(np.exp(rng.uniform(*np.log(ACQUIRE_WIDTH_PX))))
-    around = rng.uniform(0.0, 1.0, 2) * frame_wh if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
+    aspect = float(np.exp(rng.uniform(*np.log(ACQUIRE_ASPECT))))
+    whole_wh = np.maximum(frame_wh, [frame_wh[1] * aspect, frame_wh[0] / aspect])
+    first = (frame_wh - whole_wh) / 2  # where the bars begin
+    anywhere = first + rng.uniform(0.0, 1.0, 2) * whole_wh
+    around = anywhere if box_xyxy_px is None else box_xyxy_px.reshape(2, 2).mean(axis=0)
     low = around - rng.uniform(0.0, 1.0, 2) * side
-    return np.where(frame_wh > side, np.clip(low, 0.0, np.maximum(frame_wh - side, 0.0)), low), side
+    return np.where(whole_wh > side, np.clip(low, first, np.maximum(first + whole_wh - side, first)), low), side
 
 
-def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int) -> NDArray[np.uint8]:
-    """Resample with anti-aliasing: when shrinking, the image is blurred to the window's pixel size first."""
+def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int, border: int) -> NDArray[np.uint8]:
+    """Resample with anti-aliasing: when shrinking, the image is blurred to the window's pixel size first. `border`: how
+    OpenCV fills what is outside the image."""
     scale = np.diag(to_window)
     if (scale < 1.0).any():
         margin = 2.0 / scale
@@ -210,7 +221,7 @@ def _resampled(picture: NDArray[np.uint8], to_window: Array, size_px: int) -> ND
             to_window = to_window.copy()
             to_window[:, 2] += to_window[:, :2] @ start
     return np.asarray(
-        cv2.warpAffine(picture, to_window, (size_px, size_px), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+        cv2.warpAffine(picture, to_window, (size_px, size_px), flags=cv2.INTER_LINEAR, borderMode=border),
         np.uint8,
     )
 

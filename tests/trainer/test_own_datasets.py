@@ -59,6 +59,28 @@ def test_of_an_upright_picture_the_windows_are_reduced_as_the_daemon_reduces_it(
     assert scales.min() < flown.scale_xy[0] < scales.max()
 
 
+def test_acquire_windows_show_the_black_bars_beside_a_frame_and_track_windows_none(tmp_path: Path) -> None:
+    """The daemon letterboxes the frame; a network that never saw a bar takes its edge for targets."""
+    K, (width, height) = np.array([[1500.0, 0, 319.5], [0, 1500, 239.5], [0, 0, 1]]), (640, 480)
+    box, t_m = np.array([9.5, 29.5, 30.5, 50.5]), 260.0 * np.linalg.solve(K, [20.0, 40.0, 1.0])
+    with SceneWriter(tmp_path / "train" / "000001") as writer:
+        image = np.full((height, width, 3), 150, np.uint8)
+        writer.add(BopFrame(0, K, (BopTarget(1, np.eye(3), t_m, box, box, 441, 441),)), image)
+    barred = 0
+    for acquire_share in (0.0, 1.0):
+        batch = DatasetSampler(tmp_path, "train", 1, 128, acquire_share).batch(0, 20)
+        for image, K_window in zip(batch.image_bgr, batch.K, strict=True):
+            u, v = np.meshgrid(np.arange(128), np.arange(128))
+            in_frame = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K @ np.linalg.inv(K_window)).T
+            beside = (np.abs(in_frame[..., :2] - K[:2, 2]) - np.array([width, height]) / 2).max(axis=-1)
+            assert image[beside < -3].min() > 140
+            if acquire_share and (beside > 3).any():
+                assert image[beside > 3].max() == 0
+                barred += 1
+            assert acquire_share or image.min() > 140
+    assert 5 < barred < 20
+
+
 def test_datasets_without_a_validation_split_leave_their_shares_to_the_others_in_proportion(tmp_path: Path) -> None:
     """Of 0.8, 0.1 and 0.1 the first has none: half of what is validated on is of each other, not nearly all of one."""
     depths_m = {"near": 100.0, "far": 300.0}
