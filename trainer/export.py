@@ -25,7 +25,7 @@ from trainer.dataset_windows import DatasetSampler
 from trainer.evaluate import Predictions, Predictor, choose_threshold, measure, predict_all, torch_predictor
 from trainer.graph import onnx_predictor, quantise_graph, write_contract, write_graph
 from trainer.model import IMAGENET_MEAN_BGR, IMAGENET_STD_BGR, PoseNet
-from trainer.sources import window_sampler
+from trainer.sources import warn_of_unseen_reduction, window_sampler
 from trainer.tally import Tally, windows_in
 from trainer.unfinished import unfinished
 
@@ -227,6 +227,7 @@ def export_models(
     for path in (float_path, int8_path):
         made_folder(path.parent)
 
+    warn_of_unseen_reduction(config.contract)
     say("rendering windows for calibration and comparison")
     tally = Tally("rendering", 2 * sum(_windows_of(config.contract, samples)), say)
     calibration = render_views(config, CALIBRATION_SEED, samples, trained_on, tally)

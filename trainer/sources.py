@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
@@ -11,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_replay.bop import BopError
-from trainer.config import ConfigError, DataConfig, DatasetSource
+from trainer.config import ConfigError, ContractConfig, DataConfig, DatasetSource
 from trainer.data import Sampler
-from trainer.dataset_windows import DatasetSampler, MixedSampler, spans
+from trainer.dataset_windows import ACQUIRE_WIDTH_PX, DatasetSampler, MixedSampler, spans
 
 if TYPE_CHECKING:
     from sim_replay.render.flown import FlownFrames, FlownShare
 
 
+_log = logging.getLogger(__name__)
 RENDERED = "rendered"  # name of the renderer among the datasets
 
 
@@ -120,6 +122,18 @@ def refuse_unreadable(config: DataConfig) -> None:
             raise ConfigError(
                 f"data.datasets: no image to {purpose} on shows a target, and there are no rendered windows"
             )
+
+
+def warn_of_unseen_reduction(contract: ContractConfig) -> None:
+    """Warn if the acquire stage is to see frames larger or smaller than they are in training and evaluation windows."""
+    width_px = min(contract.acquire_size_wh[0], contract.acquire_size_wh[1] * 16 / 9)
+    low_px, high_px = ACQUIRE_WIDTH_PX
+    if contract.acquire_fit == "letterbox" and not low_px <= width_px <= high_px:
+        _log.warning(
+            "contract.acquire_size_wh: frames of 16:9 will be reduced to a width of %.0f px, but windows to train and "
+            "to measure on are of frames %.0f to %.0f px wide: whole frames will be searched worse than metrics say",
+            *(width_px, low_px, high_px),
+        )
 
 
 def window_sampler(config: DataConfig, seed: int, size_px: int, held_out: bool = False) -> Callable[[], Sampler]:

@@ -18,7 +18,7 @@ from trainer.evaluate import measure, measure_each, predict_all, torch_predictor
 from trainer.pictures import example_sheet
 from trainer.plan import Plan
 from trainer.runlog import RunLog, provenance, run_folder
-from trainer.sources import refuse_unreadable, validated_from, window_sampler
+from trainer.sources import refuse_unreadable, validated_from, warn_of_unseen_reduction, window_sampler
 from trainer.trainer import Diverged, StepResult, Trainer, size_at
 
 OpenSampler = Callable[[int, int], Callable[[], Sampler]]  # (seed, size_px) to a picklable opener
@@ -86,6 +86,8 @@ def run_training(
         if start_from is not None:
             trainer.start_from(start_from)
         with run_folder(out, resume, hold=group.first):
+            if group.first:
+                warn_of_unseen_reduction(config.contract)
             if resume:
                 earlier = resume_run(out, trainer)
                 plan = earlier.resumed(out, budget_s, samples)

@@ -24,7 +24,9 @@ from trainer.sources import validated_from, window_sampler
 from trainer.train import run_training
 
 
-def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(tmp_path: Path) -> None:
+def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_and_trained_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Some editors put one before UTF-8; it had gone into the checkpoint, which then was not valid TOML."""
     for split in ("train", "val"):
         discs(tmp_path / "own" / split / "000001", 1500.0, (200.0, 260.0))
@@ -33,6 +35,7 @@ def test_a_configuration_with_a_byte_order_mark_gives_weights_that_can_be_used_a
     command = ["train", "--config", str(config), "--out", str(run)]
     assert main([*command, "--samples", "4"]) == 0
     assert load_model(run)[2]["samples"] == 4
+    assert "frames of 16:9 will be reduced to a width of 128 px" in caplog.text  # tiny.TOML's
     assert main([*command, "--samples", "8", "--resume"]) == 0
     assert load_model(run)[2]["samples"] == 8
 

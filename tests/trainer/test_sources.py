@@ -15,7 +15,7 @@ from tests.sim_replay.test_flown import fly
 from trainer.config import ConfigError, DataConfig, DatasetSource
 from trainer.data import TrainingBatch
 from trainer.refine import fleet_size
-from trainer.sources import refinement_sampler, refuse_unreadable, window_sampler
+from trainer.sources import refinement_sampler, refuse_unreadable, warn_of_unseen_reduction, window_sampler
 
 DATA = tiny.config().data.model_copy(update={"empty_share": 0.0})
 
@@ -85,3 +85,17 @@ def test_who_trains_on_datasets_alone_and_validates_on_none_validates_on_rendere
     for seed, of_dataset in ((1, True), (2, False)):
         labels = window_sampler(data, seed, 64)().batch(0, 8).noc
         assert (np.isnan(labels).all(axis=(1, 2, 3)) == of_dataset).all()
+
+
+@pytest.mark.parametrize(
+    ("size_wh", "width_px"), [((384, 224), 384), ((1600, 896), 1593), ((1600, 448), None), ((768, 448), None)]
+)
+def test_an_acquire_stage_for_frames_of_a_size_that_no_window_has_is_warned_of(
+    size_wh: tuple[int, int], width_px: int | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    contract = tiny.config().contract
+    warn_of_unseen_reduction(contract.model_copy(update={"acquire_size_wh": size_wh}))
+    assert (f"acquire_size_wh: frames of 16:9 will be reduced to a width of {width_px} px, but" in caplog.text) == (
+        width_px is not None
+    )
+    assert (caplog.text == "") == (width_px is None)
