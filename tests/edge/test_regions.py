@@ -20,23 +20,16 @@ from edge.types import Frame, FrameMeta
 
 from .looping import Gated, looping
 from .toy_model import write_toy_model
-from .toy_scene import SIZE_WH, K
+from .toy_scene import FAINT_XYXY, SIZE_WH, K, draw_faint
 
 NETWORK_WH = (768, 448)
 BARREL = (-0.25, 0.06, 0.0, 0.0)
-# Stripes of two rows of pixels, six apart: the whole frame, reduced three times, mixes each with the dark between them.
-FAINT_XYXY = (1600, 900, 1720, 960)
-FAINT_GREY = 185
 
 
 def faint(index: int = 0) -> Frame:
-    """A target that only a tile shows, the last one."""
-    image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
-    x0, y0, x1, y1 = FAINT_XYXY
-    for row in range(y0, y1, 6):
-        image[row : row + 2, x0:x1] = FAINT_GREY
+    """What `draw_faint` draws, as the camera's frame."""
     time_ns = 1_000_000_000 + index * 33_000_000
-    return Frame(FrameMeta(index, time_ns, time_ns), image, K)
+    return Frame(FrameMeta(index, time_ns, time_ns), draw_faint(), K)
 
 
 @given(

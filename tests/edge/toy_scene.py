@@ -25,6 +25,20 @@ def draw(center_px: tuple[float, float], size_wh: tuple[int, int] = SIZE_WH) -> 
     return image
 
 
+# Stripes of two rows of pixels, six apart: the whole frame, reduced three times, mixes each with the dark between them.
+FAINT_XYXY = (1600, 900, 1720, 960)
+FAINT_GREY = 185
+
+
+def draw_faint() -> NDArray[np.uint8]:
+    """A picture of a target that only a tile of it shows, the last one."""
+    image = np.zeros((SIZE_WH[1], SIZE_WH[0], 3), np.uint8)
+    x0, y0, x1, y1 = FAINT_XYXY
+    for row in range(y0, y1, 6):
+        image[row : row + 2, x0:x1] = FAINT_GREY
+    return image
+
+
 def center_of(index: int) -> tuple[float, float]:
     return 500.5 + 8 * index, 420.5 + 2 * index
 
