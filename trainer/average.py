@@ -21,7 +21,8 @@ _log = logging.getLogger(__name__)
 def average(runs: Sequence[Path], out: Path) -> Path:
     """Write weights.pt with the mean of the runs' weights into `out`; configuration and origin are the last run's.
 
-    Raises ConfigError for fewer than two runs, for different network configurations, and for unrelated weights.
+    Raises ConfigError for fewer than two runs, for different network configurations, and for unrelated weights. Warns
+    of runs trained on the same windows.
     """
     if len(runs) < 2:
         raise ConfigError("average needs at least two runs")
@@ -34,6 +35,7 @@ def average(runs: Sequence[Path], out: Path) -> Path:
             raise ConfigError(f"{run}: its [model] differs from that of {runs[-1]}")
     for run, content in zip(runs, contents, strict=True):
         _refuse_unrelated(run, content["weights"], runs[-1], contents[-1]["weights"])
+    _warn_of_the_same_windows(runs, [config.data.seed for config in configs])
     known = {(source.path.resolve(), source.split) for source in configs[-1].data.datasets}
     for run, config in zip(runs, configs, strict=True):
         for source in config.data.datasets:
@@ -67,6 +69,15 @@ def _refuse_unrelated(run: Path, weights: dict[str, Tensor], last_run: Path, las
             f"{run}: has nothing in common with {last_run} in {', '.join(unrelated)}: a mean of unrelated weights is "
             "of no use; give runs that started from the same weights, and refine only their mean"
         )
+
+
+def _warn_of_the_same_windows(runs: Sequence[Path], seeds: list[int]) -> None:
+    """A continuation whose configuration kept the seed goes through the same windows once more."""
+    for seed in sorted(set(seeds)):
+        alike = " and ".join(str(run) for run, its in zip(runs, seeds, strict=True) if its == seed)
+        if seeds.count(seed) > 1:
+            told = "%s were trained with the same [data] seed, %d, so on much the same windows: the mean gains little"
+            _log.warning(told, alike, seed)
 
 
 def _matrices(weights: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -208,8 +208,9 @@ def _add_average(commands: argparse._SubParsersAction) -> None:
         "average",
         help="write the mean of several runs' weights",
         description="Write weights.pt with the mean of the weights of runs with a common origin, such as a run and its "
-        "continuation. The mean is often better than each of them; evaluate it to be sure. Refused are runs that began "
-        "with different random weights, and runs that were refined separately: average first, then refine.",
+        "continuation with another [data] seed. The mean is often better than each of them; evaluate it to be sure. "
+        "Refused are runs that began with different random weights, and runs that were refined separately: average "
+        "first, then refine.",
     )
     mean.add_argument("checkpoints", type=Path, nargs="+", metavar="RUN", help="run folders or their weights.pt")
     mean.add_argument("--out", type=Path, required=True, help="output folder for the mean")

@@ -16,8 +16,9 @@ from trainer.model import PoseNet
 
 
 def write_run(folder: Path, seed: int, config: str = tiny.TOML, *, began_as: int = 0) -> Path:
-    """A run that began with the random weights of seed `began_as`, and has come half as far from them as they are
-    long."""
+    """A run on the windows of `seed` that began with the random weights of seed `began_as`, and has come half as far
+    from them as they are long."""
+    config = config.replace("\nseed = 3\n", f"\nseed = {10 + seed}\n")
     torch.manual_seed(began_as)
     network = PoseNet(parse_config(config, "tiny.toml").model)
     torch.manual_seed(seed)
@@ -62,6 +63,16 @@ def test_images_that_only_an_earlier_run_was_trained_on_are_told(
     assert caplog.text == ""
     average([hawks, rendered], tmp_path / "other")
     assert f"{hawks}: was trained on /data/hawks (train), of which the mean, with the last run's" in caplog.text
+
+
+def test_runs_on_the_same_windows_are_told_to_gain_little(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Such as a run and its continuation with the same configuration file."""
+    first, again, other = (write_run(tmp_path / name, seed) for name, seed in (("a", 1), ("b", 1), ("c", 2)))
+    average([first, other], tmp_path / "mean")
+    assert caplog.text == ""
+    average([first, other, again], tmp_path / "mean")
+    assert f"{first} and {again} were trained with the same [data] seed, 11, so on much the same" in caplog.text
+    assert str(other) not in caplog.text
 
 
 def test_a_run_that_may_go_on_keeps_its_own_weights(tmp_path: Path) -> None:
