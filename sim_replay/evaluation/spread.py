@@ -2,6 +2,10 @@
 
 Frames of one flight show one aircraft against one sky and are right or wrong together, so flights are resampled, not
 frames (the percentile bootstrap over clusters, Efron and Tibshirani, An Introduction to the Bootstrap, chapter 13).
+
+If all targets of all flights are right, or none of any, every resample says the same, which is no certainty. The
+interval is then the exact one of as many trials as flights, each right or wrong as a whole (Clopper and Pearson, 1934):
+of 30 flights without a miss, 88.4 to 100 %.
 """
 
 from __future__ import annotations
@@ -41,6 +45,11 @@ def intervals_95(judged: Sequence[JudgedFrame]) -> dict[str, tuple[float, float]
 
 def _interval(rates: Array, targets: Array) -> tuple[float, float]:
     """Interval of the rate over all targets, from the rates of N flights and the number of targets of each."""
+    least_if_all = round(float((TAILS_PERCENT[0] / 100) ** (1 / len(rates))), 4)
+    if rates.min() == 1.0:
+        return least_if_all, 1.0
+    if rates.max() == 0.0:
+        return 0.0, round(1.0 - least_if_all, 4)
     drawn = np.random.default_rng(0).integers(len(rates), size=(DRAWS, len(rates)))
     overall = (rates * targets)[drawn].sum(axis=1) / targets[drawn].sum(axis=1)
     low, high = np.percentile(overall, TAILS_PERCENT)

@@ -104,7 +104,7 @@ def _intervals(intervals: dict[str, tuple[float, float]] | None) -> str:
     recall, pose = (
         "{:.0f} to {:.0f} %".format(*(100 * end for end in intervals[name])) for name in ("recall", "pose_10deg_5pct")
     )
-    return f"95 % bootstrap confidence intervals, resampled over flights: recall {recall}, Pose@10°/5 % {pose}"
+    return f"95 % confidence intervals, over flights: recall {recall}, Pose@10°/5 % {pose}"
 
 
 def _filtering(found: dict[str, Any]) -> str:

@@ -41,7 +41,17 @@ def test_flights_that_are_right_or_wrong_throughout_vary_as_so_many_draws_and_no
     assert found is not None
     by_flights = stats.binom.ppf([0.025, 0.975], 40, 0.75) / 40
     assert found["pose_10deg_5pct"] == pytest.approx(tuple(by_flights), abs=1.01 / 40)
-    assert found["recall"] == found["depth_5pct"] == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("flown", [6, 30])
+def test_no_failure_in_any_flight_and_no_success_are_no_certainty(flown: int) -> None:
+    """However many frames the flights have, their number alone tells how often others may fail."""
+    found = intervals_95(flights([[90.0] * 25] * flown))
+    assert found is not None
+    always = stats.binomtest(flown, flown).proportion_ci(0.95, method="exact")
+    never = stats.binomtest(0, flown).proportion_ci(0.95, method="exact")
+    assert found["recall"] == found["depth_5pct"] == pytest.approx((always.low, 1.0), abs=1e-4)
+    assert found["rot_10deg"] == found["pose_10deg_5pct"] == pytest.approx((0.0, never.high), abs=1e-4)
 
 
 def test_flights_of_unequal_length_agree_with_scipys_bootstrap() -> None:
