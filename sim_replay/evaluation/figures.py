@@ -16,6 +16,7 @@ from sim_replay import metrics
 from sim_replay.bop import Model
 from sim_replay.evaluation.judge import JudgedFrame
 from sim_replay.evaluation.worst import write_worst
+from sim_replay.lettering import lettering
 from sim_replay.report.peer import coordinate_errors, coordinates, root_mean_square
 from sim_replay.score import Match, stacked
 
@@ -87,7 +88,7 @@ def error_by_range(score: dict[str, Any]) -> Figure:
         axes.set_xlabel("true range, m")
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, framealpha=0.6)
-    figure.suptitle(f"{score['method']['file']} on {score['dataset']}")
+    _titled(figure, f"{score['method']['file']} on {score['dataset']}")
     return figure
 
 
@@ -157,8 +158,13 @@ def sequence(title: str, frames: Sequence[JudgedFrame]) -> Figure:
         axes.set_xlabel("image")
     if targets:
         panels[0].legend(fontsize=8)
-    figure.suptitle(title)
+    _titled(figure, title)
     return figure
+
+
+def _titled(figure: Figure, title: str) -> None:
+    (shown,), style = lettering([title])
+    figure.suptitle(shown, **style)
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from msgs.geometry import Array
 from sim_replay.ground_truth import SceneTruth
+from sim_replay.lettering import FAMILY, lettering
 from sim_replay.report.continuity import follows
 from sim_replay.report.peer import coordinate_errors, coordinates, pairs, root_mean_square
 from sim_replay.score import Match
@@ -33,7 +34,7 @@ STATE_COLORS = {
     "fault": "#ef4444",
 }
 _STYLE: Any = {
-    "font.family": "DejaVu Sans",
+    "font.family": FAMILY,
     "font.size": 9.5,
     "axes.edgecolor": "#94a3b8",
     "axes.labelcolor": "#334155",
@@ -234,14 +235,15 @@ def timeline(
                 axes.broken_barh(_runs(came, fps, unrecorded), (len(labels) - 0.3, 0.6), color=color, alpha=0.75, lw=0)
                 axes.text(came[0] / fps, len(labels), f" {track}", va="center", color="white", fontsize=8)
             labels.append("poses received")
-        axes.set_yticks(range(len(labels)), labels)
+        shown, style = lettering(labels)
+        axes.set_yticks(range(len(labels)), shown, **style)
         axes.set_ylim(len(labels) - 0.4, -0.6)
         axes.set(xlabel="time since the first frame, s")
         axes.axvline(0.0, color="#475569", lw=0.8, ls=":")
         axes.set_xlim(min([0.0, *(sample.t_s for sample in health)]), max([end_s, *(s.t_s for s in health)]))
         axes.grid(axis="y", visible=False)
-        shown = {sample.state for sample in health}
-        handles = [Patch(color=color, label=state) for state, color in STATE_COLORS.items() if state in shown]
+        states = {sample.state for sample in health}
+        handles = [Patch(color=color, label=state) for state, color in STATE_COLORS.items() if state in states]
         if handles:
             figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
         return _svg(figure, "timeline")

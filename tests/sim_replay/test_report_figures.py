@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from dataclasses import replace
@@ -11,6 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from msgs.geometry import so3_exp
+from sim_replay.evaluation.figures import error_by_range, sequence
 from sim_replay.evaluation.instances import instances
 from sim_replay.golden.run import CASES
 from sim_replay.ground_truth import read_scene_truth
@@ -309,3 +311,20 @@ def test_nothing_received_is_told_with_nulls_and_not_nan() -> None:
     assert json.loads(json.dumps(told, allow_nan=False)) == told
     assert told["rmse"]["z_m"] is None
     assert told["age_ms"]["p99"] is None
+
+
+def test_names_in_other_scripts_and_with_dollar_signs_are_drawn_and_nothing_is_complained_of(
+    caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
+) -> None:
+    """No font has the second character, so its number is shown; the third is in one that comes with matplotlib."""
+    name = "鷹 \U0010fffd ⎰ cost $x_{$"
+    seen = [replace(match, truth=replace(match.truth, airframe=name)) for match in matches("00")]
+    svg = plots.timeline([], seen, 2, FPS)
+    (shown,) = re.findall("<!-- (.*): in view -->", svg)
+    assert shown.endswith(r" \U0010fffd ⎰ cost $x_{$")
+    assert shown[0] == "鷹" or shown.startswith(r"\u9df9 ")
+    picture = io.BytesIO()
+    sequence(name, []).savefig(picture)
+    error_by_range({"by_range": {}, "method": {"file": name}, "dataset": name}).savefig(picture)
+    assert caplog.text == ""
+    assert not list(recwarn)
