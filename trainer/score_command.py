@@ -73,7 +73,13 @@ def calibrate_file(
     from sim_replay.evaluation.candidates import candidates
     from sim_replay.offline import DEFAULT_THREADS, InputError, load_model
     from trainer.graph import read_contract, write_contract
-    from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
+    from trainer.score_calibration import (
+        LEAST_OF_EACH,
+        ScoresTellNothing,
+        TooFewCandidates,
+        expected_calibration_error,
+        fit,
+    )
 
     contract = read_contract(path)
     if not os.access(path.parent, os.W_OK):
@@ -84,6 +90,12 @@ def calibrate_file(
             warn_of_training_images(dataset, contract)
         of_each = [dataset.boxed_frames() for dataset in datasets]
         pictures = [picture for frames in of_each for picture in frames]
+        visible = sum(target.box_visible_xyxy_px is not None for picture in pictures for target in picture.targets)
+        if visible < LEAST_OF_EACH:
+            raise ConfigError(
+                f"--dataset: {visible} visible targets in {len(pictures)} images: at least {LEAST_OF_EACH} are needed, "
+                "and as many peaks elsewhere"
+            )
         on_start(len(pictures))
         seen = list(candidates(load_model(path, DEFAULT_THREADS), pictures, on_frame))
     except InputError as error:

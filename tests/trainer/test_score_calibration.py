@@ -26,7 +26,7 @@ from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.graph import read_contract, write_contract
 from trainer.score_calibration import ScoresTellNothing, TooFewCandidates, expected_calibration_error, fit
-from trainer.score_command import warn_of_training_images
+from trainer.score_command import calibrate_file, warn_of_training_images
 
 __all__ = ["dark_spot_model"]
 
@@ -281,10 +281,19 @@ def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path: Path, dark_spot
 def test_a_dataset_without_false_peaks_is_refused_and_the_file_left(
     tmp_path: Path, dark_spot_model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_scene(tmp_path / "dataset" / "val" / "000000", spots=2, specks=0)
+    write_scene(tmp_path / "dataset" / "val" / "000000", spots=20, specks=0)
     model = tmp_path / "model.onnx"
     shutil.copy(dark_spot_model, model)
     content = model.read_bytes()
     assert main(["calibrate-score", "--model", str(model), "--dataset", str(tmp_path / "dataset")]) == 2
-    assert "--dataset: acquire: 2 peaks on targets and 0 elsewhere" in capsys.readouterr().err
+    assert "--dataset: acquire: 20 peaks on targets and 0 elsewhere" in capsys.readouterr().err
     assert model.read_bytes() == content
+
+
+def test_too_few_targets_are_refused_before_the_model_runs(tmp_path: Path, dark_spot_model: Path) -> None:
+    """Thousands of images may be without a target, and the model would run on each of them for nothing."""
+    write_scene(tmp_path / "dataset" / "val" / "000000", spots=2, specks=3)
+    begun: list[int] = []
+    with pytest.raises(ConfigError, match=r"--dataset: 2 visible targets in 5 images: at least 20 are needed"):
+        calibrate_file(dark_spot_model, [tmp_path / "dataset"], on_start=begun.append)
+    assert not begun
