@@ -35,7 +35,7 @@ class SerialEndpoint:
 
 def parse_endpoint(text: str) -> NetworkEndpoint | SerialEndpoint:
     """Raises ValueError with a sentence that names the text and the valid forms."""
-    serial = re.fullmatch(r"serial:(/\S+):(\d{1,8})", text)
+    serial = re.fullmatch(r"serial:(/[^\x00-\x1f]+):(\d{1,8})", text)
     if serial and 0 < int(serial[2]) <= BAUD_MAX:
         return SerialEndpoint(serial[1], int(serial[2]), text)
     network = re.fullmatch(r"(udpin|udpout|tcpin|tcpout):(?:\[([^\]]+)\]|([^:\s]+)):(\d{1,5})", text)

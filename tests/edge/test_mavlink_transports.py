@@ -141,7 +141,7 @@ def pseudo_terminal(link_at: Path) -> Pty:
 
 
 def test_a_serial_port_may_be_absent_at_first_and_pulled_out_later(tmp_path: Path) -> None:
-    device = tmp_path / "ttyAutopilot"
+    device = tmp_path / "tty of the autopilot: USB"
     with linked(f"serial:{device}:57600") as (link, own_ship):
         link.set_health(TRACKING)
         for _ in range(2):
@@ -233,7 +233,7 @@ def test_endpoints_are_read_or_refused_whole() -> None:
     assert parse_endpoint("tcpout:[fe80::1%eth0]:5760") == NetworkEndpoint(
         "tcpout", "fe80::1%eth0", 5760, "tcpout:[fe80::1%eth0]:5760"
     )
-    serial = ("serial:ttyS0:9600", "serial:/dev/ttyS0:0")
+    serial = ("serial:ttyS0:9600", "serial: /dev/ttyS0:9600", "serial:/dev/ttyS0:0", "serial:/dev/tty\nS0:9600")
     for wrong in ("udp:1.2.3.4:5", "udpin:1.2.3.4:70000", "tcpin:::1:5", "", *serial):
         with pytest.raises(ValueError, match="is not udpin:HOST:PORT"):
             parse_endpoint(wrong)
