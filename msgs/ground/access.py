@@ -28,6 +28,9 @@ class AccessSettings(Section):
     readers: list[CommonName] = Field(default_factory=list, description="read everything")
     loopback_reads: bool = Field(default=False, description="tcp from this machine reads without a certificate")
 
+    def gives_role(self, common_name: str) -> bool:
+        return common_name in (*self.vehicles, *self.operators, *self.readers)
+
 
 def access_control(access: AccessSettings, domain: int) -> dict[str, Any]:
     """The router's `access_control` section."""

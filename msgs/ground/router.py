@@ -110,6 +110,22 @@ def route(path: Path, stop: threading.Event, say: Callable[[str], None]) -> int:
 
         handler = zenoh.handlers.Callback(seen, indirect=False)
         session.liveliness().declare_subscriber(ALIVE, handler, history=True)
+        if settings.access is not None:
+            _tell_of_names_without_role(session, settings.access, say)
         say(f"listening on {', '.join(settings.listen)}" + ("" if settings.access else "; everyone may do everything"))
         stop.wait()
     return 0
+
+
+def _tell_of_names_without_role(session: zenoh.Session, access: AccessSettings, say: Callable[[str], None]) -> None:
+    """Their certificates are good, so zenoh lets them connect; it then drops all they send, and tells neither end."""
+    told: set[tuple[str, str]] = set()  # a QUIC session has two links
+
+    def linked(event: zenoh.LinkEvent) -> None:
+        name, zid = event.link.auth_identifier, str(event.link.zid)
+        if event.kind != zenoh.SampleKind.PUT or name is None or access.gives_role(name) or (name, zid) in told:
+            return
+        told.add((name, zid))
+        say(f"{name}: connected, but [access] names it in no role: nothing is passed on from it or to it")
+
+    session.info.declare_link_events_listener(zenoh.handlers.Callback(linked, indirect=False), history=True)

@@ -15,7 +15,7 @@ from msgs import client, topics
 from msgs.ground.keys import init_authority, issue
 from msgs.ground.router import load_router, open_router
 from msgs.publish import Node
-from msgs.session import TlsFiles, peer_config
+from msgs.session import TlsFiles, client_config, peer_config
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
@@ -148,17 +148,23 @@ def test_a_vehicle_hears_no_other_and_who_is_in_no_list_neither_hears_nor_is_hea
         assert [own.key in other for other in others] == [False, False]
 
 
-def test_the_router_command_says_who_comes_and_goes_and_ends_on_sigterm(
-    tmp_path: Path, keys: dict[str, TlsFiles]
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_the_router_command_says_who_comes_goes_and_has_no_role_and_ends_on_sigterm(
+    tmp_path: Path, keys: dict[str, TlsFiles], protocol: str
 ) -> None:
-    endpoint = free_endpoint().replace("tcp/", "tls/")
+    endpoint = free_endpoint().replace("tcp/", f"{protocol}/")
     path = write_router_config(tmp_path, [endpoint], keys["ground"], 'vehicles = ["uav1"]\n')
     command = [sys.executable, "-m", "msgs.ground.cli", "router", "--config", str(path)]
     router = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         assert router.stderr is not None
         assert router.stderr.readline() == f"listening on {endpoint}\n"
-        with zenoh.open(peer_config([], [endpoint], tls=keys["uav1"])) as uav1:
+        with (
+            zenoh.open(client_config([endpoint], tls=keys["unlisted"])),
+            zenoh.open(peer_config([], [endpoint], tls=keys["uav1"])) as uav1,
+        ):
+            told = router.stderr.readline()
+            assert told.startswith("unlisted: connected, but [access] names it in no role: ")
             token = uav1.liveliness().declare_token(topics.alive_token("uav1"))
             assert router.stderr.readline() == "uav1: here\n"
             token.undeclare()
