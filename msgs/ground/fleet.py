@@ -140,7 +140,15 @@ class _Vehicle:
     scores: dict[str, float] = field(default_factory=dict)
     scored_ns: int = 0  # stamp of the frame that they are of
     targets: dict[str, _Target] = field(default_factory=dict)
-    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=1024))
+    arrivals_ns: deque[int] = field(default_factory=deque)  # of poses
+
+    def pose_arrived(self, now_ns: int) -> None:
+        self.arrivals_ns.append(now_ns)
+        while not _is_recent(self.arrivals_ns[0], now_ns):
+            self.arrivals_ns.popleft()
+
+    def poses_per_s(self, now_ns: int) -> float:
+        return sum(_is_recent(arrival_ns, now_ns) for arrival_ns in self.arrivals_ns) / (RATE_WINDOW_NS / 1e9)
 
     def score(self, pose: TargetPose) -> float | None:
         """As last told; None if that was for a frame long before this pose, or after it."""
@@ -221,7 +229,7 @@ class Fleet:
         if known is None:
             known = vehicle.targets[pose.target] = _Target(row, pose.arrival_ns, ranges)
         _update(vehicle, known, row, lambda ship: target_row(pose, closing, ship, score))
-        vehicle.arrivals_ns.append(pose.arrival_ns)
+        vehicle.pose_arrived(pose.arrival_ns)
         return row
 
     def _take_direction(self, vehicle: _Vehicle, seen: TargetDirection) -> DirectionRow:
@@ -240,7 +248,6 @@ class Fleet:
             if -SET_BACK_NS <= now_ns - one.seen_ns <= FORGET_TARGET_NS
         }
         vehicle.targets = kept
-        recent = sum(-SET_BACK_NS <= now_ns - arrival_ns <= RATE_WINDOW_NS for arrival_ns in vehicle.arrivals_ns)
         targets = tuple(one.row() for _, one in sorted(vehicle.targets.items()))
         return VehicleRow(
             uav,
@@ -249,10 +256,14 @@ class Fleet:
             vehicle.health,
             vehicle.health_heard_ns,
             vehicle.event,
-            recent / (RATE_WINDOW_NS / 1e9),
+            vehicle.poses_per_s(now_ns),
             sum(vehicle.receiver.refused.values()),
             targets,
         )
+
+
+def _is_recent(arrival_ns: int, now_ns: int) -> bool:
+    return -SET_BACK_NS <= now_ns - arrival_ns <= RATE_WINDOW_NS
 
 
 def _known(vehicle: _Vehicle, target: str, stamp_ns: int) -> _Target | None:

@@ -67,6 +67,17 @@ def test_targets_of_before_our_clock_was_set_back_are_not_shown_for_as_long() ->
     assert (row.targets, row.pose_rate_hz) == ((), 0.0)
 
 
+def test_four_targets_at_120_frames_a_second_are_480_poses_a_second() -> None:
+    fleet, frame_ns = Fleet(), S // 120
+    for number in range(1, 500):
+        now_ns = NOW_NS + number * frame_ns
+        for target in ("t0", "t1", "t2", "t3"):
+            message = dataclasses.replace(pose_now(300.0), stamp_ns=now_ns)
+            assert fleet.take(incoming(topics.POSE, message, number, target=target), now_ns) is not None
+    (row,) = fleet.rows(now_ns)
+    assert row.pose_rate_hz == pytest.approx(480.0, rel=0.01)
+
+
 def detections(stamp_ns: int, number: int, score: float) -> Incoming:
     t, q, covariance = np.array([1.0, 2.0, 300.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)
     hypothesis = cdr.Hypothesis("fixed_wing", score, t, q, covariance)
