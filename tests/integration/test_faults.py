@@ -6,8 +6,10 @@ recovery took, `pytest -s` each step.
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,7 +17,7 @@ from sim_replay.faults.judge import faults_since, violations
 from sim_replay.faults.messages import AUTOPILOT, KINDS, SUBSCRIBER
 from sim_replay.faults.rig import Rig, RigSettings, can_mount
 from sim_replay.faults.run import TIMELINES, Outcome, play_timeline
-from sim_replay.faults.timeline import load_timeline
+from sim_replay.faults.timeline import Timeline, load_timeline
 
 WORD_S = 5.0
 SHORT = {"mavlink-cut", "flood"}  # the same as mavlink-cut-30s and flood-10mb, and less of it
@@ -23,6 +25,11 @@ NEED_VOLUME = {"disk-full"}
 SIGNED = ("signed-replay", "signed-reboot")
 LAST = ["daemon-alone", "daemon-killed"]  # what ends the daemon comes last: those before share one
 NAMES = sorted({path.stem for path in TIMELINES.glob("*.toml")} - SHORT - NEED_VOLUME - set(SIGNED) - set(LAST)) + LAST
+
+TELEMETRY = ["ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"]
+LASTING = ("link cut", "telemetry stopped", "camera away", "router killed")
+CLOCK_JUMP = "clock jump"
+SEED = 23  # three of them at once, and the ground hears of most
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +93,57 @@ def test_a_daemon_that_signs_comes_through(
             reboots.append(rig.witness.counters["mavlink_reboots"])
     assert violations(rig.witness) == []
     assert reboots == [0, 1]
+
+
+def overlapping(seed: int) -> Timeline:
+    """Each of the quick faults once, in a random order; those that last end at random, so that several overlap."""
+    chance, wrong, steps = random.Random(seed), set[str](), list[dict[str, Any]]()
+    to_come = chance.sample([*LASTING, CLOCK_JUMP], len(LASTING) + 1)
+    while to_come or wrong:
+        begins = bool(to_come) and (not wrong or chance.random() < 0.6)
+        fault = to_come.pop() if begins else chance.choice(sorted(wrong))
+        if fault != CLOCK_JUMP:
+            wrong ^= {fault}
+        steps += [act_of(fault, wrong), *reactions(fault, wrong)]
+    return Timeline.model_validate({"title": f"Faults that overlap, seed {seed}", "step": steps})
+
+
+def act_of(fault: str, wrong: set[str]) -> dict[str, Any]:
+    """What begins the fault if it is in `wrong`, and otherwise ends it."""
+    if fault == CLOCK_JUMP:
+        return {"do": "start", "who": "autopilot", "clock_ahead_s": 5.0}
+    if fault in ("camera away", "router killed"):
+        who = fault.split()[0]
+        return {"do": "signal", "who": who, "name": "KILL"} if fault in wrong else {"do": "start", "who": who}
+    drop = TELEMETRY if "telemetry stopped" in wrong else []
+    return {"do": "link", "which": "mavlink", "cut": "link cut" in wrong, "drop": drop}
+
+
+def reactions(fault: str, wrong: set[str]) -> list[dict[str, Any]]:
+    """What must be seen after the act while the faults `wrong` last."""
+    steps: list[dict[str, Any]] = []
+    if "router killed" not in wrong:  # else nobody hears of states and counters
+        if "camera away" in wrong:
+            state = "fault.*no frame"
+        elif wrong & {"link cut", "telemetry stopped"}:
+            state = "degraded.*no own attitude"
+        else:
+            state = "^(?!.*(no frame|no own attitude))"
+        steps.append({"do": "expect_state", "pattern": state})
+        if fault == CLOCK_JUMP and "link cut" not in wrong:
+            steps.append({"do": "expect_counter", "name": "mavlink_timesync_jumps"})
+    for peer, cut_off_by in ((AUTOPILOT, "link cut"), (SUBSCRIBER, "router killed")):
+        silent = {"do": "expect_silence", "for_s": 0.5} if wrong & {"camera away", cut_off_by} else {}
+        steps.append({"do": "expect_poses", **silent, "at": peer})
+    return steps
+
+
+@pytest.mark.timeout(400)
+@pytest.mark.usefixtures("nothing_stale")
+def test_one_daemon_comes_through_faults_that_overlap(rig: Rig, tell_recovery: Callable[[str], None]) -> None:
+    """Each fault alone says nothing of one that begins, or ends, while others last."""
+    daemon = rig.daemon
+    outcome = play_timeline(rig, overlapping(SEED), print)
+    tell_recovery(f"overlapping: {outcome.recovery()}")
+    assert outcome.wrong == []
+    assert rig.daemon is daemon
