@@ -43,6 +43,48 @@ def test_a_still_target_stands_still_while_gimbal_and_body_turn() -> None:
     assert np.linalg.norm(track.v_ned_target_mps) < 4.0
 
 
+def pointing(samples: list[tuple[int, float, GimbalFrame]], time_ms: int) -> float | None:
+    """Heading, rad, at a time of a gimbal on a level aircraft that flies north; `samples` of (ms, heading, frame)."""
+    buffer = OwnShipBuffer(gimballed=True)
+    for body_ms in range(900, 2_001, 20):
+        buffer.add_attitude(body_ms * 1_000_000, [1.0, 0.0, 0.0, 0.0], np.zeros(3))
+    for sample_ms, heading_rad, frame in samples:
+        q_xyzw = Rotation.from_euler("z", heading_rad).as_quat()
+        buffer.add_gimbal(sample_ms * 1_000_000, np.roll(q_xyzw, 1), frame)
+    own = buffer.at(time_ms * 1_000_000)
+    if own is None:
+        return None
+    assert own.R_body_gimbal is not None
+    return float(Rotation.from_matrix(own.R_body_gimbal).as_rotvec()[2])
+
+
+@pytest.mark.parametrize(("gap_ms", "last_ms"), [(4, 50), (150, 150), (160, None)])
+def test_a_gimbal_points_where_it_turned_between_its_samples_and_soon_nowhere_after_the_last(
+    gap_ms: int, last_ms: int | None
+) -> None:
+    """Turning at 2 rad/s. Samples 4 ms apart give no rate, so the last one holds, for 50 ms; samples too far apart are
+    of no use at all."""
+    samples = [(1_000 + k * gap_ms, 2e-3 * k * gap_ms, GimbalFrame.EARTH) for k in range(6)]
+    end_ms, end_rad, _ = samples[-1]
+    between = pointing(samples, 1_000 + 2 * gap_ms + gap_ms // 2)
+    if last_ms is None:
+        assert between is pointing(samples, end_ms) is None
+        return
+    assert between == pytest.approx(2e-3 * (2 * gap_ms + gap_ms // 2))
+    assert pointing(samples, 999) is None
+    after_rad = 0.0 if gap_ms == 4 else 2e-3 * last_ms
+    assert pointing(samples, end_ms + last_ms) == pytest.approx(end_rad + after_rad)
+    assert pointing(samples, end_ms + last_ms + 1) is None
+
+
+def test_a_gimbal_s_headings_against_the_earth_and_against_the_nose_are_not_mixed() -> None:
+    samples = [(1_000, 0.1, GimbalFrame.EARTH), (1_020, 0.2, GimbalFrame.EARTH), (1_040, 0.7, GimbalFrame.HEADING)]
+    assert pointing(samples, 1_010) == pytest.approx(0.15)
+    assert pointing(samples, 1_030) is None
+    assert pointing(samples, 1_090) == pytest.approx(0.7), "the last one alone tells no rate"
+    assert pointing(samples, 1_091) is None
+
+
 def slewed_rad(t_s: float) -> float:
     """Heading of a gimbal that turns by 20 degrees from 3 s on, at up to 60 deg/s, begun and ended with 600 deg/s^2."""
     ramp_s, whole_s = 0.1, 20.0 / 60.0

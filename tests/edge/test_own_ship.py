@@ -165,6 +165,36 @@ def test_samples_out_of_order_are_refused() -> None:
     np.testing.assert_allclose(own_ship.R_ned_body, np.eye(3))
 
 
+@pytest.mark.parametrize("same_axes", [True, False])
+def test_of_what_came_before_a_reset_only_that_which_still_holds_is_used(same_axes: bool) -> None:
+    """Where north may be another, so may the gimbal's zero; the origin is another in either case."""
+    buffer = OwnShipBuffer(gimballed=True)
+
+    def tell_attitude_and_position(time_ns: int) -> None:
+        buffer.add_attitude(time_ns, [1, 0, 0, 0], np.zeros(3))
+        buffer.add_position(time_ns, np.zeros(3), np.zeros(3))
+        buffer.add_global(time_ns, (47.0, 8.0, 400.0), (0.0, 0.0, 0.0))
+
+    tell_attitude_and_position(0)
+    buffer.add_gimbal(0, [1, 0, 0, 0], GimbalFrame.EARTH)
+    before = buffer.at(10 * MS)
+    assert before is not None
+    assert before.t_ned_body_m is not None
+    assert before.lat_lon_alt is not None
+    buffer.clear(same_axes=same_axes)
+    after = buffer.at(10 * MS)
+    assert (after is not None) == same_axes
+    if after is not None:
+        assert after.t_ned_body_m is after.lat_lon_alt is None
+    tell_attitude_and_position(20 * MS)
+    assert (buffer.at(30 * MS) is not None) == same_axes
+    buffer.add_gimbal(20 * MS, [1, 0, 0, 0], GimbalFrame.EARTH)
+    again = buffer.at(30 * MS)
+    assert again is not None
+    assert again.origin_epoch != before.origin_epoch
+    assert (again.axes_epoch == before.axes_epoch) == same_axes
+
+
 def test_a_writer_and_a_reader_do_not_disturb_each_other() -> None:
     buffer = OwnShipBuffer()
     failures: list[BaseException] = []
