@@ -169,6 +169,37 @@ def test_a_target_cut_by_the_edge_is_told_with_doubt_in_place_and_range(left_px:
     assert cut.box_xyxy_px[2] <= SIZE_WH[0] - 0.5
 
 
+@pytest.mark.parametrize("at_px", [(530.0, 440.0), (770.0, 440.0), (640.0, 330.0), (640.0, 550.0)])
+def test_a_target_that_a_window_cuts_is_told_with_doubt_as_at_the_frame_s_edge(at_px: tuple[float, float]) -> None:
+    """The window shows columns 500 to 799 and rows 300 to 579; the box of 60 by 60 reaches one of its sides."""
+    contract, peaks = ModelContract(**CONTRACT), peaks_of(score=1.0)
+    pixel_map = PixelMap((1, 1), (-500, -300))
+    shown = Shown(pixel_map, pixel_map.intrinsics(K), (300, 280), SIZE_WH)
+    peaks.size_px[:] = 60.0
+    depth_sigma = []
+    for x_px, y_px in (at_px, (640.0, 440.0)):
+        peaks.center_px[:] = peaks.origin_px[:] = [x_px - 500.0, y_px - 300.0]
+        (told,) = decode(peaks, 0, shown, contract, "track", 0.5, Counter())
+        depth_sigma.append(told.covariance[2, 2] ** 0.5 / told.t_cam_target_m[2])
+    assert depth_sigma == pytest.approx([np.hypot(0.05, 0.4), 0.05], rel=1e-3)
+
+
+@pytest.mark.parametrize(("width_px", "height_px", "longer_px"), [(240, 90, 240), (90, 240, 240), (1e6, 90, 1920)])
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_cut_target_is_as_long_as_expected_though_less_of_it_is_seen(
+    width_px: float, height_px: float, longer_px: float, scale: float
+) -> None:
+    """Its origin is unsure by a quarter of the length that it was predicted to have, at most that of the frame."""
+    contract, peaks = ModelContract(**CONTRACT), peaks_of(score=1.0)
+    peaks.center_px[:] = peaks.origin_px[:] = [10.0, 500.0 * scale]
+    expected = [5.0 - width_px, 500.0, 5.0, 500.0 + height_px]
+    pixel_map = PixelMap((scale, scale), (0, 0))
+    shown = WHOLE._replace(pixel_map=pixel_map, K=pixel_map.intrinsics(K))
+    (cut,) = decode(peaks, 0, shown, contract, "track", 0.5, Counter(), None, expected)
+    across_px = cut.covariance[1, 1] ** 0.5 * K[1, 1] / cut.t_cam_target_m[2]
+    assert across_px == pytest.approx(0.25 * longer_px, rel=0.01)
+
+
 def test_a_target_whose_middle_is_off_the_frame_is_not_told() -> None:
     for left_px, origin_x_px in ((-40.0, -10.0), (1900.0, 1930.0), (-20.0, np.nan)):
         assert seen_at(left_px, 60.0, origin_x_px=origin_x_px) == ([], Counter(cut_off=1))

@@ -15,7 +15,7 @@ from edge.estimator.decode import Shown
 from edge.estimator.estimator import Estimator
 from edge.estimator.given_size import TargetSize
 from edge.estimator.model import Peaks, load_model
-from edge.estimator.window import PixelMap, cut, fit_frame, pixel_aspect, window_around
+from edge.estimator.window import PixelMap, Window, cut, fit_frame, pixel_aspect, window_around
 from edge.types import Frame, FrameMeta
 
 from .toy_model import GRAPH, write_toy_model
@@ -72,6 +72,8 @@ def test_a_window_holds_its_box_and_stays_in_the_frame_where_it_fits(box: np.nda
         if length <= limit:
             assert start >= 0
             assert start + length <= limit
+        if start > 0 and start + length < limit:
+            assert start + 0.5 * (length - 1) == pytest.approx(0.5 * (low + high), abs=0.5 + 1e-9)
 
 
 @pytest.mark.parametrize("fit", ["letterbox", "squash"])
@@ -137,6 +139,17 @@ def test_a_cut_window_shows_a_target_where_its_map_says(center: tuple[float, flo
     rows, columns = np.indices(weights.shape)
     seen = np.array([(columns * weights).sum(), (rows * weights).sum()]) / weights.sum()
     np.testing.assert_allclose(seen, window.pixel_map(TRACK_WH).to_network(center), atol=0.05)
+
+
+@given(st.tuples(*[st.integers(-9, 25)] * 4))
+def test_beyond_the_frame_a_window_repeats_its_border(margins: tuple[int, int, int, int]) -> None:
+    """Margins at the left, top, right and bottom; where negative, the window ends inside the frame."""
+    image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    left, top, right, bottom = margins
+    window = Window(-left, -top, 60 + left + right, 40 + top + bottom)
+    wide = np.pad(image, ((30, 30), (30, 30), (0, 0)), mode="edge")
+    expected = wide[30 - top : 70 + bottom, 30 - left : 90 + right]
+    np.testing.assert_array_equal(cut(image, window, (window.width, window.height)), expected)
 
 
 @pytest.mark.parametrize("center", [(960.5, 540.5), (150.5, 90.5), (1800.5, 1000.5)])
