@@ -64,6 +64,15 @@ def test_the_nose_lies_where_the_target_flies() -> None:
     assert odds(towards, NORTH, flight([-25.0, 9.0, 0.0])) > 3.0
 
 
+def test_however_plainly_it_flies_that_way_a_chance_remains_that_it_is_the_other() -> None:
+    """One to e^5: flying as it points, banked into its turn and level, seen from 30 degrees above, it may yet glide."""
+    down_30 = np.array([np.cos(np.deg2rad(30)), 0.0, np.sin(np.deg2rad(30))])
+    plain = flight([28.0, 0.0, 0.0], std_mps=0.5, turn_rate_radps=0.2)
+    R = attitude(30, 0, 0)
+    assert odds(R, down_30, plain) == pytest.approx(5.0)
+    assert odds(reversal(R, down_30), down_30, plain) == pytest.approx(-5.0)
+
+
 def test_an_unsure_velocity_and_a_nose_across_the_sight_line_say_little() -> None:
     assert abs(odds(attitude(0, 0, 20), NORTH, flight([25.0, 9.0, 0.0], std_mps=60.0))) < 0.7
     assert abs(odds(attitude(0, 0, 88), NORTH, flight([2.0, 25.0, 0.0]))) < 0.5

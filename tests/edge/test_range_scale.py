@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge.tracking.range_scale import RangeScale
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, Track, TrackState
 
@@ -155,6 +156,16 @@ def test_in_cam_a_target_missed_while_the_camera_turned_is_told_where_it_is_seen
             assert np.linalg.norm(track.t_cam_target_m) == pytest.approx(200.0, rel=0.1)
 
 
+def test_in_cam_a_camera_that_swings_does_not_change_the_range() -> None:
+    """At up to 70 degrees a second across the sight line: a target that flew so fast would have been farther away."""
+    tracker = Tracker(1, LOOKING_NORTH)
+    for i, error in enumerate(np.random.default_rng(1).normal(scale=0.02, size=120)):
+        angle = 0.4 * np.sin(np.pi * i / 30.0)
+        t_cam = 200.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        (track,) = tracker.update(1 + round(i * 1e9 / 30), [sight(t_cam, float(error))], None, K, SIZE_WH)
+        assert i < 15 or np.linalg.norm(track.t_cam_target_m) == pytest.approx(200.0, rel=0.06)
+
+
 @pytest.mark.parametrize("kind", ["ned", "ned_relative"])
 @pytest.mark.parametrize("beside_m", [10.0, 20.0])
 def test_what_comes_into_sight_far_ahead_is_not_the_target_that_has_just_passed(beside_m: float, kind: str) -> None:
@@ -195,6 +206,17 @@ def test_an_error_that_all_frames_share_stays_in_the_covariance_at_any_frame_rat
     for std in stds.values():
         assert 0.8 * LOG_RANGE_STD < std < 1.3 * LOG_RANGE_STD
     assert stds[5.0] == pytest.approx(stds[60.0], rel=0.2)
+
+
+def test_one_frame_that_is_too_sure_of_itself_makes_no_range_sure() -> None:
+    scale = RangeScale.begin(0, 5.0, LOG_RANGE_STD**2)
+    common = []
+    for frame in range(1, 121):
+        told_std = LOG_RANGE_STD if frame < 30 else 0.1 * LOG_RANGE_STD
+        scale = scale.seen(frame * 33_000_000, 5.0, told_std**2, 5.0, (0.0, 0.0))
+        common.append(scale.common_variance)
+    assert common[29] > 0.9 * common[28], "that of one frame"
+    assert common[119] < 0.1 * common[28], "that of three seconds"
 
 
 def test_where_frames_disagree_more_than_the_network_says_the_track_is_less_sure() -> None:

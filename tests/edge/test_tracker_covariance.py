@@ -83,6 +83,40 @@ def test_an_attitude_gone_on_from_leaves_a_target_s_place_and_attitude_in_doubt(
     np.testing.assert_allclose(more[6:], 0.1**2)
 
 
+@pytest.mark.parametrize("attitude_known", [True, False])
+def test_a_target_first_seen_at_an_attitude_hardly_known_is_the_one_that_the_next_frames_show(
+    attitude_known: bool,
+) -> None:
+    """The first attitude is off by 0.05 rad: 10 m at 200 m. If that is not known of it, there are two targets."""
+    tracker, rng = Tracker(4, LOOKING_NORTH), np.random.default_rng(8)
+    turned = so3.exp(np.array([0.0, 0.0, 0.05]))
+    for k in range(4):
+        own = replace(STILL, time_ns=1 + 33 * k * MS)
+        if k == 0:
+            own = replace(own, R_ned_body=turned, attitude_std_rad=0.0 if attitude_known else 0.05)
+        tracks = tracker.update(own.time_ns, [sight(rng, np.array([0.0, 0.0, 200.0]), NORTH_EAST)], own, K, SIZE_WH)
+    assert len(tracks) == (2 if attitude_known else 1)
+    assert tracks[-1].t_ned_target_m == pytest.approx(AHEAD_M, rel=0.1, abs=1.0)
+
+
+@pytest.mark.parametrize("attitude_std_rad", [0.0, 0.02, 0.1])
+def test_a_sight_makes_a_place_as_much_surer_as_the_attitude_in_that_frame_is_known(attitude_std_rad: float) -> None:
+    """Across the sight line the inverses of the variances add up: that of the prediction, 9 m2, and that of the
+    measurement with the error of the attitude at 200 m."""
+    view = View.of(33 * MS, replace(STILL, attitude_std_rad=attitude_std_rad), LOOKING_NORTH)
+    estimate = sight(np.random.default_rng(9), np.array([0.0, 0.0, 200.0]), NORTH_EAST)
+    estimate = replace(estimate, t_cam_target_m=np.array([0.0, 0.0, 200.0]))
+    begun = ekf.begin(estimate, K, view)
+    predicted = replace(begun, seen_ns=0, P=np.diag([400.0, 9.0, 9.0, 25.0, 25.0, 25.0, 0.01]))
+    corrected = ekf.correct(predicted, ekf.innovation(predicted, estimate, K, view), view)
+    one_px_rad, jitter_rad = 1.0 / K[0, 0], 1e-3
+    measured_m2 = 0.04 + 200.0**2 * (one_px_rad**2 + jitter_rad**2 + attitude_std_rad**2)
+    np.testing.assert_allclose(np.diag(corrected.P)[1:3], 1.0 / (1.0 / 9.0 + 1.0 / measured_m2), rtol=1e-3)
+    # In that frame's camera, the place is as sure as it was seen, whatever the attitude.
+    seen_m2 = 1.0 / (1.0 / (9.0 + measured_m2 - 0.05) + 1.0 / 0.05)
+    np.testing.assert_allclose(np.diag(ekf.covariance_in_cam(corrected, view))[:2], seen_m2, rtol=1e-3)
+
+
 def test_a_place_told_from_the_own_ship_has_none_of_the_own_place_s_error() -> None:
     relative = own_ship_variances(replace(STILL, t_ned_body_m=None, v_ned_body_mps=None))
     assert relative[0] < 1e-9, "along the sight line neither attitude nor own place counts"
