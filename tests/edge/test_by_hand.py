@@ -105,6 +105,15 @@ def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends()
     assert by_hand.chosen_id is None, "its number may be another target's by now"
 
 
+@pytest.mark.parametrize("away_px", [(-300.0, 0.0), (300.0, 0.0), (0.0, -150.0), (0.0, 150.0)])
+def test_a_target_beside_the_box_is_not_the_one_pointed_at(away_px: tuple[float, float]) -> None:
+    beside = track(0, box_xyxy_px=np.array([1030.0, 470.0, 1090.0, 500.0]) + np.tile(away_px, 2))
+    by_hand = ByHand()
+    by_hand.take(TrackBox((0.5, 0.4, 0.6, 0.5)), 0)
+    np.testing.assert_allclose(by_hand.box_xyxy_px(1, SIZE_WH, [beside]), [959.5, 431.5, 1151.5, 539.5])
+    assert by_hand.chosen_id is None
+
+
 NEAR_PX, FAR_PX = np.array([400.0, 300.0, 700.0, 500.0]), np.array([620.0, 340.0, 650.0, 352.0])
 
 

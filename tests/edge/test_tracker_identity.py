@@ -7,9 +7,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
+from msgs.geometry import rotation_angle
 
 from .noisy_flights import SIZE_WH, K, known, seen
 
@@ -69,6 +71,20 @@ def test_a_turning_camera_with_few_frames_a_second_keeps_what_it_sees_in_each(ra
         assert [track.track_id for track in tracks if track.measured_ns == track.time_ns] == [0] or index < 4
     (seen,) = (track for track in tracks if track.measured_ns == track.time_ns)
     assert seen.state is TrackState.CONFIRMED
+
+
+@pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
+def test_of_two_seen_where_one_was_the_one_that_is_turned_like_it_is_taken_for_it(kind: str) -> None:
+    """Another aircraft, which flies across its way, comes into sight nearer to where the first was expected."""
+    flight, expected_m = Flight(kind), np.array([0.0, 0.0, 250.0])
+    for _ in range(30):
+        flight.frame(flight.sight(expected_m))
+    across = R_CAM_TARGET @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    own, other = (replace(flight.sight(expected_m), t_cam_target_m=np.array([x_m, 0.0, 250.0])) for x_m in (-1.0, 0.8))
+    tracks = flight.frame(replace(other, R_cam_target=across), own)
+    (told,) = (track for track in tracks if track.track_id == 0)
+    assert told.t_cam_target_m[0] < -0.1
+    assert rotation_angle(told.R_cam_target, R_CAM_TARGET) < np.deg2rad(15.0)
 
 
 @pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from edge.estimator.lens import Lens
 from edge.tracking import so3
 from edge.tracking.association import best_pairs
+from edge.tracking.boxes import BoxModel
 from edge.tracking.doubles import TURNS_MIN, Doubles
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, TrackState
@@ -222,6 +224,21 @@ def expected_after_a_turn(
     R_ned_body = Rotation.from_euler("z", before_deg - after_deg, degrees=True).as_matrix()
     turned = replace(own, time_ns=40_000_000, R_ned_body=R_ned_body)
     return [track.box_xyxy_px for track in tracker.predict(turned.time_ns, turned, WIDE_K, SIZE_WH, distortion)]
+
+
+@given(st.tuples(st.floats(-40.0, 40.0), st.floats(-20.0, 20.0), st.floats(60.0, 500.0)))
+def test_a_box_goes_and_grows_with_its_target_s_origin_though_that_is_not_its_middle(t_m: tuple[float, ...]) -> None:
+    """As that of a flat thing which stands upright to the optical axis; the camera's pixels are not square."""
+    lens = Lens(WIDE_K * [[1.0, 1.0, 1.0], [1.0, 1.3, 1.0], [1.0, 1.0, 1.0]], ())
+    corners_m = np.array([[-2.0, -1.0, 0.0], [7.0, 3.0, 0.0]])
+
+    def seen(at_m: np.ndarray) -> np.ndarray:
+        points = (corners_m + at_m) @ lens.K.T
+        return np.ravel(points[:, :2] / points[:, 2:])
+
+    before_m = np.array([10.0, -5.0, 200.0])
+    box = BoxModel.measured(seen(before_m), before_m, lens)
+    np.testing.assert_allclose(box.box_xyxy_px(np.array(t_m), lens), seen(np.array(t_m)), atol=1e-6)
 
 
 @pytest.mark.parametrize(("before_deg", "after_deg"), [(35, 25), (35, 5), (30, -30), (0, 40)])
