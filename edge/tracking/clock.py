@@ -139,7 +139,7 @@ class BootClock:
                 self.std_s = self._timesync.std_s(arrival_ns) or 0.0
                 return min(synced, arrival_ns)
         self.std_s = UNSYNCED_STD_S
-        return min(boot_ns + least_delay_ns, arrival_ns)
+        return boot_ns + least_delay_ns
 
     def _least_delay_ns(self, delay_ns: int, arrival_ns: int) -> int:
         while self._quickest and self._quickest[-1][1] >= delay_ns:
