@@ -13,21 +13,19 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 
+from edge.attention import Attention
 from edge.cameras import FrameSupply, open_capture
 from edge.cameras.source import EndOfStream
 from edge.clock import SleepWatch, monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
-from edge.estimator.estimator import PLACES_MOST, Estimator
-from edge.estimator.pace import Pace, looked_at_twice
-from edge.estimator.regions import Sweep
+from edge.estimator.estimator import Estimator
 from edge.estimator.upright import up_in_cam
 from edge.health import Reason
 from edge.memory import MemoryKeeper
 from edge.outlets import Outlets, start_outlets
 from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
-from edge.search import Search
 from edge.size_watch import SizeWatch
 from edge.stages import StageClock
 from edge.status_board import StatusBoard
@@ -98,17 +96,13 @@ class Pipeline:
         self._requests = requests
         self._reloader = reloader
         self._by_hand = ByHand()
-        self._acquire_every_n = config.estimator.acquire_every_n
-        self._pace = Pace()
-        self._sweep = Sweep()
+        self._attention = Attention(config.estimator)
         self._sleep = SleepWatch()
-        self._max_targets = config.estimator.max_targets
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         wants_attitude = config.mavlink.enabled
         self._size_watch = SizeWatch()
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, self._reasons)
-        self.search = Search()  # not started yet; until then each search runs in the caller's thread
-        self._since_acquire = 0
+        self.search = self._attention.search  # not started yet; until then each search runs in the caller's thread
         self._out_of_order = self._time_jumps = 0
         self._warned: tuple[str, ...] = ()  # of the model in use
 
@@ -206,60 +200,13 @@ class Pipeline:
     def _estimate(
         self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock
     ) -> list[Estimate]:
-        capture_ns = frame.meta.capture_ns
-        unhurried = self._pace.unhurried(frame.meta)
-        searches = self._by_hand.searches(capture_ns)
-        held = [track.box_xyxy_px for track in expected]
-        twice = [looked_at_twice(track.state, unhurried) for track in expected]
-        probable = sum(track.score >= self._estimator.model.doubtful_below for track in expected)
-        room = searches and probable < self._max_targets  # the others give way
-        places = self.search.places(capture_ns, held, max(PLACES_MOST - len(held), 1) if room else 0)
-        found = self._look_into(held, twice, places, frame, pointed_at, clock)
-        self._since_acquire += 1
-        if not searches:
-            return found
-        if not found:
-            # Unsuccessful track windows plus a search leave no time for finer ones; the next frame makes them.
-            # A target that has just left its window is most likely to be found in the whole frame.
-            regions = () if expected else self._sweep.next(self._estimator.regions(frame), self._pace.regions())
-            found = self._estimator.acquire(frame, thrice=unhurried and not expected, regions=regions)
-            self._since_acquire = 0
-            clock.estimated(self._estimator.model.take_runs_ns())
-        elif (
-            self._since_acquire >= self._acquire_every_n
-            and probable < self._max_targets
-            and self.search.begin(self._estimator, frame, [*held, *(place.box_xyxy_px for place in places)])
-        ):
-            self._since_acquire = 0
-        return found
-
-    def _look_into(
-        self,
-        held: list[Array],
-        twice: list[bool],
-        places: list[Estimate],
-        frame: Frame,
-        pointed_at: Array | None,
-        clock: StageClock,
-    ) -> list[Estimate]:
-        boxes = [*held, *(place.box_xyxy_px for place in places)]
-        if pointed_at is not None:
-            boxes.append(pointed_at)
-        if not boxes or not self._estimator.has_track_stage:
-            return []
-        seen = self._estimator.track(frame, boxes, twice)
-        if pointed_at is not None and (there := seen[-1]) is not None:
-            self._by_hand.found(there)
-            if not lies_on(there.box_xyxy_px, held):  # a tracked target has its slot already
-                self._tracker.make_room(there)
-        clock.estimated(self._estimator.model.take_runs_ns())
-        for i, place in enumerate(places, start=len(held)):
-            look = seen[i]
-            if look is None or lies_on(look.box_xyxy_px, held):
-                continue  # a tracked target, seen more clearly than in its own window, needs no confirmation
-            if not self._estimator.confirms(place, [look]):
-                seen[i] = None
-        return [estimate for estimate in seen if estimate is not None]
+        searches = self._by_hand.searches(frame.meta.capture_ns)
+        looked = self._attention.look(self._estimator, frame, expected, clock, searches=searches, pointed_at=pointed_at)
+        if looked.pointed_at is not None:
+            self._by_hand.found(looked.pointed_at)
+            if not lies_on(looked.pointed_at.box_xyxy_px, [track.box_xyxy_px for track in expected]):
+                self._tracker.make_room(looked.pointed_at)  # a tracked target has its slot already
+        return looked.estimates
 
     def _publish(
         self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
@@ -284,7 +231,7 @@ class Pipeline:
         if replaced:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
-        self._acquire_every_n = new.file.config.estimator.acquire_every_n
+        self._attention.acquire_every_n = new.file.config.estimator.acquire_every_n
         self._estimator.target_size = new.file.config.target.size()
         self.supervisor.apply(new.file.config.health)
         log.info("%s", new.outcome.said)

@@ -16,15 +16,15 @@ from typing import Literal
 
 import numpy as np
 
+from edge.attention import Attention
 from edge.cameras.sequence import frames_of
 from edge.config import EstimatorSettings, MavlinkSettings
 from edge.errors import InputError
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import Model
-from edge.estimator.pace import Pace, looked_at_twice
-from edge.estimator.regions import Sweep
 from edge.estimator.upright import up_in_cam
 from edge.links.outgoing import rangeless, rotation_known, sendable
+from edge.stages import StageClock
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, FrameMeta, Mount, OwnShip, Report, Track
 from msgs.geometry import so3_log
@@ -55,10 +55,7 @@ class _Sequence:
     unflown: Iterator[BopFrame]  # the scene's frames that have an image, from the first that the tracker has not seen
     errors: OwnShipErrors | None
     tracker: Tracker = field(default_factory=lambda: Tracker(_SETTINGS.max_targets, _CAMERA_ITSELF))
-    since_acquire: int = 0
-    pace: Pace = field(default_factory=Pace)
-    sweep: Sweep = field(default_factory=Sweep)  # while nothing is found
-    further_sweep: Sweep = field(default_factory=Sweep)  # for more targets
+    attention: Attention = field(default_factory=lambda: Attention(_SETTINGS))  # its searches end before the next frame
 
     @classmethod
     def of(cls, scene: BopScene, own_ship: OwnShipTold) -> _Sequence:
@@ -162,7 +159,7 @@ def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[
     size_wh, capture_ns = (image_bgr.shape[1], image_bgr.shape[0]), frame.meta.capture_ns
     started_ns = time.monotonic_ns()
     expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
-    estimates = _estimate(estimator, sequence, frame, expected)
+    estimates = sequence.attention.look(estimator, frame, expected, StageClock(frame.meta, started_ns)).estimates
     model = estimator.model
     tracks = sequence.tracker.update(
         capture_ns, estimates, own_ship, shown.K, size_wh, doubtful_below=model.doubtful_below
@@ -185,30 +182,3 @@ def _poses(index: int, told: Sequence[Track | Estimate], known: Sequence[bool]) 
         )
         for one, turned in zip(told, known, strict=True)
     )
-
-
-def _estimate(estimator: Estimator, sequence: _Sequence, frame: Frame, expected: list[Track]) -> list[Estimate]:
-    """Windows around the predicted boxes; a search if they show nothing, and periodically for more targets.
-
-    In the daemon the latter runs beside the loop, and its places are examined in a later frame.
-    """
-    found: list[Estimate] = []
-    unhurried = sequence.pace.unhurried(frame.meta)
-    if expected and estimator.has_track_stage:
-        twice = [looked_at_twice(track.state, unhurried) for track in expected]
-        seen = estimator.track(frame, [track.box_xyxy_px for track in expected], twice)
-        found = [estimate for estimate in seen if estimate is not None]
-    sequence.since_acquire += 1
-    due = sequence.since_acquire >= _SETTINGS.acquire_every_n and len(expected) < _SETTINGS.max_targets
-    if not found or due:
-        held = [estimate.box_xyxy_px for estimate in found]
-        regions = list(estimator.regions(frame))
-        if found:
-            regions = sequence.further_sweep.next(regions)
-        elif not expected:
-            regions = sequence.sweep.next(regions, sequence.pace.regions())
-        else:
-            regions = regions[:1]
-        found += estimator.acquire(frame, held, thrice=unhurried and not expected, regions=regions)
-        sequence.since_acquire = 0
-    return found

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from edge.config_estimator import EstimatorSettings
 from edge.errors import InputError
 from edge.estimator.pace import Pace
 from edge.links import outgoing
@@ -32,29 +33,33 @@ SPOT_Z_M, SPOT_SIZE_M = 200.0, 12.0  # as the network of the dark_spot_model fix
 K = np.array([[FOCAL_PX, 0, CX_PX], [0, FOCAL_PX, CY_PX], [0, 0, 1]])
 
 
-def write_scene(folder: Path, yaws_deg: list[float], east_m: float = 0.0, step_m: float = 0.0) -> None:
+def write_scene(
+    folder: Path, yaws_deg: list[float], east_m: float = 0.0, step_m: float = 0.0, joined_in: int | None = None
+) -> None:
     """A spot before a camera that stands at (10, 20, -30) in ned and turns about the vertical.
 
-    It stands still, at first so far east of north, or flies east by so much a frame.
+    It stands still, at first so far east of north, or flies east by so much a frame. From the image `joined_in` on
+    there is another, clearer one, 40 m east of it.
     """
     (folder / "rgb").mkdir(parents=True)
     t_ned_cam_m = np.array([10.0, 20.0, -30.0])
-    cameras, poses = {}, {}
+    cameras, poses = {}, dict[str, list[dict[str, object]]]()
     for image, yaw_deg in enumerate(yaws_deg):
-        t_ned_spot_m = t_ned_cam_m + np.array([SPOT_Z_M, east_m + image * step_m, 0.0])
         R_ned_cam = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix() @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
-        t_m = R_ned_cam.T @ (t_ned_spot_m - t_ned_cam_m)
-        u, v, _ = K @ t_m / t_m[2]
-        picture = np.full((1080, 1920, 3), 240, np.uint8)
-        cv2.ellipse(picture, (round(u), round(v)), (70, 14), 0, 0, 360, (90, 90, 90), -1, cv2.LINE_AA)
-        cv2.circle(picture, (round(u), round(v)), 2, (5, 5, 5), -1, cv2.LINE_AA)
+        picture, poses[str(image)] = np.full((1080, 1920, 3), 240, np.uint8), []
+        for apart_m in (0.0, 40.0) if joined_in is not None and image >= joined_in else (0.0,):
+            t_m = R_ned_cam.T @ np.array([SPOT_Z_M, east_m + image * step_m + apart_m, 0.0])
+            u, v, _ = K @ t_m / t_m[2]
+            cv2.ellipse(picture, (round(u), round(v)), (70, 14), 0, 0, 360, (90, 90, 90), -1, cv2.LINE_AA)
+            cv2.circle(picture, (round(u), round(v)), 6 if apart_m else 2, (5, 5, 5), -1, cv2.LINE_AA)
+            pose = {"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": (1e3 * t_m).tolist()}
+            poses[str(image)].append(pose)
         cv2.imwrite(str(folder / "rgb" / f"{image:06d}.png"), picture)
         cameras[str(image)] = {
             "cam_K": K.ravel().tolist(),
             "cam_R_w2c": R_ned_cam.T.ravel().tolist(),
             "cam_t_w2c": (-1e3 * R_ned_cam.T @ t_ned_cam_m).tolist(),
         }
-        poses[str(image)] = [{"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": (1e3 * t_m).tolist()}]
     (folder / "scene_camera.json").write_text(json.dumps(cameras))
     (folder / "scene_gt.json").write_text(json.dumps(poses))
     models = folder.parents[1] / "models"
@@ -123,6 +128,17 @@ def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(tmp_path:
     write_scene(scene, [0.0] * 8, east_m=-63.0, step_m=18.0)
     (scene / "sequence.toml").write_text("fps = 5.0\n")
     assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, *[True] * 6]
+
+
+def test_one_that_joins_is_examined_in_the_frame_after_the_search_as_in_the_daemon(
+    tmp_path: Path, dark_spot_model: Path
+) -> None:
+    """The search for more targets only proposes places."""
+    searched = EstimatorSettings().acquire_every_n
+    write_scene(tmp_path / "data" / "test" / "000000", [0.5] * (searched + 2), joined_in=searched - 3)
+    results = flown(tmp_path / "data", dark_spot_model)
+    measured = [[match.estimate is not None for match in frame.measured] for frame in results]
+    assert measured[searched - 4 :] == [[True], *[[True, False]] * 4, [True, True]]
 
 
 def test_own_attitude_takes_the_cameras_shaking_out_of_the_track(tmp_path: Path, dark_spot_model: Path) -> None:
