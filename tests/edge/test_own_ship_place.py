@@ -46,6 +46,19 @@ def test_position_is_interpolated_extrapolated_and_then_unknown_while_attitude_s
     assert long_after.v_ned_body_mps is None
 
 
+def test_a_velocity_between_two_positions_lies_between_theirs_and_after_the_last_it_stays() -> None:
+    buffer = OwnShipBuffer()
+    for k in range(40):
+        buffer.add_attitude(k * 20 * MS, [1, 0, 0, 0], np.zeros(3))
+    buffer.add_position(0, np.zeros(3), [20.0, 0.0, 4.0])
+    buffer.add_position(400 * MS, [9.0, 1.0, 0.0], [25.0, 10.0, -4.0])
+    for time_ms, share in ((0, 0.0), (100, 0.25), (300, 0.75), (400, 1.0), (700, 1.0)):
+        own_ship = buffer.at(time_ms * MS)
+        assert own_ship is not None
+        assert own_ship.v_ned_body_mps is not None
+        np.testing.assert_allclose(own_ship.v_ned_body_mps, [20.0 + 5.0 * share, 10.0 * share, 4.0 - 8.0 * share])
+
+
 def placed(positions_ms: list[int], time_ms: int) -> np.ndarray | None:
     """Where a ship is, which flies a circle at 25 m/s and 0.4 rad/s and tells its position at these times."""
     buffer = OwnShipBuffer()
