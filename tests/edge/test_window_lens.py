@@ -136,6 +136,28 @@ def test_the_whole_frame_is_seen_to_its_corners_through_barrel_and_pincushion(
     np.testing.assert_allclose(centroid(image), expected, atol=0.25)
 
 
+@pytest.mark.parametrize(("focal_px", "k1"), [(2000.0, -0.3), (2000.0, 0.3), (1250.0, -0.17), (1000.0, -0.1)])
+def test_a_lens_s_picture_without_distortion_ends_where_its_corners_and_sides_do(focal_px: float, k1: float) -> None:
+    """Farthest out are a barrel's corners and the middles of a pincushion's sides; by the roots of r + k1 r^3."""
+    lens = Lens(np.array([[focal_px, 0.0, 959.5], [0.0, focal_px, 539.5], [0.0, 0.0, 1.0]]), (k1, 0.0, 0.0, 0.0))
+    half = np.array([960.0, 540.0])
+    bent = np.linalg.norm(half) / focal_px if k1 < 0.0 else half / focal_px
+    grown = []
+    for one in np.broadcast_to(bent, 2):
+        roots = np.roots([k1, 0.0, 1.0, -one])
+        grown.append(min(root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0.0) / one)
+    reach = half * np.array(grown)
+    assert np.all(reach < 2.0 * half)
+    middle = np.array([959.5, 539.5])
+    np.testing.assert_allclose(lens.extent_xyxy_px(SIZE_WH), [*(middle - reach), *(middle + reach)], atol=0.1)
+
+
+def test_of_a_lens_that_bends_very_much_no_more_than_half_a_frame_is_added_at_each_side() -> None:
+    lens = Lens(np.array([[1157.0, 0.0, 959.5], [0.0, 1157.0, 539.5], [0.0, 0.0, 1.0]]), (-0.33, 0.05, 0.0, 0.0))
+    assert np.all(lens.to_pinhole([1910.0, 1070.0]) > [2900.0, 1640.0])
+    np.testing.assert_allclose(lens.extent_xyxy_px(SIZE_WH), [-960.5, -540.5, 2879.5, 1619.5])
+
+
 @pytest.mark.parametrize(
     ("focal_px", "size_wh", "distortion"),
     [
