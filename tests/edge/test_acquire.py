@@ -98,6 +98,22 @@ def test_a_track_that_cannot_wait_is_looked_at_both_ways_in_one_frame() -> None:
     assert len(model.asked) == 5
 
 
+def test_a_target_that_every_larger_window_cuts_again_is_looked_at_three_times() -> None:
+    class Cut(Scripted):
+        """Of whatever window it is shown, it says that the target reaches beyond the left edge."""
+
+        def _one(self, image: np.ndarray, K_image: np.ndarray) -> tuple[Any, ...]:
+            score, _, _, _, *pose = super()._one(image, K_image)
+            at_edge = np.array([60.0, 0.5 * image.shape[0]])
+            return score, at_edge, np.array([200.0, 100.0]), at_edge, *pose
+
+    _, model, frame = scripted([], [answer(0.9)], [answer(0.9)])
+    cut = Cut(model.script, model.contract)
+    box = np.array([1875.0, 490.0, 1905.0, 502.0])
+    assert Estimator(cut).track(frame, [box]) != [None]  # type: ignore[arg-type]
+    assert cut.asked == ["plain"] * 3
+
+
 @pytest.mark.parametrize(
     ("plain", "mirrored", "range_m"),
     [

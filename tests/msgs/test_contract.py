@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from msgs.contract import ModelContract
+from msgs.contract import ModelContract, ScoreCalibration
 
 WHOLE: dict[str, Any] = {
     "name": "toy", "configuration": "edge", "backbone": "none", "precision": "fp32", "max_peaks": 1,
@@ -30,6 +31,18 @@ def test_scores_are_calibrated_once_the_stage_that_tells_tracks_is() -> None:
     assert not ModelContract.model_validate(WHOLE | {"acquire_score": fitted}).scores_calibrated
     assert ModelContract.model_validate(WHOLE | {"track_score": fitted}).scores_calibrated
     assert ModelContract.model_validate(WHOLE | {"track_size_wh": None, "acquire_score": fitted}).scores_calibrated
+
+
+def test_a_score_becomes_a_probability_by_its_odds_and_by_the_size_shown() -> None:
+    """Odds of 9 to 1 to the power of 0.5, times e, over the square root of the size: 3 e / 4 at 16 px."""
+    fitted = ScoreCalibration(offset=1.0, slope=0.5, size_slope=-0.5, size_cap_px=100.0)
+    assert fitted.probability(0.9, 16.0) == pytest.approx(1.0 / (1.0 + 4.0 / (3.0 * math.e)))
+    assert fitted.probability(0.9, 100.0) == fitted.probability(0.9, 400.0) < fitted.probability(0.9, 99.0)
+    assert fitted.probability(0.9, 0.0) == fitted.probability(0.9, 1.0) > fitted.probability(0.9, 1.1)
+    assert 0.0 < fitted.probability(0.0, 16.0) < 0.01
+    assert 0.99 < fitted.probability(1.0, 16.0) < 1.0
+    for score, shown_px in ((NAN, 16.0), (INF, 16.0), (0.9, NAN), (0.9, INF)):
+        assert fitted.probability(score, shown_px) == 0.0
 
 
 def test_a_model_of_one_fixed_camera_has_one_focal_length() -> None:

@@ -105,6 +105,7 @@ def test_keys_and_attachments_are_judged_too() -> None:
         ({"t_cam_target_m": np.array([0.0, -1e200, 300.0])}, Refusal.POSITION),
         ({"t_cam_target_m": np.array([0.0, 0.0, 100_001.0])}, Refusal.POSITION),
         ({"covariance": np.diag([1e308, 1e308, 1e308, 1.0, 1.0, 1.0])}, Refusal.POSITION),
+        ({"covariance": np.diag([1.0, 1.0, 1.1e10, 1.0, 1.0, 1.0])}, Refusal.POSITION),
     ],
 )
 def test_what_no_camera_measured_is_refused(changes: dict[str, object], reason: Refusal) -> None:
