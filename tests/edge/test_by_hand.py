@@ -103,6 +103,8 @@ def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends()
     by_hand.settle([elsewhere])
     by_hand.settle([elsewhere, there])
     assert by_hand.chosen_id is None, "its number may be another target's by now"
+    assert by_hand.box_xyxy_px(2, SIZE_WH, []) is by_hand.box_xyxy_px(LOOK_NS + 1, SIZE_WH, []) is None
+    assert by_hand.news() == ["target 2 chosen"], "it was found, and its end is told by the tracker"
 
 
 @pytest.mark.parametrize("away_px", [(-300.0, 0.0), (300.0, 0.0), (0.0, -150.0), (0.0, 150.0)])
@@ -112,6 +114,10 @@ def test_a_target_beside_the_box_is_not_the_one_pointed_at(away_px: tuple[float,
     by_hand.take(TrackBox((0.5, 0.4, 0.6, 0.5)), 0)
     np.testing.assert_allclose(by_hand.box_xyxy_px(1, SIZE_WH, [beside]), [959.5, 431.5, 1151.5, 539.5])
     assert by_hand.chosen_id is None
+    in_a_corner = track(0, track_id=1, box_xyxy_px=np.array([1100.0, 500.0, 1140.0, 520.0]))
+    assert by_hand.box_xyxy_px(1, SIZE_WH, [beside, in_a_corner]) is None
+    by_hand.settle([beside, in_a_corner])
+    assert by_hand.news() == ["target 1 chosen"]
 
 
 NEAR_PX, FAR_PX = np.array([400.0, 300.0, 700.0, 500.0]), np.array([620.0, 340.0, 650.0, 352.0])

@@ -242,3 +242,6 @@ def test_another_size_given_in_flight_holds_from_the_next_detection_and_is_no_sp
             assert track.covariance_ned is not None
             off_mps = track.v_ned_target_mps - [26.0, 4.0, 0.0]
             assert off_mps @ np.linalg.solve(track.covariance_ned[3:6, 3:6], off_mps) < 11.3
+    if own_ship_known:
+        assert track.covariance_ned is not None
+        assert np.sqrt(np.diag(track.covariance_ned)[3:5]).max() < 20.0, "from two seconds, it is known again"

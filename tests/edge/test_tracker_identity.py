@@ -87,6 +87,29 @@ def test_of_two_seen_where_one_was_the_one_that_is_turned_like_it_is_taken_for_i
     assert rotation_angle(told.R_cam_target, R_CAM_TARGET) < np.deg2rad(15.0)
 
 
+def test_only_what_is_seen_elsewhere_in_its_box_time_after_time_takes_a_target_s_place() -> None:
+    """Six times in a row, and of several the likeliest."""
+    flight = Flight("ned")
+    here, far, farther = towards(0.0, 250.0), towards(0.0, 700.0), towards(0.0, 1_000.0)
+
+    def elsewhere() -> tuple[Estimate, ...]:
+        box = flight.sight(here).box_xyxy_px
+        return tuple(replace(flight.sight(t_m, score), box_xyxy_px=box) for t_m, score in ((farther, 0.6), (far, 0.9)))
+
+    def ranges_m(*sights: Estimate) -> list[float]:
+        return [float(np.linalg.norm(track.t_cam_target_m)) for track in flight.frame(*sights)]
+
+    for _ in range(30):
+        flight.frame(flight.sight(here))
+    for _ in range(3):
+        for _ in range(5):
+            assert ranges_m(*elsewhere()) == pytest.approx([250.0], rel=0.1)
+        assert ranges_m(flight.sight(here)) == pytest.approx([250.0], rel=0.1)
+    told = [ranges_m(*elsewhere()) for _ in range(6)]
+    assert told[4] == pytest.approx([250.0], rel=0.1)
+    assert told[5] == pytest.approx([700.0], rel=0.02)
+
+
 @pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
 @pytest.mark.parametrize(
     ("rate_hz", "apart_m"), [(3.0, 20.0), (3.0, 40.0), (5.0, 20.0), *product((10.0, 30.0), (8.0, 12.0, 20.0))]
