@@ -14,7 +14,9 @@ from edge.types import FrameMeta, OwnShip, Report, Track, TrackState
 
 K = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])
 SIZE_WH = (1920, 1080)
-R_NED_CAM = Rotation.from_euler("ZYX", [0.4, 0.1, -0.2]).as_matrix() @ np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+R_NED_BODY = Rotation.from_euler("ZYX", [0.4, 0.1, -0.2]).as_matrix()
+R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+R_NED_CAM = R_NED_BODY @ R_BODY_CAM
 R_CAM_TARGET = Rotation.from_rotvec([0.3, -1.1, 0.8]).as_matrix()
 T_CAM_TARGET_M = np.array([12.0, -5.0, 240.0])
 OWN_NED_M = np.array([100.0, 50.0, -120.0])
@@ -61,5 +63,5 @@ def make_track(now_ns: int, **changed: Any) -> Track:
 
 def make_report(*tracks: Track, sequence: int = 1, now_ns: int | None = None, own_ship: bool = True) -> Report:
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
-    own = OwnShip(now_ns, np.eye(3), OWN_NED_M, np.array([20.0, 0.0, 0.0]), ORIGIN) if own_ship else None
+    own = OwnShip(now_ns, R_NED_BODY, OWN_NED_M, np.array([20.0, 0.0, 0.0]), ORIGIN) if own_ship else None
     return Report(FrameMeta(sequence, now_ns, now_ns), K, SIZE_WH, tracks, own)

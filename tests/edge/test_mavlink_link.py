@@ -74,6 +74,8 @@ def test_box_and_place_on_the_globe_arrive_for_the_ground_station() -> None:
     assert (box.get_srcComponent(), box.tracking_status, box.tracking_mode) == (100, 1, 2)
     corners = [box.rec_top_x, box.rec_top_y, box.rec_bottom_x, box.rec_bottom_y]
     np.testing.assert_allclose(corners, (BOX_XYXY_PX + 0.5) / np.tile(SIZE_WH, 2), rtol=1e-5)
+    middle = np.reshape(corners, (2, 2)).mean(axis=0)  # what a display with room for a point draws
+    np.testing.assert_allclose([box.point_x, box.point_y], middle, rtol=1e-5)
     north_m = (place.lat * 1e-7 - ORIGIN[0]) * 111_170  # metres a degree at 47 degrees north
     east_m = (place.lon * 1e-7 - ORIGIN[1]) * 76_057
     t_ned_m = np.array([100.0, 50.0, -120.0]) + R_NED_CAM @ T_CAM_TARGET_M

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from edge import clock
 from edge.config import ZenohSettings
 from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles, Reason
 from edge.links.errors import LinkError
@@ -30,7 +32,9 @@ from tests.waiting import until
 
 from .reports import (
     OWN_NED_M,
+    R_BODY_CAM,
     R_CAM_TARGET,
+    R_NED_BODY,
     R_NED_CAM,
     ROTATION_UNKNOWN,
     SIZE_WH,
@@ -38,11 +42,12 @@ from .reports import (
     TRACKING,
     V_NED_MPS,
     K,
+    rangeless,
 )
 from .reports import make_report as report
 from .reports import make_track as track
 
-MOUNT = Mount(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.5, 0.0, 0.2]))
+MOUNT = Mount(R_BODY_CAM, np.array([0.5, 0.0, 0.2]))
 ROS = get_typestore(Stores.ROS2_JAZZY)
 # rosbags does not carry vision_msgs; these are the package's own definitions.
 VISION_MSGS = {
@@ -127,7 +132,7 @@ def test_a_report_arrives_on_every_topic_as_ros_reads_it() -> None:
     point_m = np.array([0.0, 0.0, 10.0])
     for step in reversed(tf.transforms):
         point_m = matrix(step.transform.rotation) @ point_m + vector(step.transform.translation)
-    np.testing.assert_allclose(point_m, OWN_NED_M + np.array([10.5, 0.0, 0.2]), atol=1e-9)
+    np.testing.assert_allclose(point_m, OWN_NED_M + R_NED_BODY @ np.array([10.5, 0.0, 0.2]), atol=1e-9)
     np.testing.assert_allclose(vector(tf.transforms[0].transform.translation), OWN_NED_M)
 
 
@@ -143,6 +148,23 @@ def test_without_own_attitude_there_is_a_pose_but_nothing_in_ned() -> None:
         )
         assert "sent_odom" not in link.counters()
         assert "sent_tf" not in link.counters()
+
+
+def test_without_own_position_everything_is_told_around_the_own_ship_and_nothing_in_ned() -> None:
+    endpoint, odom_name = free_endpoint(), "uav1/target/t0/odom"
+    with linked(endpoint) as link, connect(endpoint) as session:
+        samples = Samples(session)
+
+        def publish() -> None:
+            one = report(track(time.monotonic_ns()))
+            assert one.own_ship is not None
+            link.publish(replace(one, own_ship=replace(one.own_ship, t_ned_body_m=None, v_ned_body_mps=None)))
+
+        samples.wait(odom_name, "uav1/tf", each=publish)
+        odom, tf = samples.newest[odom_name], samples.newest["uav1/tf"]
+    assert odom.header.frame_id == "base_link_ned"
+    frames = [(t.header.frame_id, t.child_frame_id) for t in tf.transforms]
+    assert frames == list(itertools.pairwise(["base_link_ned", "base_link_frd", "camera_optical_frame"]))
 
 
 def test_tentative_stale_broken_and_unsure_tracks_never_leave() -> None:
@@ -189,6 +211,21 @@ def test_of_a_frame_that_is_too_old_nothing_is_told_that_has_its_time() -> None:
         until(lambda: link.counters().get("sent_tf") == 1, what="the next frame")
         counted = link.counters()
     assert (counted["sent_pose"], counted["sent_odom"], counted["sent_detections"]) == (1, 1, 1)
+
+
+def test_the_rest_of_a_report_does_not_go_out_after_the_process_was_held_up(stepped: int) -> None:
+    """As when it is stopped while it sends the first of two targets, and goes on later."""
+    seen = rangeless(track(stepped, track_id=1))
+    with linked(free_endpoint(), max_age_ms=200.0) as link:
+        assert link.session is not None
+        # A subscriber of the session that publishes is called while it publishes.
+        hold_up = zenoh.handlers.Callback(lambda _: clock.step_to(stepped + 200_000_001), indirect=False)
+        link.session.declare_subscriber("0/uav1/target/t0/pose/**", hold_up)
+        link.publish(report(track(stepped), seen, now_ns=stepped))
+        link.settle()
+        counted = link.counters()
+    assert counted["too_late"] == 4  # odometry, the other target's direction, detections, transforms
+    assert {name for name in counted if name.startswith("sent_")} == {"sent_pose", "sent_camera_info"}
 
 
 def test_the_typed_client_takes_every_pose_it_gets() -> None:
