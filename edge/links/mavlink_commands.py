@@ -96,7 +96,7 @@ def _set_interval(number: float, interval_us: float, enabled: Container[int]) ->
     if interval_us in (0.0, -1.0):
         return Answer(dialect.MAV_RESULT_ACCEPTED, interval=(message_id, None if interval_us == 0.0 else 0.0))
     low_hz, high_hz = RATE_LIMITS_HZ[message_id]
-    if interval_us < 0.0 or not low_hz <= 1e6 / interval_us <= high_hz * 1.001:
+    if not low_hz <= 1e6 / interval_us <= high_hz * 1.001:
         return Answer(dialect.MAV_RESULT_DENIED)
     return Answer(dialect.MAV_RESULT_ACCEPTED, interval=(message_id, 1e6 / interval_us))
 

@@ -20,6 +20,7 @@ from edge.requests import RequestQueue
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import TrackState
 from msgs.mavlink import FrameReader, MAVLink, dialect
+from tests.waiting import until
 
 from .mavlink_peer import CAMERA, SYSTEM_ID, Peer, linked, meet
 from .reports import (
@@ -347,6 +348,20 @@ def test_a_vehicle_that_has_the_virtual_systems_id_gets_no_traffic(caplog: pytes
     assert "FOLLOW_TARGET" not in {m.get_type() for m in peer.received}
     told = [record.message for record in caplog.records if "FOLLOW_TARGET" in record.message]
     assert told == [f"mavlink: neither FOLLOW_TARGET nor ADSB_VEHICLE is sent: this vehicle too is {SYSTEM_ID}"]
+
+
+def test_an_autopilot_that_falls_silent_is_in_the_log_once_each_time(
+    stepped: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    silence = "mavlink: the autopilot's heartbeat has stopped"
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        for times in (1, 2):
+            peer.heartbeat()
+            until(lambda times=times: link.counters().get("received_HEARTBEAT") == times, link.settle, what="heartbeat")
+            for _ in range(8):
+                clock.step_to(clock.monotonic_ns() + 1_000_000_000)
+                link.settle()
+            assert [record.message for record in caplog.records].count(silence) == times
 
 
 def test_the_own_computers_load_and_memory_are_told_where_asked_for() -> None:

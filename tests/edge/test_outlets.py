@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pytest
 import zenoh
 from mcap.reader import make_reader
 
@@ -23,8 +24,10 @@ from edge.tracking.own_ship import OwnShipBuffer
 from msgs import topics
 from msgs.cdr import Log
 from msgs.client import connect
+from msgs.ground.keys import init_authority, issue
 from msgs.mavlink import dialect
-from sim_replay.ports import free_port
+from sim_replay.ports import free_endpoint, free_port
+from tests.certificates import redate
 from tests.waiting import until
 
 from .mavlink_peer import CAMERA, Peer
@@ -64,17 +67,23 @@ class Ends:
         return texts
 
 
+def board_of(tmp_path: Path, toy_model: Path, text: str) -> StatusBoard:
+    """Of a daemon with this configuration."""
+    (tmp_path / "config.toml").write_text(f'[camera]\ntype = "sequence"\npath = "scene"\n{text}')
+    return StatusBoard(load_config(tmp_path / "config.toml"), load_model(toy_model, 1), CAMERA)
+
+
 @contextmanager
 def started(tmp_path: Path, toy_model: Path, folder: Path, *states: Condition) -> Iterator[Ends]:
     """Once the autopilot is met; `states` were told before anybody was there."""
     ground, autopilot = free_port(), free_port(socket.SOCK_DGRAM)
-    (tmp_path / "config.toml").write_text(
-        '[camera]\ntype = "sequence"\npath = "scene"\n'
+    board = board_of(
+        tmp_path,
+        toy_model,
         f'[zenoh]\nlisten = ["tcp/127.0.0.1:{ground}"]\n'
         f'[mavlink]\nendpoints = ["udpin:127.0.0.1:{autopilot}"]\n'
-        f'[recorder]\nenabled = true\nfolder = "{folder}"\nfree_min_mb = 0\n'
+        f'[recorder]\nenabled = true\nfolder = "{folder}"\nfree_min_mb = 0\n',
     )
-    board = StatusBoard(load_config(tmp_path / "config.toml"), load_model(toy_model, 1), CAMERA)
     with ExitStack() as cleanup:
         outlets = start_outlets(board, OwnShipBuffer(), RequestQueue(), lambda _: False, cleanup)
         for state in states:
@@ -141,3 +150,24 @@ def test_a_folder_that_cannot_be_recorded_to_is_told_to_ground_and_autopilot(tmp
         ends.until_heard(stopped)
     assert (stopped, logging.ERROR) in ends.by_ground
     assert (stopped, dialect.MAV_SEVERITY_ERROR) in ends.by_autopilot()
+
+
+def test_a_certificate_that_the_ground_may_refuse_is_in_the_log(
+    tmp_path: Path, toy_model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    init_authority(tmp_path)
+    issue(tmp_path, "uav2")
+    _, ended = redate(tmp_path, "uav2", begins_days=-9, ends_days=-2)
+    board = board_of(
+        tmp_path,
+        toy_model,
+        f'[mavlink]\nenabled = false\n[zenoh]\nlisten = []\nconnect = ["{free_endpoint()}"]\n'
+        '[zenoh.tls]\nroot_ca = "ca.pem"\ncertificate = "uav2.pem"\nprivate_key = "uav2.key"\n',
+    )
+    with ExitStack() as cleanup:
+        start_outlets(board, OwnShipBuffer(), RequestQueue(), lambda _: False, cleanup)
+    no_link, unheard = (record.message for record in caplog.records if record.levelno == logging.WARNING)
+    assert no_link.startswith("there may be no link over tls and quic: ")
+    assert f"uav2.pem expired on {ended:%Y-%m-%d}" in no_link
+    assert unheard.startswith("the ground may hear nothing: ")
+    assert "uav2.pem is that of uav2, not uav1's" in unheard
