@@ -70,6 +70,21 @@ def test_the_place_on_the_globe_is_above_mean_sea_level_and_climbs_as_told() -> 
     assert alt - 412.0 == pytest.approx(0.04 * 1.5)
 
 
+def test_without_a_fix_there_is_no_place_on_the_globe() -> None:
+    """Until then ArduPilot sends zeros, which are a place in the Gulf of Guinea."""
+    unplaced = dialect.MAVLink_global_position_int_message(1_040, 0, 0, 412_000, 0, 0, 0, 0, 0)
+    assert told([*map(attitude, (1_000, 1_020, 1_040)), unplaced], 1_040).lat_lon_alt is None
+
+
+def test_the_local_position_is_north_east_down_and_goes_on_as_told() -> None:
+    place = dialect.MAVLink_local_position_ned_message(1_040, 100.0, 50.0, -120.0, 20.0, -3.0, -1.5)
+    own = told([*map(attitude, (1_000, 1_020, 1_040)), place], 1_080)
+    assert own.t_ned_body_m is not None
+    np.testing.assert_allclose(own.t_ned_body_m, [100.8, 49.88, -120.06], atol=1e-6)
+    assert own.v_ned_body_mps is not None
+    np.testing.assert_allclose(own.v_ned_body_mps, [20.0, -3.0, -1.5], atol=1e-6)
+
+
 def test_a_timesync_in_utc_does_not_unwrap_the_time_since_boot() -> None:
     now_ns, boot_ms = 9_000 * MS, 5_000
     assert uptime_ms(boot_ms, 1_700_000_000_000 * MS, now_ns) == boot_ms
