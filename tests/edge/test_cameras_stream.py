@@ -128,6 +128,12 @@ def test_a_picture_is_damaged_from_a_loss_to_the_next_key_frame_or_for_two_secon
     assert damaged[-1] - damaged[9] == pytest.approx(2000.0, abs=1.01 * step_ms)
 
 
+def test_what_follows_an_outage_is_damaged_though_an_earlier_loss_has_healed_meanwhile() -> None:
+    losses, sent = Losses(), [*range(60), *range(61, 70), *range(160, 260)]
+    damaged = [index for index in sent if losses.damaged(index * 40.0, key=index == 0)]
+    assert damaged == [*range(61, 70), *range(160, 210)]
+
+
 @pytest.mark.parametrize("left_out", [5, 3])
 def test_an_encoder_that_leaves_out_pictures_by_itself_loses_few_of_those_it_sends(left_out: int) -> None:
     """Each fifth or third of 30 a second, with a key frame each two seconds."""
