@@ -49,8 +49,12 @@ def test_before_an_autopilots_heartbeat_nothing_is_sent_to_whoever_calls() -> No
         caller.send(ground)
         firmware = (dialect.MAV_TYPE_ANTENNA_TRACKER, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
         caller.send(dialect.MAVLink_heartbeat_message(*firmware, 0, 0, 4, 3))
+        without_autopilot = (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_INVALID)
+        caller.send(dialect.MAVLink_heartbeat_message(*without_autopilot, 0, 0, 4, 3))
+        caller.mav.srcSystem = 0  # which addresses all systems, and is none
+        caller.heartbeat()
         meet(link, peer)
-        assert link.counters()["refused_stranger"] == 3
+        assert link.counters()["refused_stranger"] == 5
         assert alone(caller.wire)
 
 

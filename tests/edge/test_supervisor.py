@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,18 @@ def test_slower_than_the_settings_allow_is_no_good_state(toy_model: Path, latenc
     condition = after_frames(supervisor, latency_ms)
     assert {reason.kind for reason in condition.reasons} == kinds
     assert (condition.state is HealthState.DEGRADED) == bool(kinds)
+
+
+def test_what_frames_lack_of_the_own_ship_is_told(toy_model: Path) -> None:
+    supervisor, whole = supervised(toy_model, Outlets(None, None), {}), make_report().own_ship
+    assert whole is not None
+    by_globe, by_ned = replace(whole, t_ned_body_m=None, v_ned_body_mps=None), replace(whole, lat_lon_alt=None)
+    nowhere = replace(by_globe, lat_lon_alt=None)
+    lacks = [(whole, []), (by_globe, []), (by_ned, []), (nowhere, ["no_position"]), (None, ["no_attitude"])]
+    for index, (own_ship, kinds) in enumerate(lacks):
+        supervisor.frame_done(replace(make_report(sequence=index), own_ship=own_ship), {"total": 1})
+        supervisor.turn()
+        assert [reason.kind for reason in supervisor.snapshot().condition.reasons] == kinds
 
 
 @pytest.mark.parametrize(("no_frame_s", "state"), [(0.5, HealthState.FAULT), (1.5, HealthState.SEARCHING)])
