@@ -56,6 +56,6 @@ def _first(
         wanted = (before.track_id, before.born_ns)
     else:
         wanted = None
-    if wanted is not None and wanted in [(t.track_id, t.born_ns) for t in alive]:
+    if wanted in [(t.track_id, t.born_ns) for t in alive]:
         candidates = [t for t in candidates if (t.track_id, t.born_ns) == wanted]
     return min(candidates, key=lambda t: (t.state is not TrackState.CONFIRMED, t.track_id), default=None)

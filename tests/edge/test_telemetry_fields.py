@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edge.clock import UtcClock
+from edge.links.mavlink_receive import Receiver
 from edge.links.mavlink_telemetry import Telemetry, uptime_ms
 from edge.tracking.clock import TimesyncEstimator
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import OwnShip
-from msgs.mavlink import dialect
+from msgs.mavlink import FrameReader, MAVLink, dialect
 
 MS = 1_000_000
 ROLL, PITCH, YAW = -0.2, 0.1, 0.4
@@ -28,8 +30,11 @@ def told(messages: list[Any], time_ms: int) -> OwnShip:
     """The own ship at a time, by messages that arrive as they are stamped."""
     own_ship = OwnShipBuffer()
     telemetry = Telemetry(own_ship, TimesyncEstimator(), UtcClock(), None)
+    receiver, reader, autopilot = Receiver(Counter()), FrameReader(datagram=True), MAVLink(None, 1, 1)
     for message in messages:
-        assert telemetry.take(message, message.time_boot_ms * MS) is None
+        now_ns = message.time_boot_ms * MS
+        (received,) = receiver.take(bytes(message.pack(autopilot)), reader, now_ns)
+        assert telemetry.take(received, now_ns) is None
     now = own_ship.at(time_ms * MS)
     assert now is not None
     return now
@@ -55,19 +60,20 @@ def test_an_attitude_without_rates_goes_on_as_it_turned_last() -> None:
     np.testing.assert_allclose(told(messages, 1_400).R_ned_body, turned[4].as_matrix(), atol=1e-6)
 
 
-def test_the_place_on_the_globe_is_above_mean_sea_level_and_climbs_as_told() -> None:
+@pytest.mark.parametrize("place", [(47.0, 8.0, 412.0), (-33.0, -70.0, -12.0)], ids=["Alps", "south-west"])
+def test_the_place_on_the_globe_is_above_mean_sea_level_and_climbs_as_told(place: tuple[float, float, float]) -> None:
     """Above home it is 37 m, which is no place on the globe; the vertical speed is told in cm/s, down."""
-    place = dialect.MAVLink_global_position_int_message(
-        1_040, 470_000_000, 80_000_000, 412_000, 37_000, 2_000, -300, -150, 0
+    lat, lon, alt = place
+    message = dialect.MAVLink_global_position_int_message(
+        1_040, round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 37_000, 2_000, -300, -150, 0
     )
-    messages = [attitude(boot_ms) for boot_ms in (1_000, 1_020, 1_040)] + [place]
-    assert told(messages, 1_040).lat_lon_alt == pytest.approx((47.0, 8.0, 412.0))
+    messages = [attitude(boot_ms) for boot_ms in (1_000, 1_020, 1_040)] + [message]
+    assert told(messages, 1_040).lat_lon_alt == pytest.approx(place)
     later = told(messages, 1_080).lat_lon_alt
     assert later is not None
-    lat, lon, alt = later
-    assert (lat - 47.0) * 111_175.0 == pytest.approx(0.04 * 20.0, rel=0.01)
-    assert (lon - 8.0) * 76_057.0 == pytest.approx(0.04 * -3.0, rel=0.01)
-    assert alt - 412.0 == pytest.approx(0.04 * 1.5)
+    assert (later[0] - lat) * 111_000.0 == pytest.approx(0.04 * 20.0, rel=0.01)
+    assert (later[1] - lon) * 111_320.0 * np.cos(np.deg2rad(lat)) == pytest.approx(0.04 * -3.0, rel=0.01)
+    assert later[2] - alt == pytest.approx(0.04 * 1.5)
 
 
 def test_without_a_fix_there_is_no_place_on_the_globe() -> None:
