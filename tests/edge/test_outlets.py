@@ -9,18 +9,24 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zenoh
 from mcap.reader import make_reader
 
 from edge import threads
-from edge.config import load_config
+from edge.config import MavlinkSettings, load_config
+from edge.config_ground import ZenohSettings
 from edge.estimator.model import load_model
 from edge.health import Activity, Condition, HealthState, Reason
+from edge.links.mavlink_link import MavlinkLink
+from edge.links.zenoh_link import ZenohLink
 from edge.outlets import Outlets, start_outlets
+from edge.pictures import Picture
 from edge.requests import RequestQueue
 from edge.status_board import StatusBoard
 from edge.tracking.own_ship import OwnShipBuffer
+from edge.types import Mount
 from msgs import topics
 from msgs.cdr import Log
 from msgs.client import connect
@@ -171,3 +177,21 @@ def test_a_certificate_that_the_ground_may_refuse_is_in_the_log(
     assert f"uav2.pem expired on {ended:%Y-%m-%d}" in no_link
     assert unheard.startswith("the ground may hear nothing: ")
     assert "uav2.pem is that of uav2, not uav1's" in unheard
+
+
+def test_what_a_link_has_no_room_for_is_counted(stepped: int) -> None:
+    """As where it stands still: the newest are kept."""
+    zenoh_link = ZenohLink(ZenohSettings(listen=[free_endpoint()]), "uav1", Mount(np.eye(3), np.zeros(3)))
+    mavlink = MavlinkLink(MavlinkSettings(endpoints=["udpin:127.0.0.1:0"]), OwnShipBuffer(), CAMERA, RequestQueue())
+    outlets = Outlets(zenoh_link, mavlink)
+    for number in range(70):
+        outlets.event(logging.INFO, f"target {number} acquired")
+        zenoh_link.publish_picture(Picture(stepped, b"", live=True, recorded=False))
+    lost = outlets.counters()
+    assert (lost["zenoh_events_lost"], lost["mavlink_events_lost"], lost["zenoh_pictures_replaced"]) == (6, 6, 66)
+    zenoh_link.start()
+    zenoh_link.settle()
+    zenoh_link.stop()
+    mavlink.stop()
+    sent = outlets.counters()
+    assert (sent["zenoh_sent_events"], sent["zenoh_sent_image"]) == (64, 4)
