@@ -130,6 +130,21 @@ def test_a_camera_whose_speed_is_not_told_has_that_at_which_it_came() -> None:
     moved = replace(silent, t_ned_body_m=np.array([2.0, -1.0, 0.5]))
     np.testing.assert_allclose(View.of(100 * MS, moved, LOOKING_NORTH, before).v_frame_cam_mps, [20.0, -10.0, 5.0])
     assert View.of(900 * MS, moved, LOOKING_NORTH, before).v_frame_cam_mps is None
+    relative = View.of(0, replace(silent, t_ned_body_m=None), LOOKING_NORTH)
+    for other in (View.of(0, replace(silent, origin_epoch=1), LOOKING_NORTH), relative, None):
+        assert View.of(100 * MS, moved, LOOKING_NORTH, other).v_frame_cam_mps is None
+
+
+def test_a_camera_turns_at_the_rate_between_two_attitudes_that_are_close_and_mean_the_same() -> None:
+    """Any other rate is made up, and the attitude would be doubted by it times the exposure time's error."""
+    turned, still = replace(STILL, R_ned_body=so3.exp(np.array([0.0, 0.0, 0.1]))), View.of(0, STILL, LOOKING_NORTH)
+    assert View.of(100 * MS, turned, LOOKING_NORTH, still).turning_radps == pytest.approx(1.0)
+    in_cam = View.of(0, None, LOOKING_NORTH)
+    other_north = View.of(0, replace(STILL, axes_epoch=1), LOOKING_NORTH)
+    for before, time_ms in ((still, 0), (still, 600), (in_cam, 100), (other_north, 100), (None, 100)):
+        view = View.of(time_ms * MS, turned, LOOKING_NORTH, before)
+        assert view.turning_radps == 0.0
+        assert view.attitude_variance == pytest.approx(1e-3**2)
 
 
 def test_a_frame_change_by_an_old_attitude_leaves_the_target_in_doubt_across_the_sight_line() -> None:
@@ -143,6 +158,21 @@ def test_a_frame_change_by_an_old_attitude_leaves_the_target_in_doubt_across_the
     assert np.sqrt(np.linalg.eigvalsh(more)[-1]) == pytest.approx(STALE_ATTITUDE_RADPS * np.linalg.norm(fresh.t_m))
     turned, long_turned = (rotation.reframe(attitude, ekf.between(in_ned, in_cam), age_s) for age_s in (0.0, 1.0))
     np.testing.assert_allclose(long_turned.P - turned.P, STALE_ATTITUDE_RADPS**2 * np.eye(3), atol=1e-9)
+
+
+def test_only_where_own_attitude_is_lost_its_age_makes_a_target_less_sure() -> None:
+    """Half a second at 0.5 rad/s: 50 m at 200 m. Where it is gained, it is that of this frame."""
+    tracker = Tracker(1, LOOKING_NORTH)
+    _, own = follow(tracker)
+    later = replace(own, time_ns=own.time_ns + 500 * MS)
+    (kept,), (lost,) = (tracker.predict(later.time_ns, one, K, SIZE_WH) for one in (later, None))
+    more = lost.covariance - kept.covariance
+    np.testing.assert_allclose(np.diag(more)[3:], 0.25**2, atol=1e-4)
+    np.testing.assert_allclose(np.diag(more)[:2], 50.0**2, rtol=0.1)
+    tracker.update(later.time_ns, [], None, K, SIZE_WH)
+    again = replace(later, time_ns=later.time_ns + 500 * MS)
+    (still_lost,), (gained,) = (tracker.predict(again.time_ns, one, K, SIZE_WH) for one in (None, again))
+    np.testing.assert_allclose(gained.covariance, still_lost.covariance, rtol=0.01, atol=0.05)
 
 
 def test_what_all_frames_share_is_mirrored_with_the_rotation_when_the_other_side_is_taken() -> None:

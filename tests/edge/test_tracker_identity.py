@@ -110,6 +110,16 @@ def test_only_what_is_seen_elsewhere_in_its_box_time_after_time_takes_a_target_s
     assert told[5] == pytest.approx([700.0], rel=0.02)
 
 
+def test_a_missed_target_is_not_moved_to_another_aircraft_for_which_there_is_no_slot() -> None:
+    flight = Flight("ned", max_targets=1)
+    for _ in range(30):
+        flight.frame(flight.sight(towards(-5.0, 250.0)))
+    for _ in range(30):
+        (track,) = flight.frame(flight.sight(towards(10.0, 250.0)))
+        assert track.t_cam_target_m == pytest.approx(towards(-5.0, 250.0), abs=10.0)
+        assert track.state is TrackState.COASTING
+
+
 @pytest.mark.parametrize("kind", ["cam", "ned_relative", "ned"])
 @pytest.mark.parametrize(
     ("rate_hz", "apart_m"), [(3.0, 20.0), (3.0, 40.0), (5.0, 20.0), *product((10.0, 30.0), (8.0, 12.0, 20.0))]

@@ -133,15 +133,20 @@ def test_two_that_are_often_missed_at_few_frames_a_second_are_two(seed: int) -> 
         assert len([track for track in tracks if track.measured_ns == track.time_ns]) == len(places)
 
 
-def test_who_is_chosen_stays_when_two_targets_are_one_aircraft() -> None:
-    rng, tracker, chosen = np.random.default_rng(0), Tracker(4, LOOKING_NORTH), None
-    for i in range(210):
-        place = np.array([8.0 * (i >= 60), 0.0, 200.0])
-        tracks = tracker.update(1 + round(i * 1e9 / 30), [sight(rng, place, NORTH_EAST)], None, K, SIZE_WH, (), chosen)
-        chosen = tracks[-1].track_id if i == 75 else chosen
-        if i == 75:
-            assert len(tracks) == 2
-    assert [track.track_id for track in tracks] == [chosen]
+@pytest.mark.parametrize(("chosen_id", "stays"), [(None, 0), (0, 0), (1, 1)])
+def test_of_two_targets_that_are_one_aircraft_the_older_stays_unless_the_other_is_chosen(
+    chosen_id: int | None, stays: int
+) -> None:
+    """It is seen here and there by turns, at places that each had a target of its own before."""
+    rng, tracker, frames = np.random.default_rng(0), Tracker(4, LOOKING_NORTH), []
+    here, there = np.array([0.0, 0.0, 200.0]), np.array([8.0, 0.0, 200.0])
+    for i in range(150):
+        places = [here] if i < 10 else [here, there] if i < 60 else [(here, there)[i // 15 % 2]]
+        seen = [sight(rng, place, NORTH_EAST) for place in places]
+        tracks = tracker.update(1 + round(i * 1e9 / 30), seen, None, K, SIZE_WH, (), chosen_id)
+        frames.append([track.track_id for track in tracks])
+    assert frames[10:120] == [[0, 1]] * 110
+    assert next(tracked for tracked in frames[120:] if len(tracked) < 2) == [stays]
 
 
 def test_two_that_take_turns_for_very_long_at_few_frames_a_second_are_one_at_last() -> None:
