@@ -44,5 +44,9 @@ def _upright_fonts() -> dict[str, tuple[str, int]]:
 
 @functools.cache
 def _characters(family: str) -> frozenset[int]:
+    """None of a font that cannot be read: matplotlib remembers from one run to the next which ones it has found."""
     path, index = _upright_fonts()[family]
-    return frozenset(FT2Font(path, face_index=index).get_charmap())
+    try:
+        return frozenset(FT2Font(path, face_index=index).get_charmap())
+    except (OSError, RuntimeError):
+        return frozenset()

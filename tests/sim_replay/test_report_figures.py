@@ -6,12 +6,15 @@ import io
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.font_manager import FontEntry
 from scipy.stats import chi2
 
 from msgs.geometry import so3_exp
+from sim_replay import lettering
 from sim_replay.evaluation.figures import error_by_range, sequence
 from sim_replay.evaluation.instances import instances
 from sim_replay.golden.run import CASES
@@ -328,3 +331,19 @@ def test_names_in_other_scripts_and_with_dollar_signs_are_drawn_and_nothing_is_c
     error_by_range({"by_range": {}, "method": {"file": name}, "dataset": name}).savefig(picture)
     assert caplog.text == ""
     assert not list(recwarn)
+
+
+def test_fonts_that_were_removed_or_are_spoiled_hinder_no_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """matplotlib lists them still, and looks into a font's file only to draw with it."""
+    removed, spoiled = tmp_path / "Removed.ttf", tmp_path / "Spoiled.ttf"
+    spoiled.write_bytes(b"no font")
+    for file in (removed, spoiled):
+        font = FontEntry(fname=str(file), name=f"{file.stem} Sans", style="normal", weight=400)
+        monkeypatch.setattr(lettering.fontManager, "ttflist", [*lettering.fontManager.ttflist, font])
+        lettering._upright_fonts.cache_clear()
+        try:
+            assert lettering.lettering(["\U0010fffd"])[0] == [r"\U0010fffd"]
+        finally:
+            lettering._upright_fonts.cache_clear()
