@@ -61,15 +61,9 @@ class Estimator:
         finer = tiles(frame_wh, self.model.contract.acquire_size_wh, lens, pixel_aspect(frame.K))
         return whole(frame_wh, lens), *(finer if self.has_track_stage else ())
 
-    def acquire(
-        self,
-        frame: Frame,
-        known_boxes: Sequence[Array] = (),
-        thrice: bool = True,
-        regions: Sequence[Region] = (),
-    ) -> list[Estimate]:
-        """Targets in the whole frame, or in some `regions` of it, without those that overlap one of `known_boxes`
-        (box_xyxy_px) or one of a region before; best first in each.
+    def acquire(self, frame: Frame, thrice: bool = True, regions: Sequence[Region] = ()) -> list[Estimate]:
+        """Targets in the whole frame, or in some `regions` of it, without those that overlap one of a region before;
+        best first in each.
 
         Each is evaluated in a track window of the same frame, placed by the coarse detection; if `thrice`, twice more
         in a window placed by the first result, plain and mirrored. A detection that the windows do not show, or do not
@@ -77,8 +71,7 @@ class Estimator:
         """
         found: list[Estimate] = []
         for region in regions or self.regions(frame)[:1]:
-            known = [*known_boxes, *(estimate.box_xyxy_px for estimate in found)]
-            found += self._acquire_in(region, frame, known, thrice)
+            found += self._acquire_in(region, frame, [estimate.box_xyxy_px for estimate in found], thrice)
         return found
 
     def _acquire_in(self, region: Region, frame: Frame, known_boxes: Sequence[Array], thrice: bool) -> list[Estimate]:

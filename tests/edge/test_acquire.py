@@ -16,7 +16,7 @@ from edge.types import Frame, FrameMeta, TrackState
 from msgs.contract import ModelContract
 
 from .toy_model import CONTRACT
-from .toy_scene import SIZE_WH, K, draw
+from .toy_scene import SIZE_WH, K, draw, draw_faint
 
 RANGE_M = 250.0
 TARGET_PX = np.array([700.0, 500.0])
@@ -230,11 +230,12 @@ def test_where_there_is_room_for_few_what_the_whole_frame_takes_for_likelier_hid
     np.testing.assert_allclose(found[0].box_xyxy_px[0], TARGET_PX[0] - SIZE_PX[0] / 2, atol=0.01)
 
 
-def test_no_more_targets_are_found_than_there_is_room_for(toy_model: Path) -> None:
-    frame = Frame(FrameMeta(0, 0, 0), draw((500.5, 500.5)), K)
-    estimator = Estimator(load_model(toy_model, 1), 1)
-    assert len(estimator.acquire(frame)) == 1
-    assert estimator.acquire(frame, [np.array([1500.0, 200.0, 1620.0, 260.0])]) == [], "the one is held"
+@pytest.mark.parametrize("max_targets", [1, 2])
+def test_no_more_targets_are_found_than_there_is_room_for(toy_model: Path, max_targets: int) -> None:
+    """One in the whole frame, another in a tile of it."""
+    frame = Frame(FrameMeta(0, 0, 0), np.maximum(draw((500.5, 300.5)), draw_faint()), K)
+    estimator = Estimator(load_model(toy_model, 1), max_targets)
+    assert len(estimator.acquire(frame, regions=estimator.regions(frame))) == max_targets
 
 
 def test_a_first_look_that_shows_nothing_is_the_last() -> None:
