@@ -233,8 +233,9 @@ def test_of_two_in_a_window_the_one_that_lies_where_the_target_should_be_is_take
         box = np.array([1500.0 + left_px, 900.0, 1540.0 + left_px, 920.0])
         return Estimate(score, box, np.eye(3), np.array([0.0, 0.0, 200.0]), np.eye(6), "track")
 
-    here, there = at(0.0, 0.8), at(80.0, 0.95)
-    assert nearest_expected([there, here], [1502.0, 900.0, 1542.0, 920.0]) is here
+    here = at(0.0, 0.8)
+    for there in (at(80.0, 0.95), at(-80.0, 0.95)):
+        assert nearest_expected([there, here], [1502.0, 900.0, 1542.0, 920.0]) is here
     assert nearest_expected([at(1.0, 0.3), here], [1502.0, 900.0, 1542.0, 920.0]) is here, "as near, and more sure"
 
 

@@ -87,6 +87,28 @@ def test_of_two_seen_where_one_was_the_one_that_is_turned_like_it_is_taken_for_i
     assert rotation_angle(told.R_cam_target, R_CAM_TARGET) < np.deg2rad(15.0)
 
 
+@pytest.mark.parametrize("kind", ["ned_relative", "ned"])
+def test_where_the_network_takes_each_of_two_for_turned_like_the_other_they_are_told_apart_by_place(kind: str) -> None:
+    flight, places = Flight(kind), [np.array([-0.75, 0.0, 250.0]), np.array([0.75, 0.0, 250.0])]
+    rotations = [R_CAM_TARGET, R_CAM_TARGET @ Rotation.from_euler("z", 90, degrees=True).as_matrix()]
+
+    def sights(swapped: bool) -> list[Estimate]:
+        turned = rotations[::-1] if swapped else rotations
+        seen = [flight.sight(t_m, R_cam_target=R) for t_m, R in zip(places, turned, strict=True)]
+        pixels = [np.tile([sign * 40.0, 0.0], 2) for sign in (-1.0, 1.0)]  # so that neither hides the other
+        return [
+            replace(one, t_cam_target_m=t_m, box_xyxy_px=one.box_xyxy_px + px)
+            for one, t_m, px in zip(seen, places, pixels, strict=True)
+        ]
+
+    for _ in range(30):
+        flight.frame(*sights(False))
+    for _ in range(3):
+        tracks = flight.frame(*sights(True))
+        assert [np.sign(track.t_cam_target_m[0]) for track in tracks] == [-1.0, 1.0]
+        assert [track.t_cam_target_m[0] for track in tracks] == pytest.approx([-0.75, 0.75], abs=0.2)
+
+
 def test_only_what_is_seen_elsewhere_in_its_box_time_after_time_takes_a_target_s_place() -> None:
     """Six times in a row, and of several the likeliest."""
     flight = Flight("ned")
@@ -207,3 +229,17 @@ def test_one_detection_of_two_aircraft_that_cross_is_taken_for_neither(kind: str
             ]
     assert [track.track_id for track in tracks] == [0, 1]
     assert max(nees) < 16.3
+
+
+def test_an_aircraft_that_rolls_and_shows_its_wings_is_not_taken_for_two() -> None:
+    """Twice as high in the picture from one frame to the next: its box is that at once, and its place as sure."""
+    flight, t_m = Flight("ned"), towards(0.0, 250.0)
+    for _ in range(30):
+        (before,) = flight.frame(flight.sight(t_m))
+    for _ in range(5):
+        level = flight.sight(t_m)
+        half_px = 0.5 * (level.box_xyxy_px[3] - level.box_xyxy_px[1])
+        higher = level.box_xyxy_px + np.array([0.0, -half_px, 0.0, half_px])
+        (track,) = flight.frame(replace(level, box_xyxy_px=higher))
+        assert track.box_xyxy_px == pytest.approx(higher, abs=2.0)
+        assert np.all(np.diag(track.covariance)[:2] < 1.5 * np.diag(before.covariance)[:2])
