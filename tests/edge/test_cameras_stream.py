@@ -62,6 +62,7 @@ def test_a_udp_stream_is_stamped_by_its_own_clock() -> None:
         with closing(source):
             source.open()
             frames = [source.read(threading.Event()) for _ in range(30)]
+            assert source.counts["unstamped"] == 0
     finally:
         encoder.stop.set()
         encoder.join()

@@ -141,6 +141,10 @@ def test_what_px4_steers_a_gimbals_servos_by_is_not_where_the_camera_looks(
             assert told.text.startswith("PX4 tells what it steers the gimbal's servos by")
             assert link.counters()["refused_servo_gimbal"] > 0
             assert own_ship.at(now_ns()) is None
+            for _ in range(3):
+                peer.until(lambda m: m.get_type() == "TIMESYNC", "what goes on", both)
+            texts = [m.text for m in peer.received if m.get_type() == "STATUSTEXT"]
+            assert texts.count(told.text) == 1
 
 
 @given(share=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))

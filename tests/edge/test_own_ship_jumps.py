@@ -62,11 +62,16 @@ class Autopilot:
             self.tell(dialect.MAVLink_attitude_quaternion_message(boot_ms, *q_wxyz, 0, 0, rate_radps), now_ns)
 
     def gimbal(self, k_ms: int, pan_rad: float, device_id: int = 0) -> None:
-        """Level, in the earth's frame."""
+        """One that the autopilot speaks for."""
         now_ns = BEGIN_NS + k_ms * MS
-        q_wxyz = [np.cos(0.5 * pan_rad), 0.0, 0.0, np.sin(0.5 * pan_rad)]
-        status = dialect.MAVLink_gimbal_device_attitude_status_message
-        self.tell(status(0, 0, now_ns // MS, 64, q_wxyz, 0, 0, 0, 0, 0.0, 0.0, device_id), now_ns)
+        self.tell(gimbal_status(now_ns // MS, pan_rad, device_id), now_ns)
+
+
+def gimbal_status(boot_ms: int, pan_rad: float, device_id: int = 0) -> Any:
+    """Level, in the earth's frame."""
+    q_wxyz = [np.cos(0.5 * pan_rad), 0.0, 0.0, np.sin(0.5 * pan_rad)]
+    status = dialect.MAVLink_gimbal_device_attitude_status_message
+    return status(0, 0, boot_ms, 64, q_wxyz, 0, 0, 0, 0, 0.0, 0.0, device_id)
 
 
 def seen(rng: np.random.Generator) -> Estimate:
@@ -185,6 +190,20 @@ def test_a_gimbal_that_slews_is_no_jump() -> None:
             autopilot.gimbal(k_ms, 2.0 * np.sin(4.0 * k_ms / 1000))  # 8 rad/s at most
     assert autopilot.station.counters["gimbal_jumps"] == 0
     assert autopilot.own_ship.at(BEGIN_NS + 2999 * MS) is not None
+
+
+def test_a_gimbal_with_a_clock_of_its_own_is_known_again_as_soon_as_it_has_rebooted() -> None:
+    autopilot, device, known = Autopilot(gimballed=True), MAVLink(None, srcSystem=1, srcComponent=154), 0
+    for k_ms in range(1500):
+        autopilot.attitude(k_ms)
+        now_ns, up_ms = BEGIN_NS + k_ms * MS, k_ms if k_ms < 700 else k_ms - 900
+        if k_ms % 20 == 11 and not 700 <= k_ms < 900:
+            status = gimbal_status(500_000 * (k_ms < 700) + up_ms, 0.3)
+            autopilot.station.take(FrameReader(datagram=True).feed(status.pack(device)), 0, now_ns)
+        if k_ms > 1000 and (own := autopilot.own_ship.at(now_ns)) is not None:
+            assert own.R_body_gimbal is not None
+            known += np.arctan2(own.R_body_gimbal[1, 0], own.R_body_gimbal[0, 0]) == pytest.approx(0.3)
+    assert known == 499
 
 
 @pytest.mark.parametrize("apart_deg", [5.0, 15.0, 60.0])
