@@ -262,12 +262,15 @@ def test_an_attitude_that_the_autopilot_holds_to_be_unhealthy_is_not_used_until_
         hear(own_ship, peer, Rotation.identity())
         peer.send(status(ahrs))  # another sensor's failure is the autopilot's affair
         peer.send(status(gyro, enabled=gyro))  # it estimates none
-        hear(own_ship, peer, Rotation.identity())
-        assert "refused_unhealthy" not in link.counters()
-        peer.send(status(gyro))
 
         def tell() -> None:
             peer.attitude(Rotation.identity())
+
+        peer.settle(lambda: link.counters().get("received_SYS_STATUS") == 2, "both states")
+        before = link.counters()["received_ATTITUDE_QUATERNION"]
+        peer.settle(lambda: link.counters()["received_ATTITUDE_QUATERNION"] >= before + 3, "attitudes", tell)
+        assert "refused_unhealthy" not in link.counters()
+        peer.send(status(gyro))
 
         def says_so(message: Any) -> bool:
             return message.get_type() == "STATUSTEXT" and message.text.startswith(
@@ -275,7 +278,9 @@ def test_an_attitude_that_the_autopilot_holds_to_be_unhealthy_is_not_used_until_
             )
 
         assert peer.until(says_so, "text", tell).severity == dialect.MAV_SEVERITY_WARNING
-        peer.settle(lambda: link.counters().get("refused_unhealthy", 0) >= 3, "refusals", tell)
+        refused = link.counters().get("refused_unhealthy", 0)
+        peer.settle(lambda: link.counters().get("refused_unhealthy", 0) >= refused + 10, "refusals", tell)
         assert own_ship.at(time.monotonic_ns()) is None
+        assert sum(map(says_so, peer.received)) == 1
         peer.send(status(ahrs | gyro))
         hear(own_ship, peer, Rotation.identity())

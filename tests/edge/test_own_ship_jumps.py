@@ -29,9 +29,10 @@ R_CAM_TARGET = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 class Autopilot:
     """Its messages, at their times, to a station."""
 
-    def __init__(self, gimballed: bool = False) -> None:
+    def __init__(self, gimballed: bool = False, gimbal_id: int | None = None) -> None:
         self.own_ship = OwnShipBuffer(gimballed)
-        self.station = Station(MavlinkSettings(), self.own_ship, CAMERA, RequestQueue())
+        settings = MavlinkSettings(gimbal_component_id=gimbal_id)
+        self.station = Station(settings, self.own_ship, CAMERA, RequestQueue())
         self.ahead_ms, self.attitude_ms = 0, 20  # of its clock; between two attitudes
         self.numbers = self.answers = True  # its messages, TIMESYNC
         self._mav = MAVLink(None, srcSystem=1, srcComponent=1)
@@ -180,6 +181,7 @@ def test_a_gimbal_that_jumps_points_nowhere_until_it_has_come_to_rest(lasts_ms: 
     assert len(before) > 1400
     assert len(after) > 1400
     assert min(k_ms for k_ms, _ in known_rad if k_ms > 2010) > 2290
+    assert autopilot.station.counters["gimbal_jumps"] == (2 if lasts_ms < 1000 else 1)
 
 
 def test_a_gimbal_that_slews_is_no_jump() -> None:
@@ -190,6 +192,23 @@ def test_a_gimbal_that_slews_is_no_jump() -> None:
             autopilot.gimbal(k_ms, 2.0 * np.sin(4.0 * k_ms / 1000))  # 8 rad/s at most
     assert autopilot.station.counters["gimbal_jumps"] == 0
     assert autopilot.own_ship.at(BEGIN_NS + 2999 * MS) is not None
+
+
+@pytest.mark.parametrize("chosen", [None, 2])
+def test_the_camera_s_gimbal_is_the_configured_one_else_the_first_until_it_is_silent(chosen: int | None) -> None:
+    autopilot, known_rad = Autopilot(gimballed=True, gimbal_id=chosen), []
+    for k_ms in range(2000):
+        autopilot.attitude(k_ms)
+        if k_ms % 20 == 4 and k_ms < 500:
+            autopilot.gimbal(k_ms, 0.3, device_id=1)
+        if k_ms % 20 == 9:
+            autopilot.gimbal(k_ms, 0.9, device_id=2)
+        if k_ms > 100 and (own := autopilot.own_ship.at(BEGIN_NS + k_ms * MS)) is not None:
+            assert own.R_body_gimbal is not None
+            known_rad.append((k_ms, np.arctan2(own.R_body_gimbal[1, 0], own.R_body_gimbal[0, 0])))
+    for k_ms, pan_rad in known_rad:
+        assert pan_rad == pytest.approx(0.3 if chosen is None and k_ms < 1400 else 0.9)
+    assert {100 * (k_ms // 100) for k_ms, _ in known_rad} >= {200, 300, 400, 1600, 1700, 1800, 1900}
 
 
 def test_a_gimbal_with_a_clock_of_its_own_is_known_again_as_soon_as_it_has_rebooted() -> None:
