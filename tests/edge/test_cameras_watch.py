@@ -17,7 +17,7 @@ import pytest
 
 from edge.cameras.capture import FROZEN_TOLD_NS, JUMPS_TOLD_S, Capture
 from edge.cameras.folder import FolderSource, list_pictures
-from edge.cameras.source import EndOfStream
+from edge.cameras.source import EndOfStream, SourceLost
 from edge.cameras.watch import FrameWatch, StampWatch
 from edge.config_camera import FolderCamera
 from edge.errors import InputError
@@ -238,6 +238,34 @@ def test_a_camera_whose_clock_is_set_is_told_of_while_it_gives_frames(delay_s: f
     finally:
         capture.stop()
     assert kind in kinds
+
+
+class Unplugged(Numbered):
+    """While it is, its pictures end with the one that is read just now."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gone = threading.Event()
+
+    def read(self, stop: threading.Event) -> Frame:
+        if self.gone.is_set():
+            raise SourceLost("unplugged")
+        return super().read(stop)
+
+
+def test_a_camera_is_told_as_lost_until_it_gives_frames_again() -> None:
+    source = Unplugged()
+    capture = Capture(source, True)
+    capture.start()
+    try:
+        source.gone.set()
+        source.show(0, 0)
+        until(lambda: [reason.text for reason in capture.reasons(0)] == ["camera lost: unplugged"], what="the loss")
+        source.gone.clear()
+        source.show(1, 1)
+        until(lambda: capture.reasons(0) == (), what="its return")
+    finally:
+        capture.stop()
 
 
 class Jumping(FolderSource):

@@ -135,9 +135,11 @@ def test_a_target_to_follow_is_as_sure_across_and_in_height_as_its_track() -> No
         {"covariance_ned": np.full((9, 9), np.nan)},
         {"t_ned_target_m": np.array([np.nan, 0.0, 0.0])},
         {"v_ned_target_mps": np.full(3, np.inf)},
+        {"R_ned_target": np.full((3, 3), np.nan)},
         {"t_cam_target_m": np.array([1.0, 0.0, -200.0])},
+        {"box_xyxy_px": np.array([np.nan, 480.0, 1080.0, 500.0])},
     ],
-    ids=["covariance in ned", "place in ned", "velocity in ned", "behind the camera"],
+    ids=["covariance in ned", "place in ned", "velocity in ned", "attitude in ned", "behind the camera", "box"],
 )
 def test_a_track_that_cannot_be_is_not_sent(spoilt: dict[str, Any]) -> None:
     whole, broken = make_track(NOW_NS), make_track(NOW_NS, track_id=1, **spoilt)
