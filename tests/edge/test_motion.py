@@ -60,6 +60,30 @@ def test_errors_grow_as_the_motion_itself_carries_them(own_ship: OwnShip, dt_ms:
     assert np.all(np.linalg.eigvalsh(without)[1 if begun.kind != "ned" else 0 :] > 0.0)
 
 
+def test_errors_grow_in_many_steps_as_in_one() -> None:
+    begun = ekf.begin(seen_at([5.0, -3.0, 250.0]), K, View.of(0, RELATIVE, LOOKING_NORTH))
+    at_once = steps = replace(begun, v_mps=np.array([12.0, -20.0, 3.0]))
+    for step in range(1, 31):
+        steps = ekf.propagate(steps, step * 33 * MS)
+    at_once = ekf.propagate(at_once, 990 * MS)
+    np.testing.assert_allclose(steps.t_m, at_once.t_m)
+    np.testing.assert_allclose(steps.P, at_once.P, rtol=1e-9, atol=1e-9)
+
+
+def test_where_it_was_not_detected_a_target_is_as_sure_as_that_frame_s_attitude_and_its_speed_as_its_range() -> None:
+    """0.1 rad are 25 m at 250 m; a range known within 9 %, in all frames alike, leaves as much of the speed unknown."""
+    begun = ekf.begin(seen_at([0.0, 0.0, 250.0]), K, View.of(0, STILL, LOOKING_NORTH))
+    flying = ekf.propagate(replace(begun, v_mps=np.array([50.0, 0.0, 0.0]), P=np.zeros((7, 7))), 1)
+    exact, vague = (View.of(1, replace(STILL, attitude_std_rad=std), LOOKING_NORTH) for std in (0.0, 0.1))
+    more = ekf.covariance_in_cam(flying, vague) - ekf.covariance_in_cam(flying, exact)
+    np.testing.assert_allclose(more, np.diag([625.0, 625.0, 0.0]), atol=1e-6)
+    share2 = 0.8 * (0.1**2 + 0.01**2)  # what frames have in common of the network's variance and the model's
+    told = ekf.covariance(flying, exact)
+    np.testing.assert_allclose(
+        told[[0, 0, 3], [0, 3, 3]], share2 * np.array([250.0**2, 250.0 * 50.0, 50.0**2]), rtol=0.01
+    )
+
+
 @pytest.mark.parametrize(("aside_m", "moved_m"), [(5.0, 2.5), (20.0, 6.8), (40.0, 4.6)])
 def test_what_is_seen_far_beside_where_it_was_expected_moves_a_track_little(aside_m: float, moved_m: float) -> None:
     """Both are sure within 3 m, so the middle is taken; beyond chi-square's 99 % (11.34 for three degrees of freedom)
