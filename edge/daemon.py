@@ -231,6 +231,7 @@ class Pipeline:
         if replaced:
             new.estimator.refused.update(self._estimator.refused)
         self._estimator, self._board.model, self._board.file = new.estimator, new.estimator.model, new.file
+        self._reloader.switched()
         self._attention.acquire_every_n = new.file.config.estimator.acquire_every_n
         self._estimator.target_size = new.file.config.target.size()
         self.supervisor.apply(new.file.config.health)

@@ -124,7 +124,7 @@ class Reloader:
     def __init__(self) -> None:
         self._asked = False
         self._ready: Reloaded | None = None
-        self._taken = threading.Event()
+        self._switched = threading.Event()
         self._flown: tuple[ConfigFile, Estimator] | None = None  # what is in use, for the thread that begins
         self._thread: threading.Thread | None = None  # of the reload in progress
         self._lock = threading.Lock()
@@ -146,19 +146,23 @@ class Reloader:
     def take(
         self, flying: ConfigFile, estimator: Estimator, camera: CameraInfo, event: Callable[[int, str], None]
     ) -> Reloaded | None:
-        """To be called in every iteration of the loop: start a requested reload, return a finished one. Never waits."""
+        """To be called in every iteration of the loop: start a requested reload, return a finished one, after which
+        `switched` is to be called. Never waits."""
         if (ready := self._ready) is not None:  # only then is it emptied: the thread may be filling it just now
             self._ready = None
-            self._taken.set()
             return ready
         if self._asked and self._thread is None:
             self._asked = False
-            self._taken.clear()
+            self._switched.clear()
             # Not as arguments: a thread holds its arguments until it ends.
             self._flown = (flying, estimator)
             self._thread = threading.Thread(target=self._work, args=(camera, event), name="reload", daemon=True)
             self._thread.start()
         return None
+
+    def switched(self) -> None:
+        """The loop has the estimator that `take` returned, and none of before."""
+        self._switched.set()
 
     def _work(self, camera: CameraInfo, event: Callable[[int, str], None]) -> None:
         assert self._flown is not None
@@ -177,7 +181,7 @@ class Reloader:
             outcome, self._ready = ready.outcome, ready
             del ready
             # The old estimator is released in this thread, after the loop has the new one: freeing memory takes time.
-            self._taken.wait()
+            self._switched.wait()
         del estimator
         return_memory()
         with self._lock:

@@ -281,7 +281,9 @@ def test_a_request_that_comes_during_a_reload_is_obeyed_after_it_and_each_once(
     reloader, done = Reloader(), list[Reloaded]()
 
     def turn() -> None:
-        done.extend(one for one in [reloader.take(flown, estimator, camera, lambda *_: None)] if one is not None)
+        if (made := reloader.take(flown, estimator, camera, lambda *_: None)) is not None:
+            done.append(made)
+            reloader.switched()
         assert at_work() <= 1
 
     for _ in range(2):  # the first is at work until the loop has taken what it made
@@ -302,7 +304,8 @@ def test_a_reload_that_fails_as_nobody_foresaw_is_told_of_and_the_next_is_carrie
     reloader, told, events = Reloader(), list[ReloadOutcome](), list[tuple[int, str]]()
 
     def turn(camera: CameraInfo) -> None:
-        reloader.take(flown, estimator, camera, lambda *said: events.append(said))
+        if reloader.take(flown, estimator, camera, lambda *said: events.append(said)) is not None:
+            reloader.switched()
 
     no_memory_holds_it = replace(camera, image_size_wh=(10**9, 10**9))
     assert reloader.ask_for(told.append)
@@ -344,6 +347,36 @@ def test_what_is_taken_over_is_flown_by(tmp_path: Path, gated: Gated, stepped: i
     (said,) = [(level, text) for level, text in ear.events if text.startswith("reloaded: ")]
     assert said[0] == logging.INFO
     assert "taken over: [estimator] acquire_every_n, [health] no_frame_s" in said[1]
+
+
+def test_the_old_model_is_let_go_only_after_the_loop_flies_the_new_one(
+    tmp_path: Path, gated: Gated, toy_model: Path, swaying: Path, port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the loop would free it, which takes time, and its memory would not be returned for ten minutes."""
+    another = write_toy_model(tmp_path / "another.onnx", name="another")
+    flown, switching_s = list[str](), sys.getswitchinterval()
+    with looping(gated) as (loop, _, _):
+        take = loop._reloader.take
+
+        def take_and_be_interrupted(*flying: Any) -> Reloaded | None:
+            new = take(*flying)
+            for _ in range(0 if new is None else 2_000_000):
+                pass
+            return new
+
+        monkeypatch.setattr(loop._reloader, "take", take_and_be_interrupted)
+        monkeypatch.setattr("edge.reload.return_memory", lambda: flown.append(loop._estimator.model.contract.name))
+        loop._board.file = replace(loop._board.file, path=tmp_path / "config.toml")
+        sys.setswitchinterval(1e-6)
+        try:
+            for model in (another, toy_model, another):
+                (tmp_path / "config.toml").write_text(toml(swaying, model, port))
+                loop._reloader.ask()
+                before = len(flown)
+                until(lambda count=before: len(flown) > count, loop._take_reload)
+        finally:
+            sys.setswitchinterval(switching_s)
+    assert flown == ["another", "toy", "another"]
 
 
 def test_who_is_told_how_a_reload_went_may_ask_for_the_next_at_once(tmp_path: Path, toy_model: Path) -> None:
