@@ -71,10 +71,12 @@ def test_errors_grow_in_many_steps_as_in_one() -> None:
 
 
 def test_where_it_was_not_detected_a_target_is_as_sure_as_that_frame_s_attitude_and_its_speed_as_its_range() -> None:
-    """0.1 rad are 25 m at 250 m; a range known within 9 %, in all frames alike, leaves as much of the speed unknown."""
-    begun = ekf.begin(seen_at([0.0, 0.0, 250.0]), K, View.of(0, STILL, LOOKING_NORTH))
-    flying = ekf.propagate(replace(begun, v_mps=np.array([50.0, 0.0, 0.0]), P=np.zeros((7, 7))), 1)
-    exact, vague = (View.of(1, replace(STILL, attitude_std_rad=std), LOOKING_NORTH) for std in (0.0, 0.1))
+    """0.1 rad are 25 m at 250 m; a range known within 9 %, in all frames alike, leaves as much of the speed unknown.
+    Both are those relative to the own ship."""
+    own = replace(STILL, t_ned_body_m=np.array([900.0, 400.0, -80.0]), v_ned_body_mps=np.array([20.0, 0.0, 0.0]))
+    begun = ekf.begin(seen_at([0.0, 0.0, 250.0]), K, View.of(0, own, LOOKING_NORTH))
+    flying = ekf.propagate(replace(begun, v_mps=np.array([70.0, 0.0, 0.0]), P=np.zeros((7, 7))), 1)
+    exact, vague = (View.of(1, replace(own, attitude_std_rad=std), LOOKING_NORTH) for std in (0.0, 0.1))
     more = ekf.covariance_in_cam(flying, vague) - ekf.covariance_in_cam(flying, exact)
     np.testing.assert_allclose(more, np.diag([625.0, 625.0, 0.0]), atol=1e-6)
     share2 = 0.8 * (0.1**2 + 0.01**2)  # what frames have in common of the network's variance and the model's
