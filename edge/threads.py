@@ -28,6 +28,7 @@ THREADS = (
         "the loop",
         watched=True,
     ),
+    ThreadRow("windows", "runs its share of a frame's windows through the network", "anybody"),
     ThreadRow("zenoh", "sends the newest report, events, diagnostics, pictures", "the loop", watched=True),
     ThreadRow("closing", "when the daemon stops: closes the zenoh session, or is left with it", "anybody"),
     ThreadRow("recorder", "writes what goes out to disk", "the loop, the links", watched=True),

@@ -150,7 +150,7 @@ class Estimator:
         return places[: max(max(self._max_targets, PLACES_MOST) - len(known_boxes), 1)]
 
     def track(self, frame: Frame, boxes_xyxy_px: Sequence[Array], twice: Sequence[bool] = ()) -> list[Estimate | None]:
-        """For each expected box the target in the window around it, or None. One inference for all windows.
+        """For each expected box the target in the window around it, or None. One run of the model for all windows.
 
         Every other frame is evaluated mirrored, because the network's errors on an image and on its mirror image
         differ. `twice`, if given: which boxes are evaluated both ways in this frame.

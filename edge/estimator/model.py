@@ -38,6 +38,9 @@ OUTPUT_TAILS: dict[str, tuple[int, ...]] = {
 SIZE_STEP_PX = 32
 FREE_SIDES = ("W", "H")  # names of the graph's free input dimensions
 RUNS_REMEMBERED = 16
+# Images are shared out if that keeps the threads busy for so much of the time. At work on the same layers, two are busy
+# for 0.6 of it.
+BUSY_SHARE_MIN = 0.75
 _LOG_FATAL = 4
 NOT_CALIBRATED = "scores are not calibrated: what is probably no aircraft, such as a bird, is reported as well"
 
@@ -57,10 +60,15 @@ class Peaks:
 
 @dataclass(frozen=True)
 class Sessions:
-    """One file opened on one provider: for any input size, and for one fixed size each."""
+    """One file opened on one provider: for any input size, and for one fixed size each, by (width, height).
+
+    `single` is on one thread, for several images at once: each thread then runs its own, and none waits for the others
+    at every layer. Empty on other providers, and with one thread.
+    """
 
     free: ort.InferenceSession
-    fixed: Mapping[tuple[int, int], ort.InferenceSession]  # by (width, height)
+    fixed: Mapping[tuple[int, int], ort.InferenceSession]
+    single: Mapping[tuple[int, int], ort.InferenceSession]
     chosen: ChosenProvider  # what they really run on
 
 
@@ -71,12 +79,15 @@ class Model:
         self,
         sessions: Sessions,
         reopen: Callable[[ChosenProvider], Sessions],
+        threads: int,
         contract: ModelContract,
         path: Path,
         sha256: str,
     ) -> None:
         self._sessions = sessions
         self._reopen = reopen
+        self._threads = threads
+        self._beside = ThreadPoolExecutor(max(threads - 1, 1), thread_name_prefix="windows")
         self._runs_ns: deque[tuple[int, int]] = deque(maxlen=RUNS_REMEMBERED)
         self.contract = contract
         self.path = path
@@ -120,10 +131,16 @@ class Model:
 
     def infer(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
         """As `run`, untimed; raises ONNX Runtime's error where the provider fails."""
-        feeds = {"image": images_bgr, "K": K.astype(np.float32)}
-        sessions = self._sessions
-        session = sessions.fixed.get((images_bgr.shape[2], images_bgr.shape[1]), sessions.free)
-        return Peaks(*session.run(list(OUTPUT_NAMES), feeds))
+        sessions, size_wh = self._sessions, (images_bgr.shape[2], images_bgr.shape[1])
+        single = sessions.single.get(size_wh)
+        count, rounds = len(images_bgr), -(-len(images_bgr) // self._threads)
+        if single is None or count < BUSY_SHARE_MIN * rounds * self._threads:
+            return Peaks(*_outputs(sessions.fixed.get(size_wh, sessions.free), images_bgr, K))
+        at_once = min(count, self._threads)
+        shares = list(zip(np.array_split(images_bgr, at_once), np.array_split(K, at_once), strict=True))
+        others = [self._beside.submit(_outputs, single, *share) for share in shares[1:]]
+        parts = [_outputs(single, *shares[0]), *(other.result() for other in others)]
+        return Peaks(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
     def take_runs_ns(self) -> list[tuple[int, int]]:
         """Begin and end (monotonic) of the inferences since the last call, oldest first."""
@@ -132,13 +149,14 @@ class Model:
         return taken
 
     def warm_up(self) -> None:
-        """One inference at each size, and one of two windows in a batch, as there will be with two targets.
+        """One inference at each size, and of the windows' also two at once, as there will be with two targets, and as
+        many as there are threads if these share them out.
 
         Raises InputError if the graph does not run or its outputs have wrong shapes.
         """
         self._try(1, self.contract.acquire_size_wh)
         if self.contract.track_size_wh is not None:
-            for count in (1, 2):
+            for count in sorted({1, 2, self._threads} if self._sessions.single else {1, 2}):
                 self._try(count, self.contract.track_size_wh)
 
     def _try(self, count: int, size_wh: tuple[int, int]) -> None:
@@ -158,6 +176,11 @@ class Model:
                 raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
 
 
+def _outputs(session: ort.InferenceSession, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> list[Any]:
+    outputs: list[Any] = session.run(list(OUTPUT_NAMES), {"image": images_bgr, "K": K.astype(np.float32)})
+    return outputs
+
+
 def load_model(path: Path, threads: int, spinning: bool = False, provider: Provider = "cpu") -> Model:
     """Open an ONNX file and check it against the contract. Raises InputError with the file and what is wrong.
 
@@ -170,11 +193,11 @@ def load_model(path: Path, threads: int, spinning: bool = False, provider: Provi
     reopen = partial(_open_sessions, content, path, threads, spinning)
     sessions = reopen(choose_provider(provider, ort.get_available_providers()))
     contract = _contract(sessions.free, path)
-    return Model(sessions, reopen, contract, path, hashlib.sha256(content).hexdigest())
+    return Model(sessions, reopen, threads, contract, path, hashlib.sha256(content).hexdigest())
 
 
 def session_options(threads: int, spinning: bool) -> ort.SessionOptions:
-    """One inference at a time on `threads` threads, which sleep between inferences unless `spinning`."""
+    """Each inference on `threads` threads, which sleep between inferences unless `spinning`."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
@@ -192,17 +215,25 @@ def _open_sessions(content: bytes, path: Path, threads: int, spinning: bool, cho
         free, runs_on = opener.submit(_open, content, path, session_options(threads, spinning), chosen).result()
     contract = _contract(free, path)
     _check_graph(free, contract, path)
-    fixed = {}
-    if contract.track_size_wh is not None:
-        # With fixed dimensions, shapes are computed once, here. For the whole frame the gain is too small to be worth
-        # the memory of another session.
-        options = session_options(threads, spinning)
-        for name, side in zip(FREE_SIDES, contract.track_size_wh, strict=True):
-            options.add_free_dimension_override_by_name(name, side)
-        fixed[contract.track_size_wh], too = _open(content, path, options, runs_on)
-        if too != runs_on:  # as where a device has memory for one session only: both then run on the next one
-            return _open_sessions(content, path, threads, spinning, too)
-    return Sessions(free, fixed, runs_on)
+    if contract.track_size_wh is None:
+        return Sessions(free, {}, {}, runs_on)
+    # With fixed dimensions, shapes are computed once, here. For the whole frame the gain is too small to be worth the
+    # memory of another session.
+    fixed, too = _open(content, path, _sized_options(contract.track_size_wh, threads, spinning), runs_on)
+    if too != runs_on:  # as where a device has memory for one session only: both then run on the next one
+        return _open_sessions(content, path, threads, spinning, too)
+    single = {}
+    if threads > 1 and runs_on.provider == "cpu":
+        options = _sized_options(contract.track_size_wh, 1, spinning)
+        single[contract.track_size_wh], _ = _open(content, path, options, runs_on)
+    return Sessions(free, {contract.track_size_wh: fixed}, single, runs_on)
+
+
+def _sized_options(size_wh: tuple[int, int], threads: int, spinning: bool) -> ort.SessionOptions:
+    options = session_options(threads, spinning)
+    for name, side in zip(FREE_SIDES, size_wh, strict=True):
+        options.add_free_dimension_override_by_name(name, side)
+    return options
 
 
 def _open(
