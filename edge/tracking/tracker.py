@@ -1,8 +1,9 @@
 """From single-frame estimates to tracks: association, track initiation and deletion, prediction for the next frame.
 
-A target is tentative until it was detected CONFIRM_HITS times, coasts on prediction when missed, and is lost after
-COAST_MAX_S; its number is then free. An estimate that stays outside the gate but inside the target's box replaces it
-after PERSISTENT frames. Of two targets that took turns at one aircraft for long (`doubles.py`), one is deleted.
+A target is tentative until it was detected CONFIRM_HITS times, or SURE_HITS times with little doubt, coasts on
+prediction when missed, and is lost after COAST_MAX_S; its number is then free. An estimate that stays outside the gate
+but inside the target's box replaces it after PERSISTENT frames. Of two targets that took turns at one aircraft for long
+(`doubles.py`), one is deleted.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from edge.tracking.view import NS_PER_S, View, between
 from edge.types import Array, Estimate, Mount, OwnShip, Track, TrackState
 
 CONFIRM_HITS = 3
+SURE_HITS = 2  # are enough if the score is at least SURE_SCORE: birds have been taken for aircraft, but not so surely
+SURE_SCORE = 0.95
 TENTATIVE_MISSES = 2  # in a row: deleted
 COAST_MAX_S = 2.0
 PERSISTENT = 6  # frames
@@ -109,7 +112,9 @@ class Tracker:
         """If there is no free slot, delete a target that was missed or is least certain; the slot is reserved for
         `wanted` if the next update contains it."""
         if len(self._targets) >= self.max_targets:
-            self._targets.remove(min(self._targets, key=lambda t: (t.measured_ns, t.hits >= CONFIRM_HITS, t.score)))
+            self._targets.remove(
+                min(self._targets, key=lambda t: (t.measured_ns, t.state is not TrackState.TENTATIVE, t.score))
+            )
             self._wanted = wanted
 
     def is_late(self, capture_ns: int) -> bool:
@@ -130,7 +135,7 @@ class Tracker:
         """Update with the estimates of the frame taken at `capture_ns`, not `is_late`; returns all tracks, by track_id.
 
         `chosen_id`: the target that the operator selected. `doubtful_below`: a target of a lower score gives way, if
-        there is no free slot, to an estimate that is not below.
+        there is no free slot, to an estimate that is not below; 0: scores are no probabilities.
         """
         view = View.of(capture_ns, own_ship, self.mount, self._view)
         # Before association: after a gap a prediction is so uncertain that any detection would fit it.
@@ -164,6 +169,8 @@ class Tracker:
         for i, target in enumerate(self._targets):
             if i not in hit and not _taken_over(target, spare, lens, view):
                 _miss(target)
+            elif target.state is TrackState.COASTING or _proven(target, doubtful_below > 0.0):
+                target.state = TrackState.CONFIRMED
         double = self._double(pairs, bool(spare), chosen_id, capture_ns)
         self._targets = [t for t in self._targets if t.track_id != double and _alive(t, lens, view, image_size_wh)]
         self._give_birth(spare, lens, view, chosen_id, doubtful_below)
@@ -293,8 +300,12 @@ def _seen(target: Target, estimate: Estimate, lens: Lens, view: View) -> None:
     target.hits += 1
     target.misses = 0
     target.position_disagreements = 0
-    if target.state is TrackState.COASTING or target.hits >= CONFIRM_HITS:
-        target.state = TrackState.CONFIRMED
+
+
+def _proven(target: Target, probabilities: bool) -> bool:
+    """`probabilities`: whether scores are such."""
+    sure = probabilities and target.hits >= SURE_HITS and target.score >= SURE_SCORE
+    return sure or target.hits >= CONFIRM_HITS
 
 
 def _miss(target: Target) -> None:

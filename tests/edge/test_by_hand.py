@@ -61,7 +61,7 @@ def test_stopping_drops_the_target_and_drawing_a_box_takes_it_up_again(tmp_path:
             peer.command(2010)
             assert peer.named("COMMAND_ACK").result == dialect.MAV_RESULT_ACCEPTED
             status_in(peer, IDLE)
-            # Unasked, it would be confirmed again after three frames.
+            # Unasked, it would soon be confirmed again.
             for _ in range(10):
                 assert peer.named("CAMERA_TRACKING_IMAGE_STATUS").tracking_status == IDLE
             left, top = (CENTER_PX[0] - 80) / SIZE_WH[0], (CENTER_PX[1] - 60) / SIZE_WH[1]

@@ -121,21 +121,33 @@ def test_a_track_lives_through_gaining_and_losing_own_attitude_and_position() ->
             assert np.abs(across).max() * K[0, 0] < 25.0
 
 
-def test_states_follow_what_is_seen() -> None:
+@pytest.mark.parametrize(("score", "doubtful_below", "proof"), [(0.9, 0.8, 3), (0.96, 0.8, 2), (0.96, 0.0, 3)])
+def test_states_follow_what_is_seen(score: float, doubtful_below: float, proof: int) -> None:
+    """Scores that are no probabilities, without a limit of doubt, prove nothing sooner."""
     tracker = Tracker(4, FORWARD)
     states = []
     lost_at_ns = None
     last_seen_ns = 0
     for i, now in enumerate(flight(9, frames=120)):
-        tracks = update(tracker, now, "ned", None if i < 10 else [])
+        seen_now = [replace(now.estimate, score=score)] if i < 10 else []
+        tracks = tracker.update(now.time_ns, seen_now, now.own_ship, K, SIZE_WH, doubtful_below=doubtful_below)
         states.append(tracks[0].state if tracks else None)
         last_seen_ns = now.time_ns if i < 10 else last_seen_ns
         if not tracks and lost_at_ns is None:
             lost_at_ns = now.time_ns
-    assert states[:4] == [TrackState.TENTATIVE, TrackState.TENTATIVE, TrackState.CONFIRMED, TrackState.CONFIRMED]
+    assert states[:10] == [TrackState.TENTATIVE] * (proof - 1) + [TrackState.CONFIRMED] * (11 - proof)
     assert states[10] is TrackState.COASTING
     assert lost_at_ns is not None
     assert COAST_MAX_S < (lost_at_ns - last_seen_ns) / 1e9 < COAST_MAX_S + 0.1
+
+
+@pytest.mark.parametrize("scores", [(0.99, 0.6), (0.6, 0.99), (0.94, 0.94)])
+def test_two_sights_of_which_one_is_unsure_prove_no_target(scores: tuple[float, float]) -> None:
+    tracker = Tracker(4, FORWARD)
+    for now, score in zip(flight(9, frames=2), scores, strict=True):
+        seen_now = [replace(now.estimate, score=score)]
+        (track,) = tracker.update(now.time_ns, seen_now, now.own_ship, K, SIZE_WH, doubtful_below=0.8)
+        assert track.state is TrackState.TENTATIVE
 
 
 @pytest.mark.parametrize("kind", ["ned", "cam"])

@@ -97,16 +97,19 @@ def test_a_model_whose_scores_were_not_calibrated_tells_its_targets_all_the_same
     assert len(answers[-1].poses) == 1
 
 
-@pytest.mark.parametrize(("score", "sent"), [(0.6, False), (0.9, True)])
+@pytest.mark.parametrize(
+    ("score", "sent"),
+    [(0.6, [False, False, False, False]), (0.9, [False, False, True, True]), (0.97, [False, True, True, True])],
+)
 def test_a_track_is_told_where_its_score_is_high_enough_to_be_sent(
-    tmp_path: Path, dark_spot_model: Path, score: float, sent: bool
+    tmp_path: Path, dark_spot_model: Path, score: float, sent: list[bool]
 ) -> None:
     write_scene(tmp_path / "data" / "test" / "000000", [0.5] * 4)
     model = Path(shutil.copy(dark_spot_model, tmp_path))
     always = ScoreCalibration(offset=float(np.log(score / (1.0 - score))), slope=1e-6, size_slope=0.0)
     calibrated = {"acquire_score": always, "track_score": always}
     write_contract(model, read_contract(model).model_copy(update=calibrated))
-    assert told(flown(tmp_path / "data", model)) == [False, False, sent, sent]
+    assert told(flown(tmp_path / "data", model)) == sent
 
 
 def test_a_rotation_that_no_link_would_tell_is_not_known(
