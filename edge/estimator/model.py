@@ -149,14 +149,14 @@ class Model:
         return taken
 
     def warm_up(self) -> None:
-        """One inference at each size, and of the windows' also two at once, as there will be with two targets, and as
-        many as there are threads if these share them out.
+        """One inference at each size, and of two windows at once, as there will be with two targets; where windows are
+        shared out, also of two for each thread.
 
         Raises InputError if the graph does not run or its outputs have wrong shapes.
         """
         self._try(1, self.contract.acquire_size_wh)
         if self.contract.track_size_wh is not None:
-            for count in sorted({1, 2, self._threads} if self._sessions.single else {1, 2}):
+            for count in (1, 2, 2 * self._threads) if self._sessions.single else (1, 2):
                 self._try(count, self.contract.track_size_wh)
 
     def _try(self, count: int, size_wh: tuple[int, int]) -> None:
@@ -167,7 +167,7 @@ class Model:
         try:
             peaks = self.run(images, np.stack([K] * count))
         except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
-            pictures = "" if count == 1 else f" with {count} pictures at once"
+            pictures = "" if count == 1 else " with several pictures at once"
             reason = " ".join(str(error).split())
             raise InputError(f"model {self.path} does not run at {width}x{height}{pictures}: {reason}") from error
         for name, tail in OUTPUT_TAILS.items():

@@ -116,7 +116,7 @@ def test_a_model_that_does_not_do_is_named(cli: Cli, tmp_path: Path, text: str, 
         (tmp_path / "none.onnx", "No such file"),
         (corrupt, "not a loadable ONNX file"),
         (strange, "contract version 99"),
-        (single, "does not run at 256x256 with 2 pictures at once"),
+        (single, "does not run at 256x256 with several pictures at once"),
     ):
         sentence = refusal(cli, tmp_path, text.replace(str(toy_model), str(path)) + OFF, command)
         assert sentence.startswith("config.toml:6: [model] path: ")

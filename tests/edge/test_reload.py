@@ -130,7 +130,7 @@ def test_what_is_wrong_changes_nothing_and_is_named(flight: Flight, tmp_path: Pa
     for text, words in (
         (good.replace(str(model), str(torn)), "[model] path: model"),
         (good.replace(str(model), str(other)), "contract version 99"),
-        (good.replace(str(model), str(single)), "with 2 pictures at once"),
+        (good.replace(str(model), str(single)), "with several pictures at once"),
         (good.replace(str(model), str(backwards)), "contract key trained_box_px: takes two numbers above 0"),
         (good.replace(str(model), str(tmp_path / "none.onnx")), "No such file"),
         (good + "[health]\nmood = 3\n", "[health] mood: unknown key"),
