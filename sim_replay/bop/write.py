@@ -76,11 +76,12 @@ class SceneWriter:
     def close(self) -> None:
         """Write scene_camera.json, scene_gt.json and scene_gt_info.json for the frames so far."""
         frames = sorted(self._frames, key=lambda frame: frame.image_id)
-        _write_lines(self.folder / "scene_camera.json", {f.image_id: _camera_entry(f) for f in frames})
-        _write_lines(self.folder / "scene_gt.json", {f.image_id: [_pose_entry(t) for t in f.targets] for f in frames})
+        # The cameras last: a frame that they list and the poses do not, as after a kill in between, shows no target.
         _write_lines(
             self.folder / "scene_gt_info.json", {f.image_id: [_info_entry(t) for t in f.targets] for f in frames}
         )
+        _write_lines(self.folder / "scene_gt.json", {f.image_id: [_pose_entry(t) for t in f.targets] for f in frames})
+        _write_lines(self.folder / "scene_camera.json", {f.image_id: _camera_entry(f) for f in frames})
 
 
 def write_picture(path: Path, pixels: NDArray[np.uint8], how: Sequence[int]) -> None:

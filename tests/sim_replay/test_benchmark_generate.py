@@ -208,11 +208,14 @@ def test_killed_and_resumed_by_more_workers_it_has_the_same_bytes(preset: Path, 
     words = [*PROGRAM, "--preset", str(preset), "--out", str(out), "--seed", "3", "--workers", "2"]
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
     _wait_for(out / "train" / "000000" / "rgb" / "000001.jpg", process)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.send_signal(signal.SIGKILL)
     process.wait()
-    # What was finished is readable, whatever the instant.
+    until(lambda: not any(_runs(int(child)) for child in children), what="its workers to end")
+    # What was finished is readable and has its labels, whatever the instant.
     scene = read_scene(out / "train" / "000000")
     assert len(scene.frames) >= 1
+    assert all(frame.targets for frame in scene.frames)
     assert all(scene.image_bgr(frame).shape == (270, 480, 3) for frame in scene.frames)
     assert _generate(preset, out) == 2  # not without --resume
     assert _generate(preset, out, "--resume", "--workers", "2") == 0
