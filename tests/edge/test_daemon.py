@@ -82,7 +82,7 @@ def flying(tmp_path: Path, text: str) -> Iterator[tuple[subprocess.Popen[str], l
 def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(
     tmp_path: Path, scene: Path, toy_model: Path
 ) -> None:
-    start_ns = time.monotonic_ns() + 8_000_000_000
+    start_ns = time.monotonic_ns() + 12_000_000_000
     utc_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
     endpoint = free_endpoint()
     links = f'[zenoh]\nlisten = ["{endpoint}"]\n[mavlink]\nenabled = false\n'
