@@ -29,7 +29,7 @@ def test_own_attitude_is_stamped_with_the_time_it_was_measured() -> None:
         # It arrives 200 ms after it was measured, as over a slow link.
         peer.attitude(turning, stamp_ms)
         peer.settle(lambda: own_ship.at(measured_ns + 2_000_000) is not None, "attitude")
-        assert own_ship.at(measured_ns - 10_000_000) is None, "not before it was measured"
+        assert own_ship.at(measured_ns - 100_000_000) is None, "not before it was measured"
         assert own_ship.at(measured_ns + 160_000_000) is None, "not by the time it arrived"
         now = own_ship.at(measured_ns + 2_000_000)
         assert now is not None
