@@ -99,10 +99,10 @@ def test_a_subscriber_receives_true_poses_stamped_with_their_exposure(
         assert daemon.wait(timeout=60) == 0  # the recording is over, and so is the daemon
         assert daemon.stderr is not None
         words = daemon.stderr.read()
-    assert len(frames) >= 3  # a machine that stands still now and then drops most
     np.testing.assert_allclose(frames, np.round(frames), atol=0.1)
     assert max(errors_m) < 0.03
     counted = {name: int(count) for name, count in re.findall(r"(\w+)=(\d+)", words.partition("stopped: ")[2])}
+    assert len(frames) > counted["captured"] // 8  # which come too late on a busy machine are withheld
     # On a machine that is busy some are missed, and say so.
     assert counted["captured"] <= FRAMES <= counted["captured"] + counted.get("dropped", 0)
 

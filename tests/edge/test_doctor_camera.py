@@ -49,7 +49,7 @@ class Driver:
 
     def __init__(self, given_hz: float, utc: bool, torn_every: int) -> None:
         self._given_hz, self._utc, self._torn_every = given_hz, utc, torn_every
-        self._grabbed = 0
+        self._grabbed, self._taken_ms = 0, 0.0
 
     def __call__(self, device: str, api: int) -> Driver:
         return self
@@ -62,12 +62,11 @@ class Driver:
 
     def get(self, prop: int) -> float:
         size = {cv2.CAP_PROP_FRAME_WIDTH: pictures.SIZE_WH[0], cv2.CAP_PROP_FRAME_HEIGHT: pictures.SIZE_WH[1]}
-        if prop == cv2.CAP_PROP_POS_MSEC:
-            return time.time() * 1e3 if self._utc else time.monotonic() * 1e3 - 1
-        return size.get(prop, 0.0)
+        return self._taken_ms if prop == cv2.CAP_PROP_POS_MSEC else size.get(prop, 0.0)
 
     def grab(self) -> bool:
         time.sleep(1 / self._given_hz)
+        self._taken_ms = time.time() * 1e3 if self._utc else time.monotonic() * 1e3
         self._grabbed += 1
         return True
 
