@@ -23,7 +23,7 @@ class Looked:
     """What was found in a frame."""
 
     estimates: list[Estimate]
-    pointed_at: Estimate | None = None  # of these, the one in the box that was pointed at
+    there: Estimate | None = None  # of these, the one in the box that was pointed at
 
 
 class Attention:

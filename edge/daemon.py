@@ -202,10 +202,10 @@ class Pipeline:
     ) -> list[Estimate]:
         searches = self._by_hand.searches(frame.meta.capture_ns)
         looked = self._attention.look(self._estimator, frame, expected, clock, searches=searches, pointed_at=pointed_at)
-        if looked.pointed_at is not None:
-            self._by_hand.found(looked.pointed_at)
-            if not lies_on(looked.pointed_at.box_xyxy_px, [track.box_xyxy_px for track in expected]):
-                self._tracker.make_room(looked.pointed_at)  # a tracked target has its slot already
+        if looked.there is not None:
+            self._by_hand.found(looked.there)
+            if not lies_on(looked.there.box_xyxy_px, [track.box_xyxy_px for track in expected]):
+                self._tracker.make_room(looked.there)  # a tracked target has its slot already
         return looked.estimates
 
     def _publish(
