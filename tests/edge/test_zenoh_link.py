@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
@@ -21,12 +17,10 @@ from scipy.spatial.transform import Rotation
 from edge import clock
 from edge.config import ZenohSettings
 from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles, Reason
-from edge.links.errors import LinkError
 from edge.links.zenoh_link import ZenohLink
 from edge.types import Mount, TrackState
 from msgs import topics
 from msgs.client import connect, subscribe, subscribe_all
-from msgs.session import router_config
 from sim_replay.ports import free_endpoint
 from tests.waiting import until
 
@@ -328,21 +322,6 @@ def test_health_arrives_as_diagnostics() -> None:
     )
 
 
-def test_the_ground_may_come_later_than_the_daemon_and_come_again() -> None:
-    ground = free_endpoint()
-    with linked(free_endpoint(), connect=[ground]) as link:
-        for _ in range(2):
-            with zenoh.open(router_config([ground])) as router:
-                came = threading.Event()
-                handler = zenoh.handlers.Callback(lambda _, came=came: came.set(), indirect=False)
-                subscriber = router.declare_subscriber("0/uav1/target/**", handler)
-                until(came.is_set, lambda: link.publish(report(track(time.monotonic_ns()))), what="a sample")
-                until(lambda: link.counters()["links"] == 1, what="the count of links")
-                subscriber.undeclare()
-            gone = lambda: link.publish(report(track(time.monotonic_ns())))  # noqa: E731
-            until(lambda: link.counters()["links"] == 0, gone, what="its going")
-
-
 def test_publishing_never_waits_and_the_newest_wins() -> None:
     endpoint = free_endpoint()
     with linked(endpoint) as link:
@@ -358,18 +337,6 @@ def test_publishing_never_waits_and_the_newest_wins() -> None:
         )
         assert link.counters()["reports_replaced"] > 0
     assert worst_s < 0.5
-
-
-def test_the_ground_sees_that_the_daemon_is_there_and_that_it_has_gone() -> None:
-    endpoint, tool = free_endpoint(), free_endpoint()
-    with zenoh.open(router_config([tool])) as ground:
-
-        def alive() -> list[str]:
-            return [str(reply.ok.key_expr) for reply in ground.liveliness().get("uavpose/@v1/*/alive") if reply.ok]
-
-        with linked(endpoint, connect=[tool]):
-            until(lambda: alive() == ["uavpose/@v1/uav1/alive"], what="sight of the daemon")
-        until(lambda: alive() == [], what="its going")
 
 
 def test_one_message_that_no_field_holds_does_not_end_the_link() -> None:
@@ -395,30 +362,6 @@ def test_events_go_out_beside_a_message_that_cannot() -> None:
         assert link.counters()["failed"] == 1
     finally:
         link.stop()
-
-
-def test_a_port_that_is_taken_is_a_sentence() -> None:
-    endpoint = free_endpoint()
-    with linked(endpoint):
-        second = ZenohLink(ZenohSettings(listen=[endpoint]), "uav1", MOUNT)
-        with pytest.raises(LinkError, match=f"^{endpoint} is in use: does another daemon run"):
-            second.start()
-        second.stop()
-
-
-def test_the_process_ends_when_the_link_is_stopped() -> None:
-    script = (
-        "import sys\n"
-        "from edge.config import MountSettings, ZenohSettings\n"
-        "from edge.links.zenoh_link import ZenohLink\n"
-        "link = ZenohLink(ZenohSettings(listen=[sys.argv[1]]), 'uav1', MountSettings().mount())\n"
-        "link.start()\n"
-        "link.publish_event(20, 'bye')\n"
-        "link.stop()\n"
-        "assert link.counters()['sent_events'] == 1, 'what waited was sent'\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script, free_endpoint()], timeout=60, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def vector(v: Any) -> np.ndarray:
