@@ -169,11 +169,11 @@ def test_the_command_that_gives_a_video_times_gives_each_frame_its_own(tmp_path:
         source.open()
     command = str(refused.value).rpartition("filmed at: ")[2]
     subprocess.run(shlex.split(command), cwd=tmp_path, check=True, capture_output=True)
-    with closing(source_of(tmp_path / "flight.mp4")) as source:
-        source.open()
-        frames = [source.read(threading.Event()) for _ in range(12)]
-    assert [round(frame.image_bgr.mean() / 20) for frame in frames] == list(range(12))
-    assert [frame.meta.sequence for frame in frames] == list(range(12))
+    frames = play(source_of(tmp_path / "flight.mp4"))
+    numbers = [frame.meta.sequence for frame in frames]  # a busy machine passes some over
+    assert len(numbers) >= 3
+    assert numbers[-1] == 11
+    assert [round(frame.image_bgr.mean() / 20) for frame in frames] == numbers
 
 
 def test_a_video_that_ends_before_its_first_frame_is_no_flight_that_went_well(tmp_path: Path) -> None:
