@@ -30,6 +30,7 @@ from edge.links.mavlink_endpoints import SerialEndpoint, parse_endpoint
 from edge.links.mavlink_link import MavlinkLink, signing_of, signing_state_of
 from edge.links.signing import ahead_of_clock
 from edge.links.transports.medium import resolve
+from edge.reload import changes_in_flight
 from edge.requests import RequestQueue
 from edge.status import ANY, ask, loopback_endpoints
 from edge.tracking.own_ship import OwnShipBuffer
@@ -48,7 +49,8 @@ ADVICE_RECORDER = (
     "`journalctl -u uavpose-edge` says why; outside /var/lib/uavpose the service needs ReadWritePaths=, and a restart "
     "if the disk was read-only when it started, docs/install.md"
 )
-ADVICE_CONFIG = "restart it (`sudo systemctl restart uavpose-edge`); SIGHUP is enough for [model]"
+ADVICE_RELOAD = "reload it (`sudo systemctl reload uavpose-edge`), which keeps the targets"
+ADVICE_RESTART = "restart it (`sudo systemctl restart uavpose-edge`)"
 UNPROVEN = ("refused_unsigned", "refused_signature", "refused_replay")  # counters: heard, but not believed
 STARTING = ("the daemon is still starting", "run doctor again in a few seconds")
 ADVICE_ADDRESS = "use an address of this computer, or 0.0.0.0 for all of them"
@@ -120,15 +122,16 @@ def running_daemon(config: Config) -> Mapping[str, Any] | None:
 def config_findings(config: Config, running: Mapping[str, Any]) -> Iterator[Finding]:
     """Whether the running daemon uses other values than the file has now. `running`: its `config`."""
     now, used = no_passwords(config.model_dump(mode="json")), running["config"]
-    keys = [
-        f"[{section}] {key}"
+    changed = [
+        (section, key)
         for section, values in now.items()
         for key, value in values.items()
         if used.get(section, {}).get(key) != value
     ]
-    if keys:
-        says = f"the daemon runs as {used['vehicle']['name']}, with other values than the file of {', '.join(keys)}"
-        yield poor("config", says, ADVICE_CONFIG)
+    if changed:
+        keys = ", ".join(f"[{section}] {key}" for section, key in changed)
+        says = f"the daemon runs as {used['vehicle']['name']}, with other values than the file of {keys}"
+        yield poor("config", says, ADVICE_RELOAD if all(changes_in_flight(*key) for key in changed) else ADVICE_RESTART)
 
 
 def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:

@@ -71,17 +71,20 @@ def warm_estimator(model: Model, max_targets: int, camera: CameraInfo) -> Estima
     return estimator
 
 
+def changes_in_flight(section: str, key: str) -> bool:
+    """Whether a reload is enough for a new value of `[section] key`."""
+    return section in LIVE_SECTIONS or (section, key) in LIVE_KEYS
+
+
 def needs_restart(old: Config, new: Config) -> list[str]:
     """Keys that differ and cannot change in flight, as `[section] key`."""
     named = []
     for section in Config.model_fields:
-        if section in LIVE_SECTIONS:
-            continue
         was, now = _keys(getattr(old, section)), _keys(getattr(new, section))
         named += [
             f"[{section}] {key}"
             for key in dict.fromkeys((*was, *now))
-            if (section, key) not in LIVE_KEYS and was.get(key) != now.get(key)
+            if not changes_in_flight(section, key) and was.get(key) != now.get(key)
         ]
     return named
 

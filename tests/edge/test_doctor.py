@@ -223,9 +223,12 @@ def test_a_daemon_that_was_started_with_other_values_is_told_by_its_name(
     with flying(tmp_path, text):
         _, as_started = findings(cli, tmp_path, text)
         code, found = findings(cli, tmp_path, f'[vehicle]\nname = "uav2"\n{text.replace("fps = 10", "fps = 11")}')
+        _, in_flight = findings(cli, tmp_path, f"{text}[target]\nwingspan_m = 11.0\nlength_m = 8.3\n")
     assert (code, found["config"]["verdict"]) == (0, "poor")
     assert "runs as uav1, with other values than the file of [vehicle] name, [camera] fps" in found["config"]["says"]
     assert "restart" in found["config"]["advice"]
+    assert "[target] wingspan_m, [target] length_m" in in_flight["config"]["says"]
+    assert "systemctl reload" in in_flight["config"]["advice"]
     assert "reported by the running daemon" in found["camera"]["says"]
     assert "config" not in as_started
 
