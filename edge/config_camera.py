@@ -59,7 +59,8 @@ class IntrinsicsSettings(Section):
     width: Side | None = Field(default=None, description="width of the calibration images, pixels")
     height: Side | None = Field(default=None, description="height of the calibration images, pixels")
     distortion: list[Finite] = Field(
-        default_factory=list, description="plumb-bob coefficients k1 k2 p1 p2 [k3 ...]; empty: no distortion"
+        default_factory=list,
+        description="4, 5 or 8 coefficients k1 k2 p1 p2 k3 k4 k5 k6, as OpenCV's; empty: no distortion",
     )
 
     @model_validator(mode="after")

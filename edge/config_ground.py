@@ -105,7 +105,7 @@ class RecorderSettings(Section):
         default=None,
         gt=0,
         le=DISK_MAX_MB,
-        description="limit for all files of this vehicle; default: none except the disk's size",
+        description="limit for all files of this vehicle, at least twice file_max_mb; default: the disk's size",
     )
     free_min_mb: float = Field(default=1000.0, ge=0, le=DISK_MAX_MB, description="free disk space to leave")
     when_full: Literal["oldest", "stop"] = Field(
