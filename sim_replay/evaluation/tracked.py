@@ -126,7 +126,8 @@ def tracker_answers(model: Model, size_of: SizeOf = no_size, own_ship: OwnShipTo
     It also sees the scene's images in between, which the dataset may not ask to evaluate. `size_of`: what [target] says
     in each scene.
 
-    Raises InputError if the model does not run.
+    Raises InputError if the model does not run, or a search for further targets fails: only in flight is that logged
+    and passed over.
     """
     estimator = Estimator(model, _SETTINGS.max_targets)
     model.warm_up()
@@ -160,6 +161,8 @@ def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[
     started_ns = time.monotonic_ns()
     expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
     estimates = sequence.attention.look(estimator, frame, expected, StageClock(frame.meta, started_ns)).estimates
+    if sequence.attention.search.counters().get("search_failed"):
+        raise InputError(f"{sequence.scene.folder}: the search for further targets in image {shown.image_id} failed")
     model = estimator.model
     tracks = sequence.tracker.update(
         capture_ns, estimates, own_ship, shown.K, size_wh, doubtful_below=model.doubtful_below

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edge.config_estimator import EstimatorSettings
+from edge.estimator.estimator import Estimator
 from tests.sim_replay.conftest import dark_spot_model
 from tests.sim_replay.test_tracked import flown, write_scene
+from trainer.cli import main
 from trainer.config import ConfigError
 from trainer.evaluate_dataset import DatasetRequest, Evaluation, evaluate_dataset
 
@@ -84,3 +88,20 @@ def test_the_size_of_a_scene_s_aircraft_may_be_given(spots: Path, dark_spot_mode
                 assert np.linalg.norm(larger) > np.linalg.norm(t_m) + 2.0
     with pytest.raises(ConfigError, match="--size-given: needs a model"):
         evaluate_dataset(request._replace(mode="frames", results=spots / "any.csv", size_given=True))
+
+
+def test_a_search_for_further_targets_that_fails_ends_the_evaluation(
+    tmp_path: Path, dark_spot_model: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """In flight it is passed over; figures without it are not those of what flies."""
+    write_scene(tmp_path / "data" / "test" / "000004", [0.5] * (EstimatorSettings().acquire_every_n + 1))
+
+    def out_of_memory(*_: object) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(Estimator, "anywhere", out_of_memory)
+    given = ["--dataset", str(tmp_path / "data"), "--model", str(dark_spot_model), "--out", str(tmp_path / "out")]
+    assert main(["evaluate", "--mode", "track", *given]) == 2
+    last = capfd.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(r"uavpose-trainer: .*000004: the search for further targets in image \d+ failed", last)
+    assert not (tmp_path / "out").exists()
