@@ -156,6 +156,23 @@ def test_of_two_abreast_the_one_that_goes_takes_nothing_of_the_other(kind: str, 
     assert [track.track_id for track in tracks] == [1]
 
 
+@pytest.mark.parametrize(("missed_frames", "x_m", "is_id"), [(3, 0.0, 0), (5, 12.0, 1)])
+def test_beside_one_that_went_what_is_seen_is_the_one_seen_shortly_before_and_later_the_nearer(
+    missed_frames: int, x_m: float, is_id: int
+) -> None:
+    """Number 1 was last seen 12 m to the right, 1.3 s ago: turning as a camera may, it has been anywhere since."""
+    flight = Flight("cam")
+    stays, went = np.array([0.0, 0.0, 250.0]), np.array([12.0, 0.0, 250.0])
+    for _ in range(60):
+        flight.frame(flight.sight(stays), flight.sight(went))
+    for _ in range(40 - missed_frames):
+        flight.frame(flight.sight(stays))
+    for _ in range(missed_frames):
+        flight.frame()
+    tracks = flight.frame(flight.sight(np.array([x_m, 0.0, 250.0])))
+    assert [track.track_id for track in tracks if track.measured_ns == track.time_ns] == [is_id]
+
+
 @pytest.mark.parametrize(
     ("score", "doubtful_below", "chosen_id", "held"),
     [

@@ -18,6 +18,7 @@ from edge.tracking import so3
 from edge.tracking.association import best_pairs
 from edge.tracking.boxes import BoxModel
 from edge.tracking.doubles import TURNS_MIN, Doubles
+from edge.tracking.merged import less_sure
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, TrackState
 
@@ -158,6 +159,29 @@ def test_two_that_take_turns_for_very_long_at_few_frames_a_second_are_one_at_las
     assert all(found[TURNS_MIN - 1 :])
     assert doubles.among({(0, 1), (1, 5)}, [], 30 * 10**9) == []
     assert doubles.among({(0, 1)}, [((0, 1), (1, 5))], 31 * 10**9) == [], "both were seen at once"
+
+
+@pytest.mark.parametrize(("pause_s", "one"), [(1.9, True), (2.1, False)])
+def test_turns_taken_too_long_ago_are_no_sign_of_one_aircraft(pause_s: float, one: bool) -> None:
+    doubles, pair = Doubles(), ((0, 1), (1, 5))
+    for tenth in range(2 * TURNS_MIN + 1):
+        found = doubles.among({pair[0]}, [pair], tenth * 10**8)
+    assert found == [pair]
+    assert doubles.among({pair[0]}, [pair], 4 * 10**9 + round(pause_s * 1e9)) == [pair] * one
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0])
+def test_one_that_lies_between_two_is_less_sure_across_the_line_of_sight_alone(degrees: float) -> None:
+    """Anywhere between them, evenly distributed; where they are says nothing against its range."""
+    at_m = 200.0 * np.array([np.sin(np.deg2rad(degrees)), 0.0, np.cos(np.deg2rad(degrees))])
+    estimate = replace(sight(np.random.default_rng(0), at_m, np.eye(3)), t_cam_target_m=at_m)
+    boxes = [estimate.box_xyxy_px + np.tile([x_px, 0.0], 2) for x_px in (-20.0, 20.0)]
+    left, right = (np.linalg.solve(K, [*(0.5 * (box[:2] + box[2:])), 1.0]) for box in boxes)
+    apart_rad = np.arccos(left @ right / np.linalg.norm(left) / np.linalg.norm(right))
+    added = less_sure(estimate, boxes, K).covariance - estimate.covariance
+    assert added[:3, :3] @ at_m == pytest.approx(0.0, abs=1e-9)
+    assert np.trace(added[:3, :3]) == pytest.approx((apart_rad * 200.0) ** 2 / 3.0, rel=0.001)
+    assert not added[3:].any()
 
 
 @pytest.mark.parametrize("knock_px", [80.0, 200.0])
