@@ -72,7 +72,8 @@ class DeviceSource(LiveSource):
                 log.warning("%s does not let its exposure be set", settings.device)
         exposure_ms = capture.get(cv2.CAP_PROP_EXPOSURE) / EXPOSURE_UNITS_PER_MS
         fourcc, fps = _fourcc(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)
-        for complaint in complaints(settings, fourcc, fps, exposure_ms):
+        size_wh = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        for complaint in complaints(settings, size_wh, fourcc, fps, exposure_ms):
             log.warning("%s %s", settings.device, complaint)
         return capture
 
@@ -88,9 +89,13 @@ class DeviceSource(LiveSource):
         return stamp_ns - self._latency_ns
 
 
-def complaints(settings: DeviceCamera, fourcc: str, fps: float, exposure_ms: float) -> list[str]:
-    """Deviations of the device from the requested settings; the size is checked with the intrinsics."""
+def complaints(
+    settings: DeviceCamera, size_wh: tuple[int, int], fourcc: str, fps: float, exposure_ms: float
+) -> list[str]:
+    """Deviations of the device from the requested settings; whether the intrinsics fit is checked elsewhere."""
     found = []
+    if min(size_wh) > 0 and size_wh != (settings.width, settings.height):
+        found.append(f"gives {size_wh[0]}x{size_wh[1]}, not {settings.width}x{settings.height}")
     if fourcc != settings.fourcc:
         found.append(f"gives {fourcc or 'an unnamed format'}, not {settings.fourcc}")
     if fps > 0 and abs(fps - settings.fps) > FPS_TOLERANCE * settings.fps:

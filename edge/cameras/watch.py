@@ -1,4 +1,4 @@
-"""Detects frozen cameras and wrong timestamps: repeated pictures look like frames, but are not new. Pure."""
+"""Detects frozen cameras, wrong timestamps and other modes: what looks like frames as before, but is not. Pure."""
 
 from __future__ import annotations
 
@@ -81,3 +81,26 @@ class StampWatch:
             text = "camera timestamps have become unusable: times of arrival are used instead"
             found.append(Reason("camera_unstamped", text))
         return tuple(found)
+
+
+class ModeWatch:
+    """Whether a camera gives pictures of another size than its first.
+
+    They are taken for the same view, scaled. But many sensors read out only a part in their smaller modes, and then all
+    ranges are wrong. Which of both it is cannot be known here: a person is told for as long as it lasts.
+    """
+
+    def __init__(self) -> None:
+        self._first_wh: tuple[int, int] | None = None
+        self._last_wh: tuple[int, int] | None = None
+
+    def take(self, frame: Frame) -> None:
+        self._last_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        self._first_wh = self._first_wh or self._last_wh
+
+    def reasons(self) -> tuple[Reason, ...]:
+        if self._first_wh is None or self._last_wh is None or self._last_wh == self._first_wh:
+            return ()
+        now, before = ("x".join(map(str, size_wh)) for size_wh in (self._last_wh, self._first_wh))
+        text = f"camera: pictures are {now}, no longer {before}; ranges are right only if they show the same view"
+        return (Reason("camera_size", text),)

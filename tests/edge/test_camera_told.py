@@ -113,6 +113,29 @@ def test_status_and_doctor_tell_the_size_of_the_pictures_that_come(cli: Cli, tmp
             until(lambda: told() == "nose/image/compressed 320x180", what="the new size")
 
 
+def test_a_camera_that_changes_its_mode_in_flight_is_told_of_until_it_is_in_its_first_again(
+    tmp_path: Path, toy_model: Path
+) -> None:
+    """Its smaller pictures may be scaled, as is assumed, or cut out: then all ranges are wrong."""
+    camera_port, asked_at = free_port(), free_port()
+
+    def sizes_told() -> list[str]:
+        told = (ask(f"tcp/127.0.0.1:{asked_at}", "uav1") or NONE)["info"]
+        kinds = zip(told.get("reason_kinds", []), told.get("reasons", []), strict=True)
+        return [text for kind, text in kinds if kind == "camera_size"]
+
+    size_wh = [(320, 180)]
+    text = text_of(camera_port, asked_at, toy_model)
+    with filming(camera_port, lambda index: message(index, size_wh[0])), flying(tmp_path, text):
+        until(lambda: bool((ask(f"tcp/127.0.0.1:{asked_at}", "uav1") or NONE)["info"].get("state")), what="a state")
+        assert sizes_told() == []
+        size_wh[0] = HALF_WH
+        words = "camera: pictures are 160x90, no longer 320x180; ranges are right only if they show the same view"
+        until(lambda: sizes_told() == [words], what="the other mode")
+        size_wh[0] = (320, 180)
+        until(lambda: sizes_told() == [], what="the first mode")
+
+
 def test_doctor_does_not_take_a_frozen_camera_for_a_good_one(cli: Cli, tmp_path: Path, toy_model: Path) -> None:
     camera_port = free_port()
     with filming(camera_port, lambda _: message(1)):

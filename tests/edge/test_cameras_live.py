@@ -339,9 +339,12 @@ def test_a_router_that_comes_late_is_found_and_one_that_goes_is_missed() -> None
 
 def test_a_device_that_does_other_than_asked_is_told() -> None:
     asked = DeviceCamera(type="device", fps=30, fourcc="MJPG", intrinsics=INTRINSICS)
-    assert complaints(asked, "MJPG", 30.0, 4.0) == []
-    assert complaints(asked, "MJPG", 29.97, 4.0) == []
-    assert complaints(asked, "YUYV", 5.0, 4.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
+    size_wh = (asked.width, asked.height)
+    assert complaints(asked, size_wh, "MJPG", 30.0, 4.0) == []
+    assert complaints(asked, size_wh, "MJPG", 29.97, 4.0) == []
+    assert complaints(asked, size_wh, "YUYV", 5.0, 4.0) == ["gives YUYV, not MJPG", "gives 5 frames a second, not 30"]
+    smaller = complaints(asked.model_copy(update={"width": 1920, "height": 1080}), (1280, 720), "MJPG", 30, 4)
+    assert smaller == ["gives 1280x720, not 1920x1080"], "a scaled picture fits the calibration, a cut one looks alike"
 
 
 def test_a_calibration_of_another_lens_model_is_refused(tmp_path: Path) -> None:
