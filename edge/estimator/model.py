@@ -116,11 +116,13 @@ class Model:
         return PROBABLE_SCORE if self.contract.scores_calibrated else 0.0
 
     def run(self, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> Peaks:
-        """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels. If the provider fails, the CPU takes over,
-        from this inference on."""
+        """images_bgr [N, H, W, 3] and K [N, 3, 3] of exactly these pixels. If the provider fails, or gives scores that
+        are not finite, with which nothing would ever be found, the CPU takes over, from this inference on."""
         begin_ns = clock.monotonic_ns()
         try:
             peaks = self.infer(images_bgr, K)
+            if self.provider != "cpu" and not np.isfinite(peaks.score).all():
+                raise ArithmeticError("its scores are not finite")
         except Exception as error:  # ONNX Runtime's exceptions have no common base class of their own
             if self.provider == "cpu":
                 raise
@@ -152,7 +154,7 @@ class Model:
         """One inference at each size, and of two windows at once, as there will be with two targets; where windows are
         shared out, also of two for each thread.
 
-        Raises InputError if the graph does not run or its outputs have wrong shapes.
+        Raises InputError if the graph does not run, or its outputs have wrong shapes or are not finite.
         """
         self._try(1, self.contract.acquire_size_wh)
         if self.contract.track_size_wh is not None:
@@ -171,9 +173,12 @@ class Model:
             reason = " ".join(str(error).split())
             raise InputError(f"model {self.path} does not run at {width}x{height}{pictures}: {reason}") from error
         for name, tail in OUTPUT_TAILS.items():
-            shape, wanted = getattr(peaks, name).shape, (count, self.contract.max_peaks, *tail)
-            if shape != wanted:
-                raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
+            output, wanted = getattr(peaks, name), (count, self.contract.max_peaks, *tail)
+            if output.shape != wanted:
+                says = f"has shape {output.shape}, its contract says {wanted}"
+                raise InputError(f"model {self.path}: output {name} {says}")
+            if not np.isfinite(output).all():
+                raise InputError(f"model {self.path}: output {name} is not finite: with it, no target would be found")
 
 
 def _outputs(session: ort.InferenceSession, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> list[Any]:

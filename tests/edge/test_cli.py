@@ -16,7 +16,7 @@ from tests.certificates import redate
 
 from .conftest import Cli
 from .flying import flying
-from .toy_model import ONE_PICTURE_GRAPH, write_toy_model
+from .toy_model import NO_NUMBER_GRAPH, ONE_PICTURE_GRAPH, write_toy_model
 
 OFF = "[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n"
 
@@ -108,15 +108,17 @@ def test_a_certificate_of_another_day_for_the_camera_is_told_by_check(
 
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_model_that_does_not_do_is_named(cli: Cli, tmp_path: Path, text: str, toy_model: Path, command: str) -> None:
-    corrupt, strange, single = (tmp_path / f"{name}.onnx" for name in ("corrupt", "strange", "single"))
+    corrupt, strange, single, nan = (tmp_path / f"{name}.onnx" for name in ("corrupt", "strange", "single", "nan"))
     corrupt.write_bytes(toy_model.read_bytes()[:300])
     write_toy_model(strange, metadata='{"version": 99}')
     write_toy_model(single, graph=ONE_PICTURE_GRAPH)
+    write_toy_model(nan, graph=NO_NUMBER_GRAPH)
     for path, reason in (
         (tmp_path / "none.onnx", "No such file"),
         (corrupt, "not a loadable ONNX file"),
         (strange, "contract version 99"),
         (single, "does not run at 256x256 with several pictures at once"),
+        (nan, "output score is not finite"),
     ):
         sentence = refusal(cli, tmp_path, text.replace(str(toy_model), str(path)) + OFF, command)
         assert sentence.startswith("config.toml:6: [model] path: ")

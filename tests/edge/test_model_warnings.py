@@ -30,9 +30,11 @@ from .conftest import Cli
 from .flying import flying, toml
 from .toy_model import write_toy_model
 
-# `uavpose-edge` with an ONNX Runtime that has a GPU, which the CPU stands in for until the file BROKEN is there.
+# `uavpose-edge` with an ONNX Runtime that has a GPU, which the CPU stands in for until the file BROKEN is there. Then
+# it fails, or gives no numbers if the file says so.
 WITH_A_GPU = """
 import os, sys
+import numpy
 import onnxruntime
 import onnxruntime.capi.onnxruntime_inference_collection as collection
 from edge.cli import main
@@ -58,9 +60,12 @@ class Session:
         return {name: {} for name in self.get_providers()}
 
     def run(self, *arguments):
-        if self._on_gpu and broken():
-            raise native.EPFail("CUDA failure 719: unspecified launch failure")
-        return self._session.run(*arguments)
+        outputs = self._session.run(*arguments)
+        if not self._on_gpu or not broken():
+            return outputs
+        if open(os.environ["BROKEN"]).read() == "no numbers":
+            return [numpy.full_like(output, numpy.nan) for output in outputs]
+        raise native.EPFail("CUDA failure 719: unspecified launch failure")
 
     def __getattr__(self, name):
         return getattr(self._session, name)
@@ -80,8 +85,12 @@ def on_the_gpu(text: str) -> str:
     return text.replace("threads = 1", 'threads = 1\nprovider = "cuda"')
 
 
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [("", "CUDA failure 719: unspecified launch failure"), ("no numbers", "its scores are not finite")],
+)
 def test_a_gpu_that_fails_in_flight_is_told_of_and_the_cpu_goes_on(
-    tmp_path: Path, swaying: Path, calibrated: Path
+    tmp_path: Path, swaying: Path, calibrated: Path, how: str, why: str
 ) -> None:
     port, events, broken = free_port(), queue.Queue[Log](), tmp_path / "broken"
     text, surroundings = on_the_gpu(toml(swaying, calibrated, port)), {"BROKEN": str(broken)}
@@ -91,8 +100,9 @@ def test_a_gpu_that_fails_in_flight_is_told_of_and_the_cpu_goes_on(
         with connect(endpoint) as session, subscribe(session, "uav1") as poses:
             heard = handlers.Callback(lambda sample: events.put(Log.decode(sample.payload.to_bytes())), indirect=False)
             subscriber = session.declare_subscriber("*/uav1/events/**", heard)
-            broken.touch()
-            reason = "CUDAExecutionProvider failed: CUDA failure 719: unspecified launch failure; running on the CPU"
+            (tmp_path / "how").write_text(how)
+            (tmp_path / "how").rename(broken)
+            reason = f"CUDAExecutionProvider failed: {why}; running on the CPU"
             assert " WARNING " in flight.until(f"model: {reason}")
             while not (event := events.get(timeout=60)).msg.startswith(f"model: {reason}"):
                 pass

@@ -94,6 +94,11 @@ ONE_PICTURE_GRAPH = GRAPH.replace(
     "uint8[N, H, W, 3] image, float[N, 3, 3] K", "uint8[1, H, W, 3] image, float[1, 3, 3] K"
 )
 
+# The same, broken: a score that is no number, as of weights that are none.
+NO_NUMBER_GRAPH = GRAPH.replace(
+    "score = Min(w, one)", "nothing = Sub(w, w)\n    no_number = Div(nothing, nothing)\n    score = Identity(no_number)"
+)
+
 CONTRACT: dict[str, Any] = {
     "version": 1,
     "name": "toy",
