@@ -56,7 +56,7 @@ ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
 ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"
 ADVICE_NO_IMAGE = "check that it is powered, plugged in, not used by another program, and reachable from this computer"
 ADVICE_NO_STREAM = (
-    "check that it is on and reachable from this computer; with OPENCV_FFMPEG_LOGLEVEL=16 before this command, ffmpeg "
+    "check that it is on and reachable from this computer; with OPENCV_FFMPEG_LOGLEVEL=24 before this command, ffmpeg "
     "says what the server answers"
 )
 

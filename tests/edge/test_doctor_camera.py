@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,12 @@ import cv2
 import pytest
 
 from edge.config import load_config
-from edge.doctor import _camera, camera_as_told, shortfalls
+from edge.doctor import ADVICE_NO_STREAM, _camera, camera_as_told, shortfalls
 from msgs.publish import TopicPublisher
 from sim_replay.ports import free_port
 
 from . import pictures
+from .conftest import Cli
 from .test_cameras_live import message, router
 
 
@@ -105,6 +108,36 @@ def test_a_device_with_wrong_stamps_torn_pictures_or_half_its_rate_is_not_told_a
     ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
     assert (found.verdict, words in found.says, advice in found.advice) == (verdict, True, True), found
     assert rate_hz is not None
+
+
+class Absent(BaseHTTPRequestHandler):
+    """Of a server that has nothing."""
+
+    def do_GET(self) -> None:
+        self.send_error(404)
+
+
+def test_the_advice_on_a_stream_that_does_not_open_shows_what_its_server_answers(
+    cli: Cli, tmp_path: Path, toy_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = re.search(r"(OPENCV_FFMPEG_LOGLEVEL)=(\d+)", ADVICE_NO_STREAM)
+    assert told is not None
+    with ThreadingHTTPServer(("127.0.0.1", 0), Absent) as server, ThreadPoolExecutor() as pool:
+        pool.submit(server.serve_forever)
+        (tmp_path / "config.toml").write_text(
+            f'[camera]\ntype = "stream"\nurl = "http://127.0.0.1:{server.server_port}/none"\n'
+            "intrinsics = { fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }\n"
+            f'[model]\npath = "{toy_model}"\n[zenoh]\nenabled = false\n[mavlink]\nenabled = false\n'
+        )
+        try:
+            before = cli("doctor", "--config", "config.toml")
+            monkeypatch.setenv(*told.groups())
+            after = cli("doctor", "--config", "config.toml")
+        finally:
+            server.shutdown()
+    assert ADVICE_NO_STREAM in before.stdout
+    assert "404 Not Found" not in before.stdout + before.stderr
+    assert "404 Not Found" in after.stdout + after.stderr
 
 
 def test_a_tenth_of_bad_pictures_and_four_fifths_of_the_rate_are_tolerated() -> None:
