@@ -17,6 +17,7 @@ from edge.tracking import so3
 from edge.types import Array, Estimate
 
 MIRRORED_WINGS = np.diag([1.0, -1.0, 1.0])
+TAIL_FIRST = np.diag([-1.0, -1.0, 1.0])
 NETWORK_STD_FLOOR_RAD = float(np.deg2rad(4.0))
 GRAVITY_MPS2 = 9.81
 
@@ -73,32 +74,41 @@ def network_opinion(estimate: Estimate, along: Array) -> tuple[float, Array]:
     return float(np.log((1.0 - p) / p)), np.diag(about_it)
 
 
-def flown_odds(R: Array, R_reversed: Array, P: Array, flight: Flight) -> float:
-    """Log-odds of R against its reversal from the target's flight; both [3, 3] into ned axes, P [3, 3] of either."""
-    return _limited(
-        _log_along_nose(R[:, 0], P, flight) - _log_along_nose(R_reversed[:, 0], P, flight)
-        + _log_upright(R, P, flight) - _log_upright(R_reversed, P, flight)
-    )  # fmt: skip
+def flown_odds(R: Array, R_reversed: Array, P: Array, flight: Flight) -> tuple[float, float]:
+    """Log-odds from the target's flight, of R and of a confusion; both [3, 3] into ned axes, P [3, 3] of either.
+
+    The first are those of R against its reversal. The second are those of nose and tail being confused in both, the
+    likelier of the two on each side: a network that has never seen a canard takes its foreplane for a tail.
+    """
+    both = np.stack([R, R_reversed])
+    it, other, *confused = _log_flown(np.concatenate([both, both @ TAIL_FIRST]), P, flight)
+    return _limited(it - other), _limited(max(confused) - max(it, other))
 
 
-def _log_along_nose(nose: Array, P: Array, flight: Flight) -> float:
-    """Log density of the velocity if the target flies along its nose [3]; speed and wind are marginalised."""
+def _log_flown(R: Array, P: Array, flight: Flight) -> list[float]:
+    """Log densities of the target's flight for each rotation of R [N, 3, 3] into ned axes, of covariance P [3, 3]."""
+    along_nose, upright = _log_along_nose(R[..., 0], P, flight), _log_upright(R, P, flight)
+    return [float(one) for one in along_nose + upright]
+
+
+def _log_along_nose(nose: Array, P: Array, flight: Flight) -> Array:
+    """Log densities [N] of the velocity if the target flies along its nose [N, 3]; speed and wind are marginalised."""
     v = flight.v_mps.copy()
-    across = so3.IDENTITY - np.outer(nose, nose)
+    along = nose[:, :, None] * nose[:, None, :]
     slip = SLIP_STD_RAD**2 + float(np.trace(P)) / 3.0
-    S = flight.P_v + WIND_STD_MPS**2 * so3.IDENTITY + AIRSPEED_STD_MPS**2 * np.outer(nose, nose)
-    S += AIRSPEED_MPS**2 * slip * across
+    S = flight.P_v + WIND_STD_MPS**2 * so3.IDENTITY + AIRSPEED_STD_MPS**2 * along
+    S += AIRSPEED_MPS**2 * slip * (so3.IDENTITY - along)
     if flight.own_nose_ned is not None:
         v += OWN_AIRSPEED_MPS * flight.own_nose_ned
         S += OWN_AIRSPEED_STD_MPS**2 * np.outer(flight.own_nose_ned, flight.own_nose_ned)
     residual = v - AIRSPEED_MPS * nose
-    d2 = float(residual @ np.linalg.solve(S, residual))
-    return _log_tailed(d2, 3.0) - 0.5 * float(np.log(np.linalg.det(S)))
+    d2 = np.einsum("ni,ni->n", residual, np.linalg.solve(S, residual[..., None])[..., 0])
+    return _log_tailed(d2, 3.0) - 0.5 * np.log(np.linalg.det(S))
 
 
-def _log_upright(R: Array, P: Array, flight: Flight) -> float:
-    """Log density, up to a constant, of bank and pitch of R [3, 3] in ned axes."""
-    pitch, bank = -math.asin(min(max(R[2, 0], -1.0), 1.0)), math.atan2(R[2, 1], R[2, 2])
+def _log_upright(R: Array, P: Array, flight: Flight) -> Array:
+    """Log densities [N], up to a constant, of bank and pitch of R [N, 3, 3] in ned axes."""
+    pitch, bank = -np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0)), np.arctan2(R[:, 2, 1], R[:, 2, 2])
     rotation_variance = float(np.trace(P)) / 3.0
     if flight.turn_rate_radps is None:
         climb, turned = 0.0, 0.0
@@ -117,11 +127,11 @@ def _log_upright(R: Array, P: Array, flight: Flight) -> float:
         bank_variance = BANK_STD_RAD**2 + slope**2 * flight.turn_rate_variance
     d2_pitch = (pitch - climb) ** 2 / (pitch_variance + rotation_variance)
     d2_bank = (bank - turned) ** 2 / (bank_variance + rotation_variance)
-    return _log_tailed(float(d2_pitch), 1.0) + _log_tailed(float(d2_bank), 1.0)
+    return _log_tailed(d2_pitch, 1.0) + _log_tailed(d2_bank, 1.0)
 
 
-def _log_tailed(d2: float, dimensions: float) -> float:
-    return -0.5 * (TAIL_DOF + dimensions) * math.log1p(d2 / TAIL_DOF)
+def _log_tailed(d2: Array, dimensions: float) -> Array:
+    return -0.5 * (TAIL_DOF + dimensions) * np.log1p(d2 / TAIL_DOF)
 
 
 def _limited(log_odds: float) -> float:

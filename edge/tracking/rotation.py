@@ -6,6 +6,9 @@ from the network's choices, and a part computed anew from the target's flight (`
 switched only after the odds were against it for a while, so that the output does not flicker; the covariance always
 includes the other one with its probability. Measurements that fit neither are rejected and counted.
 
+If the target flies as its tail points in both, the network may have confused nose and tail, for which it has no word:
+the covariance then includes that too.
+
 Rotation errors are on the left: R = exp(theta) R_hat. Everything here is pure.
 
 Frames of the same view have similar errors, so a share of the network's variance is never averaged out: it is modelled
@@ -34,6 +37,8 @@ NETWORK_LOG_ODDS_MAX = 3.0  # limit of the network's part, so that the evidence 
 SWITCH_LOG_ODDS = 1.0  # against the held rotation
 SWITCH_AFTER_S = 0.2
 
+TAIL_FIRST_PRIOR = 3.0  # log-odds against a network that confuses nose and tail
+
 GATE_RAD = float(np.deg2rad(60.0))
 ODD_FRAMES = 6  # in a row that fit neither hypothesis ("odd"): the last one is accepted
 ODD_MEMORY = 30  # frames over which the share of odd ones is averaged
@@ -49,6 +54,7 @@ class Attitude:
     picked: float = 0.0  # log-odds for the held rotation from the network's choices
     log_odds: float = 0.0  # from all evidence
     against_s: float = 0.0  # how long the odds have been against the held one
+    tail_first: float = 0.0  # probability that nose and tail are confused
     odd_in_a_row: int = 0
     odd_share: float = 0.0  # exponentially averaged share of frames that fitted neither
     odd_w_target_rad: Array | None = None  # [3] from the held rotation to the last odd one, target axes
@@ -120,9 +126,10 @@ def weighed(attitude: Attitude, along: Array, flight: Flight | None, dt_s: float
     """
     other = reversal(attitude.R_frame_target, along)
     P = attitude.P + attitude.common
-    log_odds = attitude.picked
+    log_odds, tail_first = attitude.picked, 0.0
     if flight is not None:
-        log_odds += flown_odds(attitude.R_frame_target, other, P, flight)
+        flown, confused = flown_odds(attitude.R_frame_target, other, P, flight)
+        log_odds, tail_first = log_odds + flown, _probability_confused(confused)
     against_s = attitude.against_s + dt_s if log_odds < -SWITCH_LOG_ODDS else 0.0
     if against_s > SWITCH_AFTER_S or (not settled and log_odds < 0.0):
         return replace(
@@ -133,24 +140,35 @@ def weighed(attitude: Attitude, along: Array, flight: Flight | None, dt_s: float
             picked=-attitude.picked,
             log_odds=-log_odds,
             against_s=0.0,
+            tail_first=tail_first,
         )
-    return replace(attitude, log_odds=log_odds, against_s=against_s)
+    return replace(attitude, log_odds=log_odds, against_s=against_s, tail_first=tail_first)
 
 
 def covariance(attitude: Attitude, along: Array) -> Array:
-    """[3, 3], rad^2 in the frame, about the held rotation, including its reversal and recent odd measurements.
+    """[3, 3], rad^2 in the frame, about the held rotation, including its reversal, the half turn that confuses nose and
+    tail, and recent odd measurements.
 
     If another rotation, w away, is the true one with probability p, it adds p w w^T.
     """
     P = attitude.P + attitude.common
     w = so3.log(reversal(attitude.R_frame_target, along) @ attitude.R_frame_target.T)
     P += np.outer(w, w) / (1.0 + np.exp(np.clip(attitude.log_odds, -30.0, 30.0)))
+    half_turn = np.pi * attitude.R_frame_target[:, 2]
+    P += attitude.tail_first * np.outer(half_turn, half_turn)
     if attitude.odd_w_target_rad is not None:
         # As if two frames had to agree: a few odd frames count for little, a large majority almost fully.
         share = attitude.odd_share**2 / (attitude.odd_share**2 + (1.0 - attitude.odd_share) ** 2)
         odd = attitude.R_frame_target @ attitude.odd_w_target_rad
         P += share * np.outer(odd, odd)
     return symmetric(P)
+
+
+def _probability_confused(log_odds: float) -> float:
+    """That nose and tail are confused: none unless the flight speaks for it, as at the prior alone every target whose
+    velocity is unknown would turn by as much as is left in doubt."""
+    evidence = max(np.expm1(log_odds), 0.0)
+    return float(evidence / (evidence + np.exp(TAIL_FIRST_PRIOR)))
 
 
 def _odd(attitude: Attitude, w_target: Array, estimate: Estimate, view: View) -> Attitude:

@@ -29,7 +29,7 @@ def flight(v_mps: list[float], std_mps: float = 2.0, turn_rate_radps: float = 0.
 
 
 def odds(R: np.ndarray, along: np.ndarray, way: Flight) -> float:
-    return flown_odds(R, reversal(R, along), EXACT, way)
+    return flown_odds(R, reversal(R, along), EXACT, way)[0]
 
 
 @settings(deadline=None, max_examples=50)
@@ -80,6 +80,20 @@ def test_an_unsure_velocity_and_a_nose_across_the_sight_line_say_little() -> Non
     assert abs(odds(attitude(0, 0, 88), NORTH, flight([2.0, 25.0, 0.0]))) < 0.5
 
 
+@pytest.mark.parametrize("yaw_deg", [60.0, 100.0])
+def test_a_target_that_flies_as_its_tail_points_shows_that_both_are_confused(yaw_deg: float) -> None:
+    """Nose and reversed nose point east of north and of south; a velocity hardly known says nothing."""
+    R = attitude(0, 0, yaw_deg)
+
+    def confused(speed_mps: float, std_mps: float = 2.0) -> float:
+        way = flight([float(v) for v in speed_mps * R[:, 0]], std_mps)
+        return flown_odds(R, reversal(R, NORTH), EXACT, way)[1]
+
+    assert confused(-25.0) > 3.0
+    assert confused(25.0) < -3.0
+    assert abs(confused(-25.0, std_mps=100.0)) < 0.5
+
+
 def test_an_aircraft_seen_from_above_flies_level_not_steeply() -> None:
     """From 20 degrees above, the reversal of a level aircraft points its nose 40 degrees up or down."""
     down_20 = np.array([np.cos(np.deg2rad(20)), 0.0, np.sin(np.deg2rad(20))])
@@ -99,14 +113,14 @@ def test_a_bank_leans_into_its_turn() -> None:
 def test_the_likeliest_bank_is_that_of_a_coordinated_turn(other_deg: float) -> None:
     """At 25 m/s and 0.2 rad/s, tan(bank) = v w / g = 25 * 0.2 / 9.81: 27 degrees."""
     turning = flight([0.0, 25.0, 0.0], turn_rate_radps=0.2)
-    assert flown_odds(attitude(27, 0, 90), attitude(other_deg, 0, 90), EXACT, turning) > 0.15
+    assert flown_odds(attitude(27, 0, 90), attitude(other_deg, 0, 90), EXACT, turning)[0] > 0.15
 
 
 @pytest.mark.parametrize("other_deg", [-14, 0, 30])
 def test_the_likeliest_pitch_is_the_climb(other_deg: float) -> None:
     """6 m/s up at 24 m/s over ground: 14 degrees."""
     climbing = flight([0.0, 24.0, -6.0])
-    assert flown_odds(attitude(0, 14, 90), attitude(0, other_deg, 90), EXACT, climbing) > 0.5
+    assert flown_odds(attitude(0, 14, 90), attitude(0, other_deg, 90), EXACT, climbing)[0] > 0.5
 
 
 def log_density(R: np.ndarray, P: np.ndarray, way: Flight) -> float:
@@ -139,7 +153,7 @@ def log_density(R: np.ndarray, P: np.ndarray, way: Flight) -> float:
 @pytest.mark.parametrize("relative", [False, True])
 def test_the_odds_are_those_of_the_densities_of_how_aircraft_fly(relative: bool) -> None:
     rng = np.random.default_rng(3)
-    within = 0
+    within = np.zeros(2)
     for _ in range(100):
         along = rng.normal(size=3) * [1.0, 1.0, 0.4]
         along /= np.linalg.norm(along)
@@ -148,10 +162,14 @@ def test_the_odds_are_those_of_the_densities_of_how_aircraft_fly(relative: bool)
         v_mps, P_v, P = rng.normal(size=3) * [20.0, 20.0, 8.0], root_v @ root_v.T, root @ root.T
         rate = rng.normal(scale=0.3)
         way = Flight(v_mps, P_v, None, 0.0, NORTH) if relative else Flight(v_mps, P_v, rate, 0.1**2, None)
-        expected = log_density(R, P, way) - log_density(reversal(R, along), P, way)
-        assert flown_odds(R, reversal(R, along), P, way) == pytest.approx(np.clip(expected, -5.0, 5.0), abs=1e-5)
-        within += abs(expected) < 5.0
-    assert within > 50
+        both = [log_density(one, P, way) for one in (R, reversal(R, along))]
+        half_turn = Rotation.from_euler("Z", 180, degrees=True).as_matrix()
+        confused = [log_density(one @ half_turn, P, way) for one in (R, reversal(R, along))]
+        expected = np.array([both[0] - both[1], max(confused) - max(both)])
+        odds = flown_odds(R, reversal(R, along), P, way)
+        assert odds == pytest.approx(np.clip(expected, -5.0, 5.0), abs=1e-5)
+        within += np.abs(expected) < 5.0
+    assert np.all(within > 50)
 
 
 def test_relative_motion_counts_with_the_own_ships_nose() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edge.tracking import rotation
-from edge.tracking.heading import network_opinion, reversal
+from edge.tracking.heading import Flight, flown_odds, network_opinion, reversal
 from edge.tracking.rotation import COMMON_SHARE, ODD_FRAMES, Attitude
 from edge.tracking.view import View
 from edge.types import Array, Estimate, OwnShip
@@ -127,6 +127,21 @@ def test_another_rotation_that_stays_is_taken_with_doubt_that_fades() -> None:
     np.testing.assert_allclose(taken.R_frame_target, off, atol=1e-6)
     assert doubt(taken, NOSE) == pytest.approx(np.sqrt(0.5) * np.deg2rad(110.0), rel=0.05)
     assert doubt(follow(taken, [True] * 120), NOSE) < 0.2 * doubt(taken, NOSE)
+
+
+def test_nose_and_tail_that_may_be_confused_are_a_doubt_about_the_turn_between_them_that_passes() -> None:
+    """Flying west while both rotations point east: what the odds are above even ones, against a prior of e^3."""
+    R, north = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 0.0, 0.0])
+    held = Attitude(R, 0.002 * np.eye(3), 0.002 * np.eye(3), picked=3.0)
+    westwards, eastwards = (Flight(np.array([0.0, v, 0.0]), np.eye(3), 0.0, 1e-4, None) for v in (-25.0, 25.0))
+    confused = rotation.weighed(held, north, westwards, FRAME_S, settled=True)
+    sure = rotation.weighed(confused, north, eastwards, FRAME_S, settled=True)
+    unknown = rotation.weighed(confused, north, None, FRAME_S, settled=True)
+    added = rotation.covariance(confused, north) - rotation.covariance(sure, north)
+    _, odds = flown_odds(R, reversal(R, north), held.P + held.common, westwards)
+    share = np.expm1(odds) / (np.expm1(odds) + np.exp(3.0))
+    np.testing.assert_allclose(added, np.diag([0.0, 0.0, share * np.pi**2]), atol=1e-6)
+    assert sure.tail_first == unknown.tail_first == 0.0
 
 
 def test_in_other_axes_a_rotation_and_its_doubts_are_the_same() -> None:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from edge.links.outgoing import rotation_known
 from edge.tracking.heading import reversal
 from edge.tracking.rotation import ODD_FRAMES
 from edge.tracking.tracker import COAST_MAX_S, Tracker
@@ -235,6 +236,22 @@ def test_the_way_it_flies_settles_which_end_is_the_nose() -> None:
         if i == 2:
             assert rotation_angle(track.R_cam_target, now.R_cam_target) > np.deg2rad(90.0)
     assert rotation_angle(track.R_cam_target, now.R_cam_target) < np.deg2rad(15.0)
+
+
+@pytest.mark.parametrize(("kind", "seen"), [("ned", True), ("ned_relative", True), ("cam", False)])
+def test_a_target_that_flies_tail_first_has_no_known_rotation_and_where_it_does_not_nothing_is_doubted(
+    kind: str, seen: bool
+) -> None:
+    """As a network takes a canard whose like it has never seen, in every frame. In `cam` nothing tells of it."""
+    half_turn = Rotation.from_euler("z", 180, degrees=True).as_matrix()
+    for confused in (False, True):
+        tracker, told = Tracker(4, FORWARD), []
+        for now in flight(21, frames=150):
+            R = now.estimate.R_cam_target @ (half_turn if confused else np.eye(3))
+            (track,) = update(tracker, now, kind, [replace(now.estimate, R_cam_target=R)])
+            told.append(rotation_known(track))
+        share = np.mean(told[60:])
+        assert share < 0.1 if confused and seen else share == 1.0
 
 
 def test_in_cam_a_rotation_that_turns_over_again_and_again_is_told_as_unsure_about_that_axis() -> None:
