@@ -153,7 +153,7 @@ class Pipeline:
             self._out_of_order += 1
             return
         clock = StageClock(frame.meta, monotonic_ns())
-        capture_ns, size_wh = frame.meta.capture_ns, (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        capture_ns, size_wh = frame.meta.capture_ns, frame.size_wh
         own_ship = self._own_ship.at(capture_ns)
         frame = replace(frame, up_cam=up_in_cam(own_ship, self._tracker.mount))
         self._take_requests(capture_ns)
@@ -173,7 +173,7 @@ class Pipeline:
         for text in self._by_hand.news():
             self._outlets.event(logging.INFO, text)
         clock.lap("track")
-        report = self._publish(frame, size_wh, tracks, own_ship)
+        report = self._publish(frame, tracks, own_ship)
         clock.lap("publish")
         self.supervisor.frame_done(report, clock.stages_ns())
 
@@ -208,11 +208,11 @@ class Pipeline:
                 self._tracker.make_room(looked.there)  # a tracked target has its slot already
         return looked.estimates
 
-    def _publish(
-        self, frame: Frame, size_wh: tuple[int, int], tracks: tuple[Track, ...], own_ship: OwnShip | None
-    ) -> Report:
+    def _publish(self, frame: Frame, tracks: tuple[Track, ...], own_ship: OwnShip | None) -> Report:
         chosen_id, doubtful_below = self._by_hand.chosen_id, self._estimator.model.doubtful_below
-        report = Report(frame.meta, frame.K, size_wh, tracks, own_ship, chosen_id, frame.distortion, doubtful_below)
+        report = Report(
+            frame.meta, frame.K, frame.size_wh, tracks, own_ship, chosen_id, frame.distortion, doubtful_below
+        )
         self._outlets.publish(report)
         self._outlets.show(frame)
         return report

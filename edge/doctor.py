@@ -185,7 +185,7 @@ def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
             if not seen_ns:
                 enough_s = time.monotonic() + WATCHED_S
             seen_ns.append(frame.meta.capture_ns)
-            size_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+            size_wh = frame.size_wh
     return seen_ns, size_wh
 
 

@@ -32,6 +32,10 @@ class Frame:
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] (plumb bob); empty: a pinhole camera
     up_cam: Array | None = None  # [3], unit vector upwards in `cam`; None: unknown, taken for the top of the picture
 
+    @property
+    def size_wh(self) -> tuple[int, int]:
+        return self.image_bgr.shape[1], self.image_bgr.shape[0]
+
 
 @dataclass(frozen=True)
 class CameraInfo:

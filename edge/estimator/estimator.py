@@ -44,7 +44,7 @@ class Estimator:
 
     def warm_up(self, frame: Frame) -> None:
         """Run both stages on `frame`, an empty one of the camera's size, so that the first real frame is fast."""
-        width, height = frame.image_bgr.shape[1], frame.image_bgr.shape[0]
+        width, height = frame.size_wh
         self.acquire(frame)
         box = np.array([0.4 * width, 0.4 * height, 0.6 * width, 0.6 * height])
         if self.has_track_stage:
@@ -56,10 +56,9 @@ class Estimator:
     def regions(self, frame: Frame) -> tuple[Region, ...]:
         """What there is to search in a frame: first the whole of it, then tiles, if there is a track stage that can
         confirm what they show."""
-        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         lens = lens_of(frame.K, frame.distortion)
-        finer = tiles(frame_wh, self.model.contract.acquire_size_wh, lens, pixel_aspect(frame.K))
-        return whole(frame_wh, lens), *(finer if self.has_track_stage else ())
+        finer = tiles(frame.size_wh, self.model.contract.acquire_size_wh, lens, pixel_aspect(frame.K))
+        return whole(frame.size_wh, lens), *(finer if self.has_track_stage else ())
 
     def acquire(self, frame: Frame, thrice: bool = True, regions: Sequence[Region] = ()) -> list[Estimate]:
         """Targets in the whole frame, or in some `regions` of it, without those that overlap one of a region before;
@@ -139,9 +138,8 @@ class Estimator:
         contract = self.model.contract
         size_wh, fit = contract.acquire_size_wh, contract.acquire_fit
         lens = lens_of(frame.K, frame.distortion)
-        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         image, pixel_map = fit_frame(frame.image_bgr, size_wh, fit, lens, pixel_aspect(frame.K), region.window)
-        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame.size_wh, frame.up_cam)
         turns = quarter_turns(frame.up_cam)
         peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), size_wh, turns)
         least = region.score_of(score_min)
@@ -196,7 +194,7 @@ class Estimator:
             return []
         expected = expected or boxes_xyxy_px
         size_wh = contract.track_size_wh
-        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        frame_wh = frame.size_wh
         lens = lens_of(frame.K, frame.distortion)
         scale, aspect = contract.track_window_scale, pixel_aspect(frame.K)
         windows = [window_around(box, scale, size_wh, frame_wh, lens, aspect) for box in boxes_xyxy_px]

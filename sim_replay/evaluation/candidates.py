@@ -44,9 +44,8 @@ def candidates(
     model.warm_up()
     for picture in pictures:
         frame = Frame(FrameMeta(picture.image_id, 0, 0), picture.undistorted_bgr(), picture.K)
-        frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
         truth_boxes, other_boxes = (
-            [box for box in picture.undistorted_boxes_xyxy_px(frame_wh, targets) if box is not None]
+            [box for box in picture.undistorted_boxes_xyxy_px(frame.size_wh, targets) if box is not None]
             for targets in (picture.targets, picture.unlisted)
         )
         yield from _in_frame(estimator, frame, truth_boxes, other_boxes)
@@ -64,7 +63,6 @@ def _in_frame(
     estimator: Estimator, frame: Frame, truth_boxes: Sequence[Array], other_boxes: Sequence[Array]
 ) -> Iterator[Candidate]:
     contract = estimator.model.contract
-    frame_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
     aspect = pixel_aspect(frame.K)
     whole_map = fit_frame(frame.image_bgr, contract.acquire_size_wh, contract.acquire_fit, aspect=aspect)[1]
     for found in estimator.anywhere(frame, (), Counter()):
@@ -72,7 +70,7 @@ def _in_frame(
         if contract.track_size_wh is None:
             continue
         scale, size_wh = contract.track_window_scale, contract.track_size_wh
-        window = window_around(found.box_xyxy_px, scale, size_wh, frame_wh, aspect=aspect)
+        window = window_around(found.box_xyxy_px, scale, size_wh, frame.size_wh, aspect=aspect)
         for seen in estimator.track(frame, [found.box_xyxy_px]):
             if seen is not None:
                 yield from _labelled(seen, window.pixel_map(size_wh), truth_boxes, other_boxes)

@@ -157,7 +157,7 @@ def _flown(estimator: Estimator, sequence: _Sequence, shown: BopFrame) -> tuple[
     own_ship = sequence.own_ship(shown.image_id)
     up_cam = None if own_ship is None else up_in_cam(own_ship, _CAMERA_ITSELF)
     frame = Frame(sequence.meta(shown.image_id), image_bgr, shown.K, up_cam=up_cam)
-    size_wh, capture_ns = (image_bgr.shape[1], image_bgr.shape[0]), frame.meta.capture_ns
+    size_wh, capture_ns = frame.size_wh, frame.meta.capture_ns
     started_ns = time.monotonic_ns()
     expected = sequence.tracker.predict(capture_ns, own_ship, shown.K, size_wh)
     estimates = sequence.attention.look(estimator, frame, expected, StageClock(frame.meta, started_ns)).estimates
