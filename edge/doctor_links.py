@@ -35,7 +35,7 @@ from edge.requests import RequestQueue
 from edge.status import ANY, ask, loopback_endpoints
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.types import CameraInfo
-from msgs.session import client_config, peer_config
+from msgs.session import client_config, peer_config, reason_of
 
 CAMERA_REASONS = ("camera_", "no_camera", "no_frame")  # prefixes of the kinds of edge.health.Reason about it
 NO_AUTOPILOT = "no_attitude"
@@ -142,7 +142,7 @@ def _zenoh(settings: ZenohSettings) -> Iterator[Finding]:
             "zenoh", f"can listen on {', '.join(settings.listen)}" if settings.listen else "no address to listen on"
         )
     except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0]  # the rest is a location in zenoh's source
+        reason = reason_of(error)
         code = re.search(r"\(os error (\d+)\)", reason)
         advice = _advice_to_listen(int(code[1]) if code else None, "[zenoh] listen")
         yield wrong("zenoh", f"cannot listen on {', '.join(settings.listen)}: {reason}", advice)

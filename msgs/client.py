@@ -24,7 +24,7 @@ from zenoh import ext, handlers
 
 from msgs import topics
 from msgs.receive import PoseReceiver, TargetDirection, TargetPose
-from msgs.session import TlsFiles, check_endpoint, client_config
+from msgs.session import TlsFiles, check_endpoint, client_config, reason_of
 from msgs.topics import Topic
 from msgs.wire import Refusal
 
@@ -51,8 +51,8 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
     try:
         session = zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0].strip()  # cuts off the location in zenoh's source
-        raise ConnectionError(f"no zenoh session with {endpoint}: {reason}. Is a router or daemon there?") from None
+        told = f"no zenoh session with {endpoint}: {reason_of(error)}. Is a router or daemon there?"
+        raise ConnectionError(told) from None
     with _opened_lock:
         _opened[:] = [*(one for one in _opened if not one.is_closed()), session]
     return session

@@ -78,8 +78,7 @@ class Node:
     def publisher(self, topic: Topic, target: str | None = None) -> TopicPublisher:
         """Declare a publisher for a topic with its quality of service; `target` (`t0`, …) for per-target topics."""
         self._entity_id += 1
-        names = {"domain": self._domain, "distribution": self._distribution}
-        key = topics.publication_key(topic, self._uav, target, **names)  # type: ignore[arg-type]
+        key = topics.publication_key(topic, self._uav, target, domain=self._domain, distribution=self._distribution)
         token = topics.publisher_token(
             self._zid,
             _NODE_ID,

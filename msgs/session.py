@@ -215,6 +215,11 @@ def client_config(connect: Sequence[str], *, tls: TlsFiles | None = None) -> zen
     return _config("client", [], connect, tls)
 
 
+def reason_of(error: zenoh.ZError) -> str:
+    """What went wrong, without the location in zenoh's source that follows it."""
+    return str(error).partition(" at /")[0].strip()
+
+
 def _thinned_by_radio(pose_rate_max_hz: float) -> dict[str, Any]:
     """zenoh's downsampling rules for tls, quic and udp links."""
     rates_hz = {

@@ -21,7 +21,7 @@ from edge.config_camera import ZenohCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
 from msgs.cdr import CompressedImage
-from msgs.session import client_config
+from msgs.session import client_config, reason_of
 from msgs.topics import IMAGE, dds_type, parse_attachment
 from msgs.wire import PayloadError
 
@@ -88,7 +88,7 @@ class ZenohSource:
             self._session.declare_subscriber(f"{self._stem}/**", handlers.Callback(self._take, indirect=False))
         except zenoh.ZError as error:
             self.close()
-            reason = str(error).partition(" at /")[0].rstrip("! ")  # the rest is a location in zenoh's source
+            reason = reason_of(error).rstrip("! ")
             raise SourceLost(f"no zenoh session with {self._settings.connect}: {reason}") from error
         return self.nominal()
 

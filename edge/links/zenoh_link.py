@@ -35,7 +35,7 @@ from msgs import topics
 from msgs.cdr import CompressedImage, Log, Payload
 from msgs.publish import Node, TopicPublisher
 from msgs.recording import Recorder
-from msgs.session import peer_config
+from msgs.session import peer_config, reason_of
 from msgs.topics import Topic
 
 log = logging.getLogger(__name__)
@@ -113,8 +113,7 @@ class ZenohLink:
                 endpoints = " or ".join(endpoint for endpoint in settings.listen if taken[1] in endpoint)
                 raise LinkError(f"{endpoints} is in use: does another daemon run?") from error
             endpoints = ", ".join(settings.listen) or "none"
-            reason = str(error).partition(" at /")[0]  # the rest is a location in zenoh's source
-            raise LinkError(f"zenoh cannot listen on {endpoints}: {reason}") from error
+            raise LinkError(f"zenoh cannot listen on {endpoints}: {reason_of(error)}") from error
 
     def publish(self, report: Report) -> None:
         """Leave a report for the worker; one it has not taken yet is replaced and counted."""
@@ -197,8 +196,8 @@ class ZenohLink:
         with ExitStack() as stack:
             node: Node | None = None
             if session is not None:
-                names = {"domain": self._settings.domain, "distribution": self._settings.ros_distribution}
-                node = stack.enter_context(Node(session, self._vehicle_name, **names))  # type: ignore[arg-type]
+                domain, distribution = self._settings.domain, self._settings.ros_distribution
+                node = stack.enter_context(Node(session, self._vehicle_name, domain=domain, distribution=distribution))
                 token = session.liveliness().declare_token(topics.alive_token(self._vehicle_name))
                 stack.enter_context(token)
             desk = Desk(node, self._recorder, self._vehicle_name, self._mount, self._settings.max_age_ms)

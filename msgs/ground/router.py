@@ -27,7 +27,7 @@ from pydantic import Field, model_validator
 from msgs.ground.access import AccessSettings, access_control
 from msgs.ground.errors import InputError
 from msgs.ground.feed import ALIVE, alive_uav
-from msgs.session import TlsFiles, check_endpoint, router_config
+from msgs.session import TlsFiles, check_endpoint, reason_of, router_config
 from msgs.settings import Section, WrittenPath, load_settings
 
 
@@ -75,8 +75,7 @@ def open_router(settings: RouterSettings, folder: Path) -> Iterator[zenoh.Sessio
     try:
         session = zenoh.open(router_config(settings.listen, tls=tls, access_control=rules))
     except zenoh.ZError as error:
-        reason = str(error).partition(" at /")[0]  # cuts off the location in zenoh's source
-        raise InputError(f"the router cannot listen on {', '.join(settings.listen)}: {reason}") from error
+        raise InputError(f"the router cannot listen on {', '.join(settings.listen)}: {reason_of(error)}") from error
     with session:
         yield session
 
