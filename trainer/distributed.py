@@ -39,13 +39,13 @@ class Group:
         for tensor, mean in zip(kept, flat.split([t.numel() for t in kept]), strict=True):
             tensor.detach().copy_(mean.view_as(tensor))
 
-    def agreed(self, *values: float) -> tuple[float, ...]:
-        """The first process's values, returned in all processes."""
+    def agreed(self, value: float) -> float:
+        """The first process's value, returned in all processes."""
         if self.size == 1:
-            return values
-        told = torch.tensor(values, dtype=torch.float64, device=self.device)
+            return value
+        told = torch.tensor(value, dtype=torch.float64, device=self.device)
         dist.broadcast(told, src=0)
-        return tuple(told.tolist())
+        return float(told)
 
     def largest(self, value: float) -> float:
         """The largest of the processes' values."""

@@ -128,9 +128,8 @@ class _Loop:
         return self.plan.used_before_s + time.monotonic() - self.started_s
 
     def progress(self) -> float:
-        return self.group.agreed(self.plan.progress(self.trainer.samples, self.used_s()))[
-            0
-        ]  # collective: all processes must call it
+        """Of the schedule, 0..1; all processes must call it."""
+        return self.group.agreed(self.plan.progress(self.trainer.samples, self.used_s()))
 
     def note(self, text: str) -> None:
         if self.log is not None:
