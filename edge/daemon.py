@@ -183,7 +183,7 @@ class Pipeline:
         if slept_ns == 0:
             return False
         self._tracker.drop_all()
-        self._own_ship.clear(same_autopilot=True)
+        self._own_ship.clear(same_autopilot=True, until_ns=monotonic_ns())
         text = f"the computer has slept for {slept_ns / 1e9:.1f} s: all targets are forgotten"
         log.warning("%s", text)
         self._outlets.event(logging.WARNING, text)

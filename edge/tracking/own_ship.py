@@ -32,6 +32,7 @@ GIMBAL_STEP_MIN_NS = 5_000_000  # the difference of closer samples is mostly rou
 POSITION_GAP_MAX_NS = 2_000_000_000
 POSITION_AHEAD_MAX_NS = 500_000_000
 GLOBAL_AGE_MAX_NS = 5_000_000_000
+LONG_AGO_NS = -(10**18)
 NS_PER_S = 1e9
 
 
@@ -88,6 +89,7 @@ class OwnShipBuffer:
         self._global: _Global | None = None
         self._in_local_ned = False  # whether this autopilot sends positions in its local ned frame
         self._axes_epoch = self._origin_epoch = 0
+        self._refused_until_ns = LONG_AGO_NS
 
     def add_attitude(
         self, time_ns: int, q_ned_body_wxyz: ArrayLike, rates_body_radps: ArrayLike, clock_std_s: float = 0.0
@@ -96,7 +98,7 @@ class OwnShipBuffer:
         rates_radps = np.array(rates_body_radps, dtype=np.float64)
         sample = _Attitude(time_ns, R_from_q_wxyz(q_ned_body_wxyz), rates_radps, clock_std_s)
         with self._lock:
-            return _append(self._attitudes, sample)
+            return self._append(self._attitudes, sample)
 
     def add_gimbal(
         self, time_ns: int, q_frame_gimbal_wxyz: ArrayLike, frame: GimbalFrame, clock_std_s: float = 0.0
@@ -106,14 +108,14 @@ class OwnShipBuffer:
         Raises ValueError on a zero quaternion.
         """
         with self._lock:
-            return _append(self._gimbals, _Gimbal(time_ns, R_from_q_wxyz(q_frame_gimbal_wxyz), frame, clock_std_s))
+            return self._append(self._gimbals, _Gimbal(time_ns, R_from_q_wxyz(q_frame_gimbal_wxyz), frame, clock_std_s))
 
     def add_position(self, time_ns: int, t_ned_m: ArrayLike, v_ned_mps: ArrayLike) -> bool:
         """Position and velocity [3] of the body origin in the local ned frame."""
         sample = _Position(time_ns, np.array(t_ned_m, dtype=np.float64), np.array(v_ned_mps, dtype=np.float64))
         with self._lock:
             self._in_local_ned = True
-            return _append(self._positions, sample)
+            return self._append(self._positions, sample)
 
     def add_global(
         self, time_ns: int, lat_lon_alt: tuple[float, float, float], v_ned_mps: tuple[float, float, float]
@@ -124,19 +126,22 @@ class OwnShipBuffer:
         loses its position it keeps sending the last global one, at rest, but stops sending the local one.
         """
         with self._lock:
-            if self._global is not None and time_ns <= self._global.time_ns:
+            before_ns = self._refused_until_ns if self._global is None else self._global.time_ns
+            if time_ns <= before_ns:
                 return False
             self._global = _Global(time_ns, lat_lon_alt, np.array(v_ned_mps, dtype=np.float64))
             return True
 
-    def clear(self, *, same_axes: bool = False, same_autopilot: bool = False) -> None:
+    def clear(self, *, same_axes: bool = False, same_autopilot: bool = False, until_ns: int = LONG_AGO_NS) -> None:
         """Discard all samples: the autopilot or its estimator was reset, and its local origin with it.
 
         `same_axes`: attitudes keep their meaning and are kept: without one for a frame, the targets' velocities would
         be lost. Otherwise north, or the gimbal's zero, may have changed.
         `same_autopilot`: it sends the same kinds of position as before.
+        `until_ns`: samples of that time or before, which may wait to be read, are rejected from now on.
         """
         with self._lock:
+            self._refused_until_ns = max(self._refused_until_ns, until_ns)
             self._in_local_ned = self._in_local_ned and same_autopilot
             self._origin_epoch += 1
             if not same_axes:
@@ -180,6 +185,12 @@ class OwnShipBuffer:
                 self._origin_epoch,
             )
 
+    def _append(self, samples: deque, sample: _Attitude | _Gimbal | _Position) -> bool:
+        if sample.time_ns <= (samples[-1].time_ns if samples else self._refused_until_ns):
+            return False
+        samples.append(sample)
+        return True
+
     @property
     def _sources(self) -> tuple[deque[_Attitude], deque[_Gimbal]]:
         return self._attitudes, self._gimbals
@@ -208,13 +219,6 @@ class OwnShipBuffer:
         if then is None or abs(age_ns) > GLOBAL_AGE_MAX_NS:
             return None
         return origin_of_ned(place, then[0])
-
-
-def _append(samples: deque, sample: _Attitude | _Gimbal | _Position) -> bool:
-    if samples and sample.time_ns <= samples[-1].time_ns:
-        return False
-    samples.append(sample)
-    return True
 
 
 def _first_after(samples: deque, time_ns: int) -> int:

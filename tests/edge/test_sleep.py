@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edge import clock
 from edge.cameras.source import SourceLost
@@ -101,6 +102,27 @@ def test_a_report_that_the_computer_slept_over_in_a_link_is_not_sent(sleep: Slee
         assert "sent_pose" not in link.counters()
         link.publish(make_report(make_track(time.monotonic_ns())))
         until(lambda: link.counters().get("sent_pose") == 1, what="the next report")
+
+
+def test_telemetry_that_waited_in_a_socket_while_the_computer_slept_is_not_taken_for_that_of_now(
+    toy_model: Path, sleep: Sleep
+) -> None:
+    """The loop may wake first: what it forgets must not come back from the link's socket."""
+    level = Rotation.identity()
+    with (
+        looping(Gated(load_model(toy_model, 1))) as (loop, _, _),
+        mavlink(own_ship=loop._own_ship) as (link, own_ship),
+        Peer(link.ports[0]) as peer,
+    ):
+        meet(link, peer)
+        before_ms = peer.boot_ms()
+        sleep(HOUR_NS)
+        loop._process(empty(0))
+        peer.attitude(level, before_ms)
+        until(lambda: link.counters().get("received_ATTITUDE_QUATERNION") == 1, what="the attitude of before")
+        assert own_ship.at(time.monotonic_ns()) is None
+        peer.boot_at_ns -= HOUR_NS
+        peer.settle(lambda: own_ship.at(time.monotonic_ns()) is not None, "own attitude", lambda: peer.attitude(level))
 
 
 def test_what_waited_in_a_stream_while_the_computer_slept_is_not_told_as_that_of_now(
