@@ -83,7 +83,7 @@ class MountSettings(Section):
         default=None, description="3x3 rotation matrix from cam (optical) to body (FRD)"
     )
     t_body_cam_m: tuple[LeverM, LeverM, LeverM] = Field(
-        default=(0.0, 0.0, 0.0), strict=False, description="camera position in body, metres"
+        default=(0.0, 0.0, 0.0), strict=False, description="camera position in body, metres, on a gimbal too"
     )
 
     @model_validator(mode="after")

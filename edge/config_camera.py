@@ -78,7 +78,7 @@ class IntrinsicsSettings(Section):
 class Camera(Section):
     mount: Literal["fixed", "gimbal"] = Field(
         default="fixed",
-        description="gimbal: [mount] is the pose of the camera on the gimbal, whose attitude comes over MAVLink",
+        description="gimbal: [mount] turns the camera on the gimbal, whose attitude comes over MAVLink",
     )
 
 

@@ -87,7 +87,7 @@ class OwnShip:
     origin_epoch: int = 0  # the same for the ned origin
 
     def camera(self, mount: Mount) -> Mount:
-        """Camera pose on the body at this instant; with a gimbal, `mount` is the camera pose on the gimbal."""
+        """Camera pose on the body at this instant; of `mount`, a gimbal only changes the rotation."""
         if self.R_body_gimbal is None:
             return mount
         return Mount(self.R_body_gimbal @ mount.R_body_cam, mount.t_body_cam_m)
