@@ -206,7 +206,10 @@ class MavlinkSettings(Section):
 
 class HealthSettings(Section):
     no_frame_s: float = Field(
-        default=2.0, ge=0.2, le=60, description="time without a frame after which the state is FAULT"
+        default=2.0,
+        ge=0.2,
+        le=60,
+        description="time without a frame after which the state is FAULT; before the first frame at least 10 s",
     )
     latency_max_ms: float | None = Field(
         default=None,
