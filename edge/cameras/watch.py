@@ -95,7 +95,7 @@ class ModeWatch:
         self._last_wh: tuple[int, int] | None = None
 
     def take(self, frame: Frame) -> None:
-        self._last_wh = (frame.image_bgr.shape[1], frame.image_bgr.shape[0])
+        self._last_wh = frame.size_wh
         self._first_wh = self._first_wh or self._last_wh
 
     def reasons(self) -> tuple[Reason, ...]:
