@@ -113,14 +113,14 @@ def geo_status(report: Report, track: Track) -> Any | None:
         # Relative to the own ship: the own position's error is missing, and such a velocity cannot be expressed.
         P_place = P_place + POSITION_STD_M**2 * np.eye(3)
     elif track.v_ned_target_mps is not None:
-        velocity, vel_acc = track.v_ned_target_mps.tolist(), _largest_std(P[3:6, 3:6])
+        velocity, vel_acc = track.v_ned_target_mps.tolist(), largest_std(P[3:6, 3:6])
     heading_rad, heading_std_rad = _heading_rad(R, P[6:, 6:]) if rotation_known(track) else (NAN, NAN)
     return dialect.MAVLink_camera_tracking_geo_status_message(
         TRACKING_STATUS[track.state],
         round(lat * 1e7),
         round(lon * 1e7),
         alt,
-        _largest_std(P_place[:2, :2]),
+        largest_std(P_place[:2, :2]),
         math.sqrt(P_place[2, 2]),
         *velocity,
         vel_acc,
@@ -197,5 +197,6 @@ def _heading_rad(R_ned_target: Array, P: Array) -> tuple[float, float]:
     return heading_rad % (2.0 * math.pi), std_rad
 
 
-def _largest_std(P: Array) -> float:
+def largest_std(P: Array) -> float:
+    """Standard deviation along the worst axis of a covariance [n, n]."""
     return math.sqrt(max(float(np.linalg.eigvalsh(P)[-1]), 0.0))

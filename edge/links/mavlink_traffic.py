@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
+from edge.links.mavlink_messages import largest_std
 from edge.links.outgoing import rotation_known
 from edge.tracking.geodesy import lat_lon_alt_from_ned
 from edge.types import OwnShip, Report, Track
@@ -35,7 +34,6 @@ def follow_target(report: Report, track: Track) -> Any | None:
         return None
     turned = rotation_known(track)
     known = POSITION_KNOWN | VELOCITY_KNOWN | ATTITUDE_KNOWN * turned
-    horizontal_std_m = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
     lat, lon, alt = place
     return dialect.MAVLink_follow_target_message(
         report.meta.capture_ns // NS_PER_MS,
@@ -47,7 +45,7 @@ def follow_target(report: Report, track: Track) -> Any | None:
         [0.0] * 3,
         q_wxyz_from_R(R).tolist() if turned else [0.0] * 4,
         [0.0] * 3,
-        [horizontal_std_m, math.sqrt(P[2, 2]), 0.0],
+        [largest_std(P[:2, :2]), math.sqrt(P[2, 2]), 0.0],
         0,
     )
 
@@ -96,6 +94,6 @@ def _velocity_mps(own_ship: OwnShip | None, track: Track) -> list[float] | None:
     if own_ship is None or own_ship.t_ned_body_m is None or track.v_ned_target_mps is None:
         return None
     P = track.covariance_ned
-    if P is None or np.linalg.eigvalsh(P[3:6, 3:6])[-1] > VELOCITY_STD_MAX_MPS**2:
+    if P is None or largest_std(P[3:6, 3:6]) > VELOCITY_STD_MAX_MPS:
         return None
     return [float(v) for v in track.v_ned_target_mps]

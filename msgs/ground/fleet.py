@@ -330,15 +330,14 @@ def closing_mps(ranges: deque[tuple[int, float]]) -> float | None:
 
 def target_row(pose: TargetPose, closing: float | None, ship: OwnShip | None, score: float | None) -> TargetRow:
     """Row for a pose; `ship` is None if the own attitude is unknown."""
-    R_ned_cam = None if ship is None else ship.R_ned_cam
     t_m, covariance = pose.pose.t_cam_target_m, pose.pose.covariance
     range_m = float(np.linalg.norm(t_m))
     along = t_m / max(range_m, 1e-9)
     attitude: tuple[float, float, float] | None = None
     bearing_deg, elevation_deg, frame, own_age_s = _bearing(t_m, pose.stamp_ns, ship)
-    if R_ned_cam is not None and pose.rotation_known:
+    if ship is not None and pose.rotation_known:
         R_cam_target = R_from_q_wxyz(np.roll(pose.pose.q_cam_target_xyzw, 1))
-        roll, pitch, yaw = np.degrees(euler_from_R(R_ned_cam @ R_cam_target))
+        roll, pitch, yaw = np.degrees(euler_from_R(ship.R_ned_cam @ R_cam_target))
         attitude = (float(roll), float(pitch), float(yaw) % 360.0)
     sigma_rotation_rad = math.sqrt(max(float(np.trace(covariance[3:, 3:])), 0.0) / 3.0)
     x, y, z, w = map(float, pose.pose.q_cam_target_xyzw)
