@@ -29,12 +29,9 @@ from edge.errors import InputError
 from edge.links.mavlink_endpoints import parse_endpoint, plain_host
 from edge.links.signing_key import load_key
 from edge.types import Mount
-from msgs.geometry import R_from_euler, nearest_rotation
+from msgs.geometry import R_FORWARD_CAM, R_from_euler, nearest_rotation
 from msgs.settings import Fault, Section, faults_of, parse_toml, read_text
 from msgs.topics import check_uav_name
-
-# The mount with all three angles zero: optical axis along the nose, image right along the right wing.
-R_BODY_CAM_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 # For keys that are easily given another kind of value.
 _WRONG_KINDS = ("string_type", "model_type", "model_attributes_type")
@@ -105,7 +102,7 @@ class MountSettings(Section):
             R_body_cam = nearest_rotation(self.R_body_cam)
         else:
             angles_rad = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
-            R_body_cam = R_from_euler(*angles_rad) @ R_BODY_CAM_FORWARD
+            R_body_cam = R_from_euler(*angles_rad) @ R_FORWARD_CAM
         return Mount(R_body_cam, np.array(self.t_body_cam_m))
 
 

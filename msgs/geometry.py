@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+# `cam` (x right, y down, z forward) into axes that point forward, right and down: of a camera along the nose, upright.
+R_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+R_FORWARD_CAM.setflags(write=False)
 # Variance that stands for "unknown"; ROS has no other representation for it.
 NOT_ESTIMATED = 1e6
 # Cosine of pitch below which rounding, and no longer the matrix, decides what is roll and what is yaw.
@@ -43,6 +46,11 @@ def so3_log(R: ArrayLike) -> Array:
     half_angle = np.arctan2(np.linalg.norm(q[..., 1:], axis=-1, keepdims=True), q[..., :1])
     scale = 2.0 / np.sinc(half_angle / np.pi)
     return q[..., 1:] * scale
+
+
+def slerp(R_a: Array, R_b: Array, share: ArrayLike) -> Array:
+    """Rotations [..., 3, 3] at the given share [...] of the shortest turn from R_a to R_b [..., 3, 3]."""
+    return R_a @ so3_exp(np.asarray(share)[..., None] * so3_log(R_a.swapaxes(-1, -2) @ R_b))
 
 
 def rotation_angle(R_a: ArrayLike, R_b: ArrayLike) -> Array:

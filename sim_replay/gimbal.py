@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs.geometry import Array, R_from_q_wxyz, q_wxyz_from_R, so3_exp, so3_log
+from msgs.geometry import R_FORWARD_CAM, Array, R_from_q_wxyz, q_wxyz_from_R, slerp
 from sim_replay.telemetry import TelemetryError
 
-R_GIMBAL_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 COLUMNS = ("t_ns", "q_ned_gimbal_w", "q_ned_gimbal_x", "q_ned_gimbal_y", "q_ned_gimbal_z")
 
 
@@ -33,7 +32,7 @@ class GimbalTrack:
         i = int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
         share = float(t_ns - self.t_ns[i]) / float(self.t_ns[i + 1] - self.t_ns[i])
         R_a, R_b = R_from_q_wxyz(self.q_ned_gimbal_wxyz[i : i + 2])
-        return q_wxyz_from_R(R_a @ so3_exp(share * so3_log(R_a.T @ R_b)))
+        return q_wxyz_from_R(slerp(R_a, R_b, share))
 
 
 def track_of(
@@ -45,7 +44,7 @@ def track_of(
     """
     numbers = np.arange(len(R_cam_ned)) if frames is None else np.asarray(frames)
     t_ns = frame0_ns + np.round(numbers * 1e9 / fps).astype(np.int64)
-    q_wxyz = [q_wxyz_from_R(R.T @ R_GIMBAL_CAM.T) for R in R_cam_ned]
+    q_wxyz = [q_wxyz_from_R(R.T @ R_FORWARD_CAM.T) for R in R_cam_ned]
     return GimbalTrack(t_ns, np.array(q_wxyz))
 
 

@@ -16,12 +16,12 @@ from edge.cameras.sequence import frames_of
 from edge.config import MountSettings
 from edge.errors import InputError
 from edge.types import Mount
-from msgs.geometry import Array
+from msgs.geometry import R_FORWARD_CAM, Array
 from sim_replay.bop import Distortion, Model, read_scene
 from sim_replay.bop.scene import Image
 from sim_replay.datasets import Dataset, read_undistorted_bgr
 from sim_replay.evaluation.judge import is_hidden, is_seen
-from sim_replay.gimbal import R_GIMBAL_CAM, GimbalTrack, track_of
+from sim_replay.gimbal import GimbalTrack, track_of
 from sim_replay.overlay import Extents
 from sim_replay.score import Truth
 from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
@@ -153,7 +153,7 @@ def read_sequence(folder: Path) -> PlayedSequence:
         raise InputError(str(error)) from error
     check_spans(telemetry, telemetry_csv, frame0_ns, len(scene.images), fps)
     if gimballed:
-        gimbal, mount = _gimbal(folder, frames, frame0_ns, fps), Mount(R_GIMBAL_CAM, mount.t_body_cam_m)
+        gimbal, mount = _gimbal(folder, frames, frame0_ns, fps), Mount(R_FORWARD_CAM, mount.t_body_cam_m)
     return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal)
 
 

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.tracking.geodesy import lat_lon_alt_from_ned
-from msgs.geometry import R_from_euler, q_wxyz_from_R, so3_log
+from msgs.geometry import R_FORWARD_CAM, R_from_euler, q_wxyz_from_R, so3_log
 from sim_replay.airframes import AIRFRAMES, airframe_id
 from sim_replay.bop import SceneWriter, write_camera, write_models
 from sim_replay.flight.encounter import ORIGIN_DEG_M
 from sim_replay.flight.pilot import GRAVITY_MPS2
-from sim_replay.flight.pointing import R_BODY_FORWARD_CAM
 from sim_replay.render.frame import render_frame
 from sim_replay.render.records import bop_frame, bop_target
 from sim_replay.render.scene import Camera, Scene, Target, environment_from_seed
@@ -39,7 +38,7 @@ AIRFRAME = "twin_boom_inverted_v"
 LIVERY_SEED = 8
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 1920, 1080, 2700.0
 MOUNT_PITCH_RAD = np.radians(4.0)
-R_BODY_CAM = R_from_euler(0.0, MOUNT_PITCH_RAD, 0.0) @ R_BODY_FORWARD_CAM
+R_BODY_CAM = R_from_euler(0.0, MOUNT_PITCH_RAD, 0.0) @ R_FORWARD_CAM
 T_BODY_CAM_M = np.array([0.45, 0.0, 0.12])
 SENSOR = Sensor(
     blur_sigma_px=0.6,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msgs.geometry import Array, R_from_q_wxyz, q_wxyz_from_R, so3_exp, so3_log
+from msgs.geometry import Array, R_from_q_wxyz, q_wxyz_from_R, slerp
 
 COLUMNS = (
     *("t_ns", "q_ned_body_w", "q_ned_body_x", "q_ned_body_y", "q_ned_body_z", "p_radps", "q_radps", "r_radps"),
@@ -66,7 +66,7 @@ class Telemetry:
             share = float(t_ns - self.t_ns[i]) / float(self.t_ns[i + 1] - self.t_ns[i])
             row = (1.0 - share) * self.values[i] + share * self.values[i + 1]
             R_a, R_b = R_from_q_wxyz(self.values[i : i + 2, :4])
-            row[:4] = q_wxyz_from_R(R_a @ so3_exp(share * so3_log(R_a.T @ R_b)))
+            row[:4] = q_wxyz_from_R(slerp(R_a, R_b, share))
         lat_deg, lon_deg, alt_m = (float(value) for value in row[13:16])
         return OwnShipState(row[:4], row[4:7], row[7:10], row[10:13], lat_deg, lon_deg, alt_m)
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from edge.tracking.geodesy import LATITUDE_MAX_DEG, lat_lon_alt_from_ned, origin_of_ned
 from edge.types import Array, OwnShip
-from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, so3_exp, so3_log
+from msgs.geometry import R_from_euler, R_from_q_wxyz, euler_from_R, slerp, so3_exp
 
 KEPT = 1024  # samples of each kind: 10 s at 100 Hz
 ATTITUDE_GAP_MAX_NS = 500_000_000  # no interpolation between samples further apart
@@ -244,7 +244,7 @@ def _attitude_at(samples: deque[_Attitude], time_ns: int) -> Array | None:
     if b.time_ns - a.time_ns > ATTITUDE_GAP_MAX_NS:
         return None
     share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
-    return a.R_ned_body @ so3_exp(share * so3_log(a.R_ned_body.T @ b.R_ned_body))
+    return slerp(a.R_ned_body, b.R_ned_body, share)
 
 
 def _body_turned_rad(samples: deque[_Attitude], time_ns: int) -> float:
@@ -312,7 +312,7 @@ def _gimbal_at(samples: deque[_Gimbal], time_ns: int, R_ned_body: Array) -> Arra
         a, share = b, 0.0  # the last sample alone, without a rate
     else:
         share = (time_ns - a.time_ns) / (b.time_ns - a.time_ns)
-    R = a.R_frame_gimbal @ so3_exp(share * so3_log(a.R_frame_gimbal.T @ b.R_frame_gimbal))
+    R = slerp(a.R_frame_gimbal, b.R_frame_gimbal, share)
     if b.frame is GimbalFrame.HEADING:
         if np.hypot(R_ned_body[0, 0], R_ned_body[1, 0]) < LEVEL_MIN:
             return None

@@ -10,7 +10,7 @@ import numpy as np
 
 from msgs import topics
 from msgs.cdr import TFMessage
-from msgs.geometry import R_from_q_wxyz, so3_exp, so3_log
+from msgs.geometry import R_from_q_wxyz, slerp
 from msgs.wire import Array
 
 GAP_NS = 500_000_000  # longest gap to interpolate over; at five messages a second, one may be lost
@@ -88,10 +88,9 @@ class OwnShipHistory:
 def _between(before: OwnShip, after: OwnShip, stamp_ns: int) -> OwnShip:
     """The state between two others of the same root, or beyond the second, at a constant turn rate and velocity."""
     share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-    turn = so3_log(before.R_ned_cam.T @ after.R_ned_cam)
     own_m = before.t_ned_own_m + share * (after.t_ned_own_m - before.t_ned_own_m)
     cam_m = before.t_ned_cam_m + share * (after.t_ned_cam_m - before.t_ned_cam_m)
-    return OwnShip(stamp_ns, before.root, before.R_ned_cam @ so3_exp(share * turn), own_m, cam_m)
+    return OwnShip(stamp_ns, before.root, slerp(before.R_ned_cam, after.R_ned_cam, share), own_m, cam_m)
 
 
 def own_ship(message: TFMessage) -> OwnShip | None:

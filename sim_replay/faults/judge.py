@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edge.config import R_BODY_CAM_FORWARD
-from msgs.geometry import q_wxyz_from_R
+from msgs.geometry import R_FORWARD_CAM, q_wxyz_from_R
 from sim_replay.faults.messages import AUTOPILOT, SUBSCRIBER, ReceivedMessage
 from sim_replay.faults.witness import ExposedFrame, ReceivedPose, Witness
 
@@ -20,7 +19,7 @@ AGE_MAX_NS = {AUTOPILOT: 200_000_000, SUBSCRIBER: 500_000_000}
 TRANSIT_MAX_NS = 900_000_000
 SAME_FRAME_NS = 30_000_000
 # The rig's own ship hovers level, facing north, with a camera along its nose.
-Q_NED_CAM_WXYZ = q_wxyz_from_R(R_BODY_CAM_FORWARD)
+Q_NED_CAM_WXYZ = q_wxyz_from_R(R_FORWARD_CAM)
 ATTITUDE_TOLERANCE = 1e-2
 # These may be refused: packets that a relay corrupted, and messages under the system id of a replaced autopilot.
 MAY_REFUSE = {

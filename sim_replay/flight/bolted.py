@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from msgs.geometry import R_from_euler
-from sim_replay.flight.pointing import R_BODY_FORWARD_CAM, bearing_rad
+from msgs.geometry import R_FORWARD_CAM, R_from_euler
+from sim_replay.flight.pointing import bearing_rad
 from sim_replay.flight.track import Array, Mask, Track
 
 STEEPEST_MOUNT_RAD = np.radians(55.0)
@@ -13,7 +13,7 @@ STEEPEST_MOUNT_RAD = np.radians(55.0)
 
 def bolted(yaw_rad: Array, pitch_rad: Array) -> Array:
     """R_body_cam [..., 3, 3] of upright cameras rotated to the right and up from the nose by angles [...]."""
-    return R_from_euler(np.zeros_like(yaw_rad), pitch_rad, yaw_rad) @ R_BODY_FORWARD_CAM
+    return R_from_euler(np.zeros_like(yaw_rad), pitch_rad, yaw_rad) @ R_FORWARD_CAM
 
 
 def mean_aim(own: Track, relative_m: Array) -> tuple[Array, Array]:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msgs.geometry import so3_exp
-from sim_replay.flight.track import Array, Track, slerp, spans
+from msgs.geometry import slerp, so3_exp
+from sim_replay.flight.track import Array, Track, spans
 
-R_BODY_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # along the nose, upright
 DOWN = np.array([0.0, 0.0, 1.0])
 
 
@@ -51,7 +50,7 @@ class Pointing:
     def still_at(self, t_s: Array) -> Array:
         """R_body_cam [M, 3, 3] at times [M], without jitter: a fixed camera's mount."""
         i, share, _ = spans(self.t_s, t_s)
-        return slerp(self.R_body_cam, i, share)
+        return slerp(self.R_body_cam[i], self.R_body_cam[i + 1], share)
 
 
 def look(direction_ned: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from msgs.geometry import so3_exp, so3_log
+from msgs.geometry import slerp, so3_exp
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,7 +40,7 @@ class Track:
         position = p0 + h * u * (v0 + u * (3 * rise - 2 * v0 - v1 + u * (v0 + v1 - 2 * rise)))
         velocity = v0 + u * (2 * (3 * rise - 2 * v0 - v1) + 3 * u * (v0 + v1 - 2 * rise))
         rates = (1 - u) * self.rates_body_radps[i] + u * self.rates_body_radps[i + 1]
-        return Track(wanted, slerp(self.R_ned_body, i, share), position, velocity, rates)
+        return Track(wanted, slerp(self.R_ned_body[i], self.R_ned_body[i + 1], share), position, velocity, rates)
 
     def turned(self, yaw_rad: float) -> Track:
         """The same flight with the world rotated by `yaw_rad` about down: gravity and height are unchanged."""
@@ -61,9 +61,3 @@ def spans(grid: Array, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
     i = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
     step = grid[i + 1] - grid[i]
     return i, np.clip((t - grid[i]) / step, 0.0, 1.0), step
-
-
-def slerp(R: Array, i: NDArray[np.intp], share: Array) -> Array:
-    """Rotations [M, 3, 3] at the given fraction [M] from R[i] to R[i + 1], R [N, 3, 3]."""
-    turn = so3_log(np.swapaxes(R[i], -1, -2) @ R[i + 1])
-    return R[i] @ so3_exp(share[:, None] * turn)

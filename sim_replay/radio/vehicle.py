@@ -23,12 +23,12 @@ from edge.config_ground import ZenohSettings, ZenohTlsSettings
 from edge.health import Activity, Condition, HealthSnapshot, HealthState, Percentiles
 from edge.links.zenoh_link import ZenohLink
 from edge.types import FrameMeta, OwnShip, Report, Track, TrackState
+from msgs.geometry import R_FORWARD_CAM
 
 RANGE_MIN_M = 100.0
 PERIOD_S = 600.0  # after which ranges repeat
 EVENT_S = 1.0
 _K = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])
-_R_NED_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _OWN_NED_M = np.array([0.0, 0.0, -120.0])
 
 
@@ -61,11 +61,11 @@ def report(sequence: int, targets: int, uav_number: int = 0) -> Report:
             born_ns=now_ns,
             score=0.9,
             box_xyxy_px=np.array([950.0, 530.0, 970.0, 550.0]),
-            R_cam_target=_R_NED_CAM.T,
+            R_cam_target=R_FORWARD_CAM.T,
             t_cam_target_m=t_cam_m,
             covariance=covariance,
             R_ned_target=np.eye(3),
-            t_ned_target_m=own_m + _R_NED_CAM @ t_cam_m,
+            t_ned_target_m=own_m + R_FORWARD_CAM @ t_cam_m,
             v_ned_target_mps=np.array([21.0, 0.0, 0.0]),
             covariance_ned=covariance_ned,
         )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from msgs.geometry import Array, euler_from_R
+from msgs.geometry import R_FORWARD_CAM, Array, euler_from_R
 from sim_replay import metrics
 from sim_replay.report.continuity import continuity, follows
 from sim_replay.score import Match, TargetPose, stacked, statistics
@@ -16,8 +16,6 @@ from sim_replay.score import Match, TargetPose, stacked, statistics
 COORDINATES = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
 # 95 % quantiles of chi-square, by degrees of freedom (any table of its quantiles).
 CHI2_95 = {3: 7.815, 6: 12.592}
-# cam to a frame with a pilot's axes along the optical axis: x forward, y right, z down.
-R_FORWARD_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def peer_figures(

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edge.errors import InputError
+from msgs.geometry import R_FORWARD_CAM
 from sim_replay.bop import BopScene, Model, ModelFrame, ModelFrames
 from sim_replay.datasets import Dataset, DatasetFrame, open_dataset
 from sim_replay.evaluation.bop_results import file_answers, read_results, results_name, write_results
@@ -22,7 +23,7 @@ from sim_replay.evaluation.figures import cumulative_error, sequence
 from sim_replay.evaluation.files import frame_record
 from sim_replay.evaluation.judge import Answer, JudgedFrame, judge_frames
 from sim_replay.evaluation.worst import badness, worst_matches, write_worst
-from sim_replay.report.peer import R_FORWARD_CAM, coordinates
+from sim_replay.report.peer import coordinates
 from sim_replay.score import Match, TargetPose, Truth
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time\n"

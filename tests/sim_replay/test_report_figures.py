@@ -13,7 +13,7 @@ import pytest
 from matplotlib.font_manager import FontEntry
 from scipy.stats import chi2
 
-from msgs.geometry import so3_exp
+from msgs.geometry import R_FORWARD_CAM, so3_exp
 from sim_replay import lettering
 from sim_replay.evaluation.figures import error_by_range, sequence
 from sim_replay.evaluation.instances import instances
@@ -23,7 +23,6 @@ from sim_replay.report import plots
 from sim_replay.report.continuity import continuity
 from sim_replay.report.peer import (
     CHI2_95,
-    R_FORWARD_CAM,
     longest_silence_s,
     nees,
     peer_figures,

@@ -14,7 +14,7 @@ import rerun as rr
 
 from msgs import topics
 from msgs.cdr import CameraInfo, CompressedImage, DiagnosticArray, Log, PoseWithCovarianceStamped, TFMessage
-from msgs.geometry import R_from_q_wxyz
+from msgs.geometry import R_FORWARD_CAM, R_from_q_wxyz
 from msgs.ground.feed import Incoming
 from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, VEHICLES_MAX, DirectionRow, Fleet, Row, TargetRow
 from msgs.ground.own_ship import GAP_NS, OwnShipHistory
@@ -26,7 +26,7 @@ from msgs.wire import Array, PayloadError
 GONE_NS = 1_000_000_000
 _WAITING_MAX = 256
 # Without own attitude the own ship is drawn where it was last, level and heading north, and the camera looking north.
-_R_NED_CAM_UNKNOWN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_R_NED_CAM_UNKNOWN = R_FORWARD_CAM
 
 
 @dataclass
