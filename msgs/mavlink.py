@@ -118,17 +118,24 @@ def pack(mav: Any, message: Any, *, unknown: Collection[str] = ()) -> bytes:
     Raises ValueError, naming message and field, for a number that is not finite, unless the field is in `unknown`
     (fields whose definition uses NaN for "unknown"), and for a value that does not fit its field.
     """
-    for field in message.get_fieldnames():
-        value = getattr(message, field)
-        numbers = value if isinstance(value, (list, tuple)) else (value,)
-        if field not in unknown and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
-            raise ValueError(f"{message.get_type()}.{field} is not finite: {value}")
+    if (field := not_finite(message, but=unknown)) is not None:
+        raise ValueError(f"{message.get_type()}.{field} is not finite: {getattr(message, field)}")
     try:
         packed = message.pack(mav)
     except (struct.error, OverflowError, IndexError, TypeError) as error:
         raise ValueError(f"{message.get_type()} cannot be packed: {error}") from error
     mav.seq = (mav.seq + 1) % 256
     return packed
+
+
+def not_finite(message: Any, *, but: Collection[str]) -> str | None:
+    """The first field, of others than `but`, with a number that is not finite; None: there is none."""
+    for field in message.get_fieldnames():
+        value = getattr(message, field)
+        numbers = value if isinstance(value, (list, tuple)) else (value,)
+        if field not in but and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
+            return str(field)
+    return None
 
 
 def target_relative(

@@ -20,7 +20,7 @@ from edge.links.mavlink_table import (
     LOCAL_POSITION_NED,
     READ_IDS,
 )
-from msgs.mavlink import FrameReader, dialect
+from msgs.mavlink import FrameReader, dialect, not_finite
 
 DATAGRAM_MAX = 8192  # bytes; longer ones carry no telemetry
 RATE_MAX_HZ = 2000
@@ -124,7 +124,7 @@ def malformed(message: Any) -> str | None:
         return "message_id"
     if message_id in COMMANDS:
         return None  # NaN means "not given" there; each command checks the parameters it reads
-    if not _finite(message):
+    if not_finite(message, but=OPTIONAL_FIELDS) is not None:
         return "not_finite"
     if message_id in (ATTITUDE_QUATERNION, GIMBAL_ATTITUDE) and not _is_rotation(message):
         return "quaternion_norm"
@@ -154,15 +154,6 @@ def _plausible(message: Any) -> bool:
 
 def _within(limit: float, *values: float) -> bool:
     return all(abs(value) <= limit for value in values)
-
-
-def _finite(message: Any) -> bool:
-    for field in message.get_fieldnames():
-        value = getattr(message, field)
-        numbers = value if isinstance(value, (list, tuple)) else (value,)
-        if field not in OPTIONAL_FIELDS and any(isinstance(x, float) and not math.isfinite(x) for x in numbers):
-            return False
-    return True
 
 
 def misaddressed(
