@@ -51,6 +51,8 @@ ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     UNDECODABLE: "check cable, USB port or radio link; zenoh: also that images are JPEG or PNG with 8 bits a channel",
     SLOW: "ask for a rate and a format that the camera has, give it more light, or stop other programs",
     DAMAGED: 'set [camera] rtsp_transport = "tcp", or improve the link; with more key frames, a stream recovers sooner',
+    "camera_size": "set the camera to the mode that it was calibrated in, and start the daemon again",
+    "camera_contested": "let only the camera publish on its topic, or give each camera a topic of its own",
     "camera_frozen": "point it at something that moves; if it stays frozen, unplug it and plug it in again",
 }
 ADVICE_CAMERA = "check that it is powered, plugged in and reachable from this computer"

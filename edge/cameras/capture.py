@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from edge.cameras.reconnect import Reconnect
 from edge.cameras.source import Source, SourceLost, wait_until
-from edge.cameras.watch import FrameWatch, ModeWatch, StampWatch
+from edge.cameras.watch import FrameWatch, ModeWatch, RivalWatch, StampWatch
 from edge.errors import InputError
 from edge.health import Reason
 from edge.types import Frame
@@ -37,7 +37,7 @@ class Capture:
         self._counts: Counter[str] = Counter(
             captured=0, dropped=0, dropped_at_source=0, dropped_overtaken=0, frozen=0, time_jumps=0, reconnects=0
         )
-        self._watch, self._stamps, self._mode = FrameWatch(), StampWatch(), ModeWatch()
+        self._watch, self._stamps, self._mode, self._rivals = FrameWatch(), StampWatch(), ModeWatch(), RivalWatch()
         self._unstamped = 0  # the source's count of them with the last frame
         self._frozen_since_ns: int | None = None
         self._frozen_told = False
@@ -75,7 +75,7 @@ class Capture:
 
     def reasons(self, now_ns: int) -> tuple[Reason, ...]:
         """Faults of the camera at `now_ns` (monotonic): lost, frozen, all damaged, timestamps that jump or have become
-        worse, another size of picture. From any thread."""
+        worse, another size of picture, another publisher. From any thread."""
         found = []
         with self._fresh:
             if self._lost is not None:
@@ -90,7 +90,7 @@ class Capture:
             jumps = sum(now_ns - jumped_ns <= JUMPS_TOLD_S * 1_000_000_000 for jumped_ns in self._jumped_ns)
             if jumps:
                 found.append(Reason("camera_stamps", f"camera timestamps jump ({jumps} in {JUMPS_TOLD_S} s)"))
-            found += [*self._stamps.reasons(now_ns), *self._mode.reasons()]
+            found += [*self._stamps.reasons(now_ns), *self._mode.reasons(), *self._rivals.reasons(now_ns)]
         return tuple(found)
 
     def stop(self) -> None:
@@ -158,6 +158,7 @@ class Capture:
             if self._source.live:
                 self._stamps.take(frame.meta, stamped=self._unstamped == unstamped)
                 self._mode.take(frame)
+                self._rivals.take(frame.meta, self._source.counts.get("other_publisher", 0))
             self._counts["time_jumps"] += jumps
             self._counts["frozen"] += repeats
             self._lost = None

@@ -11,6 +11,8 @@ from edge.types import Frame, FrameMeta
 SAMPLED_EVERY_PX = 8  # enough to distinguish two pictures of a real sensor
 DELAY_JUMP_NS = 250_000_000
 STAMPS_TOLD_NS = 1_000_000_000
+SUCCEEDED_NS = 1_000_000_000  # without a picture of the one in use, another publisher takes its place
+RIVALS_TOLD_NS = 5_000_000_000
 
 
 class FrameWatch:
@@ -104,3 +106,28 @@ class ModeWatch:
         now, before = ("x".join(map(str, size_wh)) for size_wh in (self._last_wh, self._first_wh))
         text = f"camera: pictures are {now}, no longer {before}; ranges are right only if they show the same view"
         return (Reason("camera_size", text),)
+
+
+class RivalWatch:
+    """Whether pictures of another publisher arrive beside those in use: of another camera, or of a recording.
+
+    Which of the two is used is chance: it may be the one that the calibration and the mount are not of.
+    """
+
+    def __init__(self) -> None:
+        self._others = 0
+        self._arrival_ns = 0
+        self._told_ns: int | None = None
+
+    def take(self, meta: FrameMeta, others: int) -> None:
+        """Add a frame; `others`: how many pictures of other publishers have arrived so far."""
+        beside = meta.arrival_ns - self._arrival_ns < SUCCEEDED_NS
+        if others > self._others and beside:
+            self._told_ns = meta.arrival_ns
+        self._others, self._arrival_ns = others, meta.arrival_ns
+
+    def reasons(self, now_ns: int) -> tuple[Reason, ...]:
+        if self._told_ns is None or now_ns - self._told_ns > RIVALS_TOLD_NS:
+            return ()
+        text = "camera: somebody else sends pictures on its topic too; only those of the first are used"
+        return (Reason("camera_contested", text),)

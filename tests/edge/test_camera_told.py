@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -11,11 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from edge.cameras.capture import Capture
+from edge.cameras.watch import RIVALS_TOLD_NS
 from edge.cameras.zenoh_topic import ZenohSource
 from edge.status import ask
 from msgs.cdr import CompressedImage
+from msgs.publish import Node
+from msgs.session import client_config
+from msgs.topics import IMAGE
 from sim_replay.ports import free_port
 from tests.waiting import until
 
@@ -134,6 +140,28 @@ def test_a_camera_that_changes_its_mode_in_flight_is_told_of_until_it_is_in_its_
         until(lambda: sizes_told() == [words], what="the other mode")
         size_wh[0] = (320, 180)
         until(lambda: sizes_told() == [], what="the first mode")
+
+
+def test_two_cameras_on_one_topic_are_told_of_while_there_are_two() -> None:
+    """Which of them is used is chance: it may be the one that [mount] and the calibration are not of."""
+    port = free_port()
+    with filming(port, message), zenoh.open(client_config([f"tcp/127.0.0.1:{port}"])) as session:
+        other = Node(session, "nose", name="rear").publisher(IMAGE)
+        capture = Capture(ZenohSource(zenoh_camera(port)), opened=False)
+        capture.start()
+
+        def told(at_ns: int) -> list[str]:
+            return [reason.text for reason in capture.reasons(at_ns) if reason.kind == "camera_contested"]
+
+        try:
+            until(lambda: capture.newest(0.1) is not None, what="the first camera")
+            assert told(time.monotonic_ns()) == []
+            words = "camera: somebody else sends pictures on its topic too; only those of the first are used"
+            until(lambda: told(time.monotonic_ns()) == [words], lambda: other.put(message(9)), what="the second")
+            other.close()
+            until(lambda: told(time.monotonic_ns() + RIVALS_TOLD_NS) == [], what="one camera again")
+        finally:
+            capture.stop()
 
 
 def test_doctor_does_not_take_a_frozen_camera_for_a_good_one(cli: Cli, tmp_path: Path, toy_model: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 from edge.cameras.capture import FROZEN_TOLD_NS, JUMPS_TOLD_S, Capture
 from edge.cameras.folder import FolderSource, list_pictures
 from edge.cameras.source import EndOfStream, SourceLost
-from edge.cameras.watch import FrameWatch, StampWatch
+from edge.cameras.watch import FrameWatch, RivalWatch, StampWatch
 from edge.config_camera import FolderCamera
 from edge.errors import InputError
 from edge.estimator.pace import Pace
@@ -297,6 +297,15 @@ def test_every_frame_tells_how_often_the_cameras_time_has_jumped(tmp_path: Path)
     (reason,) = capture.reasons(before_ns + JUMPS_TOLD_S * 1_000_000_000)
     assert (reason.kind, reason.text) == ("camera_stamps", "camera timestamps jump (2 in 5 s)")
     assert capture.reasons(time.monotonic_ns() + JUMPS_TOLD_S * 1_000_000_000 + 1) == ()
+
+
+@pytest.mark.parametrize(("gap_s", "told"), [(0.5, True), (1.5, False)])
+def test_a_publisher_that_comes_after_a_silence_is_no_rival(gap_s: float, told: bool) -> None:
+    watch = RivalWatch()
+    watch.take(FrameMeta(0, 10**12, 10**12), 0)
+    next_ns = 10**12 + round(gap_s * 1e9)
+    watch.take(FrameMeta(1, next_ns, next_ns), 3)
+    assert bool(watch.reasons(next_ns)) == told
 
 
 def test_one_pixel_that_changed_is_another_picture() -> None:
