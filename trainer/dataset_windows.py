@@ -56,7 +56,7 @@ class DatasetSampler:
             raise ConfigError(str(error)) from error
         if not self._frames:
             raise ConfigError(f"{root}: contains no frames to train on")
-        _judge_range(root, self._frames)
+        _judge_range(root, self.depths_m)
 
     @property
     def shows_targets(self) -> bool:
@@ -166,10 +166,8 @@ def _mask(frame: DatasetFrame, index: int, frame_wh: tuple[int, int]) -> NDArray
     return mask
 
 
-def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:
+def _judge_range(root: Path, Z_m: Array) -> None:
     """Warn about targets whose depth the network cannot predict; raises ConfigError if that applies to all."""
-    seen = [target for frame in frames for target in frame.targets if target.box_visible_xyxy_px is not None]
-    Z_m = np.array([target.t_cam_target_m[2] for target in seen])
     beyond = (Z_m < Z_RANGE_M[0]) | (Z_m > Z_RANGE_M[1])
     if not beyond.any():
         return
@@ -177,7 +175,7 @@ def _judge_range(root: Path, frames: Sequence[DatasetFrame]) -> None:
     if beyond.all():
         lie = f"its targets lie {Z_m.min():g} to {Z_m.max():g} m before the camera"
         raise ConfigError(f"{root}: {lie}, but {told}; cam_t_m2c is in millimetres")
-    _log.warning("%s: %d of %d targets lie where no depth can be learnt: %s", root, beyond.sum(), len(seen), told)
+    _log.warning("%s: %d of %d targets lie where no depth can be learnt: %s", root, beyond.sum(), len(Z_m), told)
 
 
 def _track_square(rng: np.random.Generator, box_xyxy_px: Array) -> tuple[Array, float]:
