@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.estimator.lens import Lens, lens_of
+from edge.estimator.window import clipped
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.layout import TARGETS_FILE, dataset_of
 from sim_replay.bop.models import models_folder
@@ -291,7 +292,7 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int, size_wh: tuple[int, 
 
 
 def _straight(lens: Lens, box_xyxy_px: Array, frame_wh: tuple[int, int]) -> Array | None:
-    straight = np.clip(lens.box_to_pinhole(box_xyxy_px), -0.5, np.tile(frame_wh, 2) - 0.5)
+    straight = clipped(lens.box_to_pinhole(box_xyxy_px), frame_wh)
     return straight if (straight[:2] < straight[2:]).all() else None  # NaN if the distortion cannot be inverted
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
 from edge.estimator.model import Peaks
-from edge.estimator.window import PixelMap, whole_frame
+from edge.estimator.window import PixelMap, clipped, whole_frame
 from edge.tracking.boxes import overlap
 from edge.types import Array, Estimate
 from msgs.contract import ModelContract
@@ -106,7 +106,7 @@ def decode(
         sigma = peaks.sigma[image, peak].astype(np.float64)
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
         origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
-        on_frame = np.clip(box, -0.5, np.tile(shown.frame_wh, 2) - 0.5)
+        on_frame = clipped(box, shown.frame_wh)
         cut = _is_cut(box, shown.frame_wh) or bool(np.any(shown.cut_sides(on_frame)))
         reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, shown.frame_wh)
         if reason is not None:

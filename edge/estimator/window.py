@@ -149,7 +149,8 @@ def window_around(
     """
     seen = whole_frame(image_size_wh, lens)
     box = np.asarray(box_xyxy_px, dtype=np.float64)
-    x0, y0, x1, y1 = box if lens is None else _straight(lens, _clipped(box, image_size_wh))
+    # The lens is known on the frame only.
+    x0, y0, x1, y1 = box if lens is None else _straight(lens, clipped(box, image_size_wh))
     side = min(window_scale * max(x1 - x0, (y1 - y0) * aspect, 1.0), float(max(seen.width, seen.height * aspect)))
     shorter = min(size_wh)
     width, height = (
@@ -233,8 +234,8 @@ def _straight(lens: Lens, box_xyxy_px: Array) -> Array:
     return straight if np.isfinite(straight).all() else box_xyxy_px
 
 
-def _clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:
-    """The box's part on the frame, as the lens is known only there. A box outside collapses onto the nearest edge."""
+def clipped(box_xyxy_px: Array, image_size_wh: tuple[int, int]) -> Array:
+    """The part of a box [4] on the frame; a box outside collapses onto the nearest edge."""
     return np.clip(box_xyxy_px, -0.5, np.tile(image_size_wh, 2) - 0.5)
 
 
