@@ -72,8 +72,8 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
         tell(FrameNews(plan.index, kept=len(job.frames(plan))))
         return True
     film = job.film(plan) if job.labels_only else metered(job.film(plan))
-    squeezed = plan.h264_kbps is not None and not job.labels_only
-    with SceneStore(folder, plan.jpeg_quality, pictures=not job.labels_only, keep_raw=squeezed) as store:
+    h264_kbps = None if job.labels_only else plan.h264_kbps
+    with SceneStore(folder, plan.jpeg_quality, pictures=not job.labels_only, keep_raw=h264_kbps is not None) as store:
         tell(FrameNews(plan.index, kept=len(store.done)))
         for number in job.frames(plan):
             if number in store.done:
@@ -82,9 +82,9 @@ def make_sequence(job: Job, plan: SequencePlan, tell: Tell, stopped: Stopped) ->
                 return False
             add_frame(store, film, number, job.labels_only)
             tell(FrameNews(plan.index, made=1))
-        if squeezed and plan.h264_kbps is not None:
+        if h264_kbps is not None:
             # At the full rate even if frames are left out: an image then has as many bits as among all of them.
-            store.replace_images(through_h264(store.raw_images(), plan.fps, plan.h264_kbps))
+            store.replace_images(through_h264(store.raw_images(), plan.fps, h264_kbps))
         K, size, distortion = film.K, film.size_wh_px, film.distortion
         store.finish(
             {
