@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from msgs.geometry import R_FORWARD_CAM, R_from_euler
-from sim_replay.flight.pointing import bearing_rad
+from sim_replay.flight.pointing import bearing_rad, radius_rad
 from sim_replay.flight.track import Array, Mask, Track
 
 STEEPEST_MOUNT_RAD = np.radians(55.0)
@@ -26,7 +26,7 @@ def mean_aim(own: Track, relative_m: Array) -> tuple[Array, Array]:
 
 def reach_rad(relative_m: Array, half_fov_rad: tuple[float, float], radius_m: float, jitter_rad: float) -> Array:
     """Largest angle off axis [..., 2] of a target's origin at which a sphere of `radius_m` is fully in the image."""
-    radius = np.arcsin(np.minimum(radius_m / np.linalg.norm(relative_m, axis=-1), 0.9))
+    radius = radius_rad(radius_m, np.linalg.norm(relative_m, axis=-1))
     return 0.97 * np.asarray(half_fov_rad) - radius[..., None] - 6.0 * jitter_rad
 
 

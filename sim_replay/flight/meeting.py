@@ -19,12 +19,16 @@ class Layouts:
     yaw_rad: Array  # [M] rotation of the second flight
     offset_ned_m: Array  # [M, 3] from first to second at mid sequence
 
+    @property
+    def R_ned_turned(self) -> Array:
+        """[M, 3, 3] rotation of the second flight about the vertical."""
+        return so3_exp(np.stack([0 * self.yaw_rad, 0 * self.yaw_rad, self.yaw_rad], axis=-1))
+
     def relative_m(self, first: Track, second: Track, middle: int) -> Array:
         """Second minus first [M, N, 3] in NED at the tracks' common times; they are placed at sample `middle`."""
         along = second.t_ned_body_m - second.t_ned_body_m[middle]
-        R = so3_exp(np.stack([0 * self.yaw_rad, 0 * self.yaw_rad, self.yaw_rad], axis=-1))
         passed = first.t_ned_body_m - first.t_ned_body_m[middle]
-        return self.offset_ned_m[:, None] + np.einsum("mij,nj->mni", R, along) - passed
+        return self.offset_ned_m[:, None] + np.einsum("mij,nj->mni", self.R_ned_turned, along) - passed
 
     def only(self, k: int) -> Layouts:
         """Layout `k` alone, M = 1."""
@@ -59,9 +63,8 @@ def flyable(relative_m: Array, near_m: float, far_m: float) -> Mask:
 
 def seen_from(layouts: Layouts, second: Track, middle: int) -> Array:
     """Directions [M, 3], in the second aircraft's body axes, from which the first one sees it at mid sequence."""
-    R = so3_exp(np.stack([0 * layouts.yaw_rad, 0 * layouts.yaw_rad, layouts.yaw_rad], axis=-1))
     direction = -layouts.offset_ned_m / np.linalg.norm(layouts.offset_ned_m, axis=-1, keepdims=True)
-    return np.einsum("mij,mi->mj", R @ second.R_ned_body[middle], direction)
+    return np.einsum("mij,mi->mj", layouts.R_ned_turned @ second.R_ned_body[middle], direction)
 
 
 def draw_aspect(rng: np.random.Generator) -> Array:

@@ -10,7 +10,7 @@ from msgs.geometry import euler_from_R
 from sim_replay.flight.aircraft import flight_class
 from sim_replay.flight.jsbsim_flight import FlightError, Sortie, fly
 from sim_replay.flight.meeting import Layouts, flyable
-from sim_replay.flight.pointing import bearing_rad
+from sim_replay.flight.pointing import bearing_rad, radius_rad
 from sim_replay.flight.sorties import Clock, draw_sortie
 from sim_replay.flight.track import Array, Mask, Track
 
@@ -86,7 +86,7 @@ def _best_layout(
         good &= np.all(np.linalg.norm(where - other.at(times).t_ned_body_m, axis=-1) > 1.15 * apart_m + 2.0, axis=1)
     sight = where - view.t_ned_cam_m
     angles = bearing_rad(np.einsum("nij,mni->mnj", view.R_ned_cam, sight))
-    radius = np.arcsin(np.minimum(radius_m / np.linalg.norm(sight, axis=-1), 0.9))
+    radius = radius_rad(radius_m, np.linalg.norm(sight, axis=-1))
     inside = np.all(np.abs(angles) + radius[..., None] <= np.asarray(view.half_fov_rad), axis=-1)
     share = inside[:, view.counted].mean(axis=1) * good
     k = int(np.argmax(share))

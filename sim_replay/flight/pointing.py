@@ -80,6 +80,11 @@ def bearing_rad(direction_cam: Array) -> Array:
     return np.where(ahead > 0.0, angles, np.pi)
 
 
+def radius_rad(radius_m: float, range_m: Array) -> Array:
+    """Angle [...] from a sphere's centre to its edge, seen from `range_m` [...] away; bounded if that is too near."""
+    return np.arcsin(np.minimum(radius_m / range_m, 0.9))
+
+
 def within(angles_rad: Array, limit_rad: Array) -> Array:
     """Angles [N, 2] smoothly limited to plus and minus `limit_rad` [N, 2]; small ones are unchanged."""
     return limit_rad * np.tanh(angles_rad / np.maximum(limit_rad, 1e-6))
@@ -152,14 +157,14 @@ def gimbal(
     step_s = float(own.t_s[1] - own.t_s[0])
     behind = lag(sight, step_s, float(rng.uniform(0.05, 0.25)))
     half = np.asarray(half_fov_rad)
-    radius_rad = np.arcsin(np.minimum(radius_m / range_m, 0.9))
+    size_rad = radius_rad(radius_m, range_m)
     shake_rad = np.sum(jitter.size_rad, axis=0).max()
-    reach = np.maximum(half - radius_rad - shake_rad - 0.02 * half, 0.02 * half)
+    reach = np.maximum(half - size_rad - shake_rad - 0.02 * half, 0.02 * half)
     late = -np.einsum("nji,nj->ni", R_ned_look, behind)[:, :2]
     angles = within(draw_wander(rng, own.t_s, half_fov_rad) + late, reach)
     if excursion is not None:
         towards = np.asarray(excursion.towards)
-        gone = towards * (half + radius_rad + shake_rad + 0.05 * half)
+        gone = towards * (half + size_rad + shake_rad + 0.05 * half)
         share = excursion.share(own.t_s)[:, None] * np.abs(towards)
         angles = (1.0 - share) * angles + share * gone
     R_ned_cam = R_ned_look @ aside(angles)
