@@ -18,7 +18,7 @@ from edge.tracking import so3
 from edge.tracking.association import best_pairs
 from edge.tracking.boxes import BoxModel
 from edge.tracking.doubles import TURNS_MIN, Doubles
-from edge.tracking.merged import less_sure
+from edge.tracking.merged import less_sure, shown_at_once
 from edge.tracking.tracker import Tracker
 from edge.types import Estimate, Mount, OwnShip, TrackState
 
@@ -168,6 +168,14 @@ def test_turns_taken_too_long_ago_are_no_sign_of_one_aircraft(pause_s: float, on
         found = doubles.among({pair[0]}, [pair], tenth * 10**8)
     assert found == [pair]
     assert doubles.among({pair[0]}, [pair], 4 * 10**9 + round(pause_s * 1e9)) == [pair] * one
+
+
+@pytest.mark.parametrize(("share", "both"), [(0.3, True), (0.2, False)])
+def test_a_detection_may_show_a_second_target_too_of_whose_box_it_covers_a_quarter(share: float, both: bool) -> None:
+    estimate = sight(np.random.default_rng(0), np.array([0.0, 0.0, 200.0]), np.eye(3))
+    first = estimate.box_xyxy_px
+    second = first + np.tile([(1.0 - share) * (first[2] - first[0]), 0.0], 2)
+    assert shown_at_once([estimate], [first, second], [False, False]) == ({0: [0, 1]} if both else {})
 
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0])
