@@ -185,6 +185,7 @@ def test_uncertainty_grows_while_coasting() -> None:
         ([0.99] * 90, 0.98, 1.0),
         ([0.95, 0.35] * 45, 0.6, 0.7),
         ([0.95] * 3 + [0.4] * 87, 0.4, 0.5),
+        ([0.95] * 60 + [0.4] * 30, 0.59, 0.62),
         ([0.9, 0.3, 0.6], 0.599, 0.601),
     ],
 )
@@ -193,6 +194,13 @@ def test_a_tracks_score_is_that_of_its_recent_frames(scores: list[float], least:
     for now, score in zip(flight(10, frames=len(scores)), scores, strict=True):
         (track,) = update(tracker, now, "ned", [replace(now.estimate, score=score)])
     assert least <= track.score <= most
+
+
+def test_what_is_not_confirmed_outlives_one_miss_and_not_two_in_a_row() -> None:
+    tracker, (first, missed, second, *last) = Tracker(4, FORWARD), flight(11, frames=5)
+    counts = [len(update(tracker, now, "ned", seen)) for now, seen in ((first, None), (missed, []), (second, None))]
+    assert counts == [1, 1, 1]
+    assert [len(update(tracker, now, "ned", [])) for now in last] == [1, 0]
 
 
 def test_one_false_detection_never_becomes_a_track() -> None:
