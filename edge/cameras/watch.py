@@ -11,7 +11,7 @@ from edge.types import Frame, FrameMeta
 SAMPLED_EVERY_PX = 8  # enough to distinguish two pictures of a real sensor
 DELAY_JUMP_NS = 250_000_000
 STAMPS_TOLD_NS = 1_000_000_000
-SUCCEEDED_NS = 1_000_000_000  # without a picture of the one in use, another publisher takes its place
+PUBLISHER_SILENT_NS = 1_000_000_000  # without a picture that can be used; then another may replace it
 RIVALS_TOLD_NS = 5_000_000_000
 
 
@@ -121,7 +121,7 @@ class RivalWatch:
 
     def take(self, meta: FrameMeta, others: int) -> None:
         """Add a frame; `others`: how many pictures of other publishers have arrived so far."""
-        beside = meta.arrival_ns - self._arrival_ns < SUCCEEDED_NS
+        beside = meta.arrival_ns - self._arrival_ns < PUBLISHER_SILENT_NS
         if others > self._others and beside:
             self._told_ns = meta.arrival_ns
         self._others, self._arrival_ns = others, meta.arrival_ns

@@ -16,6 +16,7 @@ from zenoh import handlers
 from edge.cameras.intrinsics import Intrinsics, load_intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
 from edge.cameras.stamps import StampCheck
+from edge.cameras.watch import PUBLISHER_SILENT_NS
 from edge.clock import UtcClock
 from edge.config_camera import ZenohCamera
 from edge.errors import InputError
@@ -30,7 +31,6 @@ log = logging.getLogger(__name__)
 SILENCE_S = 3.0
 LOOK_S = 0.1
 STAMP_AGE_MAX_NS = 2_000_000_000
-PUBLISHER_SILENT_NS = 1_000_000_000  # without a picture that can be used; then another may replace it
 # 200 MB when decoded, more than any camera's: a PNG of 200 kB may unpack to gigabytes, which end the process.
 PIXELS_MAX = 2**26
 PNG_HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # then width and height

@@ -154,7 +154,7 @@ class Model:
         """One inference at each size, and of two windows at once, as there will be with two targets; where windows are
         shared out, also of two for each thread.
 
-        Raises InputError if the graph does not run, or its outputs have wrong shapes or are not finite.
+        Raises InputError if the graph does not run, its outputs have wrong shapes, or its scores are not finite.
         """
         self._try(1, self.contract.acquire_size_wh)
         if self.contract.track_size_wh is not None:
@@ -173,12 +173,12 @@ class Model:
             reason = " ".join(str(error).split())
             raise InputError(f"model {self.path} does not run at {width}x{height}{pictures}: {reason}") from error
         for name, tail in OUTPUT_TAILS.items():
-            output, wanted = getattr(peaks, name), (count, self.contract.max_peaks, *tail)
-            if output.shape != wanted:
-                says = f"has shape {output.shape}, its contract says {wanted}"
-                raise InputError(f"model {self.path}: output {name} {says}")
-            if not np.isfinite(output).all():
-                raise InputError(f"model {self.path}: output {name} is not finite: with it, no target would be found")
+            shape, wanted = getattr(peaks, name).shape, (count, self.contract.max_peaks, *tail)
+            if shape != wanted:
+                raise InputError(f"model {self.path}: output {name} has shape {shape}, its contract says {wanted}")
+        # Of a single peak, what is not finite is refused when it is decoded.
+        if not np.isfinite(peaks.score).all():
+            raise InputError(f"model {self.path}: output score is not finite: no target would be found")
 
 
 def _outputs(session: ort.InferenceSession, images_bgr: NDArray[np.uint8], K: NDArray[np.float64]) -> list[Any]:

@@ -67,7 +67,8 @@ def matrix(path: Path, key: str, entry: Any, name: str, shape: tuple[int, ...]) 
 
 def is_rotation(R: Array) -> bool:
     """Whether R [3, 3] is a rotation without shear, scale or reflection."""
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0)
+    bounded = bool(np.abs(R).max() <= 1.0 + ROTATION_TOLERANCE)  # otherwise the product may overflow
+    return bounded and bool(np.abs(R @ R.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(R) > 0)
 
 
 def rotation(path: Path, key: str, entry: Any, name: str) -> Array:
