@@ -220,11 +220,15 @@ def test_a_daemon_that_was_started_with_other_values_is_told_by_its_name(
     cli: Cli, tmp_path: Path, toy_model: Path, swaying: Path
 ) -> None:
     text = toml(swaying, toy_model, free_port())
+    other = f'[vehicle]\nname = "uav2"\n{text.replace("fps = 10", "fps = 11")}'
     with flying(tmp_path, text):
         _, as_started = findings(cli, tmp_path, text)
-        code, found = findings(cli, tmp_path, f'[vehicle]\nname = "uav2"\n{text.replace("fps = 10", "fps = 11")}')
+        asked = [findings(cli, tmp_path, other)]
+        # A daemon that has to wait for the processor has faults of its own.
+        until(lambda: asked[-1][0] == 0, lambda: asked.append(findings(cli, tmp_path, other)), what="all else well")
         _, in_flight = findings(cli, tmp_path, f"{text}[target]\nwingspan_m = 11.0\nlength_m = 8.3\n")
-    assert (code, found["config"]["verdict"]) == (0, "poor")
+    _, found = asked[-1]
+    assert found["config"]["verdict"] == "poor"
     assert "runs as uav1, with other values than the file of [vehicle] name, [camera] fps" in found["config"]["says"]
     assert "restart" in found["config"]["advice"]
     assert "[target] wingspan_m, [target] length_m" in in_flight["config"]["says"]
