@@ -206,7 +206,6 @@ def test_an_interrupted_run_does_not_leave_the_report_of_an_earlier_one(tmp_path
         assert not (tmp_path / report).exists()
 
 
-@pytest.mark.timeout(420)
 def test_the_daemon_holds_on_to_nothing_in_a_minute(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["soak", "--minutes", "1", "--out", str(tmp_path), "--json"])
     told = {trend["name"]: trend for trend in json.loads(capsys.readouterr().out)["trends"]}

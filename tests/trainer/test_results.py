@@ -116,13 +116,10 @@ def test_the_readme_and_the_card_speak_of_the_shipped_model() -> None:
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first images of the bundled scene: enough to have its track confirmed and sent."""
     folder = tmp_path_factory.mktemp("begins") / "crossing"
-    shutil.copytree(CROSSING, folder)
+    shutil.copytree(CROSSING, folder, ignore=shutil.ignore_patterns("0000[4-9]*", "0001*"))
     for labels in folder.glob("scene_*.json"):
         kept = {key: told for key, told in json.loads(labels.read_text()).items() if int(key) < 40}
         labels.write_text(json.dumps(kept))
-    for picture in (*folder.glob("rgb/*"), *folder.glob("mask*/*")):
-        if int(picture.name[:6]) >= 40:
-            picture.unlink()
     return folder
 
 
