@@ -142,6 +142,16 @@ def test_a_search_that_fails_is_counted_and_the_next_one_does(search: Search, ga
     assert search.counters()["search_failed"] == 1
 
 
+@pytest.mark.usefixtures("stepped")
+def test_in_lock_step_a_search_that_fails_ends_the_replay(gated: Gated) -> None:
+    gated.sees = RuntimeError("out of memory")
+    gated.gate.set()
+    search = Search()
+    search.start()
+    with pytest.raises(RuntimeError, match="out of memory"):
+        search.begin(gated, frame(0, OTHER), [])
+
+
 def test_one_search_at_a_time(search: Search, gated: Gated) -> None:
     assert search.begin(gated, frame(0, OTHER), [])
     assert gated.begun.wait(60)
