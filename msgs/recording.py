@@ -159,7 +159,8 @@ class Recorder:
                 self._woken = False
                 samples, self._waiting, self._waiting_bytes = self._waiting, deque(), 0
                 self._in_hand = len(samples)
-                go_on, stopping = self._wanted and not self._stopping, self._stopping
+                wanted, stopping = self._wanted, self._stopping
+                go_on = wanted and not stopping
             self._tell_gaps()
             runs = _between_clock_steps(samples) or [[]]
             while runs:
@@ -172,6 +173,8 @@ class Recorder:
                 runs.pop(0)
             if stopping:
                 return
+            if self._stopped and not wanted:
+                self._forget_failure()
 
     def _due(self) -> bool:
         """Whether the writer should start before the second has ended."""
@@ -236,6 +239,13 @@ class Recorder:
                 self._file.write(one.name, one.topic.ros_type, one.payload, began_ns, one.publish_ns, one.publisher)
         if self._failure is not None:
             self._set_failure(None)
+
+    def _forget_failure(self) -> None:
+        """Once switched off: the disk may have room again by the time that it is switched on."""
+        self._stopped = False
+        with self._changed:
+            self._failure = None
+            self._counters["stopped"] = 0
 
     def _tell_going(self) -> None:
         """Report recovery only after samples were written: a disk may have room for a file's first bytes only."""

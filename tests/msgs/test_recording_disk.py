@@ -63,6 +63,27 @@ def test_a_full_disk_is_told_once_and_recording_goes_on_when_there_is_room(
     assert counters["recorded"] + counters["lost"] == len(sent) + 1
 
 
+def test_a_failure_is_forgotten_when_recording_is_switched_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who switches it on again would otherwise be told that the disk takes nothing."""
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    full, real_write = os.open("/dev/full", os.O_WRONLY), os.write
+    told: list[str] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda _, text: told.append(text))
+    recorder.start()
+    monkeypatch.setattr(os, "write", lambda _, data: real_write(full, data))
+    until(lambda: told != [], lambda: record_some(recorder, [b"lost"]))
+    recorder.switch(False)
+    until(lambda: recorder.counters()["stopped"] == 0, what="the failure to be forgotten")
+    monkeypatch.setattr(os, "write", real_write)
+    os.close(full)
+    recorder.switch(True)
+    assert recorder.recording
+    record_some(recorder, [b"after"])
+    recorder.stop()
+    assert told == ["recording stopped: No space left on device"], "it was switched on, and goes on from nothing"
+    assert [data for path in tmp_path.iterdir() for *_, data, _ in read(path)] == [b"after"]
+
+
 def test_recording_goes_on_where_its_messages_reach_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A message each time old recordings make room, and nobody reads them any more."""
     monkeypatch.setattr(recording, "FLUSH_S", 0.02)
