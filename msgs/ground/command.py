@@ -22,6 +22,7 @@ RELOAD_ANSWER_S = 60.0  # the model is loaded and warmed up before the answer
 LINK_S = 10.0
 LOOK_EVERY_S = 0.02
 TIME_OVER = 0.9  # share of the time to answer
+NOBODY_S = 0.5  # a query that no vehicle receives ends sooner
 EXIT_REFUSED = 1
 RATE_MIN_HZ, RATE_MAX_HZ = 0.1, 240.0  # the vehicle refuses others
 
@@ -96,8 +97,11 @@ def ask(
         try:
             reply = replies.try_recv()
         except zenoh.ZError:  # no further replies
+            passed_s = time.monotonic() - began_s
             # When the time is over, a router may end the query before zenoh tells of it here.
-            silent = silent or time.monotonic() - began_s >= TIME_OVER * timeout_s
+            silent = silent or passed_s >= TIME_OVER * timeout_s
+            if passed_s >= NOBODY_S:
+                why = f"{uav} does not answer: not there, or its link was lost, and it may have done it"
             break
         if reply is not None:
             answer = _answer(reply)

@@ -6,7 +6,9 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -14,7 +16,7 @@ import zenoh
 from zenoh import handlers
 
 from msgs.client import connect
-from msgs.ground.command import RELOAD_ANSWER_S, ask, body
+from msgs.ground.command import NOBODY_S, RELOAD_ANSWER_S, ask, body
 from msgs.ground.errors import InputError
 from msgs.session import peer_config
 from tests.waiting import until
@@ -52,6 +54,19 @@ def test_a_command_without_an_answer_in_time_may_have_been_done(network: Network
         until(lambda: held, lambda: said.update(ask(session, "uav1", "stop", {}, timeout_s=0.5)), what="the command")
     assert said["error"].startswith("uav1 does not answer within ")
     assert "it may have done it" in said["error"]
+
+
+def test_a_command_whose_vehicle_loses_its_link_may_have_been_done(network: Network, held: list[zenoh.Query]) -> None:
+    """zenoh ends the query with the link, as it does where nobody is there."""
+    with connect(network.endpoint) as session, ThreadPoolExecutor(1) as elsewhere:
+        asking = elsewhere.submit(ask, session, "uav1", "reload", {}, timeout_s=RELOAD_ANSWER_S)
+        until(lambda: held, what="the command")
+        began_s = time.monotonic()
+        until(lambda: time.monotonic() - began_s >= NOBODY_S, what="that it is not as if nobody were there")
+        network.daemon.close()
+        lost, nobody = asking.result(), ask(session, "uav1", "reload", {})
+    assert "it may have done it" in lost["error"]
+    assert nobody["error"].startswith("uav1 does not answer: not there, or ")
 
 
 def test_of_two_vehicles_of_one_name_both_answers_are_told(network: Network) -> None:
