@@ -41,11 +41,13 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
     """Open a session with a router or daemon, e.g. `tcp/127.0.0.1:7447`; close it, or use it as a context. One that is
     still open when the program ends is closed then.
 
-    Raises ConnectionError if the endpoint is malformed or nothing answers there: immediately if the host is reachable,
-    after about four seconds if it is not, after ten over `quic/`.
+    Raises ConnectionError if the endpoint is malformed, the certificates are unusable or nothing answers there:
+    immediately if the host is reachable, after about four seconds if it is not, after ten over `quic/`.
     """
     try:
         check_endpoint(endpoint, tls=tls is not None)
+        if tls is not None:
+            tls.check()
     except ValueError as error:
         raise ConnectionError(str(error)) from error
     try:

@@ -54,6 +54,12 @@ def test_an_endpoint_that_is_none_is_a_connection_error(endpoint: str) -> None:
         client.connect(endpoint)
 
 
+def test_certificates_that_cannot_be_read_are_told_and_not_that_nobody_answers(tmp_path: Path) -> None:
+    tls = session.TlsFiles(*(tmp_path / name for name in ("ca.pem", "alice.pem", "alice.key")))
+    with pytest.raises(ConnectionError, match=r"ca\.pem cannot be read: No such file or directory$"):
+        client.connect(free_endpoint().replace("tcp/", "quic/"), tls=tls)
+
+
 def _openssl(*arguments: str) -> None:
     subprocess.run(["openssl", *arguments], check=True, capture_output=True)
 
