@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -95,7 +95,7 @@ class VehicleRow:
     health_heard_ns: int  # UTC of reception by our clock; 0: never
     event: str
     pose_rate_hz: float
-    refused: int
+    refused: Counter[Refusal]  # samples, by reason
     targets: tuple[Row, ...]
 
 
@@ -257,7 +257,7 @@ class Fleet:
             vehicle.health_heard_ns,
             vehicle.event,
             vehicle.poses_per_s(now_ns),
-            sum(vehicle.receiver.refused.values()),
+            vehicle.receiver.refused.copy(),
             targets,
         )
 

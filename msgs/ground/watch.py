@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
@@ -21,6 +22,7 @@ from msgs.command_line import output
 from msgs.ground.feed import Incoming, linked, listening, session
 from msgs.ground.fleet import HEALTH_STALE_NS, SET_BACK_NS, TAKEN, DirectionRow, Fleet, Row, TargetRow, VehicleRow
 from msgs.session import TlsFiles
+from msgs.wire import Refusal
 
 REFRESH_S = 0.25
 PLAIN_PERIOD_S = 2.0
@@ -105,8 +107,8 @@ class Fitted:
 def _watch_json(
     options: WatchOptions, fleet: Fleet, opened: zenoh.Session, stop: threading.Event, console: Console
 ) -> None:
-    """One JSON object per line: `pose`, `direction` (range unknown), `health`, `event`, `vehicle` (present or gone) and
-    `link` (up or down).
+    """One JSON object per line: `pose`, `direction` (range unknown), `health`, `event`, `refused` (how many samples),
+    `vehicle` (present or gone) and `link` (up or down).
 
     Raises OutputError if the lines cannot be written, as into a file on a full disk, BrokenPipeError if nobody reads
     them any more.
@@ -151,11 +153,16 @@ def _watch_json(
 
     with listening(opened, options.uavs, options.domain, take, alive, TAKEN):
         told: bool | None = None
+        counted = dict[str, Counter[Refusal]]()
         while True:
             up = linked(opened)
             if up != told:
                 tell(type="link", up=up)
                 told = up
+            for row in fleet.rows(time.time_ns()):
+                if row.refused != counted.get(row.uav, Counter()):
+                    tell(type="refused", uav=row.uav, counts={why.value: number for why, number in row.refused.items()})
+                    counted[row.uav] = row.refused
             if stop.wait(REFRESH_S):
                 break
     if broken:
@@ -187,7 +194,7 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int, 
         health, event = _health(one, now_ns), Text(_printable(one.event) or "–")
         for text in (health, event) if one_line else ():
             text.no_wrap, text.overflow = True, "ellipsis"
-        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused), event)
+        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused.total()), event)
     return Group(link, found, fleet)
 
 

@@ -67,7 +67,7 @@ def fly_fleet(vehicles: int, seconds: float, fps: float = 20.0, transport: Trans
         share = (time.process_time() - used_s) / (time.monotonic() - began_s)
         sent = {vehicle.uav: vehicle.end()["sent_pose"] for vehicle in flying}
         threading.Event().wait(DRAIN_S)
-        refused = sum(row.refused for row in fleet.rows(time.time_ns()))
+        refused = sum(row.refused.total() for row in fleet.rows(time.time_ns()))
     return _outcome(ledgers, sent, (fps, seconds, transport), refused, share)
 
 

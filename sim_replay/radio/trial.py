@@ -165,7 +165,7 @@ def _as_program(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[
 def _as_watch(plan: Plan, session: zenoh.Session, ledger: Ledger) -> Iterator[Callable[[], int]]:
     fleet = Fleet(max_age_s=plan.max_age_s)
     with listening(session, [UAV], 0, taker(fleet, {UAV: ledger}), fleet.alive, TAKEN):
-        yield lambda: sum(row.refused for row in fleet.rows(time.time_ns()))
+        yield lambda: sum(row.refused.total() for row in fleet.rows(time.time_ns()))
 
 
 def taker(fleet: Fleet, ledgers: Mapping[str, Ledger]) -> Callable[[Incoming], None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from msgs.ground.view.saving import saved
 from msgs.ground.view.scene import Scene
 from msgs.ground.view.viewer import page, window
 from msgs.session import TlsFiles
+from msgs.wire import Refusal
 
 APPLICATION = "uavpose"
 DRAWN = (*TAKEN, topics.CAMERA_INFO, topics.IMAGE)
@@ -67,9 +69,10 @@ def view(options: ViewOptions, stop: threading.Event, say: Callable[[str], None]
             _listen(options, scene, stop, say)
         scene.finish()
     into = f" into {options.save}" if options.save is not None else ""
-    refused = sum(one.refused for one in fleet.rows(time.time_ns()))
+    refused = sum((one.refused for one in fleet.rows(time.time_ns())), Counter[Refusal]())
+    why = "; ".join(f"{number}: {reason.value}" for reason, number in refused.most_common())
     what = f"{scene.drawn} poses" + (f" and {scene.directions_drawn} directions" if scene.directions_drawn else "")
-    say(f"{what} drawn{into}" + (f", {refused} samples refused" if refused else ""))
+    say(f"{what} drawn{into}" + (f", {refused.total()} samples refused ({why})" if refused else ""))
     return 0
 
 

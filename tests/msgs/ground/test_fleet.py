@@ -13,6 +13,7 @@ from msgs import cdr, topics
 from msgs.ground.feed import Incoming
 from msgs.ground.fleet import DirectionRow, Fleet, TargetRow
 from msgs.topics import Topic
+from msgs.wire import Refusal
 
 from ..conftest import pose_now
 from .flight import R_BODY_CAM
@@ -253,7 +254,7 @@ def test_of_two_daemons_of_one_name_one_tells_targets_attitude_and_health() -> N
         (row,) = fleet.rows(now_ns + 20 * MS)
         seen |= {(row.health, one.target, round(one.range_m), round(one.bearing_deg)) for one in row.targets}
     assert seen == {("well", "t0", 300, 0)}
-    assert row.refused == 60 * 4
+    assert row.refused == {Refusal.PUBLISHER: 60 * 4}
     (after,) = [pose(now_ns + 2 * S, 900, 450.0)]
     assert fleet.take(dataclasses.replace(after, sender="b"), now_ns + 2 * S) is not None, "the first is silent"
 

@@ -266,7 +266,8 @@ def test_what_is_refused_of_a_recording_is_told(
 ) -> None:
     out = tmp_path / "twice.rrd"
     assert main(["view", str(halves[0]), str(halves[0]), "--max-age", "0.001", "--save", str(out)]) == 0
-    assert capsys.readouterr().err.splitlines()[-1] == f"0 poses drawn into {out}, 20 samples refused"
+    why = "20: stamp is too old, or older than one already taken"
+    assert capsys.readouterr().err.splitlines()[-1] == f"0 poses drawn into {out}, 20 samples refused ({why})"
 
 
 def test_a_recording_is_left_when_told_to_stop_and_what_was_drawn_is_kept(

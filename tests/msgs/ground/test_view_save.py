@@ -167,4 +167,5 @@ def test_of_two_vehicles_of_one_name_one_is_drawn_from_a_recording_too(
     file.close()
     out = tmp_path / "both.rrd"
     assert main(["view", str(tmp_path / "both.mcap"), "--save", str(out)]) == 0
-    assert capsys.readouterr().err.splitlines()[-1] == f"10 poses drawn into {out}, 10 samples refused"
+    why = "10: another publisher of this target was heard within the last second"
+    assert capsys.readouterr().err.splitlines()[-1] == f"10 poses drawn into {out}, 10 samples refused ({why})"

@@ -124,6 +124,9 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
             known = ("closing_mps", "attitude_deg", "score")
             return [one for one in lines.objects("pose") if None not in (one[key] for key in known)]
 
+        def refused(uav: str) -> str:
+            return next((str(one["counts"]) for one in reversed(lines.objects("refused")) if one["uav"] == uav), "")
+
         def complete() -> bool:
             heard = {one["uav"] for one in full()}
             others = all(lines.objects(kind) for kind in ("health", "event", "direction"))
@@ -150,6 +153,8 @@ def test_json_lines_tell_poses_health_events_and_who_comes_and_goes(network: Net
         assert [one["event"] for one in lines.objects("event")] == ["tracking"]
         assert {(one["uav"], one["alive"]) for one in lines.objects("vehicle")} == {("uav1", True), ("uav2", True)}
         assert [one["up"] for one in lines.objects("link")] == [True]
+        uav2.publishers[topics.POSE.name].put(b"junk")
+        until(lambda: "'not little-endian CDR': 1" in refused("uav2"), what="the count of what is refused")
         uav2.token.undeclare()
         until(lambda: lines.objects("vehicle")[-1] == {"type": "vehicle", "uav": "uav2", "alive": False})
         process.terminate()
