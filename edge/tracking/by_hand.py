@@ -1,8 +1,9 @@
 """Operator requests to the tracker. Pure: every time is an argument.
 
 A requested box is examined in every frame for up to LOOK_NS until a target is found there; that is then the chosen
-target while its track exists, and if the track ends before it was confirmed the examination continues. "Stop" drops all
-targets and suspends the search for REST_NS or until the next selection.
+target while its track exists, and if the track ends before it was confirmed the examination continues. The same box
+again within REPEATED_NS keeps it. "Stop" drops all targets and suspends the search for REST_NS or until the next
+selection.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from edge.types import Array, Estimate, Track, TrackState
 
 LOOK_NS = 1_000_000_000
 REST_NS = 10_000_000_000
+# A sender whose acknowledgement was lost repeats the request, two or three times, with nothing that tells it from a new
+# one: MAVSDK leaves `confirmation` at 0. By then the target may have left the box.
+REPEATED_NS = 3_000_000_000
 
 
 class ByHand:
     def __init__(self) -> None:
         self._chosen: tuple[int, int] | None = None  # track_id and born_ns
         self._box_share: Array | None = None
+        self._pointed: tuple[Request, int] | None = None  # the last request, if it was a box, and when it came first
         self._wanted_id: int | None = None  # of a target that was selected by its number
         self._look_until_ns = 0
         self._rest_until_ns = 0
@@ -36,12 +41,15 @@ class ByHand:
 
     def take(self, request: Request, now_ns: int) -> None:
         """Process a request that arrived before the frame of `now_ns`."""
-        self._chosen = self._wanted_id = None
+        if self._chosen is not None and self._repeats(request, now_ns):
+            return
+        self._chosen = self._wanted_id = self._pointed = None
         if isinstance(request, SelectTarget):
             self._box_share, self._wanted_id, self._rest_until_ns = None, request.track_id, now_ns
         elif isinstance(request, TrackBox):
             self._box_share = np.array(request.box_xyxy_share)
             self._look_until_ns, self._rest_until_ns = now_ns + LOOK_NS, now_ns
+            self._pointed = request, now_ns
         else:
             self._box_share, self._rest_until_ns = None, now_ns + REST_NS
 
@@ -87,6 +95,10 @@ class ByHand:
         """Messages for the operator since the last call."""
         told, self._news = self._news, []
         return told
+
+    def _repeats(self, request: Request, now_ns: int) -> bool:
+        """Whether it is the same box as in the last request, not long ago."""
+        return self._pointed is not None and self._pointed[0] == request and now_ns - self._pointed[1] <= REPEATED_NS
 
     def _choose_by_id(self, tracks: Iterable[Track], track_id: int) -> None:
         for track in tracks:

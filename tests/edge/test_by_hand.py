@@ -16,10 +16,10 @@ import pytest
 
 from edge import clock
 from edge.estimator.model import load_model
-from edge.requests import POINTED_AGE_MAX_NS, WAITING_MAX, RequestQueue, SelectTarget, StopTracking, TrackBox
-from edge.tracking.by_hand import LOOK_NS, REST_NS, ByHand
+from edge.requests import POINTED_AGE_MAX_NS, WAITING_MAX, Request, RequestQueue, SelectTarget, StopTracking, TrackBox
+from edge.tracking.by_hand import LOOK_NS, REPEATED_NS, REST_NS, ByHand
 from edge.tracking.tracker import Tracker
-from edge.types import Estimate, Mount, TrackState
+from edge.types import Estimate, Mount, Track, TrackState
 from msgs.mavlink import dialect
 from sim_replay.ports import free_port
 
@@ -105,6 +105,35 @@ def test_a_target_that_is_tracked_there_already_is_chosen_until_its_track_ends()
     assert by_hand.chosen_id is None, "its number may be another target's by now"
     assert by_hand.box_xyxy_px(2, SIZE_WH, []) is by_hand.box_xyxy_px(LOOK_NS + 1, SIZE_WH, []) is None
     assert by_hand.news() == ["target 2 chosen"], "it was found, and its end is told by the tracker"
+
+
+def test_a_box_repeated_for_want_of_an_answer_keeps_the_target_though_another_flies_there_by_now() -> None:
+    """MAVSDK sends it again after half a second, three times, each like the first."""
+    box, first = TrackBox((0.5, 0.4, 0.6, 0.5)), track(0, track_id=2, born_ns=-2)
+
+    def after(*requests: tuple[Request, int], alive: tuple[Track, ...]) -> tuple[int | None, list[str]]:
+        """What is chosen, and told, after a first box that found target 2, which has left it since."""
+        by_hand = ByHand()
+        by_hand.take(box, 0)
+        assert by_hand.box_xyxy_px(0, SIZE_WH, [first]) is None
+        by_hand.settle([first])
+        assert (by_hand.chosen_id, by_hand.news()) == (2, ["target 2 chosen"])
+        by_hand.settle(alive)
+        for request, now_ns in requests:
+            by_hand.take(request, now_ns)
+            by_hand.box_xyxy_px(now_ns, SIZE_WH, alive)
+            by_hand.settle(alive)
+        return by_hand.chosen_id, by_hand.news()
+
+    pair = (replace(first, box_xyxy_px=first.box_xyxy_px + 300.0), track(0, track_id=1, born_ns=-1))
+    assert after(*((box, at) for at in (500_000_000, 1_000_000_000, REPEATED_NS)), alive=pair) == (2, [])
+    assert after((box, REPEATED_NS + 1), alive=pair) == (1, ["target 1 chosen"]), "meant anew"
+    assert after((box, 500_000_000), alive=pair[1:]) == (1, ["target 1 chosen"]), "what was found there is no more"
+    other = TrackBox((0.5, 0.4, 0.6, 0.51))
+    assert after((other, 500_000_000), alive=pair) == (1, ["target 1 chosen"])
+    told = ["target 1 chosen", "target 2 chosen", "target 1 chosen"]
+    assert after((other, 1), (SelectTarget(2), 2), (box, 3), alive=pair) == (1, told), "between them another was asked"
+    assert after((StopTracking(), 1), alive=pair) == (None, [])
 
 
 @pytest.mark.parametrize("away_px", [(-300.0, 0.0), (300.0, 0.0), (0.0, -150.0), (0.0, 150.0)])
