@@ -130,8 +130,9 @@ def geo_status(report: Report, track: Track) -> Any | None:
     )
 
 
-def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_ms: int) -> Any:
-    """CAMERA_INFORMATION (259). The focal length in mm is computed from the sensor's width; NaN if that is unknown."""
+def camera_information(camera: CameraInfo, sensor_width_mm: float | None, gimbal_id: int | None, boot_ms: int) -> Any:
+    """CAMERA_INFORMATION (259). The focal length in mm is computed from the sensor's width; NaN if that is unknown.
+    `gimbal_id`: of the gimbal that it is on, a component id or the autopilot's number 1 to 6."""
     width_px, height_px = camera.image_size_wh
     mm_per_px = NAN if sensor_width_mm is None else sensor_width_mm / width_px
     name = camera.name.encode()[:CAMERA_NAME_BYTES].decode(errors="ignore").encode()  # whole characters
@@ -149,6 +150,7 @@ def camera_information(camera: CameraInfo, sensor_width_mm: float | None, boot_m
         CAMERA_ABILITIES,
         0,
         b"",
+        gimbal_id or 0,
     )
 
 

@@ -313,8 +313,8 @@ class Station:
     def _once(self, message_id: int, now_ns: int) -> list[Letter]:
         """The message at once if nothing else is needed for it; otherwise it is sent as soon as possible."""
         if message_id == CAMERA_INFORMATION:
-            boot_ms = now_ns // 1_000_000 % 2**32
-            information = words.camera_information(self._camera, self._settings.sensor_width_mm, boot_ms)
+            of_it = (self._settings.sensor_width_mm, self._telemetry.gimbal_id, now_ns // 1_000_000 % 2**32)
+            information = words.camera_information(self._camera, *of_it)
             return [self._letter(information, camera=True, unknown=words.CAMERA_INFORMATION_UNKNOWN)]
         if message_id == IMAGE_STATUS and not self._in_sight(now_ns):
             return [self._image_status(words.idle_image_status())]

@@ -105,6 +105,13 @@ class Telemetry:
         self._forget()
         self._attitudes_from_ns = self._positions_from_ns = self._gimbals_from_ns = 0
 
+    @property
+    def gimbal_id(self) -> int | None:
+        """Of the gimbal that the camera is on; None: it is on none, or that one is not known yet."""
+        if not self._own_ship.gimballed or self._gimbal_id is not None:
+            return self._gimbal_id
+        return None if self._gimbal is None else self._gimbal[0]
+
     def forget(self, now_ns: int) -> None:
         """Discard all state: the autopilot has rebooted, or it is another one."""
         self._forget()

@@ -159,7 +159,7 @@ def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> 
             peer.command(512, 259.0)
             information = peer.named("CAMERA_INFORMATION")
         assert (information.resolution_h, information.resolution_v) == SIZE_WH
-        assert information.flags == 512 + 1024 + 2048
+        assert (information.flags, information.gimbal_device_id) == (512 + 1024 + 2048, 0)
         if width_mm is None:
             assert math.isnan(information.focal_length), "millimetres are not known from pixels"
         else:

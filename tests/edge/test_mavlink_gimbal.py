@@ -147,6 +147,23 @@ def test_what_px4_steers_a_gimbals_servos_by_is_not_where_the_camera_looks(
             assert texts.count(told.text) == 1
 
 
+@pytest.mark.parametrize(("configured", "heard"), [(None, 154), (2, 2)])
+def test_the_camera_says_on_which_gimbal_it_is(configured: int | None, heard: int) -> None:
+    own_ship = OwnShipBuffer(gimballed=True)
+    with linked(own_ship=own_ship, gimbal_component_id=configured) as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+
+        def gimbal_told() -> int:
+            peer.command(512, 259.0)
+            return int(peer.named("CAMERA_INFORMATION").gimbal_device_id)
+
+        assert gimbal_told() == (configured or 0), "0: on none, or on one that is not known yet"
+        status = dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, 5_000, 64, [1, 0, 0, 0], 0, 0, 0, 0)
+        peer.wire.send(status.pack(MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=154)))
+        peer.settle(lambda: link.counters().get(f"received_{status.get_type()}") == 1, "attitude of the gimbal")
+        assert gimbal_told() == heard
+
+
 @given(share=st.floats(0.0, 1.0), seed=st.integers(0, 2**32 - 1))
 def test_a_gimbals_attitude_between_samples_is_their_slerp(share: float, seed: int) -> None:
     rotations = Rotation.random(2, rng=np.random.default_rng(seed))
