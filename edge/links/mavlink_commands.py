@@ -6,6 +6,7 @@
 | 2010 CAMERA_STOP_TRACKING | drop all targets |
 | 511 SET_MESSAGE_INTERVAL | for messages sent at a rate |
 | 512 REQUEST_MESSAGE | for messages that are sent |
+| 521 REQUEST_CAMERA_INFORMATION | by which QGroundControl up to 4.3 finds a camera |
 
 All other commands are UNSUPPORTED.
 """
@@ -50,6 +51,8 @@ def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
     """
     if command.command == dialect.MAV_CMD_REQUEST_MESSAGE:
         return _request_message(command.param1, enabled)
+    if command.command == dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION:
+        return _request_message(CAMERA_INFORMATION if command.param1 == 1.0 else math.nan, enabled)
     if command.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
         return _set_interval(command.param1, command.param2, enabled)
     if command.command == dialect.MAV_CMD_CAMERA_TRACK_POINT:
@@ -71,7 +74,7 @@ def concerns_us(command: Any, enabled: Container[int]) -> bool:
         return ours or command.param1 == CAMERA_INFORMATION
     if command.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
         return ours
-    return command.command in CAMERA_COMMANDS
+    return command.command in (*CAMERA_COMMANDS, dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION)
 
 
 def _request_message(number: float, enabled: Container[int]) -> Answer:

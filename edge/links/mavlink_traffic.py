@@ -24,7 +24,7 @@ NS_PER_MS = 1_000_000
 
 def follow_target(report: Report, track: Track) -> Any | None:
     """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a global position or before the
-    velocity is known: ArduPilot uses the velocity in the message regardless of est_capabilities.
+    velocity is known: ArduPilot takes a target whose est_capabilities are without a velocity to stand still.
 
     Acceleration and turn rate are not estimated and are 0; est_capabilities says so.
     """

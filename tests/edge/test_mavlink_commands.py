@@ -70,6 +70,7 @@ ACCEPTED, DENIED, UNSUPPORTED = (
         (512, (30.0,), UNSUPPORTED),
         (512, (246.0,), DENIED),
         (512, (math.inf,), DENIED),
+        (521, (0.0,), DENIED),
         (511, (275.0, 100_000.0), ACCEPTED),
         (511, (275.0, 500_000.0), ACCEPTED),
         (511, (275.0, 1_000_000.0), ACCEPTED),
@@ -156,7 +157,9 @@ def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> 
     for width_mm in (None, 6.4):
         with linked(sensor_width_mm=width_mm) as (link, _), Peer(link.ports[0]) as peer:
             meet(link, peer)
-            peer.command(512, 259.0)
+            peer.command(*((512, 259.0) if width_mm is None else (521, 1.0)))
+            ack = peer.named("COMMAND_ACK")
+            assert (ack.result, ack.get_srcComponent()) == (ACCEPTED, CAMERA_COMPONENT)
             information = peer.named("CAMERA_INFORMATION")
         assert (information.resolution_h, information.resolution_v) == SIZE_WH
         assert (information.flags, information.gimbal_device_id) == (512 + 1024 + 2048, 0)
