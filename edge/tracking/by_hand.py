@@ -18,9 +18,10 @@ from edge.types import Array, Estimate, Track, TrackState
 
 LOOK_NS = 1_000_000_000
 REST_NS = 10_000_000_000
-# A sender whose acknowledgement was lost repeats the request, two or three times, with nothing that tells it from a new
-# one: MAVSDK leaves `confirmation` at 0. By then the target may have left the box.
-REPEATED_NS = 3_000_000_000
+# A sender whose acknowledgement was lost repeats the request, with nothing that tells it from a new one: MAVSDK (every
+# 0.5 s, three times) and old QGroundControl (after 3 s) leave `confirmation` at 0. By then the target may have left the
+# box.
+REPEATED_NS = 4_000_000_000
 
 
 class ByHand:
