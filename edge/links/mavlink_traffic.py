@@ -26,7 +26,8 @@ def follow_target(report: Report, track: Track) -> Any | None:
     """FOLLOW_TARGET (144), stamped with the exposure in ms of our uptime; None without a global position or before the
     velocity is known: ArduPilot takes a target whose est_capabilities are without a velocity to stand still.
 
-    Acceleration and turn rate are not estimated and are 0; est_capabilities says so.
+    Acceleration and turn rate are not estimated and are 0; est_capabilities says so of the acceleration, but has one
+    bit for attitude and turn rate.
     """
     place, velocity = _place(report.own_ship, track), _velocity_mps(report.own_ship, track)
     R, P = track.R_ned_target, track.covariance_ned
