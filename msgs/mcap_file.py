@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import io
 import os
@@ -121,6 +122,8 @@ class _Stream:
 
     def sync(self) -> None:
         os.fdatasync(self._fd)
+        if not os.fstat(self._fd).st_nlink:  # writing succeeds, and everything is gone when it is closed
+            raise FileNotFoundError(errno.ENOENT, "its file was removed")
 
     def close(self) -> None:
         os.close(self._fd)

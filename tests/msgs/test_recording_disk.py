@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,6 +83,25 @@ def test_a_failure_is_forgotten_when_recording_is_switched_off(tmp_path: Path, m
     recorder.stop()
     assert told == ["recording stopped: No space left on device"], "it was switched on, and goes on from nothing"
     assert [data for path in tmp_path.iterdir() for *_, data, _ in read(path)] == [b"after"]
+
+
+def test_a_file_that_somebody_removes_while_it_is_written_is_told_and_another_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writing to it would succeed until it is full, and nothing of that would be left."""
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.05)
+    told: list[str] = []
+    folder = tmp_path / "recordings"
+    recorder = Recorder(folder, "uav1", ROOM, lambda _, text: told.append(text))
+    recorder.start()
+    record_some(recorder, [b"before"])
+    until(lambda: recorder.counters()["recorded"] == 1)
+    shutil.rmtree(folder)
+    until(lambda: len(told) == 2, lambda: record_some(recorder, [b"after"]), what="another file")
+    recorder.stop()
+    assert told == ["recording stopped: its file was removed", "recording again"]
+    assert {data for path in folder.iterdir() for *_, data, _ in read(path)} == {b"after"}
 
 
 def test_recording_goes_on_where_its_messages_reach_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
