@@ -175,7 +175,8 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int, 
     to what fits on one line, and are wrapped otherwise.
 
     A bearing with a `c` is measured from the optical axis to the right, as the vehicle's attitude is unknown. A range
-    of `?` is not known: no pose is sent of that target, only its direction.
+    of `?` is not known: no pose is sent of that target, only its direction. Of a vehicle without targets, the
+    table says why most samples were refused.
     """
     link = Text(f"{endpoint}: up" if up else f"{endpoint}: no link", style="green" if up else "bold red")
     fleet = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -192,9 +193,12 @@ def table(vehicles: Sequence[VehicleRow], up: bool, endpoint: str, now_ns: int, 
             found.add_row(*_cells(target, now_ns), style="dim" if stale else None)
         here = Text("here", style="green") if one.alive else Text("gone", style="bold red")
         health, event = _health(one, now_ns), Text(_printable(one.event) or "–")
-        for text in (health, event) if one_line else ():
+        refused = Text(str(one.refused.total()))
+        if one.refused and not one.targets:
+            refused.append(f": {one.refused.most_common(1)[0][0].value}")
+        for text in (health, refused, event) if one_line else ():
             text.no_wrap, text.overflow = True, "ellipsis"
-        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", str(one.refused.total()), event)
+        fleet.add_row(one.uav, here, health, f"{one.pose_rate_hz:.1f}", refused, event)
     return Group(link, found, fleet)
 
 

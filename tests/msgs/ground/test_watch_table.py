@@ -71,6 +71,14 @@ def test_health_that_is_no_longer_told_is_dim_and_says_its_age() -> None:
     assert f"{DIM}tracking (2 s ago)" in line(fleet, NOW_NS + 2 * S, "uav1")
 
 
+def test_why_nothing_is_shown_is_told_beside_the_number_of_refused_samples() -> None:
+    fleet = Fleet()
+    tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS + 7200 * S), NOW_NS, "t0")
+    assert " 1: stamp lies in the future " in line(fleet, NOW_NS, "uav1")
+    tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS), NOW_NS, "t1")
+    assert "stamp" not in line(fleet, NOW_NS, "uav1 ")
+
+
 def test_a_target_is_dim_by_when_it_was_heard_whatever_the_vehicle_s_clock_says() -> None:
     fleet = Fleet()
     tell(fleet, topics.POSE, dataclasses.replace(pose_now(), stamp_ns=NOW_NS - 3 * S // 2), NOW_NS, "t0")
