@@ -44,15 +44,16 @@ class Answer:
     interval: tuple[int, float | None] | None = None  # message id, Hz as Schedule.set_rate takes it
 
 
-def answer(command: Any, enabled: Container[int], aspect: float) -> Answer:
+def answer(command: Any, enabled: Container[int], aspect: float, of_camera: bool) -> Answer:
     """Answer a COMMAND_LONG or COMMAND_INT; none of its parameters is trusted.
 
-    `enabled`: message ids that the configuration allows to be sent; `aspect`: image width over height.
+    `enabled`: message ids that the configuration allows to be sent; `aspect`: image width over height; `of_camera`: the
+    camera is asked, not the onboard computer.
     """
     if command.command == dialect.MAV_CMD_REQUEST_MESSAGE:
-        return _request_message(command.param1, enabled)
+        return _request_message(command.param1, enabled, of_camera)
     if command.command == dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION:
-        return _request_message(CAMERA_INFORMATION if command.param1 == 1.0 else math.nan, enabled)
+        return _request_message(CAMERA_INFORMATION if command.param1 == 1.0 else math.nan, enabled, of_camera)
     if command.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
         return _set_interval(command.param1, command.param2, enabled)
     if command.command == dialect.MAV_CMD_CAMERA_TRACK_POINT:
@@ -77,11 +78,12 @@ def concerns_us(command: Any, enabled: Container[int]) -> bool:
     return command.command in (*CAMERA_COMMANDS, dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION)
 
 
-def _request_message(number: float, enabled: Container[int]) -> Answer:
+def _request_message(number: float, enabled: Container[int], of_camera: bool) -> Answer:
     if not math.isfinite(number):
         return Answer(dialect.MAV_RESULT_DENIED)
     message_id = int(number)
-    if message_id not in REQUESTABLE:
+    # MAVSDK asks each component for it, and one that accepts again and again, until it comes from there.
+    if message_id not in REQUESTABLE or (message_id == CAMERA_INFORMATION and not of_camera):
         return Answer(dialect.MAV_RESULT_UNSUPPORTED)
     if message_id in RATE_LIMITS_HZ and message_id not in enabled:
         return Answer(dialect.MAV_RESULT_DENIED)

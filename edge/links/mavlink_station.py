@@ -282,12 +282,12 @@ class Station:
 
     def _obey(self, command: Any, now_ns: int) -> list[Letter]:
         width_px, height_px = self._camera.image_size_wh
-        reply = answer(command, self._enabled(), width_px / height_px)
+        camera = command.target_component in (0, self._settings.camera_component_id)
+        reply = answer(command, self._enabled(), width_px / height_px, camera)
         result = reply.result
         refused = reply.request is not None and not self._requests.put(reply.request)
         if refused or (reply.send_once is not None and not self._tells(reply.send_once, now_ns)):
             result = dialect.MAV_RESULT_TEMPORARILY_REJECTED
-        camera = command.target_component in (0, self._settings.camera_component_id)
         asker = (command.get_srcSystem(), command.get_srcComponent())
         ack = dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *asker)
         out = [self._letter(ack, camera=camera)]

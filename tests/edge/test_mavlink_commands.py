@@ -171,6 +171,19 @@ def test_the_camera_says_what_it_is_and_its_lens_where_the_sensor_is_known() -> 
             assert information.sensor_size_v == pytest.approx(6.4 * SIZE_WH[1] / SIZE_WH[0])
 
 
+def test_the_onboard_computer_says_that_it_is_no_camera() -> None:
+    """MAVSDK asks it too, and goes on if it accepts: what it waits for comes from the camera alone."""
+    with linked() as (link, _), Peer(link.ports[0]) as peer:
+        meet(link, peer)
+        for request in ((512, 259.0), (521, 1.0)):
+            peer.command(*request, component=MavlinkSettings().component_id)
+            ack = peer.named("COMMAND_ACK")
+            assert (ack.command, ack.result, ack.get_srcComponent()) == (request[0], UNSUPPORTED, 191)
+        peer.command(2010)
+        peer.named("COMMAND_ACK")
+        assert "CAMERA_INFORMATION" not in {message.get_type() for message in peer.received}
+
+
 def test_a_camera_that_opens_at_another_size_than_its_calibrations_is_told_as_it_is() -> None:
     with linked() as (link, _), Peer(link.ports[0]) as peer:
         meet(link, peer)
