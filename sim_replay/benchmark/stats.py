@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,7 @@ from edge.errors import InputError
 from msgs.settings import read_toml
 from sim_replay.bop import BopError, BopFrame, BopScene, find_scenes, object_names
 from sim_replay.bop.fields import integer, load_object
+from sim_replay.bop.scene import picture_size_wh
 from sim_replay.evaluation.judge import is_seen
 from sim_replay.label_fit import Labelled, lies_beside_its_box
 
@@ -41,12 +43,12 @@ class _Counts:
 
     sequences: Counter[str] = field(default_factory=Counter)  # by split
     frames: Counter[str] = field(default_factory=Counter)
-    pictures: Counter[tuple[int, int]] = field(default_factory=Counter)  # width, height; once per scene
+    pictures: Counter[tuple[int, int]] = field(default_factory=Counter)  # width, height; once per scene that has it
     targets_in_frame: Counter[int] = field(default_factory=Counter)
     airframes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))  # frames, by split
     flights: dict[str, set[tuple[str, int]]] = field(default_factory=lambda: defaultdict(set))
     range_m: list[float] = field(default_factory=list)
-    focal_px: list[float] = field(default_factory=list)  # one per scene
+    focal_px: list[float] = field(default_factory=list)  # each that a scene has, once per scene
     box_share: list[float] = field(default_factory=list)
     beside_box: list[bool] = field(default_factory=list)
     visible_fraction: list[float] = field(default_factory=list)
@@ -58,8 +60,9 @@ def dataset_statistics(root: Path, on_scene: Callable[[], None] = lambda: None) 
     """Measure a BOP dataset, split or scene folder. Raises InputError, naming file and key.
 
     Targets marked as hidden are not counted. Ranges are distances of target origins from the camera; box shares are
-    those of the first visible target in each frame, its visible box over the image's area. Sizes are of each scene's
-    first image, or from its camera.json if there are only labels. A value that the files do not contain is None.
+    those of the first visible target in each frame, its visible box over the image's area. Sizes of images that a scene
+    lists but lacks are those of its first image, or from its camera.json if there are only labels. A value that the
+    files do not contain is None.
     """
     counts = _Counts()
     try:
@@ -78,15 +81,15 @@ def _take_scene(counts: _Counts, scene: BopScene, names: Mapping[int, str]) -> N
     frames = scene.frames
     if not frames:
         return
-    size = _picture_size(scene)
+    sizes = _picture_sizes(scene)
     counts.sequences[split] += 1
     counts.frames[split] += len(frames)
-    counts.pictures[size] += 1
-    counts.focal_px.append(float(np.sqrt(frames[0].K[0, 0] * frames[0].K[1, 1])))
+    counts.pictures.update(set(sizes))
+    counts.focal_px += sorted({float(np.sqrt(frame.K[0, 0] * frame.K[1, 1])) for frame in frames})
     counts.distorted += frames[0].distortion is not None
     flown = _toml(scene.folder / "sequence.toml")
-    for frame in frames:
-        _take_frame(counts, split, frame, size[0] * size[1], names, in_ned=bool(flown))
+    for frame, (width, height) in zip(frames, sizes, strict=True):
+        _take_frame(counts, split, frame, width * height, names, in_ned=bool(flown))
         fits = (lies_beside_its_box(Labelled(t, frame.K, frame.distortion, scene.folder)) for t in frame.targets)
         counts.beside_box += [beside for beside in fits if beside is not None]
     if flown.get("airframe") and "flight_seed" in flown:
@@ -114,16 +117,21 @@ def _take_frame(
         counts.airframes[split][names.get(target.object_id, f"object {target.object_id}")] += 1
 
 
-def _picture_size(scene: BopScene) -> tuple[int, int]:
-    """Width and height of the scene's first image, otherwise from camera.json, otherwise zeros. Raises BopError."""
-    try:
-        height, width = scene.image_bgr(scene.pictured[0]).shape[:2]
-        return width, height
-    except BopError:
-        path = scene.folder / "camera.json"
-        entry = load_object(path, optional=True)
-        width, height = (integer(path, "camera", entry, name) if name in entry else 0 for name in ("width", "height"))
-        return width, height
+def _picture_sizes(scene: BopScene) -> list[tuple[int, int]]:
+    """Width and height of each frame's image, see `dataset_statistics`; zeros if nothing tells. Raises BopError."""
+    sizes: dict[int, tuple[int, int]] = {}
+    for frame in scene.frames:
+        with suppress(BopError):  # it is missing, or cannot be read
+            sizes[frame.image_id] = picture_size_wh(scene.image_path(frame))
+    first = next(iter(sizes.values()), None) or _size_of_camera(scene.folder / "camera.json")
+    return [sizes.get(frame.image_id, first) for frame in scene.frames]
+
+
+def _size_of_camera(path: Path) -> tuple[int, int]:
+    """Width and height in a camera.json; zeros where it, or the file, lacks them. Raises BopError."""
+    entry = load_object(path, optional=True)
+    width, height = (integer(path, "camera", entry, name) if name in entry else 0 for name in ("width", "height"))
+    return width, height
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -193,6 +193,25 @@ def test_the_size_is_of_the_first_picture_that_is_there(dataset: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["pictures"] == {"320x180": 3}
 
 
+def test_a_scene_of_several_cameras_counts_each_picture_by_its_own(
+    dataset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = dataset / "train/000000"
+    cv2.imwrite(str(scene / "rgb/000001.jpg"), np.zeros((90, 160, 3), np.uint8))  # the other has 320 x 180
+    cameras = json.loads((scene / "scene_camera.json").read_text())
+    cameras["1"]["cam_K"][0] = cameras["1"]["cam_K"][4] = 700.0
+    (scene / "scene_camera.json").write_text(json.dumps(cameras))
+    for name in ("scene_gt.json", "scene_gt_info.json"):
+        content = json.loads((scene / name).read_text())
+        (scene / name).write_text(json.dumps(content | {"1": content["0"]}))
+    assert main(["stats", "--dataset", str(scene), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["pictures"] == {"320x180": 1, "160x90": 1}
+    assert (told["focal_px"]["min"], told["focal_px"]["max"]) == (700.0, 1500.0)
+    shares = (told["box_share"]["min"], told["box_share"]["max"])
+    assert shares == pytest.approx((64 * 36 / (320 * 180), 64 * 36 / (160 * 90)))
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"width": "wide", "height": 180}'])
 def test_a_camera_file_that_is_damaged_is_named(dataset: Path, capsys: pytest.CaptureFixture[str], text: str) -> None:
     scene = dataset / "test/000002"
