@@ -38,8 +38,8 @@ EXPLANATION = (
     "as a failure in the rates that need one, and in no rotation error. *Size given*: with the wingspan and length of "
     "each flight's aircraft, as [target] gives them to the daemon, unless the flight has aircraft of several types. "
     "*False / 1,000*: false positives per 1,000 frames in which no target is visible. *Pose, 95 %*: 95 % bootstrap "
-    "confidence interval of Pose@10°/5 %, resampled over flights, or, if all targets or none are within it, the exact "
-    "binomial one of as many trials as flights."
+    "confidence interval of Pose@10°/5 %, resampled over flights, and, if fewer than six flights have a target that is "
+    "not within it, or one that is, widened to the exact binomial one of as many trials as flights."
 )
 CURVES = (
     "Held-out windows as training went on. Each run has its own curves: a thin vertical line marks its first "
