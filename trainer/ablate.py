@@ -18,6 +18,7 @@ from trainer.config import ConfigError, DataConfig, TrainerConfig, load_config, 
 from trainer.data import Sampler, render_once
 from trainer.evaluate import measure, null_where_unknown, predict_all, torch_predictor
 from trainer.sources import window_sampler
+from trainer.tally import windows_in
 from trainer.train import run_training
 
 OpenView = Callable[[DataConfig, int, int], Callable[[], Sampler]]
@@ -175,7 +176,8 @@ def _measured(folder: Path, config: TrainerConfig, scale: Scale, open_view: Open
     batches = render_once(open_view(data, config.data.validation_seed, scale.size_px), scale.windows)
     metrics = measure(predict_all(torch_predictor(model), batches), batches)
     origin = {"weights_sha256": sha256, "trained_samples": training["samples"], "commit": training["commit"]}
-    return {**origin, **null_where_unknown(metrics)}
+    # Not only those that show no second aircraft, whose number differs between kinds of windows.
+    return {**origin, **null_where_unknown(metrics), "windows": float(windows_in(batches))}
 
 
 def table(result: dict[str, Any]) -> str:

@@ -55,7 +55,7 @@ EMPTY_SHARE = 0.4  # of the rendered windows: what the presence head tells targe
 RENDERED_AT_ONCE = 32
 BATCH = 512
 HELD_OUT_SHARE = 0.04
-FEWEST = 50  # targets
+FEWEST = 50  # targets; also peaks of none, which the presence head learns from
 LEARNING_RATE, WEIGHT_DECAY = 2e-3, 0.2
 # The choice is learnt from few windows in which the network errs, so it overfits sooner.
 DROPOUT, DROPOUT_OF_CHOICE = 0.3, 0.5
@@ -141,6 +141,11 @@ def refine(
         data = data.model_copy(update={"flown": list(plan.flown), "flown_share": plan.flown_share})
     opener = open_sampler(data, plan.seed, size_px, plan.strangers, *from_datasets)
     kept = look(model, config, opener, plan.windows, say)
+    if heads.presence is not None and (others := int((~kept.target).sum())) < FEWEST:
+        say(
+            f"WARNING: {others} of the {len(kept.target)} peaks are of no target: too few to learn what is none. "
+            "The presence head may take anything for one; give images without a target, or a smaller --dataset-share"
+        )
     learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
     fit(heads, kept, learnt, plan.epochs, say)
     for (module_name, _), head in zip(HEADS.values(), heads, strict=True):
