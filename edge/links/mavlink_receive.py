@@ -126,6 +126,9 @@ def malformed(message: Any) -> str | None:
         return None  # NaN means "not given" there; each command checks the parameters it reads
     if not_finite(message, but=OPTIONAL_FIELDS) is not None:
         return "not_finite"
+    # Senders that do not know it leave it at 0: MAVSDK does in SYSTEM_TIME. Beside others it would look like a reboot.
+    if getattr(message, "time_boot_ms", None) == 0:
+        return "unstamped"
     if message_id in (ATTITUDE_QUATERNION, GIMBAL_ATTITUDE) and not _is_rotation(message):
         return "quaternion_norm"
     return None if _plausible(message) else "implausible"

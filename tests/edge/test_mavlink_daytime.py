@@ -86,7 +86,7 @@ def test_the_difference_is_no_longer_counted_once_the_autopilot_has_rebooted() -
         meet(link, peer)
         peer.send(dialect.MAVLink_system_time_message(time.time_ns() // 1000, peer.boot_ms()))
         peer.settle(lambda: "utc_ahead_ms" in link.counters(), "count")
-        peer.boot_at_ns = time.monotonic_ns()
+        peer.boot_at_ns = time.monotonic_ns() - 1_000_000
         peer.send(dialect.MAVLink_system_time_message(0, peer.boot_ms()))  # it has no fix yet
         peer.settle(lambda: link.counters()["reboots"] == 1, "reboot")
         peer.settle(lambda: "utc_ahead_ms" not in link.counters(), "the count's end")

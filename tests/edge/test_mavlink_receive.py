@@ -112,6 +112,10 @@ def hostile() -> dict[str, list[Any]]:
             d.MAVLink_attitude_message(stamp, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0),
             d.MAVLink_local_position_ned_message(stamp, 0.0, math.inf, 0.0, 0.0, 0.0, 0.0),
         ],
+        "unstamped": [
+            d.MAVLink_attitude_quaternion_message(0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+            d.MAVLink_system_time_message(1_700_000_000_000_000, 0),  # as MAVSDK sends it
+        ],
         "quaternion_norm": [d.MAVLink_attitude_quaternion_message(stamp, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)],
         "message_id": [
             d.MAVLink_setup_signing_message(SYSTEM_ID, 191, [7] * 32, 2**48 - 1),
@@ -124,13 +128,18 @@ def hostile() -> dict[str, list[Any]]:
 def test_nonsense_with_a_valid_checksum_is_counted_and_changes_nothing(reason: str) -> None:
     with linked() as (link, own_ship), Peer(link.ports[0]) as peer:
         meet(link, peer)
-        for message in hostile()[reason]:
-            peer.send(message)
-        expected = len(hostile()[reason])
-        peer.settle(lambda: link.counters().get(f"refused_{reason}", 0) == expected, "refusal")
+
+        def refused(times: int) -> None:
+            for message in hostile()[reason]:
+                peer.send(message)
+            expected = times * len(hostile()[reason])
+            peer.settle(lambda: link.counters().get(f"refused_{reason}", 0) == expected, "refusal")
+
+        refused(1)
         assert own_ship.at(time.monotonic_ns()) is None
         hear(own_ship, peer, Rotation.identity())
-        assert link.counters().get("failed", 0) == 0
+        refused(2)
+        assert (link.counters().get("failed", 0), link.counters()["reboots"]) == (0, 0)
 
 
 def test_another_vehicles_telemetry_from_the_autopilots_address_is_refused() -> None:

@@ -47,7 +47,7 @@ def test_a_reboot_clears_the_own_ship_and_asks_for_rates_again() -> None:
         meet(link, peer)
         hear(own_ship, peer, Rotation.identity())
         before_ns = time.monotonic_ns()
-        peer.boot_at_ns = before_ns
+        peer.boot_at_ns = before_ns - 1_000_000
         peer.attitude(Rotation.from_euler("x", 1.0))
         peer.settle(lambda: link.counters()["reboots"] == 1, "reboot")
         assert own_ship.at(before_ns - 1_000_000) is None, "what was before the reboot is gone"
