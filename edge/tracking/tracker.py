@@ -147,7 +147,7 @@ class Tracker:
         lens = Lens(K, distortion)
         finite = [one for one in estimates if _finite(one)]
         self.not_finite += len(estimates) - len(finite)
-        boxes = [_box(target, view, lens) for target in self._targets]
+        boxes = [_outline(target, view, lens) for target in self._targets]
         lately = [(capture_ns - target.merged_ns) / NS_PER_S <= COAST_MAX_S for target in self._targets]
         merged = shown_at_once(finite, boxes, lately)
         for i, several in merged.items():
@@ -322,6 +322,15 @@ def _alive(target: Target, lens: Lens, view: View, image_size_wh: Size) -> bool:
 
 def _box(target: Target, view: View, lens: Lens) -> Array:
     return target.box.box_xyxy_px(ekf.t_in_cam(target.motion, view), lens)
+
+
+def _outline(target: Target, view: View, lens: Lens) -> Array:
+    """Its box [4]; an empty one, which hides no other target, if it is beside or behind the camera or may well be:
+    without own attitude, what has flown by is soon predicted anywhere around the camera."""
+    t_cam_m = ekf.t_in_cam(target.motion, view)
+    doubt_m2 = float(np.trace(target.motion.P[ekf.POSITION, ekf.POSITION]))
+    ahead = t_cam_m[2] > RANGE_MIN_M and doubt_m2 < t_cam_m @ t_cam_m
+    return target.box.box_xyxy_px(t_cam_m, lens) if ahead else np.zeros(4)
 
 
 def _track(target: Target, motion: Motion, attitude: Attitude, view: View, lens: Lens) -> Track:

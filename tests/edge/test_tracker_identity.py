@@ -248,6 +248,18 @@ def test_one_detection_of_two_aircraft_that_cross_is_taken_for_neither(kind: str
     assert max(nees) < 16.3
 
 
+@pytest.mark.parametrize(("kind", "x_m", "y_m"), [("cam", -10.0, -5.0), ("ned", 10.0, 5.0)])
+def test_one_that_flew_by_the_camera_hides_none_ahead(kind: str, x_m: float, y_m: float) -> None:
+    """Behind the camera it has no box, and without own attitude it is soon predicted anywhere around the camera."""
+    flight, ahead_m, across_m = Flight(kind, rate_hz=10.0), np.array([0.0, 0.0, 400.0]), []
+    for index in range(55):
+        near_m = np.array([x_m, y_m, 250.0 - 7.0 * index])
+        tracks = flight.frame(flight.sight(ahead_m), *([flight.sight(near_m)] if near_m[2] > 25.0 else []))
+        (told,) = (track for track in tracks if track.t_cam_target_m[2] > 300.0)
+        across_m.append(float(np.sqrt(told.covariance[:2, :2].diagonal().max())))
+    assert max(across_m[20:]) < 1.2 * across_m[20]
+
+
 def test_an_aircraft_that_rolls_and_shows_its_wings_is_not_taken_for_two() -> None:
     """Twice as high in the picture from one frame to the next: its box is that at once, and its place as sure."""
     flight, t_m = Flight("ned"), towards(0.0, 250.0)
