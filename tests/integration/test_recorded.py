@@ -327,6 +327,9 @@ def test_what_holds_nothing_to_fly_is_said(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "torn.mcap").write_bytes(b"no MCAP at all")
     assert main(["play", "--sequence", str(tmp_path / "torn.mcap"), "--out", str(tmp_path / "out")]) == 2
     assert "torn.mcap" in capsys.readouterr().err
+    (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n")  # power was lost as it began
+    assert main(["play", "--sequence", str(tmp_path / "torn.mcap"), "--out", str(tmp_path / "out")]) == 2
+    assert "torn.mcap: is not a complete MCAP file (it ends early)" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert main(["play", "--sequence", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
     assert "is not a scene folder" in capsys.readouterr().err

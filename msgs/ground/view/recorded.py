@@ -64,7 +64,9 @@ def _messages(stream: BinaryIO) -> Iterator[tuple[Schema | None, Channel, Messag
     whole = unfinished_bytes(stream)
     if not whole:
         stream.seek(0)
-        yield from make_reader(stream, validate_crcs=True).iter_messages()
+        reader = make_reader(stream, validate_crcs=True)
+        reader.get_header()  # of a file that is too short to end with an index, it says so
+        yield from reader.iter_messages()
         return
     with mmap.mmap(stream.fileno(), whole, access=mmap.ACCESS_READ) as part:
         try:
