@@ -275,5 +275,6 @@ def _received(receive: Receive[Received], sample: zenoh.Sample) -> Received | No
 
 
 def sender_of(sample: zenoh.Sample) -> str:
-    """Id of the zenoh session that sent a sample, taken from its timestamp; empty if it has none."""
+    """Id of the zenoh session that sent a sample, taken from its timestamp; empty if it has none. A router whose clock
+    is more than half a second behind the sender's sets a timestamp, and hence an id, of its own."""
     return "" if sample.timestamp is None else str(sample.timestamp.get_id())

@@ -79,8 +79,8 @@ class PoseReceiver:
     """Validates the poses and directions of one UAV's targets and counts refusals by reason.
 
     A vehicle has one daemon at a time. If two publish under one name, the first one received is accepted until none of
-    its poses has been accepted for one second (as after a restart). They are distinguished by their zenoh session
-    (`sender`) or, where that is unknown, by the publisher gid of each target.
+    its poses has been accepted for one second (as after a restart). They are distinguished by the publisher gid of each
+    target that is being heard, and otherwise by their zenoh session (`sender`), if it is known.
     Ages compare the sender's clock with ours: `max_age_s` must allow for their offset.
     """
 
@@ -152,9 +152,11 @@ class PoseReceiver:
     ) -> None:
         publisher = topic.name, target, gid
         last = self._last.get((topic.name, target))
-        if not self.believes(sender, now_ns):
-            raise PayloadError(Refusal.PUBLISHER)
-        if last is not None and gid != last.gid and 0 <= now_ns - last.arrival_ns <= _SILENT_NS:
+        if last is not None and 0 <= now_ns - last.arrival_ns <= _SILENT_NS:
+            believed = gid == last.gid  # a publisher that goes on, whatever its session is called now
+        else:
+            believed = self.believes(sender, now_ns)
+        if not believed:
             raise PayloadError(Refusal.PUBLISHER)
         if sequence <= self._sequences.get(publisher, 0):
             raise PayloadError(Refusal.SEQUENCE)

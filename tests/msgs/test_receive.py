@@ -71,6 +71,16 @@ def test_of_two_publishers_the_first_alone_is_believed_while_it_is_heard() -> No
     assert dict(receiver.refused) == {Refusal.PUBLISHER: 39}
 
 
+def test_a_publisher_goes_on_though_a_router_puts_its_own_session_in_place_of_that_of_a_clock_ahead() -> None:
+    receiver = PoseReceiver("uav1")
+    second = topics.publication_key(POSE, "uav1", "t1")
+    for n in range(1, 40):
+        now_ns, session = NOW_NS + n * S // 10, ("daemon", "router")[n % 2]
+        assert receiver.receive(KEY, *sample(n, now_ns), now_ns, session)
+        assert receiver.receive(second, *sample(n, now_ns, OTHER_GID), now_ns, "another daemon") is None
+    assert dict(receiver.refused) == {Refusal.PUBLISHER: 39}
+
+
 def test_a_publisher_of_whom_nothing_can_be_taken_keeps_no_other_out() -> None:
     receiver = PoseReceiver("uav1")
     assert receiver.receive(KEY, *sample(1, NOW_NS), NOW_NS)

@@ -34,9 +34,8 @@ def event(text: str, stamp_ns: int, number: int, gid: bytes = GID) -> Incoming:
     return incoming(topics.EVENTS, cdr.Log(stamp_ns, 20, "uavpose_edge", text), number, gid)
 
 
-def pose(stamp_ns: int, number: int, z_m: float = 300.0) -> Incoming:
-    message = dataclasses.replace(pose_now(z_m), stamp_ns=stamp_ns)
-    return incoming(topics.POSE, message, number, target="t0")
+def pose(stamp_ns: int, number: int, z_m: float = 300.0, gid: bytes = GID, target: str = "t0") -> Incoming:
+    return incoming(topics.POSE, dataclasses.replace(pose_now(z_m), stamp_ns=stamp_ns), number, gid, target)
 
 
 def told(fleet: Fleet) -> str:
@@ -243,10 +242,8 @@ def test_of_two_daemons_of_one_name_one_tells_targets_attitude_and_health() -> N
         ours = [incoming(topics.TF, attitude(now_ns, 0.0), k + 1)] if k % 2 == 0 else []
         ours += [pose(now_ns, k + 1), incoming(topics.DIAGNOSTICS, well, k + 1)]
         later_ns = now_ns + 10 * MS
-        theirs = [incoming(topics.TF, attitude(later_ns, 180.0), k + 1, OTHER_GID), pose(later_ns, k + 1, 450.0)]
-        theirs.append(
-            incoming(topics.POSE, dataclasses.replace(pose_now(450.0), stamp_ns=later_ns), k + 1, OTHER_GID, "t1")
-        )
+        theirs = [incoming(topics.TF, attitude(later_ns, 180.0), k + 1, OTHER_GID)]
+        theirs += [pose(later_ns, k + 1, 450.0, OTHER_GID, target) for target in ("t0", "t1")]
         theirs.append(incoming(topics.DIAGNOSTICS, ill, k + 1, OTHER_GID))
         for sender, samples in (("a", ours), ("b", theirs)):
             for one in samples:
@@ -255,7 +252,7 @@ def test_of_two_daemons_of_one_name_one_tells_targets_attitude_and_health() -> N
         seen |= {(row.health, one.target, round(one.range_m), round(one.bearing_deg)) for one in row.targets}
     assert seen == {("well", "t0", 300, 0)}
     assert row.refused == {Refusal.PUBLISHER: 60 * 4}
-    (after,) = [pose(now_ns + 2 * S, 900, 450.0)]
+    (after,) = [pose(now_ns + 2 * S, 900, 450.0, OTHER_GID)]
     assert fleet.take(dataclasses.replace(after, sender="b"), now_ns + 2 * S) is not None, "the first is silent"
 
 
