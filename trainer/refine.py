@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from sim_replay.bop import BopError, find_scenes, names_split
+from sim_replay.bop import BopError, names_split
 from sim_replay.datasets import open_dataset
 from trainer import equations as eq
 from trainer.checkpoint import (
@@ -31,7 +31,6 @@ from trainer.config import (
     REFINED_BY_DEFAULT,
     ConfigError,
     DataConfig,
-    DatasetSource,
     TrainerConfig,
     made_folder,
     parse_config,
@@ -43,7 +42,7 @@ from trainer.model import Perception, PoseNet
 from trainer.presence import PresenceHead
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
-from trainer.sources import refinement_sampler
+from trainer.sources import refinement_sampler, trained_scenes
 
 # The module of each of REFINED_HEADS, and the prefix of what the weights tell of its training.
 HEADS = {
@@ -175,7 +174,8 @@ def _refined_on(plan: RefinePlan, data: DataConfig) -> list[str]:
     Raises ConfigError if a dataset has images on which the network was trained, or a test split that nobody named, or
     is unreadable.
     """
-    trained_on = {folder for source in data.datasets for folder in _trained_scenes(source)}
+    sources = data.datasets if plan.datasets else []
+    trained_on = {folder for source in sources for folder in trained_scenes(source)}
     told = []
     for path in plan.datasets:
         try:
@@ -190,18 +190,6 @@ def _refined_on(plan: RefinePlan, data: DataConfig) -> list[str]:
             raise ConfigError(f"--dataset {path}: contains the split {tests[0]!r}, for evaluation; choose by --split")
         told += [f"{dataset.name}, split {split}" for split in sorted({s.split for s in scenes if s.split is not None})]
     return told if plan.dataset_share > 0.0 else []
-
-
-def _trained_scenes(source: DatasetSource) -> set[Path]:
-    """Folders of the scenes of a training split, without links; none where the dataset is no longer there.
-
-    A split `train` takes in every `train_...`: the one that there was need not be the only one now.
-    """
-    try:
-        scenes = find_scenes(source.path)
-    except BopError:
-        return set()
-    return {s.folder.resolve() for s in scenes if s.split and f"{s.split}_".startswith(f"{source.split}_")}
 
 
 def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Path, trained: Collection[str]) -> PoseNet:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_replay.bop import BopError
+from sim_replay.bop import BopError, find_scenes
 from trainer.config import ConfigError, ContractConfig, DataConfig, DatasetSource
 from trainer.data import Sampler
 from trainer.dataset_windows import ACQUIRE_WIDTH_PX, DatasetSampler, MixedSampler, spans
@@ -122,6 +122,19 @@ def refuse_unreadable(config: DataConfig) -> None:
             raise ConfigError(
                 f"data.datasets: no image to {purpose} on shows a target, and there are no rendered windows"
             )
+
+
+def trained_scenes(source: DatasetSource) -> set[Path]:
+    """Folders of the scenes of a training split, without links; none, with a warning, where the dataset is not there.
+
+    A split `train` takes in every `train_...`: the one that there was need not be the only one now.
+    """
+    try:
+        scenes = find_scenes(source.path)
+    except BopError as error:  # moved, or a relative path of another working directory
+        _log.warning("%s: the network was trained on it, so whether other datasets share its images is unknown", error)
+        return set()
+    return {s.folder.resolve() for s in scenes if s.split and f"{s.split}_".startswith(f"{source.split}_")}
 
 
 def warn_of_unseen_reduction(contract: ContractConfig) -> None:

@@ -19,14 +19,14 @@ from tests.sim_replay.foreign import write_json, write_models_info, write_scene
 from trainer.checkpoint import load_file, load_model, save_weights, write_atomic
 from trainer.choice import ChoiceHead, option_count
 from trainer.cli import main
-from trainer.config import REFINED_HEADS, ConfigError, DataConfig
+from trainer.config import REFINED_HEADS, ConfigError, DataConfig, DatasetSource
 from trainer.equations import heatmap_peaks
 from trainer.graph import open_session, write_graph
 from trainer.losses import pose_residual, to_tensors
 from trainer.presence import PresenceHead
 from trainer.refine import Heads, Kept, RefinePlan, fit, fleet_size, look, refine
 from trainer.refinement import Evidence, RefinementHead, answer_count
-from trainer.sources import refinement_sampler
+from trainer.sources import refinement_sampler, trained_scenes
 
 NO_ANGLES = torch.zeros(6000, 4)
 PLAN = RefinePlan(seed=11, windows=96, epochs=2, strangers=0.5, heads=REFINED_HEADS)
@@ -159,6 +159,21 @@ def test_images_that_the_network_was_trained_on_are_refused_where_they_are_linke
             with pytest.raises(ConfigError, match=r"--dataset .*: the network was trained on it; give another"):
                 refine_on(run, given)
         refine_on(run, own / "val")
+
+
+def test_that_training_images_are_not_where_they_were_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A relative path is one of the working directory that training had."""
+    write_splits(tmp_path / "own", "train", "val")
+    trained_on = DatasetSource(path=Path("own"), share=0.5)
+    monkeypatch.chdir(tmp_path)
+    assert trained_scenes(trained_on) == {tmp_path.resolve() / "own" / "train" / "000000"}
+    assert not caplog.messages
+    monkeypatch.chdir(tmp_path / "own")
+    assert trained_scenes(trained_on) == set()
+    (told,) = caplog.messages
+    assert told.startswith(f"own is not a folder in {Path.cwd()}: the network was trained on it")
 
 
 def test_a_test_split_is_refined_on_only_if_named(tmp_path: Path) -> None:
