@@ -89,6 +89,8 @@ class Subscription(Generic[Received]):
         return self._receiver.refused
 
     def __iter__(self) -> Iterator[Received]:
+        if self._closed:
+            return
         for sample in self._subscriber:
             one = _received(self._receive, sample)
             if one is not None:

@@ -203,6 +203,7 @@ def test_what_is_closed_has_no_more_poses_and_may_be_closed_again(network: Netwo
     with client.connect(network.endpoint) as tool, client.subscribe(tool, "uav1") as poses:
         poses.close()
         assert poses.poll() is None
+        assert list(poses) == []
     with client.connect(network.endpoint) as tool:
         left = client.subscribe(tool, "uav1")
     assert left.poll() is None
