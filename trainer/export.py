@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -184,7 +185,8 @@ def _contract(
 def data_told(data: DataConfig) -> str:
     """Description of a configuration's training data."""
     rendered = data.rendered_share
-    parts = [f"{source.path.name}, split {source.split}: {source.share:.0%}" for source in data.datasets]
+    name_of = lambda path: os.path.basename(os.path.abspath(path))  # noqa: E731, "." has no name of its own
+    parts = [f"{name_of(source.path)}, split {source.split}: {source.share:.0%}" for source in data.datasets]
     if rendered > 0.0:
         told = f"rendered windows: {rendered:.0%}, of them {data.empty_share:.0%} without a target"
         told += f", {data.acquire_share:.0%} of the whole frame"

@@ -18,7 +18,7 @@ from trainer.comparison import Tolerance, Views
 from trainer.config import ConfigError, parse_config
 from trainer.data import training_batch
 from trainer.dataset_windows import DatasetSampler
-from trainer.export import export_models, make_contract
+from trainer.export import data_told, export_models, make_contract
 from trainer.graph import read_contract
 from trainer.sources import refuse_unreadable
 from trainer.train import run_training
@@ -69,6 +69,16 @@ def test_the_contract_tells_what_was_trained_on_and_not_what_was_measured_on(tmp
     contract = exported(tmp_path, on_dataset(tmp_path / "own"))
     assert contract.trained_range_m == (69.0, 91.0)
     assert contract.trained_focal_px[1] < 15_000.0
+
+
+def test_a_dataset_is_told_by_its_name_also_if_it_is_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`calibrate-score` knows by it the images that were trained on."""
+    (tmp_path / "hawks" / "runs").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "hawks" / "runs")
+    for written, name in ((".", "runs"), ("..", "hawks"), ("/data/kites/", "kites")):
+        assert data_told(parse_config(on_dataset(Path(written)), "own.toml").data) == f"{name}, split train: 100%"
 
 
 def test_a_range_that_the_configuration_tells_is_the_contracts(tmp_path: Path) -> None:
