@@ -260,6 +260,19 @@ def test_one_that_flew_by_the_camera_hides_none_ahead(kind: str, x_m: float, y_m
     assert max(across_m[20:]) < 1.2 * across_m[20]
 
 
+def test_one_detection_of_two_is_taken_for_neither_where_their_ranges_begin_anew() -> None:
+    """How far away they are says nothing of where they are seen."""
+    flight, truth = Flight("ned"), np.array([[-3.0, 0.0, 250.0], [3.0, 0.0, 250.0]])
+    for _ in range(30):
+        tracks = flight.frame(*(flight.sight(t_m) for t_m in truth))
+    flight.tracker.doubt_ranges()
+    boxes = np.array([track.box_xyxy_px for track in tracks])
+    union = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+    tracks = flight.frame(replace(flight.sight(truth.mean(axis=0)), box_xyxy_px=union))
+    (told,) = (track for track in tracks if track.measured_ns == track.time_ns)
+    assert np.sqrt(told.covariance[0, 0]) > 2.0
+
+
 def test_an_aircraft_that_rolls_and_shows_its_wings_is_not_taken_for_two() -> None:
     """Twice as high in the picture from one frame to the next: its box is that at once, and its place as sure."""
     flight, t_m = Flight("ned"), towards(0.0, 250.0)
