@@ -76,6 +76,13 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
     return R if np.linalg.det(R) > 0.0 else u @ np.diag([1.0, 1.0, -1.0]) @ vt
 
 
+def _matrices(rows: list[list[Array]]) -> Array:
+    """Entries [...], row by row, to matrices [..., rows, columns]; for a single one much quicker than np.stack."""
+    entries = np.array(rows)
+    # Contiguous: NumPy multiplies others by another algorithm, which rounds differently.
+    return np.ascontiguousarray(entries.transpose(*range(2, entries.ndim), 0, 1))
+
+
 def q_wxyz_from_R(R: ArrayLike) -> Array:
     """Rotation matrices [..., 3, 3] to unit quaternions [..., 4], w >= 0 (Bar-Itzhack: largest diagonal first)."""
     m = np.asarray(R, dtype=np.float64)
@@ -88,8 +95,8 @@ def q_wxyz_from_R(R: ArrayLike) -> Array:
         [y, xy, 1 - m00 + m11 - m22, yz],
         [z, xz, yz, 1 - m00 - m11 + m22],
     ]
-    candidates = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    best = np.argmax(np.stack([m00 + m11 + m22, m00, m11, m22], axis=-1), axis=-1)
+    candidates = _matrices(rows)
+    best = np.argmax(np.array([m00 + m11 + m22, m00, m11, m22]), axis=0)
     q = np.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0.0, -q, q)
@@ -101,13 +108,14 @@ def R_from_q_wxyz(q_wxyz: ArrayLike) -> Array:
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if not np.all(norm > 1e-9):
         raise ValueError("a zero or non-finite quaternion is not a rotation")
-    w, x, y, z = np.moveaxis(q / norm, -1, 0)
+    unit = q / norm
+    w, x, y, z = unit[..., 0], unit[..., 1], unit[..., 2], unit[..., 3]
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return _matrices(rows)
 
 
 def R_from_euler(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Array:
