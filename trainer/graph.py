@@ -172,7 +172,13 @@ def write_contract(path: Path, contract: ModelContract) -> None:
 
 def read_contract(path: Path) -> ModelContract:
     """The contract in a model file. Raises ConfigError naming the file."""
-    metadata = open_session(path).get_modelmeta().custom_metadata_map
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such model file")
+    try:
+        model = onnx.load(str(path), load_external_data=False)  # a session is much slower
+    except Exception as error:
+        raise ConfigError(f"{path}: not an ONNX model: {error}") from None
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
     if METADATA_KEY not in metadata:
         raise ConfigError(f"{path}: has no {METADATA_KEY} metadata: not a model of this program")
     try:

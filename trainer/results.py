@@ -342,7 +342,7 @@ def register(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate and write the page. Raises ConfigError."""
     from sim_replay.offline import SHIPPED_MODEL
-    from trainer.graph import read_contract
+    from trainer.graph import open_session, read_contract
 
     # Check the inputs before hours of evaluation.
     history, shipped = read_history(HISTORY), read_contract(SHIPPED_MODEL).training
@@ -352,6 +352,7 @@ def run(arguments: argparse.Namespace) -> None:
     refuse_other_pictures(beside, datasets)
     for path in arguments.model:
         read_contract(path)
+        open_session(path)
     made_folder(arguments.out)
     scores = measure([None, *arguments.model], datasets, lambda text: print(text, file=sys.stderr, flush=True))
     (arguments.out / "results.json").write_text(json.dumps(scores, indent=1) + "\n", encoding="utf-8")

@@ -281,6 +281,8 @@ def test_what_lies_beside_the_test_split_is_not_measured(tmp_path: Path) -> None
     [
         (["--out", "{tmp}/file"], "{tmp}/file: cannot be made a folder"),
         (["--out", "{tmp}/out", "--model", "{tmp}/typo.onnx"], "{tmp}/typo.onnx: no such model file"),
+        (["--out", "{tmp}/out", "--model", "{tmp}/history.jsonl"], "{tmp}/history.jsonl: not an ONNX model"),
+        (["--out", "{tmp}/out", "--model", "{tmp}/file"], "{tmp}/file: has no uavpose_contract metadata"),
         (["--out", "{tmp}/out", "--beside", "{tmp}/none.json"], "{tmp}/none.json: is not a metrics.json"),
     ],
 )
