@@ -35,7 +35,8 @@ LEVEL_DEG, UPSIDE_DOWN_DEG = 0.0, 180.0
 def said(system: int, tilt_deg: float, now_ns: int) -> list[bytes]:
     """An autopilot's heartbeat each second and its attitude each 20 ms."""
     mav = MAVLink(None, srcSystem=system, srcComponent=1)
-    q = np.roll(Rotation.from_euler("x", tilt_deg, degrees=True).as_quat(), 1).tolist()
+    half_rad = np.deg2rad(tilt_deg) / 2
+    q = (np.cos(half_rad), np.sin(half_rad), 0.0, 0.0)
     attitude = dialect.MAVLink_attitude_quaternion_message(now_ns // MS, *q, 0.0, 0.0, 0.0)
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, 3, 0, 0, 4, 3)
     return [bytes(message.pack(mav)) for message in ([beat] if now_ns % S == 0 else []) + [attitude]]
