@@ -23,23 +23,17 @@ BIN = Path(sys.executable).parent
 LAST_FRAMES = ["--start", "4.6"]  # of 150 at 30 Hz: the last twelve
 
 
-def replay(*arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]:
-    command = [BIN / "uavpose-replay", *arguments]
-    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=200)
-
-
 def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_the_same_frames_give_the_same_files_at_any_speed_and_by_hand(tmp_path: Path) -> None:
-    quick = replay("play", "--lockstep", *LAST_FRAMES, "--out", tmp_path / "quick")
-    assert quick.returncode == 0, quick.stderr
+    assert main(["play", "--lockstep", *LAST_FRAMES, "--out", str(tmp_path / "quick")]) == 0
     began_s = time.monotonic()
-    slow = replay("play", "--speed", "0.25", *LAST_FRAMES, "--out", tmp_path / "slow")
-    assert slow.returncode == 0, slow.stderr
+    assert main(["play", "--speed", "0.25", *LAST_FRAMES, "--out", str(tmp_path / "slow")]) == 0
     assert time.monotonic() - began_s > 11 / 30 / 0.25
-    stepped = replay("play", "--step", *LAST_FRAMES, "--out", tmp_path / "stepped", typed="\n\ng\n")
+    by_hand = [BIN / "uavpose-replay", "play", "--step", *LAST_FRAMES, "--out", tmp_path / "stepped"]
+    stepped = subprocess.run(by_hand, input="\n\ng\n", capture_output=True, text=True, timeout=200)
     assert stepped.returncode == 0, stepped.stderr
     assert stepped.stdout.count("before frame") == 3
     assert stepped.stdout.count("t0 at") >= 8
@@ -62,18 +56,17 @@ def test_a_target_that_is_given_as_larger_is_farther_away(tmp_path: Path) -> Non
     for share in (0.9, 1.1):
         size = [f"{share * side_m:.2f}" for side_m in (12.0, 6.5)]
         out = tmp_path / f"{share}"
-        played = replay("play", "--lockstep", *LAST_FRAMES, "--target-size", *size, "--out", out)
-        assert played.returncode == 0, played.stderr
+        assert main(["play", "--lockstep", *LAST_FRAMES, "--target-size", *size, "--out", str(out)]) == 0
         poses = [json.loads(line) for line in files(out)["poses.jsonl"].splitlines()]
         away_m.append(np.mean([pose["t_cam_target_m"][2] for pose in poses]))
     assert 1.01 * away_m[0] < away_m[1] < 1.22 * away_m[0]
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path) -> None:
-    played = replay("golden", case, "--out", tmp_path)
-    assert played.returncode == 0, f"{played.stdout}\n{played.stderr}\naccept it: uavpose-replay golden --accept"
-    assert played.stdout.strip().endswith(f"{case}: no differences")
+def test_the_daemon_says_what_was_accepted(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, said = main(["golden", case, "--out", str(tmp_path)]), capsys.readouterr()
+    assert code == 0, f"{said.out}\n{said.err}\naccept it: uavpose-replay golden --accept"
+    assert said.out.strip().endswith(f"{case}: no differences")
 
 
 def test_a_golden_run_that_fails_leaves_nothing_of_an_earlier_one(

@@ -177,8 +177,8 @@ def test_a_flight_of_moments_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_soak_without_a_pose_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sky = write_toy_flight(tmp_path / "sky", target=False)
     model = write_toy_model(tmp_path / "toy.onnx")
-    flown = ["soak", "--minutes", "0.2", "--sequence", str(sky), "--model", str(model), "--out", str(tmp_path)]
-    assert main(flown) == 1
+    flown = ["soak", "--minutes", "0.2", "--fps", "5", "--sequence", str(sky), "--model", str(model)]
+    assert main([*flown, "--out", str(tmp_path)]) == 1
     assert "the autopilot received no pose" in capsys.readouterr().out
     assert "the subscriber received no pose" in json.loads((tmp_path / "soak.json").read_text())["silences"]
 
