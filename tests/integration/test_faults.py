@@ -17,12 +17,13 @@ from sim_replay.faults.judge import faults_since, violations
 from sim_replay.faults.messages import AUTOPILOT, KINDS, SUBSCRIBER
 from sim_replay.faults.rig import Rig, RigSettings, can_mount
 from sim_replay.faults.run import TIMELINES, Outcome, play_timeline
-from sim_replay.faults.timeline import Timeline, load_timeline
+from sim_replay.faults.timeline import Flood, Timeline, load_timeline
 
 WORD_S = 5.0
 SHORT = {"mavlink-cut", "flood"}  # the same as mavlink-cut-30s and flood-10mb, and less of it
 NEED_VOLUME = {"disk-full"}
 SIGNED = ("signed-replay", "signed-reboot")
+SIGNED_BYTES = 1_000_000  # of each flood at them: what the autopilot said, again and again; more is the same once more
 LAST = ["daemon-alone", "daemon-killed"]  # what ends the daemon comes last: those before share one
 NAMES = sorted({path.stem for path in TIMELINES.glob("*.toml")} - SHORT - NEED_VOLUME - set(SIGNED) - set(LAST)) + LAST
 
@@ -61,9 +62,20 @@ def volume(rig: Rig) -> None:
 
 
 def played(rig: Rig, name: str, tell_recovery: Callable[[str], None]) -> Outcome:
-    outcome = play_timeline(rig, load_timeline(TIMELINES / f"{name}.toml"), print)
+    timeline = load_timeline(TIMELINES / f"{name}.toml")
+    if name in SIGNED:
+        timeline = less_flooded(timeline, SIGNED_BYTES)
+    outcome = play_timeline(rig, timeline, print)
     tell_recovery(f"{name}: {outcome.recovery()}")
     return outcome
+
+
+def less_flooded(timeline: Timeline, bytes_max: int) -> Timeline:
+    steps = [
+        step.model_copy(update={"total_bytes": min(step.total_bytes, bytes_max)}) if isinstance(step, Flood) else step
+        for step in timeline.step
+    ]
+    return timeline.model_copy(update={"step": steps})
 
 
 @pytest.mark.timeout(400)
