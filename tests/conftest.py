@@ -16,6 +16,9 @@ settings.load_profile("any machine")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Images for containers often forbid bytecode: then each of the hundreds of processes compiles what it imports anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# NumPy's and SciPy's threads spin when they are started, in each of those processes; no matrix here is large enough
+# for more than one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 RECOVERY = "recovery"  # the user property in which a test leaves a line for the closing report
 
