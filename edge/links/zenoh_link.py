@@ -21,7 +21,7 @@ import zenoh
 from zenoh import CongestionControl, Reliability
 
 from edge import clock
-from edge.clock import UtcClock
+from edge.clock import UTC_SET_NS, UtcClock
 from edge.config_ground import ZenohSettings
 from edge.health import HealthSnapshot
 from edge.links import zenoh_messages as ros
@@ -46,6 +46,7 @@ STOP_TIMEOUT_S = 5.0
 # Closing waits for connection attempts; one to a router that does not answer is left to end with the process.
 CLOSE_TIMEOUT_S = 2.0
 SETTLE_TIMEOUT_S = 60.0
+EXPOSURES_KEPT = 16  # a frame's picture is ready a few frames after its poses
 
 
 @dataclass
@@ -258,6 +259,7 @@ class Desk:
         self._mount = mount
         self._max_age_ms = max_age_ms
         self._clock = UtcClock()
+        self._exposures: dict[int, int] = {}  # UTC of the last ones, by monotonic time
         self._publishers: dict[tuple[str, str | None], TopicPublisher] = {}
         self._intrinsics: tuple[bytes, tuple[int, int], tuple[float, ...]] | None = None
         self._pose_rates: defaultdict[tuple[str, str | None], Rate] | None = None  # None: no limit
@@ -272,7 +274,7 @@ class Desk:
         self._pose_rates = None if max_hz is None else defaultdict(partial(Rate, max_hz))
 
     def put_report(self, report: Report) -> None:
-        stamp_ns = self._clock.utc_ns(report.meta.capture_ns)
+        stamp_ns = self._exposed_ns(report.meta.capture_ns)
         now_ns = clock.monotonic_ns()
         tracks = sendable(report, now_ns, self._max_age_ms)
         unranged = rangeless(report, now_ns, self._max_age_ms)
@@ -306,13 +308,24 @@ class Desk:
         return None if self._node is None else self._publisher(self._node, topics.IMAGE, None)
 
     def put_picture(self, picture: Picture) -> None:
-        stamp_ns = self._clock.utc_ns(picture.capture_ns)
+        stamp_ns = self._exposed_ns(picture.capture_ns)
         payload = CompressedImage(stamp_ns, topics.FRAME_CAMERA, "jpeg", picture.jpeg).encode()
         if picture.recorded and self._recorder is not None:
             self._recorder.record(topics.IMAGE, self._vehicle_name, None, payload, clock.utc_ns())
         if picture.live and self._node is not None:
             self._publisher(self._node, topics.IMAGE, None).put(payload)
             self.counted["sent_image"] += 1
+
+    def _exposed_ns(self, capture_ns: int) -> int:
+        """UTC of an exposure. A frame's picture has the same stamp as its poses, unless UTC was stepped in between."""
+        stamp_ns = self._clock.utc_ns(capture_ns)
+        told_ns = self._exposures.get(capture_ns, stamp_ns)
+        if abs(told_ns - stamp_ns) <= UTC_SET_NS:
+            stamp_ns = told_ns
+        self._exposures[capture_ns] = stamp_ns
+        while len(self._exposures) > EXPOSURES_KEPT:
+            del self._exposures[next(iter(self._exposures))]
+        return stamp_ns
 
     def put_event(self, time_ns: int, level: int, text: str) -> None:
         self._put(topics.EVENTS, Log(self._clock.utc_ns(time_ns), level, topics.NODE_NAME, text))

@@ -14,10 +14,12 @@ import pytest
 import zenoh
 from mcap.reader import make_reader
 
+from edge import clock
 from edge.config import load_config
 from edge.config_ground import ZenohSettings
 from edge.errors import InputError
 from edge.links.zenoh_link import ZenohLink
+from edge.pictures import Picture
 from msgs import recording
 from msgs.client import connect
 from msgs.recording import Recorder
@@ -75,6 +77,27 @@ def test_with_zenoh_off_it_is_recorded_all_the_same(tmp_path: Path) -> None:
     (path,) = tmp_path.iterdir()
     assert "/uav1/target/t0/pose" in {topic for topic, _ in read(path)}
     assert "sent_pose" not in link.counters()
+
+
+def test_a_frame_s_picture_has_the_stamp_of_its_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though UTC, measured anew in between, is another by nanoseconds: readers match them by it."""
+    monkeypatch.setattr(clock, "UTC_PERIOD_NS", 0)
+    link, recorder = link_and_recorder(tmp_path, enabled=False, max_age_ms=10_000.0)
+    recorder.start()
+    link.start()
+    for _ in range(10):
+        report = make_report(make_track(time.monotonic_ns()))
+        link.publish(report)
+        link.settle()
+        link.publish_picture(Picture(report.meta.capture_ns, b"", live=False, recorded=True))
+        link.settle()
+    link.stop()
+    recorder.stop()
+    (path,) = tmp_path.iterdir()
+    stamps: dict[str, list[bytes]] = {}
+    for topic, data in read(path):
+        stamps.setdefault(topic, []).append(data[4:12])
+    assert stamps["/uav1/image/compressed"] == stamps["/uav1/target/detections"]
 
 
 def test_a_folder_that_cannot_be_written_is_an_event_and_poses_still_leave(
