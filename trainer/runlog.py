@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 import subprocess
 import time
@@ -149,19 +150,18 @@ class RunLog:
         self._reset(samples)
 
     def _reset(self, samples: int) -> None:
-        self._sums: dict[str, float] = {}
-        self._count = 0
+        self._values: dict[str, list[float]] = {}
         self._since_s, self._since_samples = time.monotonic(), samples
 
     def add(self, loss: float, terms: dict[str, float], rotation_deg: float, depth_rel: float) -> None:
-        """Add one step's values; `report` averages them."""
+        """Add one step's values; `report` averages them. An error is NaN if the step saw no target."""
         for name, value in {"loss": loss, **terms, "rotation_deg": rotation_deg, "depth_rel": depth_rel}.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        self._count += 1
+            self._values.setdefault(name, []).append(value)
 
     def report(self, step: int, samples: int, progress: float, rate: float) -> None:
         """Print a line and write a JSON record with the means since the last report."""
-        means = {name: value / self._count for name, value in self._sums.items()}
+        known = {name: [value for value in values if not math.isnan(value)] for name, values in self._values.items()}
+        means = {name: sum(values) / len(values) if values else math.nan for name, values in known.items()}
         per_s = (samples - self._since_samples) / max(time.monotonic() - self._since_s, 1e-6)
         told_apart = ("loss", "rotation_deg", "depth_rel", "geodesic")
         terms = " ".join(f"{name} {value:.3f}" for name, value in means.items() if name not in told_apart)

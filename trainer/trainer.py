@@ -45,8 +45,8 @@ class Diverged(ArithmeticError):
 
 class StepResult(NamedTuple):
     loss: float
-    rotation_deg: float  # mean over the batch's targets
-    depth_rel: float  # mean over the batch's targets
+    rotation_deg: float  # mean over the batch's targets; NaN without any
+    depth_rel: float  # likewise
     terms: dict[str, float]
 
 
@@ -188,7 +188,7 @@ class Trainer:
 
 @torch.no_grad()
 def _batch_errors(out: Decoded, labels: Labels) -> dict[str, Tensor]:
-    weight = labels.present / labels.present.sum().clamp(min=1.0)
+    weight = labels.present / labels.present.sum()  # NaN if the batch shows no target
     angle = torch.rad2deg(eq.rotation_angle(out.R_ego[:, 0], labels.R_cam_target))
     Z = labels.t_cam_target_m[:, 2].clamp(min=1.0)
     off = (torch.exp(out.log_Z[:, 0]) / Z - 1).abs()

@@ -16,6 +16,7 @@ import pytest
 import synthetic_sampler
 import tiny
 import torch
+from odd_samplers import NoTargets
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.waiting import until
@@ -96,6 +97,21 @@ def test_what_a_crashed_start_told_beyond_its_checkpoint_is_not_told_twice(tmp_p
     assert told(8, 12, 16) == [4, 8, 12, 16]
     board = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [event.step for event in board.Scalars("train/loss")] == [4, 8, 12, 16]
+
+
+def test_a_step_without_a_target_has_no_error_and_does_not_better_the_curve(tmp_path: Path) -> None:
+    trainer = Trainer(tiny.config(), torch.device("cpu"))
+    samplers = synthetic_sampler.PlateSampler(5, 64), NoTargets(5, 64)
+    steps = [trainer.step(training_batch(sampler.batch(0, 4)), 0.0) for sampler in samplers]
+    log = RunLog(tmp_path, tiny.TOML, {"from_samples": 0})
+    for step in steps:
+        log.add(step.loss, step.terms, step.rotation_deg, step.depth_rel)
+    log.report(2, 8, 0.5, 1e-3)
+    log.close()
+    told = json.loads((tmp_path / "log.jsonl").read_text())
+    assert (told["rotation_deg"], told["depth_rel"]) == (steps[0].rotation_deg, steps[0].depth_rel)
+    assert told["rotation_deg"] > 0.0
+    assert told["loss"] == pytest.approx((steps[0].loss + steps[1].loss) / 2)
 
 
 @pytest.mark.parametrize(("written", "told"), [('{"starts": [', "not JSON"), ("{}", "has no list of starts")])
