@@ -325,13 +325,12 @@ def _box(target: Target, view: View, lens: Lens) -> Array:
 
 
 def _outline(target: Target, view: View, lens: Lens) -> Array:
-    """Its box [4]; an empty one, which hides no other target, if it is beside or behind the camera or may well be:
-    without own attitude, what has flown by is soon predicted anywhere around the camera."""
+    """Its box [4]; an empty one, which hides no other target, if it is beside or behind the camera or, missed, may well
+    be: without own attitude, what has flown by is soon predicted anywhere around the camera."""
     t_cam_m, along = ekf.t_in_cam(target.motion, view), _along(target.motion, view)
     P = target.motion.P[ekf.POSITION, ekf.POSITION]
-    across_m2 = float(np.trace(P) - along @ P @ along)
-    ahead = t_cam_m[2] > RANGE_MIN_M and across_m2 < t_cam_m @ t_cam_m
-    return target.box.box_xyxy_px(t_cam_m, lens) if ahead else np.zeros(4)
+    anywhere = target.misses > 0 and np.trace(P) - along @ P @ along > t_cam_m @ t_cam_m
+    return np.zeros(4) if anywhere or t_cam_m[2] <= RANGE_MIN_M else target.box.box_xyxy_px(t_cam_m, lens)
 
 
 def _track(target: Target, motion: Motion, attitude: Attitude, view: View, lens: Lens) -> Track:

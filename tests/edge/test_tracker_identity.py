@@ -260,10 +260,13 @@ def test_one_that_flew_by_the_camera_hides_none_ahead(kind: str, x_m: float, y_m
     assert max(across_m[20:]) < 1.2 * across_m[20]
 
 
-def test_one_detection_of_two_is_taken_for_neither_where_their_ranges_begin_anew() -> None:
-    """How far away they are says nothing of where they are seen."""
-    flight, truth = Flight("ned"), np.array([[-3.0, 0.0, 250.0], [3.0, 0.0, 250.0]])
-    for _ in range(30):
+@pytest.mark.parametrize(("kind", "rate_hz", "frames"), [("ned", 30.0, 30), ("cam", 1.0, 1)])
+def test_one_detection_of_two_is_taken_for_neither_though_their_ranges_begin_anew_or_their_motion_is_unknown(
+    kind: str, rate_hz: float, frames: int
+) -> None:
+    """Neither says that they are seen anywhere but where they were."""
+    flight, truth = Flight(kind, rate_hz=rate_hz), np.array([[-3.0, 0.0, 90.0], [3.0, 0.0, 90.0]])
+    for _ in range(frames):
         tracks = flight.frame(*(flight.sight(t_m) for t_m in truth))
     flight.tracker.doubt_ranges()
     boxes = np.array([track.box_xyxy_px for track in tracks])
