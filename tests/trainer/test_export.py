@@ -34,7 +34,6 @@ from trainer.graph import onnx_predictor, open_session, read_contract
 from trainer.held_out import Request, evaluate_file
 from trainer.sources import window_sampler
 from trainer.tally import Tally
-from trainer.unfinished import unfinished
 
 ANY = Tolerance(180.0, 100.0, 100.0, 100.0, 100.0)
 
@@ -195,8 +194,9 @@ def test_an_int8_file_that_is_refused_is_not_written_and_onnx_runtime_says_nothi
 
 
 def test_of_two_exports_into_one_folder_at_the_same_time_neither_uses_a_file_of_the_other(
-    exported: Exported, tmp_path: Path
+    exported: Exported, views: Views, tmp_path: Path
 ) -> None:
+    other_floats = measured(exported.fp32, views)
     save_weights(tmp_path / "run" / "weights.pt", tiny.network(1), tiny.TOML, {"seed": 3, "samples": 0})
     fp32, int8 = (tmp_path / "models" / path.name for path in (exported.fp32, exported.int8))
 
@@ -204,8 +204,9 @@ def test_of_two_exports_into_one_folder_at_the_same_time_neither_uses_a_file_of_
         if "FP32 vs. PyTorch" in text:
             shutil.copyfile(exported.fp32, fp32)
         if text == "evaluating INT8: 32 of 32 windows":
-            with unfinished(int8) as part:
-                shutil.copyfile(exported.int8, part)
+            write_int8(
+                exported.fp32, int8, read_contract(exported.fp32), views, views, other_floats, ANY, lambda _: None
+            )
 
     export_models(tmp_path / "run", tmp_path / "models", samples=16, tolerance=ANY, open_view=open_view, say=meanwhile)
     assert set((tmp_path / "models").iterdir()) == {fp32, int8}
