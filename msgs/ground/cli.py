@@ -22,8 +22,8 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit codes: 0 done, 2 bad input (the message names file and key) or output that cannot be written, 130
-    interrupted, 141 output pipe closed."""
+    """Exit codes: 0 done, 1 a command that was refused or a recording with gaps, 2 bad input (the message names file
+    and key) or output that cannot be written, 130 interrupted, 141 output pipe closed."""
     options = _parser().parse_args(arguments)
     code = exit_code(lambda: int(options.act(options)), InputError, ["ground"])
     if _still_calls():

@@ -31,7 +31,9 @@ def record(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Record these vehicles, all if none is named, until `stop` is set; returns 0. Samples are not validated.
+    """Record these vehicles, all if none is named, until `stop` is set. Samples are not validated.
+
+    Returns 0, or 1 if the disk has not taken all that was received.
 
     Raises InputError for a bad endpoint, and for a folder that cannot be written.
     """
@@ -59,8 +61,9 @@ def record(
                     up = not up
                     say(f"{endpoint}: {'up' if up else 'no link'}")
         recorder.stop()
-    say(", ".join(f"{name} {count}" for name, count in recorder.counters().items()))
-    return 0
+    counters = recorder.counters()
+    say(", ".join(f"{name} {count}" for name, count in counters.items()))
+    return 1 if counters.get("lost") else 0
 
 
 def _check_writable(folder: Path) -> None:

@@ -69,3 +69,18 @@ def test_a_recording_goes_on_when_nobody_reads_its_messages(network: Network, tm
             assert process.poll() is None
         finally:
             process.kill()
+
+
+def test_a_recording_that_the_disk_did_not_take_ends_with_1(network: Network, tmp_path: Path) -> None:
+    folder, said = tmp_path / "recordings", tmp_path / "said"
+    no_disk_has = "1e9"
+    command = [*GROUND, "record", "-e", network.endpoint, "--dir", str(folder), "--free-mb", no_disk_has]
+    with ExitStack() as stack, said.open("w") as out, subprocess.Popen(command, stderr=out) as process:
+        try:
+            uav1 = Vehicle(network.daemon, "uav1", stack)
+            until(lambda: "recording stopped: " in said.read_text(), uav1.tell)
+            process.terminate()
+            assert process.wait(60.0) == 1
+        finally:
+            process.kill()
+    assert list(folder.iterdir()) == []
