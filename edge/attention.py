@@ -5,7 +5,7 @@ The daemon's loop uses it, and evaluation, which so judges what flies.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from edge.config_estimator import EstimatorSettings
@@ -24,6 +24,11 @@ class Looked:
 
     estimates: list[Estimate]
     there: Estimate | None = None  # of these, the one in the box that was pointed at
+
+    def each(self, change: Callable[[Estimate], Estimate]) -> Looked:
+        """The same with each estimate changed."""
+        changed = [(one, change(one)) for one in self.estimates]
+        return Looked([new for _, new in changed], next((new for old, new in changed if old is self.there), None))
 
 
 class Attention:

@@ -42,6 +42,7 @@ def check(file: ConfigFile) -> list[str]:
         *([] if size is None else [f"target   wingspan {size.wingspan_m:g} m, length {size.length_m:g} m"]),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
+        + (f", rolling shutter, {config.camera.readout_ms:g} ms" if config.camera.readout_ms else "")
         + ("" if opened else "; not reachable now, the daemon will keep trying"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
         *([] if unheard is None else [f"warning  {unheard}"]),

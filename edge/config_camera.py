@@ -17,6 +17,7 @@ MONOTONIC_MAX_NS = 10**18  # 31 years since boot: a larger value is UTC
 
 PositivePx = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+ReadoutMs = Annotated[float, Field(ge=-200, le=200)]
 Side = Annotated[int, Field(gt=0, le=SIDE_MAX_PX)]
 
 
@@ -79,6 +80,11 @@ class Camera(Section):
     mount: Literal["fixed", "gimbal"] = Field(
         default="fixed",
         description="gimbal: [mount] turns the camera on the gimbal, whose attitude comes over MAVLink",
+    )
+    readout_ms: ReadoutMs = Field(
+        default=0.0,
+        description="rolling shutter: from the first row's exposure to the last one's, milliseconds; negative: the "
+        "last comes first; 0: global shutter",
     )
 
 

@@ -32,6 +32,7 @@ from edge.status_board import StatusBoard
 from edge.supervisor import Supervisor
 from edge.tracking.by_hand import ByHand
 from edge.tracking.own_ship import OwnShipBuffer
+from edge.tracking.rolling_shutter import RollingShutter
 from edge.tracking.tracker import Tracker
 from edge.types import Array, Estimate, Frame, OwnShip, Report, Track
 
@@ -99,6 +100,7 @@ class Pipeline:
         self._attention = Attention(config.estimator)
         self._sleep = SleepWatch()
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
+        self._shutter = RollingShutter(round(config.camera.readout_ms * 1e6), config.mount.mount())
         wants_attitude = config.mavlink.enabled
         self._size_watch = SizeWatch()
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, self._reasons)
@@ -160,7 +162,7 @@ class Pipeline:
         expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh, frame.distortion)
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
-        estimates = self._estimate(frame, expected, pointed_at, clock)
+        estimates = self._estimate(frame, expected, pointed_at, own_ship, clock)
         chosen_id = self._by_hand.chosen_id
         doubtful_below = self._estimator.model.doubtful_below
         self._size_watch.seen(capture_ns, estimates, doubtful_below)
@@ -198,10 +200,17 @@ class Pipeline:
             self._outlets.event(logging.WARNING, "what was pointed at is too long ago: no frame came in time")
 
     def _estimate(
-        self, frame: Frame, expected: list[Track], pointed_at: Array | None, clock: StageClock
+        self,
+        frame: Frame,
+        expected: list[Track],
+        pointed_at: Array | None,
+        own_ship: OwnShip | None,
+        clock: StageClock,
     ) -> list[Estimate]:
         searches = self._by_hand.searches(frame.meta.capture_ns)
         looked = self._attention.look(self._estimator, frame, expected, clock, searches=searches, pointed_at=pointed_at)
+        height_px = frame.size_wh[1]
+        looked = looked.each(lambda one: self._shutter.at_frame_time(one, own_ship, height_px, self._own_ship.at))
         if looked.there is not None:
             self._by_hand.found(looked.there)
             if not lies_on(looked.there.box_xyxy_px, [track.box_xyxy_px for track in expected]):

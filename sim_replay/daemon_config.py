@@ -42,6 +42,7 @@ def sequence_config(
             "mount": sequence.camera_mount,
             "path": str(sequence.scene.folder.resolve()),
             "fps": sequence.fps,
+            "readout_ms": sequence.readout_ms,
             **camera,
         },
         "mount": {

@@ -43,7 +43,9 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
     return k1, k2, p1, p2, k3
 
 
-def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool) -> None:
+def write_sequence_toml(
+    folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool, readout_ms: float = 0.0
+) -> None:
     """Write sequence.toml of a finished scene without labels; `source` is where the images are from."""
     entries = {
         SOURCE_KEY: str(source),
@@ -52,6 +54,7 @@ def write_sequence_toml(folder: Path, source: Path, fps: float, frame0_ns: int, 
         "R_body_cam": mount.R_body_cam.tolist(),
         "t_body_cam_m": mount.t_body_cam_m.tolist(),
         "mount": "gimbal" if gimballed else "fixed",
+        "readout_ms": readout_ms,
     }
     lines = [f"{key} = {toml_value(value)}\n" for key, value in entries.items()]
     (folder / "sequence.toml").write_text("".join(lines), encoding="utf-8")

@@ -15,7 +15,7 @@ from edge.cameras.file import VideoTimes, tells_times
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.video import open_video
 from edge.config import MountSettings
-from edge.config_camera import IntrinsicsSettings
+from edge.config_camera import IntrinsicsSettings, ReadoutMs
 from edge.config_path import ConfigPath
 from edge.errors import InputError
 from msgs.settings import Section, dotted, faults_of, read_toml
@@ -37,6 +37,7 @@ class FilmedFlight(Section):
     t0_ns: int = Field(default=0, description="exposure of the first picture on the telemetry's clock")
     fps: float | None = Field(default=None, gt=0, le=FPS_MAX, description="pictures a second; default: the video's own")
     intrinsics: IntrinsicsSettings
+    readout_ms: ReadoutMs = Field(default=0.0, description="rolling shutter, as in the daemon's [camera]")
     mount: MountSettings = Field(default_factory=MountSettings)
 
 
@@ -75,7 +76,8 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
     finally:
         capture.release()
     shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
-    write_sequence_toml(folder, flight.video, fps, flight.t0_ns, flight.mount.mount(), gimballed=False)
+    mount = flight.mount.mount()
+    write_sequence_toml(folder, flight.video, fps, flight.t0_ns, mount, False, flight.readout_ms)
 
 
 def _unpack(

@@ -92,10 +92,11 @@ class Supply:
 
 @contextmanager
 def looping(
-    gated: Gated, max_targets: int = 4, mount: Mapping[str, float] | None = None
+    gated: Gated, max_targets: int = 4, mount: Mapping[str, float] | None = None, readout_ms: float = 0.0
 ) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
     config = Config.model_validate({
-        "camera": {"type": "sequence", "path": "/scene"}, "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
+        "camera": {"type": "sequence", "path": "/scene", "readout_ms": readout_ms},
+        "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
         "estimator": {"acquire_every_n": 5, "max_targets": max_targets}, "mount": mount or {},
     })  # fmt: skip
     board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))

@@ -47,11 +47,12 @@ def refusal(cli: Cli, tmp_path: Path, text: str, command: str = "run") -> str:
 
 
 def test_a_configuration_that_flies_is_checked_and_flown(cli: Cli, tmp_path: Path, text: str) -> None:
-    (tmp_path / "config.toml").write_text(text + "[target]\nwingspan_m = 20.1\nlength_m = 11\n" + OFF)
+    rolling = text.replace("[camera]\n", "[camera]\nreadout_ms = -21.5\n")
+    (tmp_path / "config.toml").write_text(rolling + "[target]\nwingspan_m = 20.1\nlength_m = 11\n" + OFF)
     checked = cli("check", "--config", "config.toml")
     assert checked.returncode == 0, checked.stderr
     assert "target   wingspan 20.1 m, length 11 m\n" in checked.stdout
-    assert "1920x1080, focal length 2000.0 x 2000.0 px, no distortion\n" in checked.stdout
+    assert "1920x1080, focal length 2000.0 x 2000.0 px, no distortion, rolling shutter, -21.5 ms\n" in checked.stdout
     assert "toy fp32" in checked.stdout
     flown = cli("run", "--config", "config.toml")
     assert flown.returncode == 0, flown.stderr

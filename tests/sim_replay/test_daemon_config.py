@@ -22,14 +22,14 @@ ODD = 'Müller\'s "\U0001f6e9" \\new'
 def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     bundled = read_sequence(BUNDLED_SEQUENCE)
     folder = tmp_path / ODD
-    sequence = replace(bundled, scene=replace(bundled.scene, folder=folder))
+    sequence = replace(bundled, scene=replace(bundled.scene, folder=folder), readout_ms=-21.5)
     path = tmp_path / "config.toml"
     camera = {"start_at_ns": 12, "loop": True}
     asked = (sequence, folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera)
     path.write_text(sequence_config(*asked, target_size=TargetSize(11.0, 8.3)), encoding="utf-8")
     config = load_config(path).config
     assert isinstance(config.camera, SequenceCamera)
-    assert (config.camera.path, config.camera.fps) == (folder, sequence.fps)
+    assert (config.camera.path, config.camera.fps, config.camera.readout_ms) == (folder, sequence.fps, -21.5)
     assert (config.camera.start_at_ns, config.camera.loop) == (12, True)
     assert config.model.path == folder / "a.onnx"
     assert (config.target.wingspan_m, config.target.length_m) == (11.0, 8.3)

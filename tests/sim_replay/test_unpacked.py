@@ -78,6 +78,12 @@ def test_a_video_that_says_no_rate_is_not_given_one(suffix: str, film: Path, tmp
     assert open_sequence(film, tmp_path / "out", Console(quiet=True)).fps == 30.0
 
 
+def test_a_video_s_rolling_shutter_is_that_of_the_sequence_made_of_it(film: Path, tmp_path: Path) -> None:
+    assert open_sequence(film, tmp_path / "out", Console(quiet=True)).readout_ms == 0.0
+    film.write_text(f"readout_ms = 21.5\n{film.read_text()}")
+    assert open_sequence(film, tmp_path / "out", Console(quiet=True)).readout_ms == 21.5
+
+
 def test_a_video_is_unpacked_as_its_sensor_read_it_out(film: Path, tmp_path: Path) -> None:
     """Lens and mount are the sensor's, however the video says it is to be shown."""
     turned(write_film(tmp_path / "film.mp4", [0, 40, 80], bright=np.s_[:60]))
