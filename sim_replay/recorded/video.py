@@ -22,7 +22,7 @@ from msgs.settings import Section, dotted, faults_of, read_toml
 from sim_replay.bop.write import SceneWriter
 from sim_replay.ground_truth import check_spans
 from sim_replay.recorded.scene_files import JPEG_QUALITY, add_picture, write_sequence_toml
-from sim_replay.telemetry import TelemetryError, read_telemetry
+from sim_replay.telemetry import Telemetry, TelemetryError, read_telemetry
 
 FPS_MAX = 240.0  # of the daemon's camera
 STEADY_FRAMES = 0.5  # largest deviation of an image from a constant rate
@@ -70,9 +70,7 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         told = flight.fps is not None or tells_times(flight.video)  # otherwise the rate is a guess of ffmpeg's
         if not told or not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
-        frames = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)  # 0 or less: unknown
-        check_spans(telemetry, flight.telemetry, flight.t0_ns, frames, fps)
-        _unpack(capture, path, flight, fps, folder, on_picture)
+        _unpack(capture, path, flight, telemetry, fps, folder, on_picture)
     finally:
         capture.release()
     shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
@@ -84,6 +82,7 @@ def _unpack(
     capture: cv2.VideoCapture,
     path: Path,
     flight: FilmedFlight,
+    telemetry: Telemetry,
     fps: float,
     folder: Path,
     on_picture: Callable[[], None],
@@ -106,6 +105,9 @@ def _unpack(
                     f"{path}: video: {flight.video} is of a rate that varies: picture {count} was taken "
                     f"{off_ns / 1e9:.2f} s off {fps:g} a second; make one of a constant rate of it"
                 )
+            # One by one: where a file does not say how many pictures it has, ffmpeg guesses it from its duration, which
+            # may count from long before the first one, or to the end of the sound.
+            check_spans(telemetry, flight.telemetry, flight.t0_ns, count + 1, fps)
             add_picture(writer, count, np.asarray(image_bgr, dtype=np.uint8), lens.K, lens.distortion)
             count += 1
             on_picture()

@@ -63,6 +63,18 @@ def test_a_video_of_a_rate_that_varies_is_refused_unless_its_rate_is_told(film: 
     assert len(open_sequence(film, tmp_path / "out", Console(quiet=True)).scene.images) == 6
 
 
+def test_a_video_is_as_long_as_its_pictures_whatever_duration_its_file_says(film: Path, tmp_path: Path) -> None:
+    """That of Matroska counts from time 0, where recorders that join a running stream do not begin."""
+    write_film(tmp_path / "film.mkv", list(range(7000, 7400, 40)))
+    text = film.read_text().replace("width = 64, height = 48", "width = 320, height = 180")
+    film.write_text(text.replace("film.mp4", "film.mkv"))
+    assert len(open_sequence(film, tmp_path / "out", Console(quiet=True)).scene.images) == 10
+    film.write_text(f"t0_ns = 600000000\n{film.read_text()}")
+    with pytest.raises(InputError, match=r"tells of 0\.000 s to 0\.780 s, but the pictures were exposed from 0\.600 s"):
+        open_sequence(film, tmp_path / "late", Console(quiet=True))
+    assert not any((tmp_path / "late").glob("*"))
+
+
 @pytest.mark.parametrize("suffix", [".h264", ".mjpeg"])
 def test_a_video_that_says_no_rate_is_not_given_one(suffix: str, film: Path, tmp_path: Path) -> None:
     """Without a container there are no times; ffmpeg takes 25 a second for granted."""
