@@ -172,6 +172,12 @@ def with_datagrams(endpoint: str) -> str:
     return f"{address}{';' if '?' in address else '?'}mixed_rel=1{hash_mark}{settings}"
 
 
+def _without_brackets(endpoint: str) -> str:
+    """To call an IPv6 address over `tls/` or `quic/`: zenoh looks for the brackets in the certificate too, finds none
+    valid, and never connects. Without them it connects."""
+    return re.sub(r"^(tls|quic)/\[([^]]*)]", r"\1/\2", endpoint)
+
+
 def peer_config(
     listen: Sequence[str],
     connect: Sequence[str],
@@ -255,7 +261,8 @@ def _no_pictures_by_radio() -> dict[str, Any]:
 
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str], tls: TlsFiles | None) -> zenoh.Config:
-    listen, connect = [with_datagrams(one) for one in listen], [with_datagrams(one) for one in connect]
+    listen = [with_datagrams(one) for one in listen]
+    connect = [_without_brackets(with_datagrams(one)) for one in connect]
     config = zenoh.Config()
     _insert(config, "mode", mode)
     # An empty list instead of this table would keep zenoh's default of listening on all interfaces.

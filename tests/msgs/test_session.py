@@ -16,7 +16,7 @@ import zenoh
 
 from msgs import client, session, topics
 from msgs.publish import Node
-from sim_replay.ports import free_endpoint
+from sim_replay.ports import free_endpoint, free_port
 from tests.waiting import until
 
 from .conftest import pose_now
@@ -76,7 +76,7 @@ def _identity(folder: Path, name: str, authority: tuple[Path, Path]) -> session.
     new_key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-noenc", "-keyout", str(key)]
     _openssl("req", *new_key, "-subj", f"/CN={name}", "-out", str(request))
     extensions = folder / f"{name}.ext"
-    extensions.write_text("subjectAltName=DNS:localhost,IP:127.0.0.1\nextendedKeyUsage=serverAuth,clientAuth\n")
+    extensions.write_text("subjectAltName=DNS:localhost,IP:127.0.0.1,IP:::1\nextendedKeyUsage=serverAuth,clientAuth\n")
     signing = ["-CA", str(authority[0]), "-CAkey", str(authority[1]), "-days", "2", "-extfile", str(extensions)]
     _openssl("x509", "-req", "-in", str(request), *signing, "-out", str(certificate))
     return session.TlsFiles(authority[0], certificate, key)
@@ -203,6 +203,19 @@ def test_two_ends_meet_over_quic_whether_or_not_they_say_that_poses_are_datagram
     with (
         zenoh.open(session.router_config([endpoint + listens], tls=ground)) as router,
         client.connect(endpoint + calls, tls=uav) as caller,
+    ):
+        assert list(caller.info.routers_zid()) == [router.zid()]
+
+
+@pytest.mark.parametrize("protocol", ["tls", "quic"])
+def test_two_ends_with_certificates_meet_at_an_ipv6_address(
+    identities: Sequence[session.TlsFiles], protocol: str
+) -> None:
+    ground, uav, _ = identities
+    endpoint = f"{protocol}/[::1]:{free_port(socket.SOCK_STREAM if protocol == 'tls' else socket.SOCK_DGRAM)}"
+    with (
+        zenoh.open(session.router_config([endpoint], tls=ground)) as router,
+        client.connect(endpoint, tls=uav) as caller,
     ):
         assert list(caller.info.routers_zid()) == [router.zid()]
 
