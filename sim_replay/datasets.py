@@ -27,6 +27,7 @@ from edge.estimator.window import clipped
 from sim_replay.bop import BopError, BopFrame, BopScene, BopTarget, Distortion, Model, find_scenes, read_models
 from sim_replay.bop.layout import TARGETS_FILE, dataset_of
 from sim_replay.bop.models import models_folder
+from sim_replay.bop.records import lies_outside
 from sim_replay.bop.scene import Image, Mask, header_size_wh, picture_size_wh, read_picture_bgr
 from sim_replay.bop.target_list import Wanted, chosen_of, read_targets
 from sim_replay.label_fit import Labelled, lie_beside_their_boxes, told_of_places, told_of_sizes
@@ -207,6 +208,7 @@ class Dataset:
         ]
         if size_wh is not None:
             _refuse_boxes_outside(scene, frame, placed, size_wh)
+            placed = [replace(t, whole_px=0) if t.is_beside(size_wh) else t for t in placed]
         indices = range(len(placed)) if listed is None else chosen_of(placed, listed)
         return DatasetFrame(
             scene.scene_id,
@@ -309,7 +311,7 @@ def _refuse_boxes_outside(
 ) -> None:
     for target in targets:
         box = target.box_visible_xyxy_px
-        if box is not None and (np.any(box[:2] >= np.array(size_wh) - 0.5) or np.any(box[2:] <= -0.5)):
+        if box is not None and lies_outside(box, size_wh):
             raise BopError(
                 f"{scene.folder}: picture {frame.image_id} has {size_wh[0]} x {size_wh[1]} pixels, but the visible box "
                 f"of its obj_id {target.object_id} lies outside: "

@@ -28,7 +28,12 @@ class BopTarget:
     box_visible_xyxy_px: Array | None = None  # [4], edges half a pixel outside the outermost visible pixel centres
     box_whole_xyxy_px: Array | None = None  # [4], of the whole outline, also beyond the image
     visible_px: int | None = None  # pixels of the visible mask
-    whole_px: int | None = None  # pixels of the whole outline
+    whole_px: int | None = None  # pixels of the whole outline; bop_toolkit's are also those beyond the image
+
+    def is_beside(self, size_wh: tuple[int, int]) -> bool:
+        """Whether it is not hidden by anything, but outside an image of that size, as its whole box says."""
+        box = self.box_whole_xyxy_px
+        return self.visible_px == 0 and box is not None and lies_outside(box, size_wh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,3 +55,8 @@ class BopFrame:
             return None
         R_world_cam = self.R_cam_world.T
         return R_world_cam, -R_world_cam @ self.t_cam_world_m
+
+
+def lies_outside(box_xyxy_px: Array, size_wh: tuple[int, int]) -> bool:
+    """Whether the box [4] contains no pixel of an image of that size."""
+    return bool(np.any(box_xyxy_px[:2] >= np.array(size_wh) - 0.5) or np.any(box_xyxy_px[2:] <= -0.5))

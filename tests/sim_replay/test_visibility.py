@@ -97,3 +97,17 @@ def test_a_visible_box_of_a_target_that_is_counted_as_hidden_is_refused(scene: P
         BopError, match=r"scene_gt_info\.json: '0' has a 'bbox_visib' of obj_id 1, but 'px_count_visib'"
     ):
         read_scene(scene)
+
+
+@pytest.mark.parametrize(("left_px", "in_the_picture"), [(SIZE_WH[0] + 5, False), (SIZE_WH[0] - 5, True)])
+def test_what_is_counted_beyond_the_edge_of_the_picture_is_not_hidden_in_it(
+    scene: Path, left_px: int, in_the_picture: bool
+) -> None:
+    """bop_toolkit counts an outline's pixels, and draws its box, wherever they lie."""
+    sizes(scene)
+    put(scene, ASIDE_MM)
+    info = {"bbox_visib": [-1] * 4, "bbox_obj": [left_px, 40, 30, 12], "px_count_visib": 0, "px_count_all": 250}
+    write_json(scene / "scene_gt_info.json", {"0": [info]})
+    dataset = open_dataset(scene)
+    (frame,) = dataset.labelled_frames()
+    assert len(truths_of(0, frame, dataset.models)) == in_the_picture
