@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msgs.geometry import Array, R_from_q_wxyz, q_wxyz_from_R, slerp
 
@@ -19,6 +20,7 @@ COLUMNS = (
 FLOWN_CSV = "flown_telemetry.csv"  # in output folders: an output folder may be the scene's, which keeps its own file
 GAP_NS = 500_000_000  # without rows for longer than this, own attitude is unknown, as in the daemon
 GAP_ROWS = 5  # or this many rows, if they are further apart
+_LATITUDE, _LONGITUDE = COLUMNS.index("lat_deg") - 1, COLUMNS.index("lon_deg") - 1  # among Telemetry.values
 
 
 class TelemetryError(ValueError):
@@ -34,7 +36,7 @@ class OwnShipState:
     t_ned_body_m: Array  # [3]
     v_ned_body_mps: Array  # [3]
     lat_deg: float
-    lon_deg: float
+    lon_deg: float  # -180..180
     alt_m: float  # AMSL
 
 
@@ -57,14 +59,20 @@ class Telemetry:
         return bool(self.t_ns[i] - self.t_ns[i - 1] <= self._gap_ns)
 
     def at(self, t_ns: int) -> OwnShipState:
-        """State at `t_ns`: slerp and linear between neighbours; outside them, the first or last row without motion."""
+        """State at `t_ns`: slerp and linear between neighbours, longitude the short way round.
+
+        Outside them, the first or last row without motion.
+        """
         if t_ns <= self.t_ns[0] or t_ns >= self.t_ns[-1]:
             row = self.values[0 if t_ns <= self.t_ns[0] else -1].copy()
             row[4:7] = row[10:13] = 0.0
         else:
             i = int(np.searchsorted(self.t_ns, t_ns, side="right")) - 1
             share = float(t_ns - self.t_ns[i]) / float(self.t_ns[i + 1] - self.t_ns[i])
-            row = (1.0 - share) * self.values[i] + share * self.values[i + 1]
+            following = self.values[i + 1].copy()
+            following[_LONGITUDE] -= _whole_turns_deg(following[_LONGITUDE] - self.values[i, _LONGITUDE])
+            row = (1.0 - share) * self.values[i] + share * following
+            row[_LONGITUDE] -= _whole_turns_deg(row[_LONGITUDE])
             R_a, R_b = R_from_q_wxyz(self.values[i : i + 2, :4])
             row[:4] = q_wxyz_from_R(slerp(R_a, R_b, share))
         lat_deg, lon_deg, alt_m = (float(value) for value in row[13:16])
@@ -102,7 +110,15 @@ def read_telemetry(path: Path) -> Telemetry:
         raise TelemetryError(f"{path}: t_ns must rise over at least two rows")
     if not np.isfinite(values).all() or not np.allclose(np.linalg.norm(values[:, :4], axis=1), 1.0, atol=1e-3):
         raise TelemetryError(f"{path}: a value is not finite or a quaternion is not of unit length")
+    if np.abs(values[:, _LATITUDE]).max() > 90.0 or np.abs(values[:, _LONGITUDE]).max() > 360.0:
+        raise TelemetryError(f"{path}: lat_deg or lon_deg is not in degrees: beyond 90, or 360")
+    values[:, _LONGITUDE] -= _whole_turns_deg(values[:, _LONGITUDE])
     return Telemetry(t_ns, values)
+
+
+def _whole_turns_deg(angle_deg: ArrayLike) -> Array:
+    """The multiple of 360 nearest to each angle [...]: 0 from -180 to 180."""
+    return 360.0 * np.round(np.asarray(angle_deg, dtype=np.float64) / 360.0)
 
 
 def write_telemetry(path: Path, telemetry: Telemetry) -> None:

@@ -52,3 +52,22 @@ def test_a_number_that_is_none_is_told_with_its_line(tmp_path: Path, t_ns: str, 
     with pytest.raises(TelemetryError) as error:
         read_telemetry(path)
     assert str(error.value).startswith(f"{path}: {words}")
+
+
+@pytest.mark.parametrize("eastward", [(179.99999, -179.99999), (179.99999, 180.00001), (-180.00001, 180.00001)])
+def test_between_two_rows_on_both_sides_of_180_degrees_it_is_there_and_not_on_the_other_side_of_the_earth(
+    tmp_path: Path, eastward: tuple[float, float]
+) -> None:
+    """Some count longitudes from 0 to 360: MAVLink has no room for them."""
+    lines = rows()[:3]
+    flown = [line.replace(",8.0,", f",{lon},") for line, lon in zip(lines[1:], eastward, strict=True)]
+    telemetry = read_telemetry(write(tmp_path / "telemetry.csv", [lines[0], *flown]))
+    told = [telemetry.at(t_ns).lon_deg for t_ns in (0, 5_000_000, 15_000_000, 20_000_000)]
+    np.testing.assert_allclose(told, [179.99999, 179.999995, -179.999995, -179.99999], atol=1e-9)
+
+
+@pytest.mark.parametrize("place", ["473977000,8.0", "47.0,85456000"])
+def test_places_in_another_unit_are_refused(tmp_path: Path, place: str) -> None:
+    path = write(tmp_path / "telemetry.csv", [line.replace("47.0,8.0", place) for line in rows()])
+    with pytest.raises(TelemetryError, match="lat_deg or lon_deg is not in degrees"):
+        read_telemetry(path)
