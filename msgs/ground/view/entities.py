@@ -301,6 +301,11 @@ def log_plots(rec: rr.RecordingStream, row: TargetRow, age_s: float) -> None:
             rec.log(plot_path(row.uav, row.target, path), rr.Scalars(value))
 
 
+def clock(utc_ns: int) -> str:
+    """A time as text, such as `10:03:04 UTC`."""
+    return datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%H:%M:%S UTC")
+
+
 def log_event(rec: rr.RecordingStream, uav: str, level: int, text: str) -> None:
     """`level` as in rcl_interfaces/Log."""
     rec.log(f"{uav}/events", rr.TextLog(text, level=_LEVELS.get(level, "INFO")))
@@ -322,8 +327,7 @@ def log_health(rec: rr.RecordingStream, uav: str, message: DiagnosticArray, *, n
 def log_silence(rec: rr.RecordingStream, uav: str, last: DiagnosticArray) -> None:
     """In place of health: the time since which none was received, and the last state."""
     status = last.status[0]
-    since = datetime.fromtimestamp(last.stamp_ns // 1_000_000_000, UTC).strftime("%H:%M:%S UTC")
-    text = f"## No word since {since}\n\nThe last was: {status.message.replace('|', '¦')}"
+    text = f"## No word since {clock(last.stamp_ns)}\n\nThe last was: {status.message.replace('|', '¦')}"
     rec.log(f"{uav}/health", rr.TextDocument(text, media_type="text/markdown"))
 
 

@@ -25,6 +25,7 @@ from msgs.wire import Array, PayloadError
 
 GONE_NS = 1_000_000_000
 _WAITING_MAX = 256
+_OF_BEFORE_NS = 3_000_000_000  # so much older than all else is an event only if it is told again; clocks differ by less
 # Without own attitude the own ship is drawn where it was last, level and heading north, and the camera looking north.
 _R_NED_CAM_UNKNOWN = R_FORWARD_CAM
 
@@ -66,10 +67,12 @@ class Scene:
         self._on_vehicles = on_vehicles
         self._lock = threading.Lock()
         self._vehicles: dict[str, _Vehicle] = {}
+        self._began_ns = 0  # reception time of the first sample
 
     def take(self, incoming: Incoming, now_ns: int) -> None:
         """Draw one sample received at `now_ns` (UTC)."""
         with self._lock:
+            self._began_ns = self._began_ns or now_ns
             believed = self._fleet.believes(incoming, now_ns)
             news = self._fleet.take(incoming, now_ns)
             if incoming.topic is topics.POSE:
@@ -206,8 +209,12 @@ class Scene:
             entities.log_health(self._rec, uav, news, news=news.status[0].message != before)
             vehicle.health, vehicle.health_came_ns, vehicle.health_silent = news, now_ns, False
         elif isinstance(news, Log):
-            self._at(news.stamp_ns)
-            entities.log_event(self._rec, uav, news.level, news.msg)
+            # Whoever joins late is told what happened before. Drawn at its own time, a recording, which is played from
+            # its first time on, would begin with up to hours of nothing else.
+            of_before = news.stamp_ns < self._began_ns - _OF_BEFORE_NS
+            self._at(self._began_ns if of_before else news.stamp_ns)
+            text = f"{entities.clock(news.stamp_ns)}: {news.msg}" if of_before else news.msg
+            entities.log_event(self._rec, uav, news.level, text)
 
     def _take_own(self, uav: str, vehicle: _Vehicle, message: TFMessage) -> None:
         ship = vehicle.own.take(message)

@@ -88,6 +88,23 @@ def test_every_part_of_a_recorded_flight_is_there_at_its_time(saved: Path) -> No
     assert len(RrdReader(saved).blueprints()) == 1
 
 
+def test_what_a_late_joiner_is_told_of_hours_before_is_drawn_where_the_recording_begins(tmp_path: Path) -> None:
+    rec = rr.RecordingStream("test")
+    rec.set_log_tick_enabled(False)
+    rec.set_log_time_enabled(False)
+    rec.save(tmp_path / "flight.rrd")
+    scene = Scene(rec, Fleet(), (8.0, 12.0, 2.5), lambda _: None)
+    for number, age_s in enumerate((7200, 60, -5)):  # received in the first instant, the last one as it happens
+        stamp_ns = START_NS - age_s * 1_000_000_000
+        event = cdr.Log(stamp_ns, 20, topics.NODE_NAME, f"event {number}").encode()
+        attachment = topics.attachment(number + 1, stamp_ns, bytes(16))
+        scene.take(Incoming(UAV, topics.EVENTS, None, "", event, attachment), max(stamp_ns, START_NS))
+    rec.disconnect()
+    drawn = rows(tmp_path / "flight.rrd", "events")
+    told = [(stamp_ns - START_NS, text(row, "TextLog:text")) for stamp_ns, row in drawn]
+    assert told == [(0, "20:13:20 UTC: event 0"), (0, "22:12:20 UTC: event 1"), (5_000_000_000, "event 2")]
+
+
 def text(row: dict[str, object], name: str) -> str:
     (value,) = (value for key, value in row.items() if key.endswith(name))
     assert isinstance(value, list)
