@@ -16,7 +16,7 @@ from edge.calibrate_board import BoardSettings, Gray, Size, View, detector_of
 from edge.calibrate_fit import VIEWS_MIN, Calibration, Coefficients, calibration_of
 from edge.cameras.folder import list_pictures
 from edge.cameras.picture_file import read_8_bits
-from edge.cameras.video import open_video
+from edge.cameras.video import grab_next, open_video
 from edge.errors import InputError
 from edge.types import Array
 
@@ -49,7 +49,8 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
 def _every(video: cv2.VideoCapture, step: int, but: int | None = None) -> Generator[tuple[str, Gray], None, int]:
     """Names and gray pictures of each `step`th frame but those of each `but`th; returns the number of all frames."""
     index = 0
-    while video.grab():
+    while (undecodable := grab_next(video)) is not None:
+        index += undecodable
         if index % step == 0 and (but is None or index % but != 0):
             read, image_bgr = video.retrieve()
             if read:

@@ -13,7 +13,7 @@ import numpy as np
 
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
-from edge.cameras.video import open_video
+from edge.cameras.video import grab_next, open_video
 from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
@@ -95,11 +95,12 @@ class FileSource:
 
     def _grab(self, capture: cv2.VideoCapture) -> None:
         """Advance to the next frame. Raises EndOfStream if there is none, InputError if there never was one."""
-        if not capture.grab():
+        undecodable = grab_next(capture)
+        if undecodable is None:
             if self._times.index < 0:
                 raise InputError(f"{self._settings.path} has no readable frame")
             raise EndOfStream
-        self._times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
+        self._times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6), undecodable)
 
     def _follows(self) -> bool:
         """Whether another frame follows: the last one is not skipped, however late the reader."""
@@ -127,13 +128,14 @@ class VideoTimes:
         """Expected time of the next frame, from the last interval: its timestamp is not known before it is read."""
         return self.last_ns + self._step_ns
 
-    def take(self, stamp_ns: int) -> None:
-        """Add the next frame, by its timestamp in the file."""
-        self.index += 1
+    def take(self, stamp_ns: int, undecodable: int = 0) -> None:
+        """Add the next frame, by its timestamp in the file, and before it as many that cannot be decoded."""
         since_ns, self._stamp_ns = stamp_ns - self._stamp_ns, stamp_ns
-        if self.index == 0:
-            self._sure_stamp_ns = stamp_ns
+        if self.index < 0:
+            self.index, self._sure_stamp_ns = undecodable, stamp_ns
+            self.last_ns = self._told_ns = self._sure_ns = undecodable * self._period_ns
             return
+        self.index += 1 + undecodable
         if 0 < (since_sure_ns := stamp_ns - self._sure_stamp_ns) <= GAP_MAX_NS:
             self._told_ns = self._sure_ns + since_sure_ns
             self._sure_stamp_ns, self._sure_ns = stamp_ns, self._told_ns
@@ -141,7 +143,7 @@ class VideoTimes:
             self._told_ns += since_ns
             self._sure_stamp_ns, self._sure_ns = stamp_ns, self._told_ns
         else:
-            self._told_ns += self._period_ns
+            self._told_ns += (1 + undecodable) * self._period_ns
         by_rate_ns = round(self.index * 1e9 / self._fps)
         time_ns = by_rate_ns if abs(self._told_ns - by_rate_ns) <= ROUNDING_NS else self._told_ns
         time_ns = max(time_ns, self.last_ns + 1)

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from edge.cameras.intrinsics import Intrinsics
 from edge.cameras.source import EndOfStream, SourceLost
+from edge.cameras.video import UNDECODABLE_MAX
 from edge.clock import SleepWatch
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
-
-UNDECODABLE_MAX = 10  # pictures in a row after which the camera is reopened
 
 
 class LiveSource(ABC):
@@ -64,21 +63,26 @@ class LiveSource(ABC):
         Raises SourceLost if none arrives, or none that can be decoded, or if the computer has slept meanwhile.
         """
         assert self._capture is not None
-        why = ""
+        why, missed = "", 0
         for _ in range(UNDECODABLE_MAX):
             grabbed = self._capture.grab()
             arrival_ns = time.monotonic_ns()
             if stop.is_set():
                 raise EndOfStream
             if not grabbed:
-                raise SourceLost("the camera gives no more frames")
+                missed += 1
+                if missed == UNDECODABLE_MAX or not self._may_go_on():
+                    raise SourceLost("the camera gives no more frames")
+                continue
             if (slept_ns := self._sleep.slept_ns()) > 0:
                 # What waited meanwhile, here or in a stream's server, is old, but not by the monotonic clock.
                 raise SourceLost(f"the computer has slept for {slept_ns / 1e9:.1f} s")
             position_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
             image_bgr, why = _retrieved(self._capture)
-            sequence = self._sequence
-            self._sequence += 1
+            sequence = self._sequence + missed
+            self._sequence = sequence + 1
+            self.counts["undecodable"] += missed
+            missed = 0
             if image_bgr is None:
                 self.counts["undecodable"] += 1
                 continue
@@ -103,6 +107,10 @@ class LiveSource(ABC):
             return self._intrinsics.scaled_to(size_wh)
         except InputError as error:
             raise SourceLost(f"a picture of another shape: {error}") from error
+
+    def _may_go_on(self) -> bool:
+        """Whether a picture may follow although none was grabbed."""
+        return False
 
     @abstractmethod
     def _connect(self) -> cv2.VideoCapture:

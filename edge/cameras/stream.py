@@ -49,6 +49,7 @@ class StreamSource(LiveSource):
         self._losses = Losses()
         self._damaged = False  # the picture read last
         self._timeless = False
+        self._asked_ns = 0  # when the picture that is awaited was asked for
         self._unread_since_ns: int | None = None  # since when it is open without anything having been read
         self.counts["catching_up"] = self.counts["damaged"] = 0
 
@@ -59,6 +60,7 @@ class StreamSource(LiveSource):
             self._call_again()
         self._unread_since_ns = None
         while True:
+            self._asked_ns = time.monotonic_ns()
             frame = super().read(stop)
             if not self._clock.caught_up:
                 self.counts["catching_up"] += 1
@@ -79,6 +81,11 @@ class StreamSource(LiveSource):
         self._timeless = not transport and may_be_bare_jpeg(capture)
         self._unread_since_ns = time.monotonic_ns()
         return capture
+
+    def _may_go_on(self) -> bool:
+        """OpenCV reports a picture that its decoder refuses as it reports the end, but grabs the one after it. After a
+        silence it grabs none any more."""
+        return time.monotonic_ns() - self._asked_ns < TIMEOUT_MS * 1_000_000
 
     def _call_again(self) -> None:
         """Raises SourceLost."""

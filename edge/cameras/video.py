@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import cv2
 
 COUNTED_FPS = 25.0  # rate that ffmpeg assumes for pictures without timestamps
+UNDECODABLE_MAX = 10  # pictures in a row; with as many, it is the end
 
 
 def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:
@@ -18,6 +19,17 @@ def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:
     if capture.isOpened():
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     return capture
+
+
+def grab_next(video: cv2.VideoCapture) -> int | None:
+    """Advance to the next picture that can be decoded; returns how many before it cannot be, None at the end.
+
+    OpenCV reports a picture that its decoder refuses as it reports the end, but grabs the one after it.
+    """
+    for undecodable in range(UNDECODABLE_MAX):
+        if video.grab():
+            return undecodable
+    return None
 
 
 def may_be_bare_jpeg(capture: cv2.VideoCapture) -> bool:

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from edge.cameras.file import VideoTimes, tells_times
 from edge.cameras.intrinsics import load_intrinsics
-from edge.cameras.video import open_video
+from edge.cameras.video import grab_next, open_video
 from edge.config import MountSettings
 from edge.config_camera import IntrinsicsSettings, ReadoutMs
 from edge.config_path import ConfigPath
@@ -70,12 +70,12 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         told = flight.fps is not None or tells_times(flight.video)  # otherwise the rate is a guess of ffmpeg's
         if not told or not math.isfinite(fps) or not 0 < fps <= FPS_MAX:
             raise InputError(f"{path}: fps: is missing, and {flight.video} does not say it")
-        _unpack(capture, path, flight, telemetry, fps, folder, on_picture)
+        first_ns = _unpack(capture, path, flight, telemetry, fps, folder, on_picture)
     finally:
         capture.release()
     shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
     mount = flight.mount.mount()
-    write_sequence_toml(folder, flight.video, fps, flight.t0_ns, mount, False, flight.readout_ms)
+    write_sequence_toml(folder, flight.video, fps, flight.t0_ns + first_ns, mount, False, flight.readout_ms)
 
 
 def _unpack(
@@ -86,30 +86,32 @@ def _unpack(
     fps: float,
     folder: Path,
     on_picture: Callable[[], None],
-) -> None:
+) -> int:
+    """Returns the time in the video of its first picture that can be decoded, ns."""
     size_wh = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     try:
         lens = load_intrinsics(flight.intrinsics).scaled_to(size_wh)
     except InputError as error:
         raise InputError(f"{path}: intrinsics: {error}") from error
-    count, times = 0, VideoTimes(fps)
+    first_ns, times = None, VideoTimes(fps)
     with SceneWriter(folder, JPEG_QUALITY) as writer:
-        while True:
-            read, image_bgr = capture.read()
-            if not read:
-                break
-            times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6))
-            off_ns = abs(times.last_ns - count * 1e9 / fps)
+        while (undecodable := grab_next(capture)) is not None:
+            times.take(round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6), undecodable)
+            off_ns = abs(times.last_ns - times.index * 1e9 / fps)
             if flight.fps is None and off_ns > STEADY_FRAMES * 1e9 / fps:
                 raise InputError(
-                    f"{path}: video: {flight.video} is of a rate that varies: picture {count} was taken "
+                    f"{path}: video: {flight.video} is of a rate that varies: picture {times.index} was taken "
                     f"{off_ns / 1e9:.2f} s off {fps:g} a second; make one of a constant rate of it"
                 )
             # One by one: where a file does not say how many pictures it has, ffmpeg guesses it from its duration, which
             # may count from long before the first one, or to the end of the sound.
-            check_spans(telemetry, flight.telemetry, flight.t0_ns, count + 1, fps)
-            add_picture(writer, count, np.asarray(image_bgr, dtype=np.uint8), lens.K, lens.distortion)
-            count += 1
+            check_spans(telemetry, flight.telemetry, flight.t0_ns, times.index + 1, fps)
+            read, image_bgr = capture.retrieve()
+            if not read:
+                continue
+            add_picture(writer, times.index, np.asarray(image_bgr, dtype=np.uint8), lens.K, lens.distortion)
+            first_ns = times.last_ns if first_ns is None else first_ns
             on_picture()
-    if count == 0:
+    if first_ns is None:
         raise InputError(f"{path}: video: {flight.video} has no readable picture")
+    return first_ns

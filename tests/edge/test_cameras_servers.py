@@ -24,7 +24,7 @@ from edge.cameras.stream import StreamSource
 from edge.config_camera import StreamCamera
 from tests.waiting import until
 
-from .pictures import INTRINSICS, SIZE_WH, number_of, picture
+from .pictures import INTRINSICS, SIZE_WH, damaged_jpeg, number_of, picture
 
 FPS = 20
 RTP_BYTES = 7 * 188  # whole packets of MPEG-TS
@@ -99,11 +99,11 @@ class HttpCamera(Server):
 
 class WebCamera(Server):
     """JPEG after JPEG over HTTP (multipart/x-mixed-replace) to one caller after the other: nothing tells when one was
-    taken. `sent` of them were, and each tells in its halves which it is."""
+    taken. `sent` of them were, and each tells in its halves which it is; every `torn_every`th cannot be decoded."""
 
-    def __init__(self, fps: int) -> None:
+    def __init__(self, fps: int, torn_every: int = 10**9) -> None:
         super().__init__()
-        self._fps, self.sent = fps, 0
+        self._fps, self._torn_every, self.sent = fps, torn_every, 0
 
     def run(self) -> None:
         with self._listening:
@@ -120,6 +120,8 @@ class WebCamera(Server):
             halves = np.hstack([picture(self.sent, (2, 4)), picture(self.sent // 25, (2, 4))])
             image = cv2.resize(halves, SIZE_WH, interpolation=cv2.INTER_NEAREST)
             jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+            if index % self._torn_every == self._torn_every - 1:
+                jpeg = damaged_jpeg(jpeg, {0})
             head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             caller.sendall(head.encode() + jpeg + b"\r\n")
             self.sent += 1
@@ -250,6 +252,20 @@ def test_a_web_camera_s_pictures_that_waited_to_be_read_are_not_told_as_of_now()
         left, right = np.array_split(source.read(threading.Event()).image_bgr, 2, axis=1)
     assert round(float(left.mean()) / 10) + 25 * round(float(right.mean()) / 10) >= waiting
     assert len(camera.requests) == 2
+
+
+def test_a_stream_s_picture_that_cannot_be_decoded_is_left_out_and_the_stream_stays_open() -> None:
+    """OpenCV reports it as it reports that the stream has ended."""
+    camera = WebCamera(fps=60, torn_every=9)
+    camera.start()
+    url = f"http://127.0.0.1:{camera.port}/video.mjpg"
+    with closing(StreamSource(StreamCamera(type="stream", url=url, intrinsics=INTRINSICS))) as source:
+        source.open()
+        numbers = [source.read(threading.Event()).meta.sequence for _ in range(20)]
+    assert len(camera.requests) == 1
+    assert source.counts["undecodable"] >= 2
+    left_out = {after - before - 1 for before, after in pairwise(numbers)}
+    assert left_out == {0, 1}
 
 
 def test_jpeg_in_a_container_is_of_the_times_that_this_tells() -> None:

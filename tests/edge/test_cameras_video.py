@@ -21,7 +21,7 @@ from edge.cameras.file import FileSource, VideoTimes
 from edge.config_camera import FileCamera
 from edge.errors import InputError
 
-from .pictures import INTRINSICS, SIZE_WH, picture, play
+from .pictures import INTRINSICS, SIZE_WH, damaged_jpeg, picture, play
 
 FPS = 25
 UPRIGHT, TURNED = ((1, 0, 0, 1), (-1, 0, 0, -1))  # of a track header's matrix: a, b, c, d
@@ -140,6 +140,19 @@ def test_a_video_of_jpeg_whose_recorder_never_ended_it_has_its_times_all_the_sam
         frames = [source.read(threading.Event()) for _ in range(2)]
     steps_ns = (frames[1].meta.sequence - frames[0].meta.sequence) * 40_000_000
     assert frames[1].meta.capture_ns - frames[0].meta.capture_ns == steps_ns
+
+
+def test_a_video_goes_on_after_pictures_that_cannot_be_decoded(tmp_path: Path) -> None:
+    """As what a cable tore is recorded. OpenCV reports them as it reports the end."""
+    path = write_film(tmp_path / "flight.mkv", [40 * k for k in range(12)], "mjpeg")
+    path.write_bytes(damaged_jpeg(path.read_bytes(), {0, 4, 5}))
+    frames = play(source_of(path))
+    numbers = [frame.meta.sequence for frame in frames]  # a busy machine passes some over
+    assert numbers[-1] == 11
+    assert not {0, 4, 5} & set(numbers)
+    between_ns = frames[-1].meta.capture_ns - frames[0].meta.capture_ns
+    assert between_ns == (11 - numbers[0]) * 40_000_000
+    assert [name for name, _ in pictures_of(path)] == [f"frame {k}" for k in range(12) if k not in (0, 4, 5)]
 
 
 def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path: Path) -> None:

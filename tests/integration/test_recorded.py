@@ -27,6 +27,7 @@ from sim_replay.lock import LOCK_FILE
 from sim_replay.recorded.opened import open_sequence
 from sim_replay.report.flight_files import remove_flight
 from sim_replay.telemetry import Telemetry, read_telemetry, write_telemetry
+from tests.edge.pictures import damaged_jpeg
 from tests.waiting import until
 
 BIN = Path(sys.executable).parent
@@ -211,9 +212,9 @@ def test_what_was_not_recorded_is_a_dropped_frame_and_no_picture_shown_again(
     assert f"frame {gap[0] - first}: not recorded" in again.stdout
 
 
-def write_film(folder: Path, picture: Path, frames: int, row_s: float = 0.02) -> Path:
+def write_film(folder: Path, picture: Path, frames: int, row_s: float = 0.02, fourcc: str = "mp4v") -> Path:
     """A video of one picture, with telemetry of all of it and `flight.toml`."""
-    film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (640, 384))
+    film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*fourcc), FPS, (640, 384))
     for _ in range(frames):
         film.write(cv2.imread(str(picture)))
     film.release()
@@ -244,6 +245,18 @@ def test_a_video_whose_unpacking_was_stopped_is_unpacked_anew(
     assert len(open_sequence(path, out, Console(quiet=True)).scene.images) == frames
     left = {one.name for one in out.iterdir()}
     assert left - {LOCK_FILE} == {"sequence"}
+
+
+def test_a_picture_of_a_video_that_cannot_be_decoded_is_a_frame_that_was_not_recorded(
+    flown: Path, tmp_path: Path
+) -> None:
+    path = write_film(tmp_path, flown / "rgb/000000.png", 20, fourcc="MJPG")
+    film = tmp_path / "film.mp4"
+    film.write_bytes(damaged_jpeg(film.read_bytes(), {0, 7, 8}))
+    played = open_sequence(path, tmp_path / "out", Console(quiet=True))
+    assert len(played.scene.images) == 19
+    assert played.scene.unrecorded == {6, 7}  # the first picture of all is number 0
+    assert played.frame0_ns == 1e9 / FPS
 
 
 def test_a_video_whose_telemetry_is_of_another_time_or_too_sparse_is_refused_before_it_is_unpacked(
