@@ -10,7 +10,7 @@ import numpy as np
 
 from sim_replay.bop.records import MM_PER_M, Array, BopError
 
-_DIGITS_MOST = 18  # of an image's number, in 64 bits
+_NUMBER_MAX = 2**63 - 1  # of an image; a time in nanoseconds has 19 digits
 ROTATION_TOLERANCE = 0.02  # of R R^T from the identity: tolerates single precision and rounded files, not a shear
 
 
@@ -47,7 +47,7 @@ def by_number(path: Path, entries: dict[str, Any]) -> dict[int, Any]:
 
 def number_key(path: Path, key: str) -> int:
     """The number of an image or model. Raises BopError."""
-    if not key.isdecimal() or len(key) > _DIGITS_MOST:
+    if not key.isdecimal() or len(key.lstrip("0")) > len(str(_NUMBER_MAX)) or int(key) > _NUMBER_MAX:
         raise BopError(f"{path}: {key[:80]!r} is not the number of a picture or model")
     return int(key)
 

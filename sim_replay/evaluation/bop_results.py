@@ -11,6 +11,7 @@ import csv
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,22 +69,35 @@ def read_results(path: Path) -> list[ResultRow]:
 def _row(path: Path, line: int, cells: Sequence[str]) -> ResultRow:
     if len(cells) != len(COLUMNS):
         raise InputError(f"{path} line {line}: {len(cells)} columns, not {len(COLUMNS)}")
-    values = {}
-    for name, cell, count in zip(COLUMNS, cells, (1, 1, 1, 1, 9, 3, 1), strict=True):
-        try:
-            values[name] = np.array([float(number) for number in cell.split()])
-        except ValueError as error:
-            raise InputError(f"{path} line {line}: {name} is not a number: {cell!r}") from error
-        if values[name].shape != (count,) or not (np.abs(values[name]) < _LARGEST).all():
-            raise InputError(f"{path} line {line}: {name} is not {count} finite number{'s' * (count > 1)}")
-        if name.endswith("_id") and values[name][0] % 1:
-            raise InputError(f"{path} line {line}: {name} is not a whole number: {cell!r}")
-    R = values["R"].reshape(3, 3)
+    told = dict(zip(COLUMNS, cells, strict=True))
+    at = f"{path} line {line}"
+    scene_id, image_id, object_id = (_whole(at, name, told[name]) for name in COLUMNS[:3])
+    R = _of(at, "R", told["R"], 9).reshape(3, 3)
     if not is_rotation(R):
-        raise InputError(f"{path} line {line}: R is not a rotation")
-    scene_id, image_id, object_id = (int(values[name][0]) for name in COLUMNS[:3])
-    score, time_s = float(values["score"][0]), float(values["time"][0])
-    return ResultRow(scene_id, image_id, object_id, score, R, values["t"] / MM_PER_M, time_s)
+        raise InputError(f"{at}: R is not a rotation")
+    score, time_s = (float(_of(at, name, told[name], 1)[0]) for name in ("score", "time"))
+    return ResultRow(scene_id, image_id, object_id, score, R, _of(at, "t", told["t"], 3) / MM_PER_M, time_s)
+
+
+def _of(at: str, name: str, cell: str, count: int) -> Array:
+    """The numbers [count] in a cell. Raises InputError."""
+    try:
+        values = np.array([float(number) for number in cell.split()])
+    except ValueError as error:
+        raise InputError(f"{at}: {name} is not a number: {cell!r}") from error
+    if values.shape != (count,) or not (np.abs(values) < _LARGEST).all():
+        raise InputError(f"{at}: {name} is not {count} finite number{'s' * (count > 1)}")
+    return values
+
+
+def _whole(at: str, name: str, cell: str) -> int:
+    """The number in a cell, also if it is written as 5.0. Raises InputError."""
+    with suppress(ValueError):
+        return int(cell)  # exactly, as images may be numbered by their time
+    (value,) = _of(at, name, cell, 1)
+    if value % 1:
+        raise InputError(f"{at}: {name} is not a whole number: {cell!r}")
+    return int(value)
 
 
 def file_answers(path: Path, dataset: Dataset) -> Answerer:

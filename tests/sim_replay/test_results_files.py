@@ -65,6 +65,16 @@ def turns_deg(frames: Sequence[JudgedFrame]) -> list[float | None]:
     return [m.rotation_error_deg and round(m.rotation_error_deg) for m in frames[0].matches]
 
 
+def test_poses_of_images_that_are_numbered_by_their_time_in_nanoseconds_are_those_images(tmp_path: Path) -> None:
+    """Two in a row, which are one number in floating point."""
+    first = 1_764_414_000_123_456_789
+    write_models_info(tmp_path / "hawks")
+    write_scene(tmp_path / "hawks" / "test" / "000000", (first, first + 1), masks=False)
+    frames = judged(tmp_path / "hawks", [(1, 1.0, LEFT, True)], picture=first + 1)
+    assert [frame.picture.image_id for frame in frames] == [first, first + 1]
+    assert [frame.matches[0].estimate is not None for frame in frames] == [False, True]
+
+
 def test_the_score_chooses_among_several_poses_of_one_aircraft_and_not_the_truth(root: Path) -> None:
     aside = [(1, 0.9, LEFT + 1.0, False), (1, 0.1, LEFT, True), (1, 0.8, RIGHT, True)]
     for rows in (aside, aside[::-1]):
