@@ -121,7 +121,7 @@ def _run(args: argparse.Namespace) -> int:
 def _act(args: argparse.Namespace) -> int:
     if hasattr(args, "run"):
         return int(args.run(args))
-    console = Console()
+    console = Console(markup=False, emoji=False)  # folders are shown by the names that they have
     if args.command == "score":
         if (args.flight is None) == (args.dataset is None):
             raise InputError("score: give either FLIGHT, a folder that demo or play wrote, or --dataset DIR")

@@ -6,6 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable
+from shlex import quote
 
 from rich.console import Console
 from rich.progress import Progress
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     files = f"{POSES_JSONL}, {MESSAGES_JSONL}"
     if settings.frames == list(range(len(sequence.scene.images))):  # after a part only, the rest would count as missed
         write_flight(args.out, RecordedFlight(sequence.scene.folder, method, outputs.recording))
-        files += f"; to score it: uavpose-replay score {args.out}" if sequence.scene.can_be_scored else ""
+        files += f"; to score it: uavpose-replay score {quote(str(args.out))}" if sequence.scene.can_be_scored else ""
     text = f"{len(settings.frames)} frames: {len(outputs.poses)} poses, {len(outputs.recording.directions)} directions"
     text += f", {len(outputs.mavlink)} MAVLink messages"
     console.print(f"{text}; written to {args.out}: {files}", highlight=False, soft_wrap=True)

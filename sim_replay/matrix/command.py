@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from edge.config import SHIPPED_MODEL
@@ -91,7 +92,9 @@ def run(args: argparse.Namespace) -> int:
     for sequence, name in sequences:
         if timelines and sequence.scene.target_free:
             console.print(
-                f"{name}: shows no target, which is needed to judge faults: played without them", highlight=False
+                f"{name}: shows no target, which is needed to judge faults: played without them",
+                highlight=False,
+                markup=False,
             )
     cells: list[Cell] = []
     _write(args.out, cells)  # discards those of an earlier run
@@ -99,7 +102,9 @@ def run(args: argparse.Namespace) -> int:
         cells.append(cell)
         _write(args.out, cells)  # after each cell, so that hours of flights are kept if the next one fails
         told = "; ".join(cell.wrong) or "passed"
-        console.print(f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False)
+        console.print(
+            f"{cell.sequence}, speed {cell.speed:g}, fault {cell.fault}: {told}", highlight=False, markup=False
+        )
     if args.json:
         print(json.dumps([asdict(cell) for cell in cells]))
     else:
@@ -143,9 +148,9 @@ def table(cells: Sequence[Cell]) -> Table:
         shown.add_column(name, justify="right")
     for cell in cells:
         shown.add_row(
-            cell.sequence,
+            escape(cell.sequence),
             f"{cell.speed:g}",
-            cell.fault,
+            escape(cell.fault),
             "[red]WRONG[/red]" if cell.wrong else "ok",
             str(cell.poses),
             _text(cell.found, "{:.1%}"),

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from msgs.geometry import R_from_q_wxyz, rotation_angle, so3_exp
 from sim_replay.cli import main
 from sim_replay.demo import BUNDLED_SEQUENCE
 from sim_replay.gimbal import track_of
 from sim_replay.ground_truth import read_sequence
+from sim_replay.matrix.cells import Cell
+from sim_replay.matrix.command import table
 from sim_replay.pace import at_speed
 from sim_replay.telemetry import read_telemetry
 from tests.edge.toy_model import write_toy_model
@@ -24,7 +28,7 @@ title = "A state that there is not"
 
 [[step]]
 do = "expect_state"
-pattern = "euphoric"
+pattern = "e[u]phoric"
 within_s = 1.0
 """
 
@@ -70,16 +74,24 @@ def test_a_flight_is_scored_and_a_fault_that_is_not_met_is_wrong(
     timeline = tmp_path / "impossible.toml"
     timeline.write_text(IMPOSSIBLE)
     code = main(["matrix", "--fault", "none", "--fault", str(timeline), "--out", str(tmp_path / "out"), "--json"])
-    flight, fault = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    flight, fault = json.loads(said.out)
     assert (flight["sequence"], flight["fault"], fault["fault"]) == ("crossing", "none", str(timeline))
     assert 0.0 <= flight["found"] <= 1.0
     # A machine under load may carry no pose in time; the table must then say so.
     assert (flight["poses"] == 0) == ("the autopilot received no pose" in flight["wrong"])
     assert fault["poses"] > 0
     assert fault["found"] is None
-    assert "euphoric" in fault["wrong"][0]
+    assert "e[u]phoric" in fault["wrong"][0]
+    assert fault["wrong"][0] in " ".join(said.err.split())
     assert code == 1
     assert json.loads((tmp_path / "out" / "matrix.json").read_text()) == [flight, fault]
+
+
+def test_names_with_brackets_are_shown_as_they_are() -> None:
+    shown = io.StringIO()
+    Console(file=shown, width=160).print(table([Cell("hawks[a]/000001", 1.0, "faults[b].toml", ("none",))]))
+    assert {"hawks[a]/000001", "faults[b].toml", "WRONG"} <= set(shown.getvalue().split())
 
 
 @pytest.mark.parametrize(

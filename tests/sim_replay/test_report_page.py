@@ -313,13 +313,15 @@ def test_an_empty_sky_is_scored_by_the_poses_received_in_it(
     flown: PlayedSequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = recording(flown, {0, 2})
-    folder = tmp_path / "flight"
+    folder = tmp_path / "flight [over:sea:]"
     folder.mkdir()
     write_flight(folder, RecordedFlight(flown.scene.folder, MODEL, made))
     labels = flown.scene.folder / "scene_gt.json"
     labels.write_text("{}")
     assert main(["score", str(folder)]) == 0
-    assert re.search(r"poses that match no target +│ 2 ", capsys.readouterr().out)
+    told = capsys.readouterr().out
+    assert re.search(r"poses that match no target +│ 2 ", told)
+    assert f"written to {folder}: report.html" in told
     score = json.loads((folder / "score.json").read_text())
     assert (score["overall"]["false_poses"], score["overall"]["false_positives_per_1000"]) == (2, 400.0)
     page = (folder / "report.html").read_text()
