@@ -22,8 +22,8 @@ RANGE_EXCESS_MAX = 2.0
 # Two boxes are of one aircraft if this share of the smaller lies inside the larger.
 SAME_TARGET_OVERLAP = 0.5
 ROTATION_TOLERANCE = 0.05
-# 1-sigma of (u, v) px, log Z and rotation rad above which a network has told nothing, and the tracker's matrices would
-# become singular.
+# 1-sigma of (u, v) px, log Z and rotation rad, widened for what is doubtful, above which a network has told nothing,
+# and the tracker's matrices would become singular.
 SIGMA_MAX = np.array([1e4, 1e4, 100.0, 100.0, 100.0, 100.0])
 # A box whose longer side is below this many pixels of the frame shows too little shape for a pose.
 BOX_MIN_PX = 8.0
@@ -109,13 +109,16 @@ def decode(
         on_frame = clipped(box, shown.frame_wh)
         cut = _is_cut(box, shown.frame_wh) or bool(np.any(shown.cut_sides(on_frame)))
         reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, shown.frame_wh)
+        if reason is None:
+            longer_px = float(peaks.size_px[image, peak].max())
+            sigma = _widened(sigma, score, longer_px, contract.trained_box_px)
+            if cut:
+                sigma = np.hypot(sigma, _cut_sigma(max(longer_px, expected_px)))
+            if np.any(sigma > SIGMA_MAX):
+                reason = "unsure"
         if reason is not None:
             refused[reason] += score >= least
             continue
-        longer_px = float(peaks.size_px[image, peak].max())
-        sigma = _widened(sigma, score, longer_px, contract.trained_box_px)
-        if cut:
-            sigma = np.hypot(sigma, _cut_sigma(max(longer_px, expected_px)))
         nearest_m, farthest_m = contract.depth_limits_m
         if not nearest_m * (1.0 + LIMIT_TOLERANCE) < t_m[2] < farthest_m * (1.0 - LIMIT_TOLERANCE):
             sigma[2] = np.hypot(sigma[2], LIMIT_SIGMA_LOG_Z)
@@ -183,8 +186,6 @@ def nearest_expected(estimates: Sequence[Estimate], box_xyxy_px: ArrayLike) -> E
 def _refusal(R: Array, t_m: Array, sigma: Array, box: Array, trained_range_m: tuple[float, float]) -> str | None:
     if not all(np.all(np.isfinite(value)) for value in (R, t_m, sigma, box)):
         return "not_finite"
-    if np.any(sigma > SIGMA_MAX):
-        return "unsure"
     if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         return "no_rotation"
     if np.any(sigma <= 0) or np.any(box[2:] <= box[:2]):

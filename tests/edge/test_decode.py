@@ -61,8 +61,9 @@ def accepted(peaks: Peaks) -> tuple[int, Counter[str]]:
 
 
 def test_what_is_no_pose_is_refused_and_counted() -> None:
-    nan, mirror, flat, thin, vague = (peaks_of() for _ in range(5))
+    nan, mirror, flat, thin, vague, boundless = (peaks_of() for _ in range(6))
     vague.sigma[0, 0, 2] = 1e6
+    boundless.size_px[0, 0, 0] = 1e12
     nan.t_cam_target_m[0, 0, 0] = np.nan
     mirror.R_cam_target[0, 0, 0, 0] = -1
     flat.sigma[0, 0, 2] = 0
@@ -72,7 +73,7 @@ def test_what_is_no_pose_is_refused_and_counted() -> None:
     assert accepted(nan) == (0, Counter(not_finite=1))
     assert accepted(mirror) == (0, Counter(no_rotation=1))
     assert accepted(flat) == accepted(thin) == (0, Counter(no_size=1))
-    assert accepted(vague) == (0, Counter(unsure=1))
+    assert accepted(vague) == accepted(boundless) == (0, Counter(unsure=1))
     assert accepted(peaks_of(z_m=-5.0)) == (0, Counter(out_of_range=1))
     assert accepted(peaks_of(z_m=1201.0)) == (0, Counter(out_of_range=1))
     # What is only looked into, below what a stage asks for, is no loss.
