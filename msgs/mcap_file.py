@@ -133,7 +133,12 @@ def _locked(path: Path) -> int:
     """Descriptor of a new file. Its lock tells other recorders that it was not left by a crash."""
     while True:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError:  # as of a file system without locks: it is tried again and again
+            os.close(descriptor)
+            path.unlink(missing_ok=True)
+            raise
         if os.fstat(descriptor).st_nlink:
             return descriptor
         os.close(descriptor)  # before it was locked, another recorder took it for an empty one and removed it

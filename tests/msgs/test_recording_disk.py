@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 from collections import Counter
@@ -83,6 +84,25 @@ def test_a_failure_is_forgotten_when_recording_is_switched_off(tmp_path: Path, m
     recorder.stop()
     assert told == ["recording stopped: No space left on device"], "it was switched on, and goes on from nothing"
     assert [data for path in tmp_path.iterdir() for *_, data, _ in read(path)] == [b"after"]
+
+
+def test_a_disk_without_locks_is_told_and_costs_no_descriptors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.02)
+    monkeypatch.setattr(recording, "RETRY_S", 0.02)
+
+    def lock(_descriptor: int, _operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", lock)
+    told: list[str] = []
+    recorder = Recorder(tmp_path, "uav1", ROOM, lambda _, text: told.append(text))
+    recorder.start()
+    before = len(os.listdir("/proc/self/fd"))
+    until(lambda: recorder.counters().get("failures", 0) >= 10, lambda: record_some(recorder, [b"lost"]))
+    recorder.stop()
+    assert len(os.listdir("/proc/self/fd")) < before + 5
+    assert told == ["recording stopped: No locks available"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_that_somebody_removes_while_it_is_written_is_told_and_another_begun(
