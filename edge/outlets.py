@@ -66,6 +66,7 @@ class Outlets:
         self._say(level, text)
 
     def _say(self, level: int, text: str, of_state: bool = False) -> None:
+        text = text.encode(errors="backslashreplace").decode()  # a path need not be UTF-8; the log escapes it alike
         if self._mavlink is not None:
             self._mavlink.event(MAV_SEVERITY[level], text, of_state)
         if self._zenoh is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -114,14 +115,18 @@ LINKS = {"zenoh", "mavlink", "recorder"}
 def test_what_is_said_reaches_ground_autopilot_and_recording_as_serious_as_it_is(
     tmp_path: Path, toy_model: Path
 ) -> None:
+    no_utf8 = os.fsdecode(b"/fl\xfcge/f.toml cannot be read")
     by_ground = {"target 0 acquired": 20, "target 0 lost": 30, str(LIMPING): 30, str(FAULT): 40}
     by_autopilot = {"target 0 acquired": 6, "target 0 lost": 4, str(LIMPING): 4, str(FAULT): 3}
+    escaped = r"/fl\udcfcge/f.toml cannot be read"
+    by_ground[escaped], by_autopilot[escaped] = 40, 3
     with started(tmp_path, toy_model, tmp_path / "recordings") as ends:
         assert ends.outlets.threads() == LINKS <= threads.running()
         ends.outlets.event(logging.INFO, "target 0 acquired")
         ends.outlets.event(logging.WARNING, "target 0 lost")
         ends.outlets.tell(LIMPING)
         ends.outlets.tell(FAULT)
+        ends.outlets.event(logging.ERROR, no_utf8)
         ends.until_heard(*by_ground)
         assert dict(ends.by_ground) == by_ground
         assert by_autopilot.items() <= dict(ends.by_autopilot()).items()
