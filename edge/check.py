@@ -7,10 +7,12 @@ from functools import partial
 from typing import TypeVar
 
 from edge.cameras import open_source
+from edge.cameras.own_ship_mask import load_own_parts
 from edge.config import ConfigFile, camera_key
 from edge.config_ground import ZenohTlsSettings
 from edge.errors import InputError
 from edge.estimator.model import NOT_CALIBRATED
+from edge.estimator.own_parts import OwnParts
 from edge.reload import load_configured
 from edge.types import CameraInfo
 
@@ -26,7 +28,7 @@ def check(file: ConfigFile) -> list[str]:
     found = _tried(lambda: _camera(file), faults)
     if model is None or found is None or faults:
         raise InputError("\n".join(faults))
-    camera, opened = found
+    camera, opened, hidden = found
     contract = model.contract
     name, (width, height) = camera.name, camera.image_size_wh
     stages = f"acquire {contract.acquire_size_wh[0]}x{contract.acquire_size_wh[1]}"
@@ -42,6 +44,7 @@ def check(file: ConfigFile) -> list[str]:
         *([] if size is None else [f"target   wingspan {size.wingspan_m:g} m, length {size.length_m:g} m"]),
         f"camera   {name}: {width}x{height}, focal length {camera.K[0, 0]:.1f} x {camera.K[1, 1]:.1f} px"
         + (f", {len(camera.distortion)} distortion coefficients" if any(camera.distortion) else ", no distortion")
+        + (f", own ship hides {100 * hidden.share:.0f} %" if hidden is not None else "")
         + (f", rolling shutter, {config.camera.readout_ms:g} ms" if config.camera.readout_ms else "")
         + ("" if opened else "; not reachable now, the daemon will keep trying"),
         f"zenoh    {', '.join(config.zenoh.listen + config.zenoh.connect) if config.zenoh.enabled else 'off'}",
@@ -60,12 +63,13 @@ def _tried(look: Callable[[], Found], faults: list[str]) -> Found | None:
         return None
 
 
-def _camera(file: ConfigFile) -> tuple[CameraInfo, bool]:
-    """The camera's properties, and whether it opened. Raises InputError."""
+def _camera(file: ConfigFile) -> tuple[CameraInfo, bool, OwnParts | None]:
+    """The camera's properties, whether it opened, and what the own ship hides. Raises InputError."""
     with file.blame(*camera_key(file.config.camera)):
         source, camera, opened = open_source(file.config.camera)
         source.close()
-    return camera, opened
+        hidden = load_own_parts(file.config.camera, camera.image_size_wh)
+    return camera, opened, hidden
 
 
 def _check_certificates(file: ConfigFile, section: str, tls: ZenohTlsSettings | None) -> None:

@@ -294,6 +294,7 @@ def _contents(config: Config) -> dict[str, str]:
     files = {
         "[camera] intrinsics": (intrinsics.file,) if intrinsics is not None else (),
         "[camera] tls": _paths(camera_tls),
+        "[camera] own_ship_mask": (config.camera.own_ship_mask,),
         "[zenoh] tls": _paths(config.zenoh.tls),
         "[mavlink] signing_key": (config.mavlink.signing_key,),
     }

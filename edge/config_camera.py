@@ -86,6 +86,11 @@ class Camera(Section):
         description="rolling shutter: from the first row's exposure to the last one's, milliseconds; negative: the "
         "last comes first; 0: global shutter",
     )
+    own_ship_mask: ConfigPath | None = Field(
+        default=None,
+        description="picture of the same shape, white where the own aircraft is seen, which is painted over; default: "
+        "nothing is",
+    )
 
 
 class SequenceCamera(Camera):

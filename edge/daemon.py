@@ -15,11 +15,13 @@ from dataclasses import replace
 
 from edge.attention import Attention
 from edge.cameras import FrameSupply, open_capture
+from edge.cameras.own_ship_mask import load_own_parts
 from edge.cameras.source import EndOfStream
 from edge.clock import SleepWatch, monotonic_ns
 from edge.config import ConfigFile, camera_key
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
+from edge.estimator.own_parts import OwnParts
 from edge.estimator.upright import up_in_cam
 from edge.health import Reason
 from edge.memory import MemoryKeeper
@@ -48,6 +50,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         model = load_configured(file)
         with file.blame(*camera_key(config.camera)):
             capture, camera_info = open_capture(config.camera)
+            own_parts = load_own_parts(config.camera, camera_info.image_size_wh)
         cleanup.callback(capture.stop)
         own_ship = OwnShipBuffer(gimballed=config.camera.mount == "gimbal")
         requests = RequestQueue()
@@ -55,7 +58,7 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         outlets = start_outlets(board, own_ship, requests, reloader.ask_for, cleanup)
         estimator = warm_estimator(model, config.estimator.max_targets, camera_info)
         estimator.target_size = config.target.size()
-        pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader)
+        pipeline = Pipeline(board, estimator, own_ship, outlets, capture, requests, reloader, own_parts)
         cleanup.callback(pipeline.search.stop)
         pipeline.search.start()
         # Objects that exist now live until exit: exclude them from garbage collection between frames.
@@ -87,6 +90,7 @@ class Pipeline:
         capture: FrameSupply,
         requests: RequestQueue,
         reloader: Reloader,
+        own_parts: OwnParts | None = None,
     ) -> None:
         config = board.file.config
         self._board = board
@@ -96,6 +100,7 @@ class Pipeline:
         self._capture = capture
         self._requests = requests
         self._reloader = reloader
+        self._own_parts = own_parts
         self._by_hand = ByHand()
         self._attention = Attention(config.estimator)
         self._sleep = SleepWatch()
@@ -208,7 +213,8 @@ class Pipeline:
         clock: StageClock,
     ) -> list[Estimate]:
         searches = self._by_hand.searches(frame.meta.capture_ns)
-        looked = self._attention.look(self._estimator, frame, expected, clock, searches=searches, pointed_at=pointed_at)
+        seen = self._without_own_parts(frame)
+        looked = self._attention.look(self._estimator, seen, expected, clock, searches=searches, pointed_at=pointed_at)
         height_px = frame.size_wh[1]
         looked = looked.each(lambda one: self._shutter.at_frame_time(one, own_ship, height_px, self._own_ship.at))
         if looked.there is not None:
@@ -216,6 +222,13 @@ class Pipeline:
             if not lies_on(looked.there.box_xyxy_px, [track.box_xyxy_px for track in expected]):
                 self._tracker.make_room(looked.there)  # a tracked target has its slot already
         return looked.estimates
+
+    def _without_own_parts(self, frame: Frame) -> Frame:
+        if self._own_parts is None:
+            return frame
+        if self._own_parts.size_wh != frame.size_wh:  # the camera has changed its mode
+            self._own_parts = OwnParts.of(self._own_parts.covered, frame.size_wh)
+        return replace(frame, image_bgr=self._own_parts.hide(frame.image_bgr), own_parts=self._own_parts)
 
     def _publish(self, frame: Frame, tracks: tuple[Track, ...], own_ship: OwnShip | None) -> Report:
         chosen_id, doubtful_below = self._by_hand.chosen_id, self._estimator.model.doubtful_below

@@ -13,6 +13,7 @@ import numpy as np
 
 from edge.cameras import open_source
 from edge.cameras.capture import Capture
+from edge.cameras.own_ship_mask import load_own_parts
 from edge.cameras.source import EndOfStream
 from edge.config import ConfigFile
 from edge.doctor_links import (
@@ -117,6 +118,7 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         return
     try:
         source, info, opened = open_source(camera)
+        load_own_parts(camera, info.image_size_wh)
     except InputError as error:
         yield wrong("camera", str(error), "correct this in [camera]"), None
         return

@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.estimator.own_parts import OwnParts
+
 Array = NDArray[np.float64]
 
 
@@ -31,6 +33,7 @@ class Frame:
     K: Array  # [3, 3], pixel centres at integers
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] (plumb bob); empty: a pinhole camera
     up_cam: Array | None = None  # [3], unit vector upwards in `cam`; None: unknown, taken for the top of the picture
+    own_parts: OwnParts | None = None  # of the own aircraft, that are painted over in the image; None: nothing is
 
     @property
     def size_wh(self) -> tuple[int, int]:

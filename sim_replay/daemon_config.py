@@ -53,6 +53,8 @@ def sequence_config(
         "zenoh": {"listen": [zenoh_endpoint]},
         "mavlink": {"endpoints": [f"udpin:{LOOPBACK}:{mavlink_port}"]},
     }
+    if sequence.own_ship_mask is not None:
+        tables["camera"]["own_ship_mask"] = str(sequence.own_ship_mask.resolve())
     if to_px4:
         tables["mavlink"]["target_relative_to_px4"] = True
     if target_size is not None:

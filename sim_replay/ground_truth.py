@@ -83,6 +83,7 @@ class PlayedSequence:
     frame0_ns: int  # exposure of the first frame on the telemetry's clock
     gimbal: GimbalTrack | None = None  # None: the camera is fixed; otherwise `mount` is its mount on the gimbal
     readout_ms: float = 0.0  # the daemon's [camera] readout_ms
+    own_ship_mask: Path | None = None  # and own_ship_mask
 
     @property
     def camera_mount(self) -> str:
@@ -144,6 +145,7 @@ def read_sequence(folder: Path) -> PlayedSequence:
         frame0_ns = int(settings["t0_ns"])
         gimballed = settings.get("mount", "fixed") == "gimbal"
         readout_ms = float(settings.get("readout_ms", 0.0))
+        own_ship_mask = folder / settings["own_ship_mask"] if "own_ship_mask" in settings else None
     if not (math.isfinite(fps) and fps >= _FPS_LEAST):
         raise InputError(
             f"{folder / 'sequence.toml'}: fps is {fps:g}; it must be a number above 0, at least {_FPS_LEAST:g}"
@@ -156,7 +158,7 @@ def read_sequence(folder: Path) -> PlayedSequence:
     check_spans(telemetry, telemetry_csv, frame0_ns, len(scene.images), fps)
     if gimballed:
         gimbal, mount = _gimbal(folder, frames, frame0_ns, fps), Mount(R_FORWARD_CAM, mount.t_body_cam_m)
-    return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal, readout_ms)
+    return PlayedSequence(scene, fps, mount, telemetry_csv, frame0_ns, gimbal, readout_ms, own_ship_mask)
 
 
 def _with_unrecorded(scene: SceneTruth, frames: list[int]) -> SceneTruth:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge.estimator.given_size import Depth, TargetSize, combined, depth_by_size
 from edge.estimator.model import Peaks
+from edge.estimator.own_parts import OwnParts
 from edge.estimator.window import PixelMap, clipped, whole_frame
 from edge.tracking.boxes import overlap
 from edge.types import Array, Estimate
@@ -54,6 +55,7 @@ class Shown(NamedTuple):
     size_wh: tuple[int, int]  # of the network's input
     frame_wh: tuple[int, int]
     up_cam: Array | None = None  # as in Frame
+    own_parts: OwnParts | None = None  # as in Frame
 
     def cut_sides(self, box_xyxy_px: Array) -> NDArray[np.bool_]:
         """[4], for each side of a box on the frame: whether an edge of the window, beyond which the frame continues,
@@ -67,6 +69,20 @@ class Shown(NamedTuple):
         inwards = np.array([1.0, 1.0, -1.0, -1.0])
         hides = (window - picture) * inwards > EDGE_PX
         return np.asarray(hides & ((box - window) * inwards < _edge_margin_px(box)))
+
+    def cuts(self, box_xyxy_px: Array) -> bool:
+        """Whether some of the object in a box, on the frame or beyond, may not be seen: past an edge of the frame or
+        the window, or behind parts of the own aircraft."""
+        on_frame = clipped(box_xyxy_px, self.frame_wh)
+        if _is_cut(box_xyxy_px, self.frame_wh) or np.any(self.cut_sides(on_frame)):
+            return True
+        margin_px = _edge_margin_px(on_frame) * np.array([-1.0, -1.0, 1.0, 1.0])
+        return self.own_parts is not None and self.own_parts.touches(on_frame + margin_px)
+
+    def hides(self, point_px: Array) -> bool:
+        """Whether a point of the frame lies outside of it, or behind parts of the own aircraft."""
+        off = not np.all((point_px >= -0.5) & (point_px <= np.array(self.frame_wh) - 0.5))
+        return off or (self.own_parts is not None and self.own_parts.touches(np.tile(point_px, 2)))
 
 
 def decode(
@@ -86,9 +102,9 @@ def decode(
     `size` is given, it goes into the depth of those that no edge cuts. `expected_xyxy_px` [4]: the box, on the frame or
     beyond, of the target that the image was cut out for, if any.
 
-    The covariance is enlarged for a target that is cut by the edge of the network's image, of a size outside training,
-    at a limit of depth, or seen from farther above or below than in training. A cut target with its origin off the
-    frame, or one too small to show a shape, is rejected.
+    The covariance is enlarged for a target that is cut by the edge of the network's image or by parts of the own
+    aircraft, of a size outside training, at a limit of depth, or seen from farther above or below than in training. A
+    cut target whose origin is not to be seen, or one too small to show a shape, is rejected.
     """
     acquiring = stage == "acquire"
     calibration = contract.acquire_score if acquiring else contract.track_score
@@ -107,8 +123,9 @@ def decode(
         box = pixel_map.box_to_frame(peaks.center_px[image, peak], peaks.size_px[image, peak])
         origin_px = pixel_map.to_frame(peaks.origin_px[image, peak])
         on_frame = clipped(box, shown.frame_wh)
-        cut = _is_cut(box, shown.frame_wh) or bool(np.any(shown.cut_sides(on_frame)))
-        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m) or _unseen(box, origin_px, cut, shown.frame_wh)
+        reason = _refusal(R, t_m, sigma, box, contract.trained_range_m)
+        cut = reason is None and shown.cuts(box)
+        reason = reason or _unseen(box, shown.frame_wh) or ("cut_off" if cut and shown.hides(origin_px) else None)
         if reason is None:
             longer_px = float(peaks.size_px[image, peak].max())
             sigma = _widened(sigma, score, longer_px, contract.trained_box_px)
@@ -216,15 +233,10 @@ def _edge_margin_px(box_xyxy_px: Array) -> float:
     return EDGE_SHARE * float(np.max(box_xyxy_px[2:] - box_xyxy_px[:2])) + EDGE_PX
 
 
-def _unseen(box_xyxy_px: Array, origin_px: Array, cut: bool, frame_wh: tuple[int, int]) -> str | None:
+def _unseen(box_xyxy_px: Array, frame_wh: tuple[int, int]) -> str | None:
     """Why too little of a target is on the frame to give its pose; None: enough of it is."""
-    limit = np.array(frame_wh) - 0.5
-    visible = np.minimum(box_xyxy_px[2:], limit) - np.maximum(box_xyxy_px[:2], -0.5)
-    if np.max(visible) < BOX_MIN_PX or np.min(visible) <= 0:
-        return "too_small"
-    if cut and not np.all((origin_px >= -0.5) & (origin_px <= limit)):
-        return "cut_off"
-    return None
+    visible = np.minimum(box_xyxy_px[2:], np.array(frame_wh) - 0.5) - np.maximum(box_xyxy_px[:2], -0.5)
+    return "too_small" if np.max(visible) < BOX_MIN_PX or np.min(visible) <= 0 else None
 
 
 def _longer_side_px(box_xyxy_px: ArrayLike, shown: Shown) -> float:

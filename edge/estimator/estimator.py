@@ -139,7 +139,7 @@ class Estimator:
         size_wh, fit = contract.acquire_size_wh, contract.acquire_fit
         lens = lens_of(frame.K, frame.distortion)
         image, pixel_map = fit_frame(frame.image_bgr, size_wh, fit, lens, pixel_aspect(frame.K), region.window)
-        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame.size_wh, frame.up_cam)
+        shown = Shown(pixel_map, pixel_map.intrinsics(frame.K), size_wh, frame.size_wh, frame.up_cam, frame.own_parts)
         turns = quarter_turns(frame.up_cam)
         peaks = turned_back(run(*turned(image[None], shown.K[None], turns)), size_wh, turns)
         least = region.score_of(score_min)
@@ -199,7 +199,7 @@ class Estimator:
         scale, aspect = contract.track_window_scale, pixel_aspect(frame.K)
         windows = [window_around(box, scale, size_wh, frame_wh, lens, aspect) for box in boxes_xyxy_px]
         maps = [window.pixel_map(size_wh, lens) for window in windows]
-        shown = [Shown(one, one.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam) for one in maps]
+        shown = [Shown(one, one.intrinsics(frame.K), size_wh, frame_wh, frame.up_cam, frame.own_parts) for one in maps]
         pixels = {window: cut(frame.image_bgr, window, size_wh, lens) for window in dict.fromkeys(windows)}
         turns = quarter_turns(frame.up_cam)
         images, K = turned(np.stack([pixels[window] for window in windows]), np.stack([one.K for one in shown]), turns)

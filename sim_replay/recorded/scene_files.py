@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -44,9 +45,16 @@ def scene_distortion(distortion: tuple[float, ...]) -> Distortion | None:
 
 
 def write_sequence_toml(
-    folder: Path, source: Path, fps: float, frame0_ns: int, mount: Mount, gimballed: bool, readout_ms: float = 0.0
+    folder: Path,
+    source: Path,
+    fps: float,
+    frame0_ns: int,
+    mount: Mount,
+    gimballed: bool,
+    camera: Mapping[str, object] | None = None,
 ) -> None:
-    """Write sequence.toml of a finished scene without labels; `source` is where the images are from."""
+    """Write sequence.toml of a finished scene without labels; `source` is where the images are from, `camera` has
+    further keys."""
     entries = {
         SOURCE_KEY: str(source),
         "fps": fps,
@@ -54,7 +62,7 @@ def write_sequence_toml(
         "R_body_cam": mount.R_body_cam.tolist(),
         "t_body_cam_m": mount.t_body_cam_m.tolist(),
         "mount": "gimbal" if gimballed else "fixed",
-        "readout_ms": readout_ms,
+        **(camera or {}),
     }
     lines = [f"{key} = {toml_value(value)}\n" for key, value in entries.items()]
     (folder / "sequence.toml").write_text("".join(lines), encoding="utf-8")

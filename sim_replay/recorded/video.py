@@ -37,7 +37,8 @@ class FilmedFlight(Section):
     t0_ns: int = Field(default=0, description="exposure of the first picture on the telemetry's clock")
     fps: float | None = Field(default=None, gt=0, le=FPS_MAX, description="pictures a second; default: the video's own")
     intrinsics: IntrinsicsSettings
-    readout_ms: ReadoutMs = Field(default=0.0, description="rolling shutter, as in the daemon's [camera]")
+    readout_ms: ReadoutMs = Field(default=0.0, description="as in the daemon's [camera]")
+    own_ship_mask: ConfigPath | None = Field(default=None, description="as in the daemon's [camera]")
     mount: MountSettings = Field(default_factory=MountSettings)
 
 
@@ -62,6 +63,8 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
         raise InputError(f"{flight.telemetry}: has {rows_hz:.1f} rows a second; 10 are needed")
     if not flight.video.is_file():
         raise InputError(f"{path}: video: {flight.video} does not exist")
+    if flight.own_ship_mask is not None and not flight.own_ship_mask.is_file():
+        raise InputError(f"{path}: own_ship_mask: {flight.own_ship_mask} does not exist")
     capture = open_video(str(flight.video))
     try:
         if not capture.isOpened():
@@ -74,8 +77,12 @@ def unpack_video(path: Path, folder: Path, on_picture: Callable[[], None]) -> No
     finally:
         capture.release()
     shutil.copyfile(flight.telemetry, folder / "telemetry.csv")
+    camera: dict[str, object] = {"readout_ms": flight.readout_ms}
+    if flight.own_ship_mask is not None:
+        camera["own_ship_mask"] = f"own_ship_mask{flight.own_ship_mask.suffix}"
+        shutil.copyfile(flight.own_ship_mask, folder / str(camera["own_ship_mask"]))
     mount = flight.mount.mount()
-    write_sequence_toml(folder, flight.video, fps, flight.t0_ns + first_ns, mount, False, flight.readout_ms)
+    write_sequence_toml(folder, flight.video, fps, flight.t0_ns + first_ns, mount, False, camera)
 
 
 def _unpack(

@@ -14,6 +14,7 @@ import numpy as np
 from edge.config import Config, ConfigFile
 from edge.daemon import Pipeline
 from edge.estimator.estimator import Estimator
+from edge.estimator.own_parts import OwnParts
 from edge.estimator.regions import Region
 from edge.health import Reason
 from edge.outlets import Outlets
@@ -65,12 +66,16 @@ class Ear(Outlets):
         super().__init__(None, None)
         self.reports: list[Report] = []
         self.events: list[tuple[int, str]] = []
+        self.shown: list[Frame] = []
 
     def event(self, level: int, text: str) -> None:
         self.events.append((level, text))
 
     def publish(self, report: Report) -> None:
         self.reports.append(report)
+
+    def show(self, frame: Frame) -> None:
+        self.shown.append(frame)
 
 
 class Supply:
@@ -92,7 +97,11 @@ class Supply:
 
 @contextmanager
 def looping(
-    gated: Gated, max_targets: int = 4, mount: Mapping[str, float] | None = None, readout_ms: float = 0.0
+    gated: Gated,
+    max_targets: int = 4,
+    mount: Mapping[str, float] | None = None,
+    readout_ms: float = 0.0,
+    own_parts: OwnParts | None = None,
 ) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
     config = Config.model_validate({
         "camera": {"type": "sequence", "path": "/scene", "readout_ms": readout_ms},
@@ -101,7 +110,7 @@ def looping(
     })  # fmt: skip
     board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))
     ear, requests = Ear(), RequestQueue()
-    pipeline = Pipeline(board, gated, OwnShipBuffer(), ear, Supply(), requests, Reloader())
+    pipeline = Pipeline(board, gated, OwnShipBuffer(), ear, Supply(), requests, Reloader(), own_parts)
     pipeline.search.start()
     try:
         yield pipeline, ear, requests

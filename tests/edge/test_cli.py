@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from msgs.ground.keys import init_authority, issue
@@ -47,12 +49,16 @@ def refusal(cli: Cli, tmp_path: Path, text: str, command: str = "run") -> str:
 
 
 def test_a_configuration_that_flies_is_checked_and_flown(cli: Cli, tmp_path: Path, text: str) -> None:
-    rolling = text.replace("[camera]\n", "[camera]\nreadout_ms = -21.5\n")
-    (tmp_path / "config.toml").write_text(rolling + "[target]\nwingspan_m = 20.1\nlength_m = 11\n" + OFF)
+    mask = np.zeros((540, 960), np.uint8)
+    mask[:, :96] = 255
+    cv2.imwrite(str(tmp_path / "own.png"), mask)
+    more = text.replace("[camera]\n", '[camera]\nreadout_ms = -21.5\nown_ship_mask = "own.png"\n')
+    (tmp_path / "config.toml").write_text(more + "[target]\nwingspan_m = 20.1\nlength_m = 11\n" + OFF)
     checked = cli("check", "--config", "config.toml")
     assert checked.returncode == 0, checked.stderr
     assert "target   wingspan 20.1 m, length 11 m\n" in checked.stdout
-    assert "1920x1080, focal length 2000.0 x 2000.0 px, no distortion, rolling shutter, -21.5 ms\n" in checked.stdout
+    camera = "1920x1080, focal length 2000.0 x 2000.0 px, no distortion, own ship hides 10 %, rolling shutter, -21.5 ms"
+    assert f"{camera}\n" in checked.stdout
     assert "toy fp32" in checked.stdout
     flown = cli("run", "--config", "config.toml")
     assert flown.returncode == 0, flown.stderr

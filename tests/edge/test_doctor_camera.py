@@ -47,6 +47,13 @@ def test_a_camera_whose_stamps_do_not_advance_has_no_rate(tmp_path: Path) -> Non
     assert (found.says.partition(";")[0], rate_hz) == ("nose/image/compressed: 320x180", None)
 
 
+def test_a_mask_of_the_own_ship_that_the_daemon_would_refuse_is_told(tmp_path: Path, scene: Path) -> None:
+    (tmp_path / "config.toml").write_text(f'[camera]\ntype = "sequence"\npath = "{scene}"\nown_ship_mask = "own.png"\n')
+    ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
+    assert (found.verdict, rate_hz) == ("wrong", None)
+    assert f"{tmp_path}/own.png cannot be read" in found.says
+
+
 class Driver:
     """In place of cv2.VideoCapture: `given_hz` pictures a second, stamped in UTC or on our clock, some torn."""
 

@@ -22,7 +22,8 @@ ODD = 'Müller\'s "\U0001f6e9" \\new'
 def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     bundled = read_sequence(BUNDLED_SEQUENCE)
     folder = tmp_path / ODD
-    sequence = replace(bundled, scene=replace(bundled.scene, folder=folder), readout_ms=-21.5)
+    sequence = replace(bundled, scene=replace(bundled.scene, folder=folder))
+    sequence = replace(sequence, readout_ms=-21.5, own_ship_mask=folder / "own.png")
     path = tmp_path / "config.toml"
     camera = {"start_at_ns": 12, "loop": True}
     asked = (sequence, folder / "a.onnx", "tcp/127.0.0.1:7001", 14001, camera)
@@ -30,6 +31,7 @@ def test_the_daemon_reads_what_was_asked_for(tmp_path: Path) -> None:
     config = load_config(path).config
     assert isinstance(config.camera, SequenceCamera)
     assert (config.camera.path, config.camera.fps, config.camera.readout_ms) == (folder, sequence.fps, -21.5)
+    assert config.camera.own_ship_mask == folder / "own.png"
     assert (config.camera.start_at_ns, config.camera.loop) == (12, True)
     assert config.model.path == folder / "a.onnx"
     assert (config.target.wingspan_m, config.target.length_m) == (11.0, 8.3)

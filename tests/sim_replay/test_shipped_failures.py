@@ -12,6 +12,7 @@ import pytest
 from edge.config import SHIPPED_MODEL
 from edge.estimator.estimator import Estimator
 from edge.estimator.model import load_model
+from edge.estimator.own_parts import OwnParts
 from edge.types import Estimate, Frame, FrameMeta
 from sim_replay import metrics
 from sim_replay.bop import BopScene
@@ -164,3 +165,23 @@ def test_a_target_beyond_the_trained_range_is_told_with_the_doubt_it_deserves_or
         t_m = scene.targets[0].pose_in(scene.camera)[1]
         aside = np.tan(np.radians(metrics.bearing_error_deg(estimate.t_cam_target_m, t_m)))
         assert aside * scene.camera.K[0, 0] < 0.4 * 100.0, "pixels of the target's hundred"
+
+
+def winglets_found(estimator: Estimator, grey: float, seed: int, hidden: bool) -> int:
+    """In an empty, noisy sky that shows the own winglet at its right edge."""
+    picture = np.full((1080, 1920, 3), grey) + np.linspace(-15.0, 15.0, 1080)[:, None, None]
+    corners = np.array([[1920, 594], [1728, 648], [1699, 518], [1728, 518], [1766, 632], [1920, 562]])
+    cv2.fillPoly(picture, [corners], (235.0, 230.0, 230.0), cv2.LINE_AA)
+    picture += np.random.default_rng(seed).normal(0.0, 4.0, picture.shape)
+    image = picture.clip(0, 255).astype(np.uint8)
+    mask = cv2.dilate(cv2.fillPoly(np.zeros(image.shape[:2], np.uint8), [corners], 255), np.ones((9, 9)))
+    own = OwnParts.of(mask, (1920, 1080))
+    K = np.array([[2000.0, 0.0, 959.5], [0.0, 2000.0, 539.5], [0.0, 0.0, 1.0]])
+    frame = Frame(FrameMeta(0, 0, 0), own.hide(image) if hidden else image, K, own_parts=own if hidden else None)
+    return len(estimator.acquire(frame, regions=estimator.regions(frame)))
+
+
+def test_the_own_winglet_is_taken_for_an_aircraft_unless_a_mask_hides_it(estimator: Estimator) -> None:
+    skies = [(105.0, 0), (165.0, 1)]
+    assert sum(winglets_found(estimator, *sky, hidden=False) for sky in skies) > 0
+    assert sum(winglets_found(estimator, *sky, hidden=True) for sky in skies) == 0

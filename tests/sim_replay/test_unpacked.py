@@ -90,10 +90,20 @@ def test_a_video_that_says_no_rate_is_not_given_one(suffix: str, film: Path, tmp
     assert open_sequence(film, tmp_path / "out", Console(quiet=True)).fps == 30.0
 
 
-def test_a_video_s_rolling_shutter_is_that_of_the_sequence_made_of_it(film: Path, tmp_path: Path) -> None:
-    assert open_sequence(film, tmp_path / "out", Console(quiet=True)).readout_ms == 0.0
-    film.write_text(f"readout_ms = 21.5\n{film.read_text()}")
-    assert open_sequence(film, tmp_path / "out", Console(quiet=True)).readout_ms == 21.5
+def test_a_video_s_rolling_shutter_and_own_parts_are_those_of_the_sequence_made_of_it(
+    film: Path, tmp_path: Path
+) -> None:
+    plain = open_sequence(film, tmp_path / "out", Console(quiet=True))
+    assert (plain.readout_ms, plain.own_ship_mask) == (0.0, None)
+    film.write_text(f'readout_ms = 21.5\nown_ship_mask = "own.png"\n{film.read_text()}')
+    with pytest.raises(InputError, match=r"own_ship_mask: .*own\.png does not exist"):
+        open_sequence(film, tmp_path / "out", Console(quiet=True))
+    (tmp_path / "own.png").write_bytes(b"a mask")
+    told = open_sequence(film, tmp_path / "out", Console(quiet=True))
+    (tmp_path / "own.png").unlink()
+    assert told.readout_ms == 21.5
+    assert told.own_ship_mask is not None
+    assert told.own_ship_mask.read_bytes() == b"a mask"
 
 
 def test_a_video_is_unpacked_as_its_sensor_read_it_out(film: Path, tmp_path: Path) -> None:
