@@ -47,7 +47,10 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any]:
     if _is_torn_jpeg(coded):
         raise InputError(f"{path} is cut short: what is missing would be read as gray")
     coded = _with_tiff_unturned(coded)
-    pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION) if coded else None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(coded, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION) if coded else None
+    except cv2.error:  # a header that tells of more pixels than OpenCV takes
+        pixels = None
     if pixels is None:
         raise InputError(f"{path} is not a readable picture")
     return pixels

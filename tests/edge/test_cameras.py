@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections import Counter
@@ -30,6 +31,7 @@ from .toy_scene import write_scene
 
 VIDEO_WH = (320, 180)
 INTRINSICS = IntrinsicsSettings(fx=300, fy=300, cx=159.5, cy=89.5, width=VIDEO_WH[0], height=VIDEO_WH[1])
+BMP_TOO_WIDE = struct.pack("<2sI4xIIiiHHI24x", b"BM", 54, 54, 40, 2**30, 1, 1, 24, 0)
 TORN_JPEG = cv2.imencode(".jpg", np.tile(np.arange(180, dtype=np.uint8)[:, None, None], (1, 320, 3)))[1].tobytes()[:-99]
 
 
@@ -175,6 +177,7 @@ def test_a_capture_thread_that_breaks_ends_the_loop_instead_of_leaving_it_to_wai
         ("rgb/000000.png", None, "has no pictures in rgb/ or gray/"),
         ("rgb/000000.png", b"junk", "000000.png is not a readable picture"),
         ("rgb/000000.png", TORN_JPEG, "000000.png is cut short"),
+        ("rgb/000000.png", BMP_TOO_WIDE, "000000.png is not a readable picture"),
     ],
 )
 def test_a_damaged_scene_is_told_with_file_and_fault(
