@@ -10,6 +10,8 @@ from edge.cameras.sequence import PICTURE_SUFFIXES, ScenePicture, SequenceSource
 from edge.config_camera import FolderCamera
 from edge.errors import InputError
 
+DECIMALS = 20  # more than any clock tells
+
 
 class FolderSource(SequenceSource):
     """Picture k counts as exposed at start + k / fps; those that a late reader missed are skipped, as with a camera."""
@@ -23,7 +25,7 @@ class FolderSource(SequenceSource):
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """The folder's pictures, `2.png` before `10.png`, but no hidden ones: macOS writes `._2.png` beside `2.png`.
+    """The folder's pictures in the order of `_place`, but no hidden ones: macOS writes `._2.png` beside `2.png`.
 
     Raises InputError when there are none.
     """
@@ -34,4 +36,11 @@ def list_pictures(folder: Path) -> list[Path]:
     paths = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
     if not paths:
         raise InputError(f"{folder} has no pictures ({', '.join(sorted(PICTURE_SUFFIXES))})")
-    return sorted(paths, key=lambda path: [(int(n or 0), text) for n, text in re.findall(r"(\d*)(\D*)", path.name)])
+    return sorted(paths, key=lambda path: _place(path.name))
+
+
+def _place(name: str) -> list[tuple[int, str]]:
+    """Sorts `2.png` before `10.png`, and times in seconds since 1970 by their decimals: `1764415083.25.png` before
+    `1764415083.5.png`, as Python writes them."""
+    in_full = re.sub(r"(?<=\d{9}\.)\d+", lambda decimals: decimals[0].ljust(DECIMALS, "0"), name)
+    return [(int(number or 0), text) for number, text in re.findall(r"(\d*)(\D*)", in_full)]

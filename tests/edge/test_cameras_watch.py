@@ -163,6 +163,15 @@ def test_a_camera_that_shows_each_picture_twice_leaves_the_time_of_both() -> Non
     assert [pace.unhurried(meta) for meta in taken] == [False, *[True] * 5]
 
 
+def test_a_folder_s_pictures_follow_each_other_as_they_were_numbered_or_timed(tmp_path: Path) -> None:
+    """Python leaves out the last zeros of a time's decimals."""
+    names = ["cam2.png", "cam10.png", "flight 1.2.png", "flight 1.10.png"]
+    names += [f"seen {1764415083 + 0.15 * k}.png" for k in range(20)]
+    for name in names:
+        (tmp_path / name).touch()
+    assert [path.name for path in list_pictures(tmp_path)] == names
+
+
 def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("none here")
     with pytest.raises(InputError, match=rf"{tmp_path} has no pictures"):
