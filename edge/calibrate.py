@@ -36,14 +36,15 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
         return
     if not os.path.isfile(source):
         raise InputError(f"{source} does not exist")
-    video = open_video(str(source))
+    opened = str(source.absolute())  # a relative path with a colon, as 2026-11-29T10:15.mp4, would be taken for a URL
+    video = open_video(opened)
     if not video.isOpened():
         raise InputError(f"{source} is neither a folder of images nor a readable video")
     every = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)) // PICTURES_MAX, 1)
     frames = yield from _every(video, every)
     # Recorders that count in milliseconds may state 1000 frames a second, from which the number of frames is guessed.
     if frames // every < PICTURES_MAX // 2 and every > 1:
-        yield from _every(open_video(str(source)), max(frames // PICTURES_MAX, 1), but=every)
+        yield from _every(open_video(opened), max(frames // PICTURES_MAX, 1), but=every)
 
 
 def _every(video: cv2.VideoCapture, step: int, but: int | None = None) -> Generator[tuple[str, Gray], None, int]:

@@ -95,12 +95,13 @@ def test_a_known_camera_is_found_again_and_its_file_flies(cli: Cli, tmp_path: Pa
 
 def test_a_video_of_a_board_becomes_a_file_and_a_person_is_told_how_good_it_is(cli: Cli, tmp_path: Path) -> None:
     pictures = film(tmp_path / "board", "charuco", poses(0.55, 1.0))
-    video = cv2.VideoWriter(str(tmp_path / "board.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE_WH)
+    name = "2026-11-29T10:15.mp4"
+    video = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, SIZE_WH)
     for picture in sorted(pictures.iterdir()):
         for _ in range(HELD_FRAMES):
             video.write(cv2.imread(str(picture)))
     video.release()
-    done = cli("calibrate", "board.mp4", "--out", "nose.yaml", "--name", '[nose: "left" #1')
+    done = cli("calibrate", name, "--out", "nose.yaml", "--name", '[nose: "left" #1')
     assert done.returncode == 0, done.stderr
     told = re.search(r"reprojection error ([\d.]+) px RMS over \d+ views", done.stdout)
     assert told is not None
