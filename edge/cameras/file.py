@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
+from shlex import quote
 
 import cv2
 import numpy as np
@@ -55,7 +56,8 @@ class FileSource:
             # Not `-c copy`: frames are copied in the order in which they are decoded, and would get each other's times.
             raise InputError(
                 f"{path} does not say when its frames were taken; put it into a file that does, "
-                f"with the rate it was filmed at: ffmpeg -framerate 30 -i {path.name} -crf 12 {path.stem}.mp4"
+                f"with the rate it was filmed at: ffmpeg -framerate 30 -i {quote(path.name)} -crf 12 "
+                f"{quote(f'{path.stem}.mp4')}"
             )
         self._frames = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # 0 or less: unknown
         size_wh = (

@@ -169,7 +169,7 @@ def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path:
 
 def test_the_command_that_gives_a_video_times_gives_each_frame_its_own(tmp_path: Path) -> None:
     """H.264 stores frames that were predicted from later ones after these."""
-    with av.open(str(tmp_path / "flight.h264"), "w") as out:
+    with av.open(str(tmp_path / "my flight.h264"), "w") as out:
         stream = out.add_stream("libx264", rate=30, options={"x264-params": "b-adapt=0"})
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
@@ -178,11 +178,11 @@ def test_the_command_that_gives_a_video_times_gives_each_frame_its_own(tmp_path:
             brighter = np.full((SIZE_WH[1], SIZE_WH[0], 3), 20 * index, np.uint8)
             out.mux(stream.encode(av.VideoFrame.from_ndarray(brighter, format="bgr24")))
         out.mux(stream.encode(None))
-    with closing(source_of(tmp_path / "flight.h264")) as source, pytest.raises(InputError) as refused:
+    with closing(source_of(tmp_path / "my flight.h264")) as source, pytest.raises(InputError) as refused:
         source.open()
     command = str(refused.value).rpartition("filmed at: ")[2]
     subprocess.run(shlex.split(command), cwd=tmp_path, check=True, capture_output=True)
-    frames = play(source_of(tmp_path / "flight.mp4"))
+    frames = play(source_of(tmp_path / "my flight.mp4"))
     numbers = [frame.meta.sequence for frame in frames]  # a busy machine passes some over
     assert len(numbers) >= 3
     assert numbers[-1] == 11
