@@ -142,6 +142,9 @@ def _is_journal(stream: TextIO) -> bool:
 
 def set_up_logging() -> None:
     """Log everything from INFO on to standard error. To be called before OpenCV is imported."""
+    if sys.stderr is None:  # it was closed: libraries would write to whatever is opened next and takes its number
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = os.fdopen(2, "w", closefd=False)
     for variable, level in QUIET.items():
         os.environ.setdefault(variable, level)
     handler = CountingHandler(PatientStream(sys.stderr))  # type: ignore[arg-type]

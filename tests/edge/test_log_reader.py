@@ -87,6 +87,21 @@ def test_the_journal_is_told_how_grave_each_line_is_and_a_terminal_when_it_was()
     assert terminal[0][:4].isdecimal()
 
 
+LOGS_TO_NOBODY = """
+import logging, os
+from edge.logs import set_up_logging
+set_up_logging()
+logging.getLogger("camera").error("lost")
+print(os.open(os.devnull, os.O_RDONLY) > 2)
+"""
+
+
+def test_where_standard_error_is_closed_nothing_that_is_opened_later_takes_its_place() -> None:
+    command = ["sh", "-c", 'exec "$@" 2>&-', "sh", sys.executable, "-c", LOGS_TO_NOBODY]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout == "True\n"
+
+
 def test_what_a_slow_reader_missed_is_told_to_it() -> None:
     read_end, write_end = os.pipe()
     fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
