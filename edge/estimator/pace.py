@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from edge.types import FrameMeta, TrackState
 
 UNHURRIED_NS = 60_000_000  # frame interval from which on there is time to evaluate each target more than once
@@ -9,21 +11,24 @@ REGION_NS = 60_000_000  # frame interval per region of the frame that is searche
 
 
 class Pace:
-    """Of one camera; remembers the previous frame."""
+    """Of one camera; remembers the previous frames."""
 
     def __init__(self) -> None:
         self._before: FrameMeta | None = None
-        self._interval_ns = 0.0
+        self._intervals_ns: deque[float] = deque(maxlen=2)
 
     def unhurried(self, meta: FrameMeta) -> bool:
         """Whether there is time to evaluate each target more than once. To be called for every frame, in order."""
         before, self._before = self._before, meta
-        self._interval_ns = 0.0 if before is None else _interval_ns(before, meta)
-        return self._interval_ns >= UNHURRIED_NS
+        if before is None:
+            return False
+        self._intervals_ns.append(_interval_ns(before, meta))
+        return self._intervals_ns[-1] >= UNHURRIED_NS
 
     def regions(self) -> int:
-        """How many regions of the last frame there is time to search."""
-        return max(1, int(self._interval_ns // REGION_NS))
+        """How many regions of the last frame there is time to search. A single long interval is a gap, as of a camera
+        that was lost: after it, frames come as before."""
+        return max(1, int(min(self._intervals_ns, default=0.0) // REGION_NS))
 
 
 def looked_at_twice(state: TrackState, unhurried: bool) -> bool:

@@ -139,6 +139,14 @@ def test_a_slow_camera_leaves_time_for_more_regions(fps: int, regions: int) -> N
     assert pace.regions() == regions
 
 
+def test_a_camera_that_was_lost_is_no_slow_one() -> None:
+    """To search all regions of its first frame, of 4K seventeen, would take seconds, and all that is found be stale."""
+    pace = Pace()
+    for k, time_ns in enumerate((0, 33_000_000, 5_033_000_000, 5_066_000_000)):
+        pace.unhurried(FrameMeta(k, time_ns, time_ns))
+        assert pace.regions() == 1
+
+
 def test_a_target_that_the_whole_frame_does_not_show_is_found_in_a_tile(toy_model: Path) -> None:
     estimator, seen = Estimator(load_model(toy_model, 1)), faint()
     assert estimator.acquire(seen) == []
