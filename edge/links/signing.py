@@ -30,6 +30,9 @@ RESERVED_AHEAD = 60 * 100_000  # reserved beyond the time by each save of the st
 # ours. Not a minute: autopilots count on from what they hear, so each crash would take both a minute further, until one
 # that starts anew with the right time is rejected.
 RESERVED_MIN = 10 * 100_000
+# Reserved anew while this much is left: a power cut takes a save of the last five seconds with it, after which ext4
+# commits, and the one before it must do.
+RESERVED_LEFT = 6 * 100_000
 AHEAD_MAX_S = 600.0  # saved timestamp minus clock; beyond it one of the two is wrong
 
 
@@ -74,7 +77,7 @@ class Signing:
         """For the next message: the current time, or one more than the last timestamp."""
         now = timestamp_of(self._utc_ns())
         self._last = min(max(self._last + 1, now), TIMESTAMP_MAX)
-        if self._last > self._reserved:
+        if self._last > self._reserved - RESERVED_LEFT and self._reserved < TIMESTAMP_MAX:
             self._reserved = min(max(now + RESERVED_AHEAD, self._last + RESERVED_MIN), TIMESTAMP_MAX)
             self._save(self._reserved)
         return self._last

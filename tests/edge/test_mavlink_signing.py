@@ -267,6 +267,16 @@ def test_a_restart_repeats_no_timestamp_even_without_a_clock(tmp_path: Path) -> 
     assert open_signing(key, state, lambda: NOW_NS).next_timestamp() == timestamp_of(NOW_NS)
 
 
+def test_a_power_cut_that_takes_the_last_save_with_it_has_no_timestamp_repeated() -> None:
+    now_ns = NOW_NS
+    saves: list[tuple[int, int]] = []  # when, and what
+    one = Signing(KEY, 0, lambda stamp: saves.append((now_ns, stamp)), lambda: now_ns)
+    one.next_timestamp()
+    for now_ns in range(NOW_NS + 5 * 10**9, NOW_NS + 300 * 10**9, 10**8):
+        stamp = one.next_timestamp()
+        assert stamp <= max(saved for when_ns, saved in saves if when_ns <= now_ns - 5 * 10**9)
+
+
 def test_an_autopilot_that_knows_the_time_is_believed_however_often_the_link_begins_anew(tmp_path: Path) -> None:
     key, state = tmp_path / "key", tmp_path / "state"
     write_new_key(key)
