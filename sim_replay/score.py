@@ -116,7 +116,10 @@ def match_poses(truths: Sequence[Truth], estimates: Iterable[TargetPose]) -> tup
         by_frame.setdefault(estimate.frame, []).append(estimate)
     pairs = []
     for i, truth in enumerate(truths):
-        gate_deg = np.rad2deg(truth.diameter_m / np.linalg.norm(truth.t_cam_target_m))
+        range_m = float(np.linalg.norm(truth.t_cam_target_m))
+        if not truth.visible and range_m < 0.5 * truth.diameter_m:
+            continue  # it would take every pose: some datasets list what is not there at the origin
+        gate_deg = np.rad2deg(truth.diameter_m / range_m)
         for estimate in by_frame.get(truth.frame, []):
             bearing_deg = float(metrics.bearing_error_deg(estimate.t_cam_target_m, truth.t_cam_target_m))
             has_direction = np.linalg.norm(estimate.t_cam_target_m) >= 0.5 * truth.diameter_m

@@ -53,9 +53,11 @@ def is_hidden(target: BopTarget) -> bool:
     return target.visible_px == 0 and bool(target.whole_px)
 
 
-def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) -> list[Truth]:
+def truths_of(
+    index: int, picture: DatasetFrame, models: Mapping[int, Model], *, out_of_view: bool = False
+) -> list[Truth]:
     """The image's targets, with size, name and model points, then the unlisted ones; to be estimated are the visible
-    ones among the former.
+    ones among the former. `out_of_view`: also those that the dataset tells of, and the image does not show.
 
     Raises InputError for an object without a model that is to be estimated; others are as large as their box tells.
     """
@@ -63,7 +65,7 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
     for target, listed in [*((t, True) for t in picture.targets), *((t, False) for t in picture.unlisted)]:
         visible = is_seen(target)
         wanted = listed and visible
-        if not visible and not is_hidden(target):
+        if not (visible or is_hidden(target) or out_of_view):
             continue
         model = models.get(target.object_id) or (None if wanted else _as_it_looks(target, picture))
         if model is None and not wanted:
@@ -83,6 +85,7 @@ def truths_of(index: int, picture: DatasetFrame, models: Mapping[int, Model]) ->
                 model.name,
                 model.points_m,
                 visible=visible,
+                occluded=is_hidden(target),
                 wanted=wanted,
             )
         )
@@ -108,7 +111,8 @@ def judge_frames(
     judged = []
     for index, picture in enumerate(pictures):
         answered = answer(index, picture)
-        truths = truths_of(index, picture, models)
+        # A tracker rightly tells of what has just left the image.
+        truths = truths_of(index, picture, models, out_of_view=answered.measured is not None)
         matches, false_poses = match_poses(truths, answered.poses)
         measured = match_poses(truths, answered.measured)[0] if answered.measured is not None else ()
         seen, false_directions = match_poses(truths, answered.directions) if answered.directions else ((), ())
@@ -121,7 +125,7 @@ def judge_frames(
                 measured=_wanted(measured),
                 directions=_wanted(seen),
                 false_directions=tuple(false_directions),
-                not_asked=tuple(truth for truth in truths if not truth.wanted),
+                not_asked=tuple(t for t in truths if not t.wanted and (t.visible or t.occluded)),
             )
         )
         on_frame(judged[-1])

@@ -10,7 +10,8 @@ import pytest
 
 from sim_replay.bop import BopError, read_scene
 from sim_replay.datasets import open_dataset
-from sim_replay.evaluation.judge import truths_of
+from sim_replay.evaluation.judge import Answer, judge_frames, score_of, truths_of
+from sim_replay.score import TargetPose
 from tests.sim_replay.foreign import BOX, SIZE_WH, T_MM, UNIT, write_json, write_scene
 
 ASIDE_MM = [60000.0, 0.0, 200000.0]  # 360 px from the middle of an image 160 px wide
@@ -99,15 +100,29 @@ def test_a_visible_box_of_a_target_that_is_counted_as_hidden_is_refused(scene: P
         read_scene(scene)
 
 
-@pytest.mark.parametrize(("left_px", "in_the_picture"), [(SIZE_WH[0] + 5, False), (SIZE_WH[0] - 5, True)])
-def test_what_is_counted_beyond_the_edge_of_the_picture_is_not_hidden_in_it(
-    scene: Path, left_px: int, in_the_picture: bool
+@pytest.mark.parametrize(
+    ("left_px", "tracked", "aside_m", "false_alarms", "per_1000"),
+    [
+        (SIZE_WH[0] - 5, False, 59.0, 0, None),  # hidden in the picture
+        (SIZE_WH[0] + 5, False, 59.0, 1, 1000.0),
+        (SIZE_WH[0] + 5, True, 59.0, 0, 0.0),
+        (SIZE_WH[0] + 5, True, -40.0, 1, 1000.0),
+    ],
+)
+def test_what_has_left_the_picture_is_not_hidden_in_it_and_a_tracker_may_still_tell_of_it(
+    scene: Path, left_px: int, tracked: bool, aside_m: float, false_alarms: int, per_1000: float | None
 ) -> None:
     """bop_toolkit counts an outline's pixels, and draws its box, wherever they lie."""
     sizes(scene)
-    put(scene, ASIDE_MM)
+    put(scene, ASIDE_MM, [0.0, 0.0, 0.0])  # the other one is nowhere: some list it at the origin
     info = {"bbox_visib": [-1] * 4, "bbox_obj": [left_px, 40, 30, 12], "px_count_visib": 0, "px_count_all": 250}
-    write_json(scene / "scene_gt_info.json", {"0": [info]})
+    write_json(scene / "scene_gt_info.json", {"0": [info, {"bbox_visib": [-1] * 4, "px_count_visib": 0}]})
     dataset = open_dataset(scene)
-    (frame,) = dataset.labelled_frames()
-    assert len(truths_of(0, frame, dataset.models)) == in_the_picture
+    told = Answer((TargetPose(0, np.eye(3), np.array([aside_m, 0.0, 190.0])),), None, () if tracked else None)
+    frames = judge_frames(dataset.labelled_frames(), dataset.models, lambda *_: told)
+    overall = score_of(dataset, {}, frames)["overall"]
+    assert (overall["targets"], overall["false_poses"], overall["false_positives_per_1000"]) == (
+        0,
+        false_alarms,
+        per_1000,
+    )
