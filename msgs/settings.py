@@ -31,6 +31,8 @@ _REASONS = {
     "less_than_equal": "must be at most {le:.12g}",
     "multiple_of": "must be a multiple of {multiple_of:.12g}",
     "literal_error": "must be {expected}",
+    "union_tag_not_found": "{discriminator} is missing",
+    "union_tag_invalid": "{discriminator} must be one of {expected_tags}",
     "too_short": "must have {min_length} or more items, not {actual_length}",
     "too_long": "must have {max_length} or fewer items, not {actual_length}",
     "string_too_short": "must have {min_length} or more characters",

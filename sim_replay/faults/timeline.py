@@ -261,5 +261,7 @@ def load_timeline(path: Path) -> Timeline:
 
 
 def _step_and_key(location: tuple[str | int, ...]) -> str:
+    if location == ("step",):
+        return "[[step]]"
     place = [f"step {part + 1}" if isinstance(part, int) else part for part in location if part != "step"]
     return ", ".join(place)

@@ -69,7 +69,9 @@ def test_a_camera_whose_clock_is_slow_does_not_make_an_old_pose_young() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('title = "x"\n[[step]]\ndo = "explode"\n', "step 1"),
+        ('title = "x"\n', "[[step]]: is missing"),
+        ('title = "x"\n[[step]]\nfor_s = 1\n', "step 1: 'do' is missing"),
+        ('title = "x"\n[[step]]\ndo = "explode"\n', "step 1: 'do' must be one of 'hold', 'start', 'signal'"),
         ('title = "x"\n[[step]]\ndo = "hold"\nfor_s = 1\nsoftly = true\n', "softly: unknown key"),
         ('title = "x"\n[[step]]\ndo = "link"\nwhich = "mavlink"\ndrop = ["NONE"]\n', "NONE is not a MAVLink message"),
         ("title = \n", "not valid TOML"),
