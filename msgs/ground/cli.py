@@ -62,7 +62,7 @@ def _add_watch(commands: Commands) -> None:
     watch.add_argument(
         "--json",
         action="store_true",
-        help="print one JSON object per line: pose, direction, health, event, vehicle, link",
+        help="print one JSON object per line: pose, direction, health, event, refused, vehicle, link",
     )
     watch.add_argument(
         "--max-age", type=_not_negative, default=2.0, metavar="S", help="reject poses older than this (default 2)"

@@ -53,6 +53,16 @@ def test_each_command_parses(command: str) -> None:
     assert callable(cli._parser().parse_args(shlex.split(command)).act)
 
 
+def test_the_kinds_of_lines_that_watch_prints_are_the_same_in_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["watch", "--help"])
+    told = re.search(r"one JSON object per line: ([a-z, \n]+)", capsys.readouterr().out)
+    between = re.search(r"\| `type` \| keys.*?\n\n", TEXT, re.DOTALL)
+    assert told is not None
+    assert between is not None
+    assert re.findall(r"\w+", told[1]) == re.findall(r"^\| `(\w+)` \| (?!keys)", between[0], re.MULTILINE)
+
+
 @pytest.mark.parametrize("program", re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL))
 def test_each_program_imports_what_it_uses(program: str) -> None:
     nodes = list(ast.walk(ast.parse(program)))
