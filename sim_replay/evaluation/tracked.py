@@ -7,6 +7,7 @@ Any other scene is taken at DEFAULT_FPS, with an unknown own ship; time then fol
 
 from __future__ import annotations
 
+import logging
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -36,8 +37,15 @@ from sim_replay.evaluation.own_ship import OwnShipErrors
 from sim_replay.score import TargetPose
 
 OwnShipTold = Literal["exact", "usual"]  # what the tracker is given: the true own-ship pose, or one with typical errors
+_log = logging.getLogger(__name__)
 DEFAULT_FPS = 30.0
 FIRST_FRAME_NS = 1_000_000_000
+# Of a camera that was slower the tracker would take its targets for faster ones, and be far from all of them.
+_GUESSED = (
+    "%s (and each other scene without sequence.toml): taken as %g frames a second, the usual step between its image "
+    "numbers as one frame; if that is not so, write `fps = …` into its sequence.toml (whose cam_R_w2c, if it has them, "
+    "must refer to north-east-down)"
+)
 _SETTINGS = EstimatorSettings()
 _MAX_AGE_MS = MavlinkSettings().max_age_ms
 _CAMERA_ITSELF = Mount(np.eye(3), np.zeros(3))  # cam_R_w2c is taken as the pose of the own ship
@@ -132,10 +140,14 @@ def tracker_answers(model: Model, size_of: SizeOf = no_size, own_ship: OwnShipTo
     estimator = Estimator(model, _SETTINGS.max_targets)
     model.warm_up()
     current: list[_Sequence] = []
+    guessed: list[BopScene] = []  # the first scene whose frame rate nobody tells
 
     def answer(index: int, picture: DatasetFrame) -> Answer:
         if not current or current[-1].scene is not picture.scene:
             current[:] = [_Sequence.of(picture.scene, own_ship)]
+            if not current[-1].in_ned and not guessed:
+                guessed.append(picture.scene)
+                _log.warning(_GUESSED, picture.scene.folder, DEFAULT_FPS)
             estimator.target_size = size_of(picture.scene)
         for shown in current[-1].until(picture.image_id):
             report, estimates, time_ms = _flown(estimator, current[-1], shown)

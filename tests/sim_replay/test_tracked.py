@@ -77,12 +77,16 @@ def told(results: list[JudgedFrame]) -> list[bool]:
     return [frame.matches[0].estimate is not None for frame in results]
 
 
-def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(tmp_path: Path, dark_spot_model: Path) -> None:
+def test_each_scene_begins_anew_with_what_is_not_confirmed_yet(
+    tmp_path: Path, dark_spot_model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     for scene in ("000000", "000001"):
         write_scene(tmp_path / "data" / "test" / scene, [0.5] * 5)
     results = flown(tmp_path / "data", dark_spot_model)
     assert told(results) == [False, False, True, True, True] * 2
     assert all(frame.measured[0].estimate is not None for frame in results)
+    (guessed,) = [record.getMessage() for record in caplog.records if "sequence.toml" in record.getMessage()]
+    assert "000000 (and each other scene without sequence.toml): taken as 30 frames a second" in guessed
 
 
 def test_a_model_whose_scores_were_not_calibrated_tells_its_targets_all_the_same(tmp_path: Path) -> None:
@@ -125,12 +129,15 @@ def test_a_rotation_that_no_link_would_tell_is_not_known(
     assert [m.estimate is not None and m.estimate.rotation_known for m in results[-1].matches] == [True]
 
 
-def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(tmp_path: Path, dark_spot_model: Path) -> None:
+def test_a_target_that_leaves_its_window_between_two_frames_is_tracked(
+    tmp_path: Path, dark_spot_model: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """It flies 90 m/s across five pictures a second: how fast, no window around its first place can tell."""
     scene = tmp_path / "data" / "test" / "000000"
     write_scene(scene, [0.0] * 8, east_m=-63.0, step_m=18.0)
     (scene / "sequence.toml").write_text("fps = 5.0\n")
     assert told(flown(tmp_path / "data", dark_spot_model)) == [False, False, *[True] * 6]
+    assert "taken as" not in caplog.text
 
 
 def test_one_that_joins_is_examined_in_the_frame_after_the_search_as_in_the_daemon(
