@@ -1,4 +1,4 @@
-"""Distractors, objects in the air that are not aircraft: birds, specks, wisps of cloud."""
+"""Distractors, objects that are not aircraft: birds, specks, wisps of cloud, other things."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_replay.render.other_things import paint
 from sim_replay.render.scene import Scene
 
 _SPAN_PX = (5.0, 60.0)
@@ -17,12 +18,12 @@ _PALE_SHARE = 0.15
 _RUFFLED = 0.012  # 1-sigma displacement of an outline's corners, share of the span
 
 
-_WISP_SHARE = 0.25  # of decoys; the others are birds
+WISP_SHARE, BIRD_SHARE = 0.25, 0.4  # of decoys; the rest are other things
 
 
 @dataclass(frozen=True)
 class Decoy:
-    """A bird or a wisp of cloud placed like a target."""
+    """A bird, a wisp of cloud or another thing placed like a target."""
 
     center_px: tuple[float, float]
     span_px: float
@@ -99,10 +100,15 @@ def _wisp(rng: np.random.Generator, side: int, decoy: Decoy) -> tuple[NDArray[np
 
 
 def add_decoy(image_bgr: NDArray[np.uint8], decoy: Decoy, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Draw a bird or a wisp of cloud on a square image [S, S, 3]."""
-    draw = _wisp if rng.random() < _WISP_SHARE else _bird
-    alpha, level = draw(rng, image_bgr.shape[0], decoy)
-    image = image_bgr + alpha[..., None] * (level.astype(np.float32) - image_bgr)
+    """Draw a bird, a wisp of cloud or another thing on a square image [S, S, 3]."""
+    kind, side = rng.random(), image_bgr.shape[0]
+    if kind < WISP_SHARE + BIRD_SHARE:
+        alpha, level = (_wisp if kind < WISP_SHARE else _bird)(rng, side, decoy)
+        colour = level.astype(np.float32)
+    else:
+        thing = paint(rng, side, decoy.center_px, decoy.span_px)
+        alpha, colour = thing.alpha, thing.colour
+    image = image_bgr + alpha[..., None] * (colour - image_bgr)
     return np.clip(image, 0, 255).astype(np.uint8)
 
 

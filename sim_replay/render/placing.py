@@ -33,8 +33,8 @@ WINDOW_SCALE = 1.8
 ACQUIRE_DOWNSCALE = (1.5, 3.0)  # downscaling of the whole frame for the acquire stage
 VISIBLE_SHARE_MIN = 0.35
 DISTRACTORS_SHARE, DISTRACTORS_EMPTY_SHARE = 0.2, 0.5  # of windows with a target, and of those without
-# Share of the windows without a target that show a bird or a wisp in its place. More often than not, a false
-# detection in the whole frame is one of these, and the window around it shows it as large as a target.
+# Share of the windows without a target that show a bird, a wisp or another thing in its place. More often than not, a
+# false detection in the whole frame is one of these, and the window around it shows it as large as a target.
 DECOY_SHARE = 0.75
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 QUALITY_SHARES = (0.2, 0.65, 0.15)  # good, ordinary, poor
