@@ -185,9 +185,11 @@ def check_spans(telemetry: Telemetry, path: Path, frame0_ns: int, frames: int, f
     last_ns = frame0_ns + round((frames - 1) * 1e9 / fps)
     from_ns, to_ns = int(telemetry.t_ns[0]), int(telemetry.t_ns[-1])
     if frame0_ns < from_ns - UNCOVERED_NS_MAX or last_ns > to_ns + UNCOVERED_NS_MAX:
+        exposed = f"the first picture was exposed at {frame0_ns * 1e-9:.3f} s"
+        if frames > 1:  # of a video that is not unpacked yet, the first one is asked for alone
+            exposed = f"the pictures were exposed from {frame0_ns * 1e-9:.3f} s to {last_ns * 1e-9:.3f} s"
         raise InputError(
-            f"{path}: tells of {from_ns * 1e-9:.3f} s to {to_ns * 1e-9:.3f} s, but the pictures were exposed from "
-            f"{frame0_ns * 1e-9:.3f} s to {last_ns * 1e-9:.3f} s on its clock (t0_ns, fps)"
+            f"{path}: tells of {from_ns * 1e-9:.3f} s to {to_ns * 1e-9:.3f} s, but {exposed} on its clock (t0_ns, fps)"
         )
 
 

@@ -266,7 +266,7 @@ def test_a_video_whose_telemetry_is_of_another_time_or_too_sparse_is_refused_bef
     text = path.read_text()
     path.write_text(f"t0_ns = 7000000000\n{text}")
     assert main(["play", "--sequence", str(path), "--out", str(tmp_path / "out")]) == 2
-    told = "own.csv: tells of 0.000 s to 1.980 s, but the pictures were exposed from 7.000 s to 7.000 s"
+    told = "own.csv: tells of 0.000 s to 1.980 s, but the first picture was exposed at 7.000 s on its clock"
     assert told in capsys.readouterr().err
     path = write_film(tmp_path, flown / "rgb/000000.png", 20, row_s=0.5)
     assert main(["play", "--sequence", str(path), "--out", str(tmp_path / "out")]) == 2
