@@ -24,7 +24,7 @@ from zenoh import ext, handlers
 
 from msgs import topics
 from msgs.receive import PoseReceiver, TargetDirection, TargetPose
-from msgs.session import TlsFiles, check_endpoint, client_config, reason_of
+from msgs.session import SECURE, TlsFiles, check_endpoint, client_config, reason_of
 from msgs.topics import Topic
 from msgs.wire import Refusal
 
@@ -54,6 +54,8 @@ def connect(endpoint: str, *, tls: TlsFiles | None = None) -> zenoh.Session:
         session = zenoh.open(client_config([endpoint], tls=tls))
     except zenoh.ZError as error:
         told = f"no zenoh session with {endpoint}: {reason_of(error)}. Is a router or daemon there?"
+        if tls is not None and endpoint.startswith(SECURE):
+            told += f" Or one end refuses the other's certificate: {tls.doubt() or 'do names, dates, authority fit?'}"
         raise ConnectionError(told) from None
     with _opened_lock:
         _opened[:] = [*(one for one in _opened if not one.is_closed()), session]
