@@ -155,7 +155,7 @@ class VideoTimes:
 def tells_times(path: Path) -> bool:
     """Whether a video's frames have timestamps, or it has only one. H.264 and JPEG without a container have none."""
     capture = open_video(str(path))
-    stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if capture.grab()]
+    stamps_ms = [capture.get(cv2.CAP_PROP_POS_MSEC) for _ in range(2) if grab_next(capture) is not None]
     capture.release()
     return len(stamps_ms) < 2 or (stamps_ms[0] < stamps_ms[1] and not _is_bare_jpeg(path))
 

@@ -157,11 +157,14 @@ def test_a_video_goes_on_after_pictures_that_cannot_be_decoded(tmp_path: Path) -
 
 def test_a_video_whose_frames_have_no_times_is_refused_with_what_to_do(tmp_path: Path) -> None:
     """As a camera's encoder writes it where nothing packs it into a file with times."""
+    torn = bare_jpeg(tmp_path / "torn.mjpeg")
+    torn.write_bytes(damaged_jpeg(torn.read_bytes(), {0}))
     part = b"--next\r\nContent-Type: image/jpeg\r\n\r\n"  # as a web camera's answer is saved
     for path in (
         write_film(tmp_path / "flight.h264", [0, 40, 80], "libx264"),
         bare_jpeg(tmp_path / "flight.mjpeg"),
         bare_jpeg(tmp_path / "answer.mjpeg", part, b"\r\n"),
+        torn,
     ):
         with closing(source_of(path)) as source, pytest.raises(InputError, match=f"when its frames.*{path.name}"):
             source.open()
