@@ -1,4 +1,4 @@
-"""Pictures of a stream that were lost on the way, told by the steps of its own times. Pure."""
+"""Pictures of a stream that are missing: lost on the way, told by the steps of its own times, or undecodable. Pure."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ HEALED_MS = 2000.0  # without a key frame for so long, the encoder refreshes its
 
 
 class Losses:
-    """Says which pictures are damaged: those after a lost one are predicted from it, up to the next key frame."""
+    """Says which pictures are damaged: those after a missing one are predicted from it, up to the next key frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, lossy: bool) -> None:
+        """lossy: of a longer step of the times, the link lost a picture; otherwise the camera took none."""
+        self._lossy = lossy
         self._steps_ms: deque[float] = deque(maxlen=STEPS)
         self._last_ms: float | None = None
         self._since_ms: float | None = None  # of the latest loss that no key frame has followed yet
 
-    def damaged(self, position_ms: float, key: bool) -> bool:
-        """Whether the picture at this time of the stream is; `key`: it was coded without others. Call it for each."""
+    def damaged(self, position_ms: float, key: bool, after_undecodable: bool = False) -> bool:
+        """Whether the picture at this time of the stream is; `key`: it was coded without others. Call it for each that
+        can be decoded."""
         step_ms = 0.0 if self._last_ms is None else position_ms - self._last_ms
         self._last_ms = position_ms
         usual_ms = sorted(self._steps_ms)[int(USUAL_SHARE * len(self._steps_ms))] if self._steps_ms else 0.0
-        lost = len(self._steps_ms) >= STEPS_MIN and step_ms > LOST_STEP * usual_ms
+        longer = len(self._steps_ms) >= STEPS_MIN and step_ms > LOST_STEP * usual_ms
+        lost = after_undecodable or (self._lossy and longer)
         if step_ms > 0.0:
             self._steps_ms.append(step_ms)
         if key or (self._since_ms is not None and not lost and position_ms - self._since_ms >= HEALED_MS):

@@ -46,7 +46,8 @@ class StreamSource(LiveSource):
         self._lossy = settings.url.startswith(LOSSY) or (
             settings.url.startswith("rtsp") and settings.rtsp_transport == "udp"
         )
-        self._losses = Losses()
+        self._losses = Losses(self._lossy)
+        self._undecodable = 0  # of what is counted, how many came before the picture read last
         self._damaged = False  # the picture read last
         self._timeless = False
         self._asked_ns = 0  # when the picture that is awaited was asked for
@@ -71,7 +72,7 @@ class StreamSource(LiveSource):
 
     def _connect(self) -> cv2.VideoCapture:
         transport = f"rtsp_transport;{self._settings.rtsp_transport}|" if self._settings.url.startswith("rtsp") else ""
-        self._clock, self._losses, self._damaged = StreamClock(), Losses(), False
+        self._clock, self._losses, self._damaged = StreamClock(), Losses(self._lossy), False
         limits = [
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS,
             cv2.CAP_PROP_N_THREADS, DECODER_THREADS,
@@ -104,9 +105,10 @@ class StreamSource(LiveSource):
 
     def _exposure_ns(self, arrival_ns: int, position_ms: float) -> int:
         self._timeless = self._timeless and is_counted(position_ms)
-        if self._lossy and self._capture is not None:
+        if self._capture is not None:
             key = int(self._capture.get(cv2.CAP_PROP_FRAME_TYPE)) == KEY_FRAME
-            self._damaged = self._losses.damaged(position_ms, key)
+            before, self._undecodable = self._undecodable, self.counts["undecodable"]
+            self._damaged = self._losses.damaged(position_ms, key, after_undecodable=self._undecodable > before)
         stamp_ns = self._clock.monotonic_ns(0 if self._timeless else round(position_ms * 1e6), arrival_ns)
         if (behind_ns := self._clock.behind_ns()) > BEHIND_MAX_NS:
             raise SourceLost(f"the stream runs {behind_ns / 1e9:.1f} s behind itself")

@@ -121,7 +121,7 @@ def test_a_stream_of_which_all_is_damaged_is_told_of_until_it_recovers() -> None
 
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0])
 def test_a_picture_is_damaged_from_a_loss_to_the_next_key_frame_or_for_two_seconds(rate_hz: float) -> None:
-    losses, step_ms = Losses(), 1000.0 / rate_hz
+    losses, step_ms = Losses(lossy=True), 1000.0 / rate_hz
     times_ms = [index * step_ms for index in range(200) if index not in (50, 130)]
     damaged = [time_ms for time_ms in times_ms if losses.damaged(time_ms, key=time_ms in (0.0, 60 * step_ms))]
     assert damaged[:9] == pytest.approx([index * step_ms for index in range(51, 60)])
@@ -130,7 +130,7 @@ def test_a_picture_is_damaged_from_a_loss_to_the_next_key_frame_or_for_two_secon
 
 
 def test_what_follows_an_outage_is_damaged_though_an_earlier_loss_has_healed_meanwhile() -> None:
-    losses, sent = Losses(), [*range(60), *range(61, 70), *range(160, 260)]
+    losses, sent = Losses(lossy=True), [*range(60), *range(61, 70), *range(160, 260)]
     damaged = [index for index in sent if losses.damaged(index * 40.0, key=index == 0)]
     assert damaged == [*range(61, 70), *range(160, 210)]
 
@@ -138,23 +138,27 @@ def test_what_follows_an_outage_is_damaged_though_an_earlier_loss_has_healed_mea
 @pytest.mark.parametrize("left_out", [5, 3])
 def test_an_encoder_that_leaves_out_pictures_by_itself_loses_few_of_those_it_sends(left_out: int) -> None:
     """Each fifth or third of 30 a second, with a key frame each two seconds."""
-    losses, sent = Losses(), [index for index in range(1800) if index % left_out]
+    losses, sent = Losses(lossy=True), [index for index in range(1800) if index % left_out]
     damaged = [losses.damaged(index * 1000.0 / 30.0, key=index % 60 == 1) for index in sent]
     assert sum(damaged) < 0.1 * len(sent)
 
 
 def test_an_encoder_that_halves_its_rate_in_flight_is_soon_taken_as_it_is() -> None:
     """As in the dusk, when the camera exposes for longer; without a key frame."""
-    losses = Losses()
+    losses = Losses(lossy=True)
     times_ms = [*(index * 100.0 / 3.0 for index in range(3000)), *(1e5 + index * 200.0 / 3.0 for index in range(1000))]
     assert sum(losses.damaged(time_ms, key=False) for time_ms in times_ms) < 60
 
 
 class SilentCamera(threading.Thread):
-    """A server that sends so many pictures of H.264 in MPEG-TS and then nothing, until told to stop."""
+    """A server that sends so many pictures of H.264 and then nothing, until told to stop."""
 
-    def __init__(self, pictures: int) -> None:
+    def __init__(self, pictures: int, torn: int | None = None) -> None:
+        """`torn`: the number of a picture, modulo 50, of which nothing but ones arrive, in Matroska: of MPEG-TS, ffmpeg
+        leaves out what is no picture."""
         super().__init__(daemon=True)
+        self._torn = torn
+        self._container, self._options = ("mpegts", {}) if torn is None else ("matroska", {"cluster_time_limit": "1"})
         self._server, self._pictures, self.stop = socket.create_server(("127.0.0.1", 0)), pictures, threading.Event()
         self.port = int(self._server.getsockname()[1])
 
@@ -162,16 +166,20 @@ class SilentCamera(threading.Thread):
         with (
             self._server,
             self._server.accept()[0] as connected,
-            av.open(Caller(connected), "w", format="mpegts") as out,
+            av.open(Caller(connected), "w", format=self._container, options=self._options) as out,
         ):
             stream = out.add_stream("libx264", rate=50, options=TENTH_IS_KEY)
             stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
             start_s = time.monotonic()
             for index in range(self._pictures):
-                time.sleep(max(start_s + index / 50 - time.monotonic(), 0))
+                if self.stop.wait(max(start_s + index / 50 - time.monotonic(), 0)):
+                    break
                 frame = av.VideoFrame.from_ndarray(picture(index), format="bgr24")
                 frame.pts, frame.time_base = index, Fraction(1, 50)
-                out.mux(stream.encode(frame))
+                for packet in stream.encode(frame):
+                    if index % 50 == self._torn:
+                        packet.update(bytes(packet)[:4] + b"\xff" * (packet.size - 4))
+                    out.mux(packet)
             self.stop.wait()
 
 
@@ -189,6 +197,22 @@ def test_the_decoder_holds_no_picture_back() -> None:
     camera.join()
     late = [frame for frame in frames if frame.meta.arrival_ns - frames[-1].meta.arrival_ns > -1_000_000_000]
     assert [number_of(frame) for frame in late] == [198 % 25, 199 % 25]
+
+
+def test_what_is_predicted_from_a_picture_that_cannot_be_decoded_is_not_shown() -> None:
+    camera = SilentCamera(pictures=200, torn=13)
+    camera.start()
+    settings = StreamCamera(type="stream", url=f"tcp://127.0.0.1:{camera.port}", intrinsics=INTRINSICS)
+    with closing(StreamSource(settings)) as source:
+        source.open()
+        numbers = [number_of(source.read(threading.Event()))]
+        before = source.counts["damaged"]  # that the stream began with
+        while source.counts["damaged"] == before:
+            numbers.append(number_of(source.read(threading.Event())))
+    camera.stop.set()
+    camera.join()
+    assert source.counts["damaged"] == before + 6
+    assert numbers[-2:] == [12, 20]
 
 
 class Caller:
