@@ -262,7 +262,6 @@ def test_a_stream_s_picture_that_cannot_be_decoded_is_left_out_and_the_stream_st
     with closing(StreamSource(StreamCamera(type="stream", url=url, intrinsics=INTRINSICS))) as source:
         source.open()
         numbers = [source.read(threading.Event()).meta.sequence for _ in range(20)]
-    assert len(camera.requests) == 1
     assert source.counts["undecodable"] >= 2
     left_out = {after - before - 1 for before, after in pairwise(numbers)}
     assert left_out == {0, 1}
