@@ -100,7 +100,7 @@ class Pipeline:
         self._capture = capture
         self._requests = requests
         self._reloader = reloader
-        self._own_parts = own_parts
+        self._own_parts = self._own_parts_now = own_parts
         self._by_hand = ByHand()
         self._attention = Attention(config.estimator)
         self._sleep = SleepWatch()
@@ -224,11 +224,12 @@ class Pipeline:
         return looked.estimates
 
     def _without_own_parts(self, frame: Frame) -> Frame:
-        if self._own_parts is None:
+        if self._own_parts is None or self._own_parts_now is None:
             return frame
-        if self._own_parts.size_wh != frame.size_wh:  # the camera has changed its mode
-            self._own_parts = OwnParts.of(self._own_parts.covered, frame.size_wh)
-        return replace(frame, image_bgr=self._own_parts.hide(frame.image_bgr), own_parts=self._own_parts)
+        if self._own_parts_now.size_wh != frame.size_wh:  # the camera has changed its mode
+            # From the mask as it was: one that was made smaller has lost what is thin for good.
+            self._own_parts_now = OwnParts.of(self._own_parts.covered, frame.size_wh)
+        return replace(frame, image_bgr=self._own_parts_now.hide(frame.image_bgr), own_parts=self._own_parts_now)
 
     def _publish(self, frame: Frame, tracks: tuple[Track, ...], own_ship: OwnShip | None) -> Report:
         chosen_id, doubtful_below = self._by_hand.chosen_id, self._estimator.model.doubtful_below

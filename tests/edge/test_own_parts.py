@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -109,6 +110,17 @@ def test_the_loop_tracks_nothing_of_the_own_aircraft_and_shows_the_picture_as_it
     (track,) = ear.reports[-1].tracks
     np.testing.assert_allclose(track.box_xyxy_px, box_around(OTHER), atol=3.0)
     np.testing.assert_array_equal(ear.shown[-1].image_bgr, frame(0, HELD, OTHER).image_bgr)
+
+
+def test_a_wire_is_hidden_again_after_pictures_too_small_to_show_it(toy_model: Path) -> None:
+    mask = mask_of(SIZE_WH, (300, 0, 302, SIZE_WH[1]))
+    usual = frame(0, HELD)
+    small = replace(usual, image_bgr=cv2.resize(usual.image_bgr, (320, 180)), K=usual.K * [[1 / 6], [1 / 6], [1]])
+    with looping(Gated(load_model(toy_model, 1)), own_parts=OwnParts.of(mask, SIZE_WH)) as (loop, _, _):
+        for one in (usual, small, usual):
+            seen = loop._without_own_parts(one)
+    assert seen.own_parts is not None
+    np.testing.assert_array_equal(seen.own_parts.covered, mask)
 
 
 def parts_from(mask: Path) -> OwnParts | None:
