@@ -111,9 +111,9 @@ def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], recorded: N
                 sigma[row, :3] = np.sqrt(np.diagonal(match.estimate.covariance)[:3])
     for k, axes in enumerate(panels):
         wrapped = k >= 3
-        axes.plot(t_s, _unjoined(true[:, k], wrapped), color=TRUTH_COLOR, lw=2.4, alpha=0.85)
+        axes.plot(*_unjoined(t_s, true[:, k], wrapped), color=TRUTH_COLOR, lw=2.4, alpha=0.85)
         marker = "." if len(recorded) <= MARKED_MAX else ""
-        axes.plot(t_s, _unjoined(estimated[:, k], wrapped), color=ESTIMATE_COLOR, marker=marker, ms=2.5, lw=1.1)
+        axes.plot(*_unjoined(t_s, estimated[:, k], wrapped), color=ESTIMATE_COLOR, marker=marker, ms=2.5, lw=1.1)
         if np.isfinite(sigma[:, k]).any():
             low, high = estimated[:, k] - _SIGMAS * sigma[:, k], estimated[:, k] + _SIGMAS * sigma[:, k]
             axes.fill_between(t_s, low, high, color=ESTIMATE_COLOR, alpha=0.18, lw=0)
@@ -291,13 +291,10 @@ def _runs(frames: Sequence[int], fps: float, unrecorded: Collection[int]) -> lis
     return [(float(part[0]) / fps, float(part[-1] + 1 - part[0]) / fps) for part in parts if len(part)]
 
 
-def _unjoined(values: Array, wrapped: bool) -> Array:
-    """Angles with a NaN at each jump across ±180°, so that no line connects them."""
-    if not wrapped:
-        return values
-    out = values.copy()
-    out[1:][np.abs(np.diff(values)) > _JUMP_DEG] = np.nan
-    return out
+def _unjoined(t_s: Array, values: Array, wrapped: bool) -> tuple[Array, Array]:
+    """Times and angles with a NaN between two on both sides of ±180°, so that no line connects them."""
+    jumps = np.flatnonzero(wrapped & (np.abs(np.diff(values)) > _JUMP_DEG)) + 1
+    return np.insert(t_s, jumps, t_s[jumps]), np.insert(values, jumps, np.nan)
 
 
 def _at_least(axes: Axes, span: float) -> None:

@@ -99,6 +99,16 @@ def test_no_line_is_drawn_where_a_target_flew_out_of_view(unrecorded: range, lin
         assert [path.count("M") for path in drawn] == [lines, lines], "in 3-D and from above"
 
 
+def test_a_target_that_flies_towards_the_camera_has_every_pose_drawn_and_no_line_from_180_to_minus_180() -> None:
+    """Its yaw goes to and fro across ±180°: each crossing hid a pose, as if its rotation were not known."""
+    towards = [so3_exp([0.0, yaw_rad, 0.0]) @ R_FORWARD_CAM.T for yaw_rad in (3.1, 3.2, 3.1, 3.2, 3.0)]
+    turned = [replace(m.truth, R_cam_target=R) for m, R in zip(matches("00000"), towards, strict=True)]
+    svg = plots.pose_over_time([Match(truth, truth) for truth in turned], len(turned), FPS)
+    assert len(re.findall(rf"<use [^>]*stroke: {plots.ESTIMATE_COLOR}", svg)) == 6 * len(turned)
+    lines = re.findall(rf'<path d="([^"]*)" clip-path[^>]*stroke: {plots.ESTIMATE_COLOR}', svg)
+    assert [path.count("M") for path in lines] == [1, 1, 1, 1, 1, 5]
+
+
 def test_figures_are_over_all_targets_each_from_when_it_came_into_view() -> None:
     late, at_once, last = "--0-0", "1-1", "-----2"
     held = continuity(
