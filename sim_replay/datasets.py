@@ -275,9 +275,9 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int, size_wh: tuple[int, 
     target = frame.targets[index]
     if not _unseen(target):
         return target
-    mask = scene.mask(frame, index)
-    if mask is None:
-        mask = scene.whole_mask(frame, index)
+    visible = scene.mask(frame, index)
+    whole = scene.whole_mask(frame, index) if visible is None or not visible.any() else None
+    mask = whole if visible is None else visible
     if mask is None:
         return target
     if size_wh is not None and mask.shape != size_wh[::-1]:
@@ -290,7 +290,8 @@ def _with_box(scene: BopScene, frame: BopFrame, index: int, size_wh: tuple[int, 
             f"{scene.folder}: a mask shows obj_id {target.object_id} in picture {frame.image_id}, "
             "but its cam_t_m2c lies behind the camera"
         )
-    return replace(target, box_visible_xyxy_px=box_of_mask(mask), visible_px=int(mask.sum()))
+    whole_px = None if whole is None else int(whole.sum())
+    return replace(target, box_visible_xyxy_px=box_of_mask(mask), visible_px=int(mask.sum()), whole_px=whole_px)
 
 
 def _straight(lens: Lens, box_xyxy_px: Array, frame_wh: tuple[int, int]) -> Array | None:

@@ -12,7 +12,7 @@ from sim_replay.bop import BopError, read_scene
 from sim_replay.datasets import open_dataset
 from sim_replay.evaluation.judge import Answer, judge_frames, score_of, truths_of
 from sim_replay.score import TargetPose
-from tests.sim_replay.foreign import BOX, SIZE_WH, T_MM, UNIT, write_json, write_scene
+from tests.sim_replay.foreign import BOX, SIZE_WH, T_MM, UNIT, silhouette, write_json, write_scene
 
 ASIDE_MM = [60000.0, 0.0, 200000.0]  # 360 px from the middle of an image 160 px wide
 
@@ -126,3 +126,15 @@ def test_what_has_left_the_picture_is_not_hidden_in_it_and_a_tracker_may_still_t
         false_alarms,
         per_1000,
     )
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_masks_alone_tell_what_is_entirely_hidden_from_what_is_not_there(scene: Path, hidden: bool) -> None:
+    sizes(scene)
+    for kind, shown in (("mask", hidden), ("mask_visib", False)):
+        (scene / kind).mkdir()
+        cv2.imwrite(str(scene / kind / "000000_000000.png"), silhouette() * shown)
+    dataset = open_dataset(scene)
+    told = Answer((TargetPose(0, np.eye(3), np.array(T_MM) / 1e3),), None)
+    score = score_of(dataset, {}, judge_frames(dataset.labelled_frames(), dataset.models, lambda *_: told))
+    assert score["overall"]["false_positives_per_1000"] == (None if hidden else 1000.0)
