@@ -43,9 +43,9 @@ class StreamSource(LiveSource):
         self._latency_ns = round(settings.latency_ms * 1e6)
         self._clock = StreamClock()
         # Over TCP nothing is lost; a step is then of the camera's own, which predicts its pictures from those it sent.
-        self._lossy = settings.url.startswith(LOSSY) or (
-            settings.url.startswith("rtsp") and settings.rtsp_transport == "udp"
-        )
+        rtsp = settings.url.startswith("rtsp")
+        described = settings.url.partition("?")[0].endswith(".sdp")  # on a web server; the RTP comes in datagrams
+        self._lossy = settings.url.startswith(LOSSY) or (settings.rtsp_transport == "udp" if rtsp else described)
         self._losses = Losses(self._lossy)
         self._undecodable = 0  # of what is counted, how many came before the picture read last
         self._damaged = False  # the picture read last

@@ -5,8 +5,10 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from contextlib import closing, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext, suppress
 from fractions import Fraction
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import av
 import cv2
@@ -29,17 +31,20 @@ TENTH_IS_KEY = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "ke
 
 
 class UdpCamera(threading.Thread):
-    """An encoder that sends MPEG-TS over UDP in real time until told to stop, with a key frame each tenth. While `bad`
-    is set, these do not arrive."""
+    """An encoder that sends MPEG-TS or RTP over UDP in real time until told to stop, with a key frame each tenth. While
+    `bad` is set, these do not arrive."""
 
-    def __init__(self, port: int, fps: int, lost: int | None = None) -> None:
+    def __init__(self, port: int, fps: int, lost: int | None = None, rtp: bool = False) -> None:
         """`lost`: the number of a picture, modulo 50, that does not arrive."""
         super().__init__()
         self._url, self._fps, self.stop = f"udp://127.0.0.1:{port}?pkt_size=1316", fps, threading.Event()
+        self._format = "mpegts"
+        if rtp:
+            self._url, self._format = f"rtp://127.0.0.1:{port}", "rtp"
         self._lost, self.bad = lost, threading.Event()
 
     def run(self) -> None:
-        with av.open(self._url, "w", format="mpegts") as out:
+        with av.open(self._url, "w", format=self._format) as out:
             stream = out.add_stream("libx264", rate=self._fps, options=TENTH_IS_KEY)
             stream.width, stream.height, stream.pix_fmt = *SIZE_WH, "yuv420p"
             start_s, index = time.monotonic(), 0
@@ -74,17 +79,41 @@ def test_a_udp_stream_is_stamped_by_its_own_clock() -> None:
     assert all(frame.distortion == tuple(LENS) for frame in frames)
 
 
-def test_what_is_damaged_by_a_loss_before_it_is_not_shown() -> None:
+@contextmanager
+def described(port: int) -> Iterator[str]:
+    """The address of a web server that answers with the SDP of H.264 by RTP to this port."""
+
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            session = ("v=0", "o=- 0 0 IN IP4 127.0.0.1", "s=-", "c=IN IP4 127.0.0.1", "t=0 0")
+            media = (f"m=video {port} RTP/AVP 96", "a=rtpmap:96 H264/90000", "a=fmtp:96 packetization-mode=1")
+            sdp = "".join(f"{line}\r\n" for line in (*session, *media)).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(sdp)))
+            self.end_headers()
+            self.wfile.write(sdp)
+
+        def log_message(self, format: str, *values: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Answer) as server:
+        threading.Thread(target=server.serve_forever).start()
+        yield f"http://127.0.0.1:{server.server_port}/nose.sdp"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("rtp", [False, True])
+def test_what_is_damaged_by_a_loss_before_it_is_not_shown(rtp: bool) -> None:
     port = free_port(socket.SOCK_DGRAM)
-    encoder = UdpCamera(port, fps=20, lost=33)
+    encoder = UdpCamera(port, fps=20, lost=33, rtp=rtp)
     encoder.start()
     try:
-        source = StreamSource(StreamCamera(type="stream", url=f"udp://127.0.0.1:{port}", intrinsics=INTRINSICS))
-        with closing(source):
-            source.open()
-            numbers = []
-            while source.counts["damaged"] == 0:
-                numbers.append(number_of(source.read(threading.Event())))
+        with described(port) if rtp else nullcontext(f"udp://127.0.0.1:{port}") as url:
+            source, numbers = StreamSource(StreamCamera(type="stream", url=url, intrinsics=INTRINSICS)), list[int]()
+            with closing(source):
+                source.open()
+                while source.counts["damaged"] == 0:
+                    numbers.append(number_of(source.read(threading.Event())))
     finally:
         encoder.stop.set()
         encoder.join()
