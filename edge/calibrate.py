@@ -16,7 +16,7 @@ from edge.calibrate_board import BoardSettings, Gray, Size, View, detector_of
 from edge.calibrate_fit import VIEWS_MIN, Calibration, Coefficients, calibration_of
 from edge.cameras.folder import list_pictures
 from edge.cameras.picture_file import read_8_bits
-from edge.cameras.video import grab_next, open_video
+from edge.cameras.video import check_file, grab_next, open_video
 from edge.errors import InputError
 from edge.types import Array
 
@@ -34,8 +34,7 @@ def pictures_of(source: Path) -> Iterator[tuple[str, Gray]]:
         for path in list_pictures(source):
             yield path.name, read_8_bits(path, cv2.IMREAD_GRAYSCALE)
         return
-    if not os.path.isfile(source):
-        raise InputError(f"{source} does not exist")
+    check_file(source)
     opened = str(source.absolute())  # a relative path with a colon, as 2026-11-29T10:15.mp4, would be taken for a URL
     video = open_video(opened)
     if not video.isOpened():

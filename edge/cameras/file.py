@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import Counter
@@ -14,7 +13,7 @@ import numpy as np
 
 from edge.cameras.intrinsics import load_intrinsics
 from edge.cameras.source import EndOfStream, wait_until
-from edge.cameras.video import grab_next, open_video
+from edge.cameras.video import check_file, grab_next, open_video
 from edge.config_camera import FileCamera
 from edge.errors import InputError
 from edge.types import CameraInfo, Frame, FrameMeta
@@ -44,8 +43,7 @@ class FileSource:
     def open(self) -> CameraInfo:
         """Raises InputError: no video, no timestamps, or intrinsics that do not fit."""
         path = self._settings.path
-        if not os.path.isfile(path):  # Path.is_file raises if a parent folder may not be entered
-            raise InputError(f"{path} does not exist")
+        check_file(path)
         self._capture = open_video(str(path))
         if not self._capture.isOpened():
             raise InputError(f"{path} is not a readable video")

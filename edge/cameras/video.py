@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 
+from edge.errors import InputError
+
 COUNTED_FPS = 25.0  # rate that ffmpeg assumes for pictures without timestamps
 UNDECODABLE_MAX = 10  # pictures in a row; with as many, it is the end
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError unless it is a file that may be read: OpenCV does not say why it opens none."""
+    try:
+        there, readable = stat.S_ISREG(path.stat().st_mode), os.access(path, os.R_OK)
+    except OSError as error:
+        there, readable = False, not isinstance(error, PermissionError)  # a folder above it may not be entered
+    if not readable:
+        raise InputError(f"{path} cannot be read: {os.strerror(errno.EACCES)}")
+    if not there:
+        raise InputError(f"{path} does not exist")
 
 
 def open_video(name: str, settings: Sequence[int] = ()) -> cv2.VideoCapture:

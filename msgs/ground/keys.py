@@ -143,7 +143,8 @@ def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePri
         certificate = x509.load_pem_x509_certificate(certificate_path.read_bytes())
         key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
     except OSError as error:
-        raise InputError(f"{error.filename}: cannot be read ({error.strerror}); `keys init` creates it") from error
+        how = "; `keys init` creates it" if isinstance(error, FileNotFoundError) else ""
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror}){how}") from error
     except ValueError as error:
         raise InputError(f"{folder}: {AUTHORITY}.pem or {AUTHORITY}.key is not a PEM file: {error}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():

@@ -133,7 +133,8 @@ sys.exit(cli.main(["calibrate", *sys.argv[1:]]))
     ("arguments", "said"),
     [
         (["board.mp4", "--out", "home/nose.yaml"], "home/nose.yaml cannot be written\n"),
-        (["home/board.mp4"], "home/board.mp4 does not exist\n"),
+        (["home/board.mp4"], "home/board.mp4 cannot be read: Permission denied\n"),
+        (["closed.mp4"], "closed.mp4 cannot be read: Permission denied\n"),
     ],
 )
 def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_without_a_traceback(
@@ -142,6 +143,7 @@ def test_what_lies_in_a_folder_that_may_not_be_entered_is_told_without_a_traceba
     with tempfile.TemporaryDirectory() as folder:  # whoever is not root may enter this one, and write there
         Path(folder).chmod(0o777)
         (Path(folder) / "home").mkdir(mode=0o000)
+        (Path(folder) / "closed.mp4").touch(mode=0o000)
         command = [sys.executable, "-c", NO_ROOT_CALIBRATES, *arguments]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (2, said)

@@ -86,6 +86,9 @@ def test_a_certificate_for_one_end_alone_is_not_doubted(tmp_path: Path, use: Obj
 def test_nothing_is_overwritten_and_bad_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="`keys init` creates it"):
         issue(tmp_path, "uav1")
+    (tmp_path / "another" / "ca.pem").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)$"):
+        issue(tmp_path / "another", "uav1")
     init_authority(tmp_path)
     before = (tmp_path / "ca.key").read_bytes()
     with pytest.raises(InputError, match="already exists"):
