@@ -3,7 +3,7 @@
 # Does nothing when that was done before and pyproject.toml has not changed since.
 set -eu
 use=${1:?usage: bootstrap.sh demo|dev}
-cd "$(dirname "$0")/.."
+CDPATH= cd "$(dirname "$0")/.."
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 

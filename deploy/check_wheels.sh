@@ -4,7 +4,7 @@
 #   sh deploy/check_wheels.sh [PLATFORM]      default manylinux_2_28_aarch64
 set -u
 platform=${1:-manylinux_2_28_aarch64}
-cd "$(dirname "$0")/.."
+CDPATH= cd "$(dirname "$0")/.."
 python=.venv/bin/python
 [ -x "$python" ] || python=python3
 folder=$(mktemp -d)

@@ -26,12 +26,15 @@ exit $status
 
 
 def set_up(folder: Path) -> subprocess.CompletedProcess[str]:
-    """What bootstrap says; pip finds no package, so nothing is downloaded."""
-    environment = {**os.environ, "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
+    """What bootstrap says, called as make does by a user whose `cd` looks elsewhere first; pip finds no package, so
+    nothing is downloaded."""
+    elsewhere = folder.parent / "elsewhere"
+    (elsewhere / "deploy").mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "CDPATH": str(elsewhere), "PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
     for variable in ("PIP_FIND_LINKS", "PIP_EXTRA_INDEX_URL", "PIP_INDEX_URL"):
         environment.pop(variable, None)
-    command = ["sh", folder / "deploy" / "bootstrap.sh", "demo"]
-    return subprocess.run(command, capture_output=True, text=True, env=environment)
+    command = ["sh", "deploy/bootstrap.sh", "demo"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
 
 
 def checkout(folder: Path) -> Path:
