@@ -110,7 +110,7 @@ class BopScene:
     def _pictures(self) -> dict[int, Path]:
         found = {}
         for name in PICTURE_FOLDERS:
-            for path in sorted((self.folder / name).glob("*"), reverse=True):  # of 7.jpg and 7.png the first is used
+            for path in sorted(_listed(self.folder / name), reverse=True):  # of 7.jpg and 7.png the first is used
                 if path.stem.isdecimal() and path.suffix.lower() in PICTURE_SUFFIXES:
                     found[int(path.stem)] = path
         return found
@@ -120,7 +120,7 @@ class BopScene:
         """By kind, image and target: IMAGE_TARGET.png; IMAGE.png if an image shows only one target."""
         found = {}
         for kind in ("mask", "mask_visib"):
-            for path in (self.folder / kind).glob("*"):
+            for path in _listed(self.folder / kind):
                 name = re.fullmatch(r"(\d+)(?:_(\d+))?", path.stem)
                 if name and path.suffix.lower() in PICTURE_SUFFIXES:
                     found[kind, int(name[1]), int(name[2] or 0)] = path
@@ -170,6 +170,16 @@ class ImagewiseScene(BopScene):
             return None
         entry = load_object(path).get(str(target_index))
         return None if entry is None else _mask_of_runs(path, target_index, entry)
+
+
+def _listed(folder: Path) -> list[Path]:
+    """What is in it, or nothing if it is not there. Raises BopError; `glob` takes a closed folder for an empty one."""
+    try:
+        return list(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise BopError(f"{folder}: cannot be listed: {error.strerror}") from error
 
 
 def imagewise_keys(folder: Path) -> dict[int, tuple[tuple[int, str], ...]]:

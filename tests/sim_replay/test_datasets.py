@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -150,6 +151,15 @@ def test_listed_pictures_that_are_missing_are_left_out_and_told(root: Path, capl
         path.unlink()
     with pytest.raises(BopError, match="000007 holds no picture of those that it lists"):
         list(open_dataset(root, "train").frames())
+
+
+@pytest.mark.parametrize("kind", ["rgb", "mask_visib"])
+def test_a_folder_that_cannot_be_listed_is_not_taken_for_an_empty_one(root: Path, kind: str) -> None:
+    folder = root / "train_pbr" / "000007" / kind
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.symlink_to(folder)  # as little to be listed as one without permission, by root too
+    with pytest.raises(BopError, match=f"{kind}: cannot be listed: Too many levels of symbolic links"):
+        [frame.scene.mask(frame.scene.frames[0], 0) for frame in open_dataset(root, "train").frames()]
 
 
 def test_pictures_of_an_unknown_camera_are_left_out_and_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
