@@ -45,6 +45,9 @@ LIMIT_SIGMA_LOG_Z, LIMIT_TOLERANCE = 1.0, 1e-3
 # No sight line in training is steeper: the network does not know the outlines of aircraft seen from farther above or
 # below. The excess, as 1-sigma about each axis, covers the shipped model's errors up to the vertical.
 TRAINED_STEEPNESS_RAD = float(np.deg2rad(40.0))
+# The same of sight lines farther off the optical axis, as only wide-angle lenses have them: a pinhole image stretches
+# there what it shows.
+TRAINED_OFF_AXIS_RAD = float(np.deg2rad(40.0))
 
 
 class Shown(NamedTuple):
@@ -103,8 +106,9 @@ def decode(
     beyond, of the target that the image was cut out for, if any.
 
     The covariance is enlarged for a target that is cut by the edge of the network's image or by parts of the own
-    aircraft, of a size outside training, at a limit of depth, or seen from farther above or below than in training. A
-    cut target whose origin is not to be seen, or one too small to show a shape, is rejected.
+    aircraft, of a size outside training, at a limit of depth, or seen from farther above or below than in training, or
+    farther off the optical axis. A cut target whose origin is not to be seen, or one too small to show a shape, is
+    rejected.
     """
     acquiring = stage == "acquire"
     calibration = contract.acquire_score if acquiring else contract.track_score
@@ -142,6 +146,7 @@ def decode(
         # Outside the trained range the depth may be as far off as its distance to it.
         sigma[2] = np.hypot(sigma[2], np.log(_excess(t_m[2], contract.trained_range_m)))
         sigma[3:] = np.hypot(sigma[3:], max(_steepness_rad(t_m, shown.up_cam) - TRAINED_STEEPNESS_RAD, 0.0))
+        sigma[3:] = np.hypot(sigma[3:], max(_off_axis_rad(t_m) - TRAINED_OFF_AXIS_RAD, 0.0))
         R, oversize = nearest_rotation(R), None
         if size is not None and not cut:
             sides = peaks.size_px[image, peak] / np.diag(shown.K)[:2]
@@ -287,3 +292,8 @@ def _excess(value: float, trained: tuple[float, float]) -> float:
 def _steepness_rad(t_m: Array, up_cam: Array | None) -> float:
     """Angle of the sight line to the horizon, 0 .. pi / 2; 0 if it is unknown where up is."""
     return 0.0 if up_cam is None else float(np.arcsin(min(abs(float(t_m @ up_cam)) / float(np.linalg.norm(t_m)), 1.0)))
+
+
+def _off_axis_rad(t_m: Array) -> float:
+    """Angle of the sight line to the camera's optical axis."""
+    return float(np.arctan2(np.hypot(t_m[0], t_m[1]), t_m[2]))

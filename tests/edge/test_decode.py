@@ -122,6 +122,21 @@ def test_an_aircraft_seen_from_farther_above_or_below_than_in_training_is_less_s
     np.testing.assert_array_equal(steep[:3], unknown[:3])
 
 
+@pytest.mark.parametrize(("off_deg", "excess_deg"), [(39.0, 0.0), (60.0, 20.0)])
+def test_an_aircraft_farther_off_the_optical_axis_than_in_training_is_less_sure_in_rotation(
+    off_deg: float, excess_deg: float
+) -> None:
+    contract, stds = ModelContract(**CONTRACT), []
+    for angle_rad in (0.0, np.deg2rad(off_deg)):
+        peaks = peaks_of(score=1.0)
+        peaks.t_cam_target_m[0, 0] = 300.0 * np.array(
+            [np.sin(angle_rad) * 0.6, np.sin(angle_rad) * 0.8, np.cos(angle_rad)]
+        )
+        (e,) = decode(peaks, 0, WHOLE, contract, "track", contract.track_score_min, Counter())
+        stds.append(np.sqrt(np.diag(e.covariance)[3:]))
+    np.testing.assert_allclose(stds[1], np.hypot(stds[0], np.deg2rad(excess_deg)), atol=1e-4)
+
+
 def test_what_may_not_be_what_it_is_taken_for_is_less_sure_in_all_it_tells() -> None:
     """Half a chance to be something else: half the variance of what such things are off by."""
     contract = ModelContract(**(CONTRACT | {"track_score_min": 0.3}))
