@@ -92,6 +92,7 @@ def pose_over_time(matches: Sequence[Match], frames: int, fps: float, unrecorded
             axes.set_ylabel(unit)
             axes.set_xlim(0.0, frames / fps)
         for axes in panels[3:]:
+            _at_least(axes, 10.0)  # when all are drawn: a fixed axis would cut off who comes later
             axes.set_xlabel("time, s")
         handles = [Patch(color=TRUTH_COLOR, label="ground truth"), Patch(color=ESTIMATE_COLOR, label="received")]
         handles.append(Patch(color=ESTIMATE_COLOR, alpha=0.18, label="±2σ of the received covariance"))
@@ -117,8 +118,6 @@ def _pose_of_target(panels: Sequence[Axes], target: Sequence[Match], recorded: N
         if np.isfinite(sigma[:, k]).any():
             low, high = estimated[:, k] - _SIGMAS * sigma[:, k], estimated[:, k] + _SIGMAS * sigma[:, k]
             axes.fill_between(t_s, low, high, color=ESTIMATE_COLOR, alpha=0.18, lw=0)
-        if wrapped:
-            _at_least(axes, 10.0)
 
 
 def trajectory(matches: Sequence[Match], scene: SceneTruth) -> str:

@@ -109,6 +109,16 @@ def test_a_target_that_flies_towards_the_camera_has_every_pose_drawn_and_no_line
     assert [path.count("M") for path in lines] == [1, 1, 1, 1, 1, 5]
 
 
+def test_a_target_that_banks_as_no_other_does_is_within_the_axes() -> None:
+    """Axes of ten degrees about the first target's roll would cut off those of the second."""
+    level, banked = matches("00000"), matches("11111", object_id=2)
+    R_banked = R_FORWARD_CAM.T @ so3_exp([np.radians(60.0), 0.0, 0.0])
+    flown = [replace(m.truth, R_cam_target=R_FORWARD_CAM.T) for m in level]
+    flown += [replace(m.truth, R_cam_target=R_banked) for m in banked]
+    svg = plots.pose_over_time([Match(truth, truth) for truth in flown], len(level), FPS)
+    assert len(re.findall(rf"<use [^>]*stroke: {plots.ESTIMATE_COLOR}", svg)) == 6 * len(flown)
+
+
 def test_figures_are_over_all_targets_each_from_when_it_came_into_view() -> None:
     late, at_once, last = "--0-0", "1-1", "-----2"
     held = continuity(
