@@ -19,6 +19,7 @@ from edge.cameras.own_ship_mask import load_own_parts
 from edge.cameras.source import EndOfStream
 from edge.clock import SleepWatch, monotonic_ns
 from edge.config import ConfigFile, camera_key
+from edge.errors import InputError
 from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
 from edge.estimator.own_parts import OwnParts
@@ -69,10 +70,17 @@ def run(file: ConfigFile, stop: threading.Event, reloader: Reloader) -> int:
         memory.start()
         pipeline.ready()
         cleanup.callback(pipeline.supervisor.stopping)
-        # In lock-step mode start() waits for the first step, before which the player may disconnect or `stop` be set.
-        with file.blame(*camera_key(config.camera)), suppress(EndOfStream):
-            capture.start(outlets.settle, stop.is_set)
-            pipeline.fly(stop)
+        try:
+            # In lock-step mode start() waits for the first step, before which the player may disconnect or `stop` be
+            # set.
+            with file.blame(*camera_key(config.camera)), suppress(EndOfStream):
+                capture.start(outlets.settle, stop.is_set)
+                pipeline.fly(stop)
+        except Exception as error:
+            # Sent before the links stop: who only misses the daemon does not know why.
+            why = error if isinstance(error, InputError) else f"an error of its own: {error!r}"
+            outlets.event(logging.ERROR, f"the daemon ends: {why}")
+            raise
     # The links have stopped, so their counters are final.
     log.info("stopped: %s", pipeline.supervisor.snapshot().line())
     return 0

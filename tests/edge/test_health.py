@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import re
 import socket
 import subprocess
 import sys
@@ -41,7 +42,7 @@ from msgs.client import connect
 from sim_replay.ports import free_port
 from tests.waiting import until
 
-from .flying import flying, toml
+from .flying import flying, toml, write_swaying_scene
 from .toy_scene import K
 
 STICKS_LATER = """
@@ -115,6 +116,43 @@ def test_a_loop_that_stands_still_ends_the_process_and_starves_systemd(
     assert "STOPPING=1" not in words
     # Fed every 0.1 s while it turned, 5 s before the end no more: the last word is not that it lives.
     assert words[-1] != "WATCHDOG=1"
+
+
+FAILS_LATER = """
+import sys
+from pathlib import Path
+from edge import cli
+from edge.tracking.tracker import Tracker
+update = Tracker.update
+def fail(self, *arguments):
+    if Path(sys.argv[-1]).with_name("fail").exists():
+        raise ArithmeticError("no inverse")
+    return update(self, *arguments)
+Tracker.update = fail
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("breaks", "why", "code"),
+    [("rgb", "rgb/[0-9]+.png is not a readable picture", 2), ("fail", r"an error of its own: Arith.*'no inverse'", 1)],
+)
+def test_a_daemon_that_cannot_go_on_says_so_to_the_ground(
+    breaks: str, why: str, code: int, tmp_path: Path, toy_model: Path
+) -> None:
+    port, heard, scene = free_port(), list[str](), write_swaying_scene(tmp_path / "scene")
+    with (
+        flying(tmp_path, toml(scene, toy_model, port), program=("-c", FAILS_LATER)) as flight,
+        connect(f"tcp/127.0.0.1:{port}") as ground,
+    ):
+        hear_event = zenoh.handlers.Callback(lambda s: heard.append(Log.decode(s.payload.to_bytes()).msg))
+        ground.declare_subscriber(topics.subscription_key(topics.EVENTS, "uav1"), hear_event)
+        if breaks == "fail":
+            (tmp_path / "fail").touch()
+        for picture in (scene / "rgb").iterdir() if breaks == "rgb" else ():
+            picture.write_text("no picture")
+        assert flight.process.wait(timeout=60) == code
+        until(lambda: any(re.search(f"the daemon ends: .*{why}", text) for text in heard), what="the last words")
 
 
 def test_a_daemon_told_to_stop_tells_systemd(tmp_path: Path, toy_model: Path, swaying: Path) -> None:
