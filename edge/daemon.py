@@ -24,9 +24,11 @@ from edge.estimator.decode import lies_on
 from edge.estimator.estimator import Estimator
 from edge.estimator.own_parts import OwnParts
 from edge.estimator.upright import up_in_cam
+from edge.fixed_places import FixedPlaces
 from edge.health import Reason
 from edge.memory import MemoryKeeper
 from edge.outlets import Outlets, start_outlets
+from edge.picture_watch import PictureWatch
 from edge.reload import Reloader, load_configured, warm_estimator
 from edge.requests import RequestQueue, StopTracking
 from edge.size_watch import SizeWatch
@@ -37,6 +39,7 @@ from edge.tracking.by_hand import ByHand
 from edge.tracking.own_ship import OwnShipBuffer
 from edge.tracking.rolling_shutter import RollingShutter
 from edge.tracking.tracker import Tracker
+from edge.tracking.view import View
 from edge.types import Array, Estimate, Frame, OwnShip, Report, Track
 
 log = logging.getLogger(__name__)
@@ -115,7 +118,8 @@ class Pipeline:
         self._tracker = Tracker(config.estimator.max_targets, config.mount.mount())
         self._shutter = RollingShutter(round(config.camera.readout_ms * 1e6), config.mount.mount())
         wants_attitude = config.mavlink.enabled
-        self._size_watch = SizeWatch()
+        self._picture_watch, self._size_watch = PictureWatch(), SizeWatch()
+        self._fixed_places = FixedPlaces(gimballed=config.camera.mount == "gimbal")
         self.supervisor = Supervisor(config.health, wants_attitude, outlets, board, self._counters, self._reasons)
         self.search = self._attention.search  # not started yet; until then each search runs in the caller's thread
         self._out_of_order = self._time_jumps = 0
@@ -151,11 +155,13 @@ class Pipeline:
             "out_of_order": self._out_of_order,
             **searched,
             "refused_by_tracker": self._tracker.not_finite,
+            "refused_fixed_in_picture": self._fixed_places.refused,
             **self._outlets.counters(),
         }
 
     def _reasons(self, now_ns: int) -> tuple[Reason, ...]:
-        return (*self._capture.reasons(now_ns), *self._size_watch.reasons(now_ns))
+        seen = *self._picture_watch.reasons(), *self._fixed_places.reasons(now_ns), *self._size_watch.reasons(now_ns)
+        return *self._capture.reasons(now_ns), *seen
 
     def _process(self, frame: Frame) -> None:
         if self._slept():
@@ -175,7 +181,9 @@ class Pipeline:
         expected = self._tracker.predict(capture_ns, own_ship, frame.K, size_wh, frame.distortion)
         pointed_at = self._by_hand.box_xyxy_px(capture_ns, size_wh, expected)
         clock.lap("track")
+        self._picture_watch.seen(frame)
         estimates = self._estimate(frame, expected, pointed_at, own_ship, clock)
+        estimates = self._fixed_places.without(frame, estimates, View.of(capture_ns, own_ship, self._tracker.mount))
         chosen_id = self._by_hand.chosen_id
         doubtful_below = self._estimator.model.doubtful_below
         self._size_watch.seen(capture_ns, estimates, doubtful_below)

@@ -29,7 +29,9 @@ from edge.doctor_machine import machine_findings
 from edge.errors import InputError
 from edge.estimator.model import NOT_CALIBRATED, Model
 from edge.findings import Finding, device_fault, good, poor, wrong
+from edge.fixed_places import FIXED
 from edge.health import percentiles_ms
+from edge.picture_watch import DARK, WHITE, PictureWatch
 from edge.reload import load_configured
 from msgs.command_line import say_out
 
@@ -44,7 +46,7 @@ DAMAGED = "camera_damaged"
 STAMPS, UNSTAMPED, UNDECODABLE, SLOW = "camera_stamps", "camera_unstamped", "camera_undecodable", "camera_slow"
 LATE = "camera_late"
 # A busy machine may cause these too; there are images nevertheless.
-USABLE = {STAMPS, LATE, UNSTAMPED, UNDECODABLE, SLOW}
+USABLE = {STAMPS, LATE, UNSTAMPED, UNDECODABLE, SLOW, DARK.kind, WHITE.kind}
 ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     STAMPS: "see docs/cameras.md on timestamps; images that arrive in bursts also cause this",
     LATE: "see docs/cameras.md on timestamps; if its clock is not this computer's, keep both together by PTP",
@@ -52,6 +54,9 @@ ADVICE = {  # by the kind of edge.health.Reason, or of a shortfall
     UNDECODABLE: "check cable, USB port or radio link; zenoh: also that images are JPEG or PNG with 8 bits a channel",
     SLOW: "ask for a rate and a format that the camera has, give it more light, or stop other programs",
     DAMAGED: 'set [camera] rtsp_transport = "tcp", or improve the link; with more key frames, a stream recovers sooner',
+    DARK.kind: "take the cap off, give it light, or let it expose longer ([camera] exposure_ms, of a V4L2 device)",
+    WHITE.kind: "let it expose less ([camera] exposure_ms, of a V4L2 device)",
+    FIXED: "wipe the lens; hide parts of the own aircraft, and what is written into pictures: [camera] own_ship_mask",
     "camera_size": "set the camera to the mode that it was calibrated in, and start the daemon again",
     "camera_contested": "let only the camera publish on its topic, or give each camera a topic of its own",
     "camera_frozen": "point it at something that moves; if it stays frozen, unplug it and plug it in again",
@@ -124,10 +129,11 @@ def _camera(file: ConfigFile) -> Iterator[tuple[Finding, float | None]]:
         return
     name = info.name
     capture = Capture(source, opened)
+    watch = PictureWatch()
     capture.start()
     try:
-        seen_ns, size_wh = _see_frames(capture)
-        reasons = [(one.kind, one.text) for one in capture.reasons(time.monotonic_ns())]
+        seen_ns, size_wh = _see_frames(capture, watch)
+        reasons = [(one.kind, one.text) for one in (*capture.reasons(time.monotonic_ns()), *watch.reasons())]
         counters = capture.counters()
     except InputError as error:
         yield wrong("camera", str(error), "correct this in [camera]"), None
@@ -176,7 +182,7 @@ def _advice(reasons: Iterable[tuple[str, str]]) -> str:
     return next((ADVICE[kind] for kind, _ in reasons if kind in ADVICE), ADVICE_CAMERA)
 
 
-def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
+def _see_frames(capture: Capture, watch: PictureWatch) -> tuple[list[int], tuple[int, int] | None]:
     """Exposure times of the first frames received, and the size of the last; None: no frame. Raises InputError."""
     until_s, seen_ns, size_wh = time.monotonic() + FRAME_S, list[int](), None
     enough_s = until_s
@@ -190,6 +196,7 @@ def _see_frames(capture: Capture) -> tuple[list[int], tuple[int, int] | None]:
                 enough_s = time.monotonic() + WATCHED_S
             seen_ns.append(frame.meta.capture_ns)
             size_wh = frame.size_wh
+            watch.seen(frame)
     return seen_ns, size_wh
 
 

@@ -2,8 +2,9 @@
 
     python -m sim_replay.faults.camera --scene DIR --listen tcp/127.0.0.1:7450 --fps 10
 
-Reads one JSON object per line from standard input (frozen, stamp_offset_s, stamp_jitter_s), and prints one per line:
-`ready`, and each `frame` with the published stamp and the true time of its exposure. Stops at the end of its input.
+Reads one JSON object per line from standard input (frozen, covered, stamp_offset_s, stamp_jitter_s), and prints one per
+line: `ready`, and each `frame` with the published stamp and the true time of its exposure. Stops at the end of its
+input.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import zenoh
 
 from edge.cameras.sequence import read_scene
@@ -36,6 +38,7 @@ class Manners:
     """The camera's current defects."""
 
     frozen: bool = False
+    covered: bool = False
     stamp_offset_s: float = 0.0
     stamp_jitter_s: float = 0.0
 
@@ -80,7 +83,8 @@ def play(scene: Path, listen: str, fps: float, control: Control) -> None:
                 index = to_and_fro(number, len(pictures))
             exposed_ns = time.time_ns()
             stamp_ns = manners.stamp_ns(exposed_ns, number)
-            image = CompressedImage(stamp_ns, "camera_optical_frame", *_coded(pictures[index], as_stored))
+            coded = _covered(pictures[index]) if manners.covered else _coded(pictures[index], as_stored)
+            image = CompressedImage(stamp_ns, "camera_optical_frame", *coded)
             # Printed before the frame is published, so that its reader knows the frame before any pose from it arrives.
             _emit({"event": "frame", "stamp_utc_ns": stamp_ns, "exposed_utc_ns": exposed_ns, "frozen": manners.frozen})
             publisher.put(image.encode())
@@ -92,6 +96,12 @@ def _coded(picture: Path, as_stored: bool) -> tuple[str, bytes]:
     if as_stored:
         return "png" if picture.suffix.lower() == ".png" else "jpeg", picture.read_bytes()
     return "png", cv2.imencode(".png", read_picture_bgr(picture), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+def _covered(picture: Path) -> tuple[str, bytes]:
+    """Format and bytes of an image of that shape through a covered lens: the sensor's noise."""
+    noise = np.random.default_rng().normal(3.0, 2.0, read_picture_bgr(picture).shape)
+    return "jpeg", cv2.imencode(".jpg", np.clip(noise, 0, 255).astype(np.uint8))[1].tobytes()
 
 
 def _emit(record: dict[str, object]) -> None:

@@ -85,6 +85,7 @@ class Camera(Section):
 
     do: Literal["camera"]
     frozen: bool = Field(default=False, description="the same image with new stamps")
+    covered: bool = Field(default=False, description="images of noise, nearly black")
     stamp_offset_s: float = Field(default=0.0, ge=-60, le=60, description="added to each stamp")
     stamp_jitter_s: float = Field(
         default=0.0, ge=0, le=60, description="alternately added and subtracted, frame by frame"

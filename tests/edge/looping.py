@@ -102,10 +102,11 @@ def looping(
     mount: Mapping[str, float] | None = None,
     readout_ms: float = 0.0,
     own_parts: OwnParts | None = None,
+    camera_mount: str = "fixed",
 ) -> Iterator[tuple[Pipeline, Ear, RequestQueue]]:
     config = Config.model_validate({
-        "camera": {"type": "sequence", "path": "/scene", "readout_ms": readout_ms},
-        "zenoh": {"enabled": False}, "mavlink": {"enabled": False},
+        "camera": {"type": "sequence", "path": "/scene", "readout_ms": readout_ms, "mount": camera_mount},
+        "zenoh": {"enabled": False}, "mavlink": {"enabled": camera_mount == "gimbal"},
         "estimator": {"acquire_every_n": 5, "max_targets": max_targets}, "mount": mount or {},
     })  # fmt: skip
     board = StatusBoard(ConfigFile(Path("c.toml"), "", config), gated.model, CameraInfo("toy", SIZE_WH, K, 30.0))

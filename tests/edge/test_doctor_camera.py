@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from edge.config import load_config
@@ -52,6 +53,22 @@ def test_a_mask_of_the_own_ship_that_the_daemon_would_refuse_is_told(tmp_path: P
     ((found, rate_hz),) = _camera(load_config(tmp_path / "config.toml"))
     assert (found.verdict, rate_hz) == ("wrong", None)
     assert f"{tmp_path}/own.png cannot be read" in found.says
+
+
+@pytest.mark.parametrize(("level", "told", "advice"), [(3, "the picture is dark", "cap"), (120, "", "")])
+def test_a_covered_lens_is_told(tmp_path: Path, level: float, told: str, advice: str) -> None:
+    (tmp_path / "images").mkdir()
+    for index in range(20):
+        noise = np.random.default_rng(index).normal(level, 2.0, (180, 320, 3)).clip(0, 255).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{index:02d}.png"), noise)
+    intrinsics = "{ fx = 300, fy = 300, cx = 159.5, cy = 89.5, width = 320, height = 180 }"
+    (tmp_path / "config.toml").write_text(
+        f'[camera]\ntype = "folder"\npath = "images"\nfps = 10\nintrinsics = {intrinsics}\n'
+    )
+    ((found, _),) = _camera(load_config(tmp_path / "config.toml"))
+    assert found.verdict == ("poor" if told else "good")
+    assert told in found.says
+    assert advice in found.advice
 
 
 class Driver:
@@ -163,6 +180,8 @@ def test_a_tenth_of_bad_pictures_and_four_fifths_of_the_rate_are_tolerated() -> 
     [
         ("camera_stamps", "timestamp"),
         ("camera_frozen", "moves"),
+        ("camera_dark", "cap"),
+        ("camera_fixed_places", "own_ship_mask"),
         ("camera_damaged", "rtsp_transport"),
         ("camera_lost", "plugged in"),
         ("no_frame", "plugged"),
