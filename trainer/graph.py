@@ -33,13 +33,16 @@ from trainer.unfinished import unfinished
 OPSET = 17
 THREADS = 2
 ORT_WARNING, ORT_ERROR = 2, 3  # severities of its log; the first is its default
-QUANTISED_OPS = ["Conv", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
+QUANTISED_OPS = ["Conv", "Gemm", "Add", "Concat", "Resize", "Mul", "Relu", "Clip"]
 # Soft-argmax, ray, sampling, depth and rotation remain in float, and so does the last layer of each head.
 QUANTISED_PARTS = (
     "/backbone/",
     "/neck/",
     "/head_hm/head_hm.0/",
     "/dts/convs/",
+    "/dts/region/",
+    "/fuse_t/context/",
+    "/fuse_r/context/",
     "/head_refine/convs/",
     "/head_choice/convs/",
     "/head_presence/convs/",

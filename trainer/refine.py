@@ -50,7 +50,7 @@ HEADS = {
     "presence": ("head_presence", "presence"),
     "choice": ("head_choice", "choice"),
 }
-EMPTY_SHARE = 0.4  # of the rendered windows: what the presence head tells targets from
+EMPTY_SHARE = 0.5  # of the rendered windows: what the presence head tells targets from
 RENDERED_AT_ONCE = 32
 BATCH = 512
 HELD_OUT_SHARE = 0.04
