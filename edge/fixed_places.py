@@ -22,6 +22,7 @@ OFF_SHARE, OFF_LEAST_PX = 0.05, 3.0
 # How far the line of sight must have swung in ned with the box at its place, and in how many frames at least.
 SWING_RAD = float(np.deg2rad(15.0))
 SIGHTS_LEAST = 10
+SWING_WITHIN_NS = 30_000_000_000  # slower, it may be the compass of a vehicle that stands still
 SAME_THING_IOU = 0.5
 UNSEEN_NS = 1_000_000_000  # a place is forgotten
 FIXED_UNSEEN_NS = 60_000_000_000  # a fixed thing is: it may have been wiped off
@@ -34,6 +35,7 @@ class Place:
     box_xyxy_px: Array  # [4], the first
     sight_ned: Array  # [3], unit vector of its first line of sight
     axes_epoch: int  # of that vector, see OwnShip
+    sighted_ns: int  # time of that line of sight
     seen_ns: int
     sights: int = 1
     fixed: bool = False
@@ -86,10 +88,10 @@ class FixedPlaces:
             moved_on = self._at(box_xyxy_px)
             if moved_on is None or not moved_on.fixed:
                 self._places = [one for one in self._places if one is not moved_on]
-                self._places.append(Place(box_xyxy_px, sight_ned, axes_epoch, now_ns))
+                self._places.append(Place(box_xyxy_px, sight_ned, axes_epoch, now_ns, now_ns))
             return
-        if place.axes_epoch != axes_epoch:
-            place.sight_ned, place.axes_epoch, place.sights = sight_ned, axes_epoch, 0
+        if place.axes_epoch != axes_epoch or now_ns - place.sighted_ns > SWING_WITHIN_NS:
+            place.sight_ned, place.axes_epoch, place.sighted_ns, place.sights = sight_ned, axes_epoch, now_ns, 0
         place.seen_ns = now_ns
         place.sights += 1
         swung = float(place.sight_ned @ sight_ned) <= np.cos(SWING_RAD)

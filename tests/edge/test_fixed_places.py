@@ -111,6 +111,7 @@ def test_a_steady_camera_an_unknown_or_a_new_attitude_tell_nothing() -> None:
         [yawed(0.1 * i) for i in range(150)],
         [None] * 150,
         [Rotation.from_euler("x", 2.0 * i, degrees=True) for i in range(150)],  # about the line of sight
+        [yawed(0.01 * i) for i in range(4000)],  # a compass that drifts by 18 degrees a minute
     ):
         flight = Flight()
         for attitude in attitudes:
