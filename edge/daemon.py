@@ -183,7 +183,6 @@ class Pipeline:
         clock.lap("track")
         self._picture_watch.seen(frame)
         estimates = self._estimate(frame, expected, pointed_at, own_ship, clock)
-        estimates = self._fixed_places.without(frame, estimates, View.of(capture_ns, own_ship, self._tracker.mount))
         chosen_id = self._by_hand.chosen_id
         doubtful_below = self._estimator.model.doubtful_below
         self._size_watch.seen(capture_ns, estimates, doubtful_below)
@@ -233,11 +232,13 @@ class Pipeline:
         looked = self._attention.look(self._estimator, seen, expected, clock, searches=searches, pointed_at=pointed_at)
         height_px = frame.size_wh[1]
         looked = looked.each(lambda one: self._shutter.at_frame_time(one, own_ship, height_px, self._own_ship.at))
-        if looked.there is not None:
+        view = View.of(frame.meta.capture_ns, own_ship, self._tracker.mount)
+        estimates = self._fixed_places.without(frame, looked.estimates, view)
+        if looked.there is not None and any(looked.there is one for one in estimates):
             self._by_hand.found(looked.there)
             if not lies_on(looked.there.box_xyxy_px, [track.box_xyxy_px for track in expected]):
                 self._tracker.make_room(looked.there)  # a tracked target has its slot already
-        return looked.estimates
+        return estimates
 
     def _without_own_parts(self, frame: Frame) -> Frame:
         if self._own_parts is None or self._own_parts_now is None:

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from edge.estimator.model import load_model
 from edge.fixed_places import FixedPlaces
+from edge.requests import TrackBox
 from edge.tracking.view import View
 from edge.types import Array, Estimate, Frame, FrameMeta
 
-from .looping import PERIOD_NS, Gated, frame, looping
-from .toy_scene import K
+from .looping import PERIOD_NS, Gated, box_around, frame, looping
+from .toy_scene import SIZE_WH, K
 
 ALONG_NOSE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 SIDES = np.array([118.0, 60.0])
@@ -126,7 +127,7 @@ def test_a_steady_camera_an_unknown_or_a_new_attitude_tell_nothing() -> None:
 @pytest.mark.parametrize("gimbal", [False, True])
 def test_the_daemon_sends_none_of_it_and_says_why_unless_a_gimbal_follows_it(toy_model: Path, gimbal: bool) -> None:
     mount = "gimbal" if gimbal else "fixed"
-    with looping(Gated(load_model(toy_model, 1)), camera_mount=mount) as (loop, ear, _):
+    with looping(Gated(load_model(toy_model, 1)), camera_mount=mount) as (loop, ear, requests):
         for index in range(240):
             now = frame(index, (500.5, 350.5))
             if index % 3 == 0:
@@ -134,7 +135,12 @@ def test_the_daemon_sends_none_of_it_and_says_why_unless_a_gimbal_follows_it(toy
                 loop._own_ship.add_attitude(now.meta.capture_ns + PERIOD_NS * 3, turned, np.zeros(3))
             loop._process(now)
         told = [reason.kind for reason in loop._reasons(now.meta.capture_ns)]
+        left, top, right, bottom = (float(one) for one in box_around((500.5, 350.5)) / np.tile(SIZE_WH, 2))
+        requests.put(TrackBox((left, top, right, bottom)))
+        for index in range(240, 280):
+            loop._process(frame(index, (500.5, 350.5)))
     assert any(report.tracks for report in ear.reports), "as long as the camera has not turned"
     assert bool(ear.reports[-1].tracks) is gimbal
     assert told == ([] if gimbal else ["camera_fixed_places"])
+    assert ("no target found where pointed" in [text for _, text in ear.events]) is not gimbal
     assert (loop._counters()["refused_fixed_in_picture"] > 0) is not gimbal
