@@ -57,6 +57,11 @@ def added_heads(state: dict[str, Tensor]) -> tuple[str, ...]:
     return tuple(head for head in ADDED_HEADS if any(key.startswith(f"{head}.") for key in state))
 
 
+def presence_beside(state: dict[str, Tensor]) -> int:
+    """How many presence heads there are beside the first."""
+    return len({key.split(".")[2] for key in state if key.startswith("head_presence.beside.")})
+
+
 def weights_sha256(state: dict[str, Tensor]) -> str:
     """Hash of the deployed weights' names and values, sorted by name; independent of the file format."""
     digest = hashlib.sha256()
@@ -111,7 +116,7 @@ def load_model(path: Path) -> tuple[PoseNet, TrainerConfig, dict[str, str | int 
         raise ConfigError(f"{path}: contains no weights; give the run folder or its {WEIGHTS_NAME}")
     config = parse_config(content["config"], f"{path} (config)")
     weights = deployed_weights(content["weights"])
-    model = PoseNet(config.model.deployed(), added_heads(weights))
+    model = PoseNet(config.model.deployed(), added_heads(weights), presence_beside(weights))
     try:
         model.load_state_dict({key: value.float() if value.ndim > 1 else value for key, value in weights.items()})
     except RuntimeError:  # its message has a line for each of some hundred tensors

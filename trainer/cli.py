@@ -81,7 +81,8 @@ def _average(arguments: argparse.Namespace) -> None:
 
 
 def _refine(arguments: argparse.Namespace) -> None:
-    from trainer.refine import RefinePlan, refine
+    from trainer.refine import refine
+    from trainer.refine_plan import RefinePlan
 
     plan = RefinePlan(
         seed=arguments.seed,
@@ -94,6 +95,7 @@ def _refine(arguments: argparse.Namespace) -> None:
         flown=tuple(arguments.flown),
         flown_share=arguments.flown_share,
         heads=tuple(arguments.heads),
+        beside=arguments.beside,
     )
     path = refine(arguments.checkpoint, arguments.out, plan, say=lambda text: print(text, flush=True))
     print(f"wrote {path}")
@@ -199,6 +201,12 @@ def _add_refine(commands: argparse._SubParsersAction) -> None:
         default=list(REFINED_BY_DEFAULT),
         metavar="HEAD",
         help="which to train, of %(choices)s (default: refinement presence); the others stay as they are",
+    )
+    refine.add_argument(
+        "--beside",
+        action="store_true",
+        help="with --heads presence: keep the presence heads that there are, and train another one; the score is the "
+        "mean of their log-odds",
     )
     refine.set_defaults(run=_refine)
 

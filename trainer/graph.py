@@ -27,6 +27,7 @@ from trainer.half_storage import store_halved
 from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
 from trainer.pixel_quads import take_quads
+from trainer.presence import BESIDE_MOST
 from trainer.tally import Tally, windows_in
 from trainer.unfinished import unfinished
 
@@ -46,6 +47,7 @@ QUANTISED_PARTS = (
     "/head_refine/convs/",
     "/head_choice/convs/",
     "/head_presence/convs/",
+    *(f"/head_presence/beside.{i}/convs/" for i in range(BESIDE_MOST)),
 )
 
 

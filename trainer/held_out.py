@@ -21,6 +21,7 @@ from trainer.evaluate import (
 )
 from trainer.export import OpenView, acquire_window_px, airframe_names, stage_sampler
 from trainer.graph import onnx_predictor, read_contract
+from trainer.refine_plan import heads_told
 
 
 class Request(NamedTuple):
@@ -47,7 +48,8 @@ class _Subject(NamedTuple):
 
 def _seeds(training: Mapping[str, object]) -> tuple[object, ...]:
     """Seeds of the last training run's windows and of those of the heads that were trained after it."""
-    return tuple(training[key] for key in ("seed", "refined_seed", "presence_seed", "choice_seed") if key in training)
+    seeds = ["seed", *(f"{prefix}_seed" for prefix in heads_told(training))]
+    return tuple(training[key] for key in seeds if key in training)
 
 
 def _checkpoint(path: Path) -> _Subject:

@@ -120,8 +120,8 @@ class PoseNet(nn.Module):
     """The network. `forward` is the exported graph (see msgs.contract); a training step calls `perceive`, `dense` and
     `decode`."""
 
-    def __init__(self, config: ModelConfig, added: Collection[str] = ()) -> None:
-        """`added`: which of ADDED_HEADS there are."""
+    def __init__(self, config: ModelConfig, added: Collection[str] = (), presence_beside: int = 0) -> None:
+        """`added`: which of ADDED_HEADS there are; `presence_beside`: presence heads beside the first."""
         super().__init__()
         self.config = config
         C, hidden = config.channels, config.hidden
@@ -144,7 +144,7 @@ class PoseNet(nn.Module):
         self.head_refine = RefinementHead(C, hidden, config.hypotheses) if config.uncertainty else None
         of_added = C, hidden, config.hypotheses
         self.head_choice = ChoiceHead(*of_added) if "head_choice" in added else None
-        self.head_presence = PresenceHead(*of_added) if "head_presence" in added else None
+        self.head_presence = PresenceHead(*of_added, presence_beside) if "head_presence" in added else None
         # Shallow on purpose, so that F_global itself must encode the object coordinates.
         self.head_dense = nn.Sequential(conv_bn_relu(C, C // 2, 3), nn.Conv2d(C // 2, 16, 1)) if config.dense else None
         self._init_priors()

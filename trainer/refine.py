@@ -14,8 +14,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from sim_replay.bop import BopError, names_split
-from sim_replay.datasets import open_dataset
 from trainer import equations as eq
 from trainer.checkpoint import (
     RESUME_NAME,
@@ -23,12 +21,12 @@ from trainer.checkpoint import (
     WEIGHTS_NAME,
     added_heads,
     load_file,
+    presence_beside,
     save_weights,
     weights_sha256,
 )
 from trainer.choice import ChoiceHead, choice_nll
 from trainer.config import (
-    REFINED_BY_DEFAULT,
     ConfigError,
     DataConfig,
     TrainerConfig,
@@ -40,16 +38,13 @@ from trainer.data import Feed, Sampler, TrainingBatch
 from trainer.losses import pose_residual, refinement_nll, to_tensors
 from trainer.model import Perception, PoseNet
 from trainer.presence import PresenceHead
+from trainer.refine_plan import TOLD_PREFIX, TOLD_PREFIX_BESIDE, RefinePlan, refined_on, refuse_beside
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
-from trainer.sources import refinement_sampler, trained_scenes
+from trainer.sources import refinement_sampler
 
-# The module of each of REFINED_HEADS, and the prefix of what the weights tell of its training.
-HEADS = {
-    "refinement": ("head_refine", "refined"),
-    "presence": ("head_presence", "presence"),
-    "choice": ("head_choice", "choice"),
-}
+# The module of each of REFINED_HEADS.
+HEADS = {"refinement": "head_refine", "presence": "head_presence", "choice": "head_choice"}
 EMPTY_SHARE = 0.5  # of the rendered windows: what the presence head tells targets from
 RENDERED_AT_ONCE = 32
 BATCH = 512
@@ -61,21 +56,6 @@ DROPOUT, DROPOUT_OF_CHOICE = 0.3, 0.5
 # How far from the network's own log-odds towards those that the choice head has learnt: half the way, most is gained of
 # what it knows better, and little lost where only the network is sure (docs/ablation.md#choice).
 CHOICE_SHARE = 0.5
-
-
-class RefinePlan(NamedTuple):
-    """How much to render and how long to train on it. The seed must differ from the network's training seeds."""
-
-    seed: int
-    windows: int = 100_000
-    epochs: int = 8
-    strangers: float = 0.35  # share of rendered targets that are generated airframes, unseen by the network
-    datasets: tuple[Path, ...] = ()  # with images on which the network was not trained
-    split: str | None = None  # of each dataset; None: all that are there, as long as none is a test split
-    dataset_share: float = 0.5  # of the windows, from the images of the datasets, if there are any
-    flown: tuple[Path, ...] = ()  # datasets whose poses and cameras are rendered anew; none: the checkpoint's, if any
-    flown_share: float = 0.5  # of the rendered windows with a target, if any are flown
-    heads: tuple[str, ...] = REFINED_BY_DEFAULT  # of REFINED_HEADS; the others stay as they are
 
 
 class Kept(NamedTuple):
@@ -123,7 +103,10 @@ def refine(
     trained = [head for head in HEADS if head in plan.heads and (head != "choice" or config.model.hypotheses > 1)]
     if not trained:
         raise ConfigError(f"{checkpoint}: has one rotation hypothesis, so there is no choice to train")
-    model = network_to_refine(config, content["weights"], checkpoint, {HEADS[head][0] for head in trained})
+    if plan.beside:
+        refuse_beside(plan.heads, content["weights"], checkpoint)
+    replaced = set() if plan.beside else {HEADS[head] for head in trained}
+    model = network_to_refine(config, content["weights"], checkpoint, replaced)
     torch.manual_seed(plan.seed)
     shape = config.model.channels, config.model.hidden, config.model.hypotheses
     heads = Heads(
@@ -132,7 +115,7 @@ def refine(
         ChoiceHead(*shape).to(device).eval() if "choice" in trained else None,
     )
     model.to(device)
-    images_of = _refined_on(plan, config.data)
+    images_of = refined_on(plan, config.data)
     size_px = config.schedule.sizes[-1].size_px
     from_datasets = plan.datasets, plan.dataset_share, plan.split
     data = config.data.model_copy(update={"empty_share": EMPTY_SHARE if "presence" in trained else 0.0})
@@ -147,9 +130,14 @@ def refine(
         )
     learnt = int(len(kept.residual) * (1.0 - HELD_OUT_SHARE))
     fit(heads, kept, learnt, plan.epochs, say)
-    for (module_name, _), head in zip(HEADS.values(), heads, strict=True):
-        if head is not None:
-            setattr(model, module_name, head)
+    if plan.beside:
+        assert model.head_presence is not None
+        assert heads.presence is not None
+        model.head_presence.beside.append(heads.presence)
+    else:
+        for module_name, head in zip(HEADS.values(), heads, strict=True):
+            if head is not None:
+                setattr(model, module_name, head)
     said = {
         "from": weights_sha256(content["weights"])[:16],
         "windows": plan.windows,
@@ -161,35 +149,16 @@ def refine(
         "flown_share": data.flown_share if data.flown else 0.0,
         "commit": commit,
     }
-    of_heads = {f"{HEADS[head][1]}_{key}": value for head in trained for key, value in said.items()}
-    training = content["training"] | of_heads
+    before = content["training"]
+    prefixes = [TOLD_PREFIX[head] for head in trained]
+    if plan.beside:
+        prefixes = [f"{TOLD_PREFIX_BESIDE}{1 + presence_beside(content['weights'])}"]
+    elif "presence" in trained:
+        before = {key: value for key, value in before.items() if not key.startswith(TOLD_PREFIX_BESIDE)}
+    training = before | {f"{prefix}_{key}": value for prefix in prefixes for key, value in said.items()}
     made_folder(out)
     save_weights(out / WEIGHTS_NAME, model, content["config"], training)
     return out / WEIGHTS_NAME
-
-
-def _refined_on(plan: RefinePlan, data: DataConfig) -> list[str]:
-    """Whose images the heads learn from: "dataset, split name".
-
-    Raises ConfigError if a dataset has images on which the network was trained, or a test split that nobody named, or
-    is unreadable.
-    """
-    sources = data.datasets if plan.datasets else []
-    trained_on = {folder for source in sources for folder in trained_scenes(source)}
-    told = []
-    for path in plan.datasets:
-        try:
-            dataset = open_dataset(path, plan.split)
-        except BopError as error:
-            raise ConfigError(f"--dataset {error}") from error
-        scenes = dataset.scenes
-        if trained_on & {scene.folder.resolve() for scene in scenes}:
-            raise ConfigError(f"--dataset {path}: the network was trained on it; give another, or another --split")
-        tests = [s.split for s in scenes if (s.split or "").startswith("test") and not names_split(path, s)]
-        if plan.split is None and tests:
-            raise ConfigError(f"--dataset {path}: contains the split {tests[0]!r}, for evaluation; choose by --split")
-        told += [f"{dataset.name}, split {split}" for split in sorted({s.split for s in scenes if s.split is not None})]
-    return told if plan.dataset_share > 0.0 else []
 
 
 def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Path, trained: Collection[str]) -> PoseNet:
@@ -198,14 +167,15 @@ def network_to_refine(config: TrainerConfig, weights: dict[str, Any], named: Pat
     """
     dense = any(key.startswith(TRAINING_ONLY_PREFIX) for key in weights)  # deployed weights have none
     added = set(added_heads(weights)) - set(trained)
-    model = PoseNet(config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense}), added)
+    own = config.model.model_copy(update={"pretrained": False, "dense": config.model.dense and dense})
+    model = PoseNet(own, added, presence_beside(weights))
     if model.head_refine is None:
         raise ConfigError(f"{named}: [model] uncertainty is false: the network has no refinement head")
-    own = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] not in trained}
-    for key in own:
-        if key not in weights or weights[key].shape != own[key].shape:
+    kept = {key: value for key, value in model.state_dict().items() if key.partition(".")[0] not in trained}
+    for key in kept:
+        if key not in weights or weights[key].shape != kept[key].shape:
             raise ConfigError(f"{named}: its weights do not match the network that its [model] describes")
-    given = {key: value for key, value in weights.items() if key in own}
+    given = {key: value for key, value in weights.items() if key in kept}
     model.load_state_dict(given, strict=False)
     return model.eval().requires_grad_(False)
 

@@ -17,6 +17,7 @@ from sim_replay.evaluation.judge import is_seen, labels_sha256
 from sim_replay.offline import InputError
 from trainer.config import ConfigError, made_folder
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
+from trainer.refine_plan import heads_told
 
 # MF-UAVPose6D: the paper's network on its own dataset (tables in its section on results).
 PAPER = {
@@ -269,13 +270,12 @@ def told(history: Sequence[Mapping[str, Any]], training: Mapping[str, str | int 
         f"Trained on {history[-1]['total_samples']:,} windows in {runs} runs, each initialised from the "
         "weights of earlier runs (those of the run before it, or a mean of several)."
     )
-    for key, head in (("refined", "refinement head"), ("presence", "presence head"), ("choice", "choice head")):
-        if f"{key}_windows" in training:
-            epochs, windows, seed = (training[f"{key}_{name}"] for name in ("epochs", "windows", "seed"))
-            words += (
-                f" The {head} was then trained alone for {epochs} epochs on {windows:,} further windows (seed {seed}; "
-                f"{100 * float(training[f'{key}_strangers']):g} % of the targets are randomly generated aircraft)."
-            )
+    for key, head in heads_told(training).items():
+        epochs, windows, seed = (training[f"{key}_{name}"] for name in ("epochs", "windows", "seed"))
+        words += (
+            f" The {head} was then trained alone for {epochs} epochs on {windows:,} further windows (seed {seed}; "
+            f"{100 * float(training[f'{key}_strangers']):g} % of the targets are randomly generated aircraft)."
+        )
     return words
 
 

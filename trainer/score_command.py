@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from msgs.contract import ModelContract
 from trainer.config import ConfigError
+from trainer.refine_plan import heads_told
 
 if TYPE_CHECKING:
     from sim_replay.datasets import Dataset
@@ -132,7 +133,7 @@ def calibrate_file(
 def warn_of_training_images(dataset: Dataset, contract: ModelContract) -> None:
     """By name, as a model file knows no folders: a network is too sure of images that it was trained on."""
     splits = sorted({scene.split for scene in dataset.scenes if scene.split is not None})
-    heads = (str(contract.training.get(f"{head}_datasets", "")) for head in ("refined", "presence", "choice"))
+    heads = (str(contract.training.get(f"{prefix}_datasets", "")) for prefix in heads_told(contract.training))
     refined_on = {source for told in heads for source in told.split("; ")}
     for split in splits:
         # Training on `train` takes in `train_pbr`, and may have been given the split's folder for the dataset's.

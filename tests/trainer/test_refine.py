@@ -24,7 +24,8 @@ from trainer.equations import heatmap_peaks
 from trainer.graph import open_session, write_graph
 from trainer.losses import pose_residual, to_tensors
 from trainer.presence import PresenceHead
-from trainer.refine import Heads, Kept, RefinePlan, fit, fleet_size, look, refine
+from trainer.refine import Heads, Kept, fit, fleet_size, look, refine
+from trainer.refine_plan import RefinePlan
 from trainer.refinement import Evidence, RefinementHead, answer_count
 from trainer.sources import refinement_sampler, trained_scenes
 
@@ -85,6 +86,41 @@ def test_an_added_head_may_be_trained_alone_also_again(tmp_path: Path, head: str
     told = load_model(again)[2]
     assert (told["refined_seed"], told[f"{head}_seed"]) == (PLAN.seed, 12)
     assert told[f"{head}_from"] == load_model(refined)[3][:16]
+
+
+def test_a_presence_head_beside_another_leaves_it_as_it_is_and_the_score_is_the_mean(tmp_path: Path) -> None:
+    refined = refine(write_run(tmp_path / "run"), tmp_path / "one", PLAN, open_sampler=open_plates, say=silent)
+    plan = PLAN._replace(seed=12, heads=("presence",))
+    second = refine(refined, tmp_path / "instead", plan, open_sampler=open_others, say=silent)
+    both = refine(refined, tmp_path / "both", plan._replace(beside=True), open_sampler=open_others, say=silent)
+    of_one, of_second, of_both = (load_file(path)["weights"] for path in (refined, second, both))
+    assert all(torch.equal(of_both[name], value) for name, value in of_one.items())
+    more = {name: value for name, value in of_both.items() if name not in of_one}
+    assert {name.replace("beside.0.", "") for name in more} == {n for n in of_one if n.startswith("head_presence.")}
+    assert all(torch.equal(value, of_second[name.replace("beside.0.", "")]) for name, value in more.items())
+    image, labels = tiny.batch(3)
+    with torch.no_grad():
+        odds = [torch.logit(load_model(path)[0](image, labels.K)[0].double()) for path in (refined, second, both)]
+    torch.testing.assert_close(odds[2], (odds[0] + odds[1]) / 2, rtol=1e-3, atol=1e-3)
+    write_graph(load_model(both)[0], tmp_path / "graph.onnx")
+    ran = open_session(tmp_path / "graph.onnx").run(["score"], {"image": image.numpy(), "K": labels.K.numpy()})[0]
+    np.testing.assert_allclose(ran, torch.sigmoid(odds[2]).numpy(), rtol=1e-3, atol=1e-3)
+    told = load_model(both)[2]
+    assert (told["presence_seed"], told["presence_beside_1_seed"]) == (PLAN.seed, 12)
+    again = refine(both, tmp_path / "again", plan, open_sampler=open_others, say=silent)
+    assert load_file(again)["weights"].keys() == of_one.keys(), "one in place of both"
+    assert not any(key.startswith("presence_beside") for key in load_model(again)[2])
+
+
+def test_beside_no_presence_head_there_is_none(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    beside = PLAN._replace(heads=("presence",), beside=True)
+    with pytest.raises(ConfigError, match="has no presence head for another one to be beside"):
+        refine(run, tmp_path / "out", beside, open_sampler=open_plates, say=silent)
+    with pytest.raises(ConfigError, match="only that of presence can be several"):
+        refine(
+            run, tmp_path / "out", beside._replace(heads=("presence", "choice")), open_sampler=open_plates, say=silent
+        )
 
 
 def test_weights_from_before_there_was_such_a_head_are_refined_all_the_same(tmp_path: Path) -> None:
