@@ -21,7 +21,7 @@ from msgs.geometry import R_FORWARD_CAM, euler_from_R, nearest_rotation, skew, s
 
 LATE_RANGE_S = (-0.3, 2.0)
 LATE_STEP_S = 0.02
-SEEN_MIN, SEEN_MIN_SHARE = 30, 0.3  # of the spans over which points were followed
+SEEN_MIN, SEEN_MIN_SHARE = 20, 0.3  # of the spans over which points were followed
 SEEN_ENOUGH_SHARE, FOCAL_GUESSES = 0.8, (0.8, 1.25, 0.64, 1.56)
 TURNED_MIN_DEG = 60.0  # in all
 KNOWN_MIN_SHARE = 0.7  # of the turns known for the best-known lateness: with fewer, another fits by chance
@@ -35,7 +35,8 @@ UNTOLD = 1e-9  # keeps what no turn tells of where it is
 BLOCKS = 12  # of consecutive turns, left out one at a time for the uncertainty (jackknife)
 SURE = 2.2  # standard deviations for 95 %, by Student's distribution for that many blocks
 LATE_STD_S = 0.0005  # at least: attitudes are stamped in whole milliseconds
-FOCAL_STD = 0.003  # at least: no scene is infinitely far
+FOCAL_STD, MOUNT_STD_RAD = 0.003, np.deg2rad(0.05)  # at least: no scene is infinitely far, and nothing quite rigid
+RATE_OVER_NS = 60_000_000  # attitudes so far apart tell how fast the camera turned
 LATE_SURE_MAX_S, MOUNT_SURE_MAX_RAD, FOCAL_SURE_MAX = 0.015, np.deg2rad(1.0), 0.05  # known, if at most this unsure
 # About a second axis, at least: what it leaves in squares, times what noise alone does, and turned in all.
 SECOND_OVER_NOISE, SECOND_MIN_DEG = 20.0, 20.0
@@ -76,17 +77,12 @@ def align(sights: Sequence[Sight], attempts: int, attitudes: Attitudes) -> Align
             f"rarer than {1e9 / ATTITUDE_AHEAD_MAX_NS:.1f}: let the autopilot send it more often"
         )
     turns = _first_turns(sights, attempts, attitudes)
-    seen = len(turns.w_cam)
-    if seen < max(SEEN_MIN, SEEN_MIN_SHARE * attempts):
-        raise UnknownError(
-            f"the camera's turn was seen in only {seen} of {attempts} spans of {SPAN_NS / 1e9:g} s: show it a far "
-            "scene full of detail, in good light, with nothing near or moving, and turn more slowly; is "
-            "[camera] intrinsics of this lens?"
-        )
+    _refuse_unseen(turns, attempts)
     state, alone = _coarse(turns)
     for renewal in range(RENEWALS + 1):
         if renewal:
-            turns = _Turns.of(sights, attitudes, state.focal_ratio)
+            turns = _Turns.of(sights, attitudes, state.focal_ratio, state)
+            _refuse_unseen(turns, attempts)
         state, left = _solved(turns, state)
         _refuse_few(len(left.w_body), turns)
         _explained(left)
@@ -115,8 +111,13 @@ class _Turns:
     attitudes: Attitudes
 
     @classmethod
-    def of(cls, sights: Sequence[Sight], attitudes: Attitudes, focal_ratio: float = 1.0) -> _Turns:
-        seen = [(one.start_ns, one.end_ns, w) for one in sights if (w := one.turn_cam_rad(focal_ratio)) is not None]
+    def of(
+        cls, sights: Sequence[Sight], attitudes: Attitudes, focal_ratio: float = 1.0, state: _State | None = None
+    ) -> _Turns:
+        """`state`: tells how the camera turned while the rows of a picture were exposed; None: as if all at once."""
+        rates = [None] * len(sights) if state is None else _rates_cam_radps(sights, attitudes, state)
+        turns = [one.turn_cam_rad(focal_ratio, rate) for one, rate in zip(sights, rates, strict=True)]
+        seen = [(one.start_ns, one.end_ns, w) for one, w in zip(sights, turns, strict=True) if w is not None]
         start_ns, end_ns = (np.array([one[i] for one in seen], dtype=np.float64) for i in (0, 1))
         return cls(start_ns, end_ns, np.array([w for *_, w in seen]).reshape(-1, 3), focal_ratio, attitudes)
 
@@ -128,6 +129,16 @@ class _Turns:
 
     def only(self, chosen: NDArray[np.bool_]) -> _Turns:
         return _Turns(self.start_ns[chosen], self.end_ns[chosen], self.w_cam[chosen], self.focal_ratio, self.attitudes)
+
+
+def _rates_cam_radps(sights: Sequence[Sight], attitudes: Attitudes, state: _State) -> Array:
+    """How fast the camera turned at start and end of each sight [N, 2, 3]; 0 where that is not known."""
+    ends_ns = np.array([(one.start_ns, one.end_ns) for one in sights], dtype=np.float64).ravel() - 1e9 * state.late_s
+    before, epoch_before = attitudes.at(ends_ns - 0.5 * RATE_OVER_NS)
+    after, epoch_after = attitudes.at(ends_ns + 0.5 * RATE_OVER_NS)
+    known = (epoch_before >= 0) & (epoch_before == epoch_after)
+    rates = so3_log(before.swapaxes(-1, -2) @ after) / (1e-9 * RATE_OVER_NS)
+    return np.asarray(np.where(known[:, None], rates, 0.0) @ state.R_body_cam).reshape(-1, 2, 3)
 
 
 def _first_turns(sights: Sequence[Sight], attempts: int, attitudes: Attitudes) -> _Turns:
@@ -152,6 +163,16 @@ def _coarse(turns: _Turns) -> tuple[_State, bool]:
     alone = 0 < best < len(grid_s) - 1 and rival > RIVAL_COST * costs[best]
     R_body_cam, scale, *_ = mounted[best]
     return _State(float(grid_s[best]), R_body_cam, scale * turns.focal_ratio), alone
+
+
+def _refuse_unseen(turns: _Turns, attempts: int) -> None:
+    seen = len(turns.w_cam)
+    if seen < max(SEEN_MIN, SEEN_MIN_SHARE * attempts):
+        raise UnknownError(
+            f"the camera's turn was seen in only {seen} of {attempts} spans of {SPAN_NS / 1e9:g} s: show it a far "
+            "scene full of detail, in good light, with nothing near or moving, and turn more slowly; are [camera] "
+            "intrinsics and readout_ms of this camera?"
+        )
 
 
 def _refuse_few(known: int, turns: _Turns) -> None:
@@ -245,27 +266,26 @@ def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
     """The solution, with uncertainties from those with a block left out, or from the residuals if that is more."""
     block = np.arange(len(turns.w_cam)) * BLOCKS // len(turns.w_cam)
     others = [_solved(turns.only(block != left_out), best, ROUNDS_FROM_NEAR)[0] for left_out in range(BLOCKS)]
-    covariance = left.variance * np.linalg.inv(left.information)
+    formal = left.variance * np.linalg.inv(left.information)
     R_others = np.array([one.R_body_cam for one in others])
-    angles = mount_angles_rad(best.R_body_cam)
-    apart = (mount_angles_rad(R_others) - angles + np.pi) % (2.0 * np.pi) - np.pi
-    about = so3_log(best.R_body_cam.T @ R_others)
-    spread = _covariance(about)
-    mount_std_rad = (
-        np.inf
-        if not _about_two_axes(left)
-        else float(np.sqrt(max(np.linalg.eigvalsh(spread)[-1], np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
-    )
-    late_std_s = max(_std(np.array([one.late_s for one in others])), float(covariance[0, 0]) ** 0.5)
-    late_std_s = float(np.sqrt(late_std_s**2 + LATE_STD_S**2 + turns.attitudes.clock_std_s**2))
-    focal_std = max(FOCAL_STD, _std(np.array([one.focal_ratio for one in others])), float(covariance[4, 4]) ** 0.5)
-    angles_std = np.sqrt(np.diag(_covariance(apart)))
+    spread = _covariance(so3_log(best.R_body_cam.T @ R_others))
+    mount_std_rad = np.inf
+    if _about_two_axes(left):
+        mount_std_rad = float(np.sqrt(max(np.linalg.eigvalsh(of)[-1] for of in (spread, formal[1:4, 1:4]))))
+    apart_rad = mount_angles_rad(R_others) - mount_angles_rad(best.R_body_cam)
+    angles_std_rad = np.sqrt(np.diag(_covariance((apart_rad + np.pi) % (2.0 * np.pi) - np.pi)))
+    late_std_s = max(_std([one.late_s for one in others]), float(formal[0, 0]) ** 0.5)
+    focal_std = max(_std([one.focal_ratio for one in others]), float(formal[4, 4]) ** 0.5)
     turned_rad = np.abs(left.w_body).sum(axis=0)
-    sure = {"mount": SURE * mount_std_rad, "latency": SURE * late_std_s, "focal": SURE * focal_std}
+    sure = {
+        "mount": SURE * float(np.hypot(mount_std_rad, MOUNT_STD_RAD)),
+        "latency": SURE * float(np.sqrt(late_std_s**2 + LATE_STD_S**2 + turns.attitudes.clock_std_s**2)),
+        "focal": SURE * float(np.hypot(focal_std, FOCAL_STD)),
+    }
     return Alignment(
         best.R_body_cam,
         sure["mount"],
-        SURE * angles_std,
+        SURE * np.hypot(angles_std_rad, MOUNT_STD_RAD),
         best.late_s,
         sure["latency"],
         best.focal_ratio,
@@ -282,8 +302,8 @@ def _covariance(others: Array) -> Array:
     return (len(others) - 1.0) / len(others) * off.T @ off
 
 
-def _std(others: Array) -> float:
-    return float(_covariance(others[:, None])[0, 0]) ** 0.5
+def _std(others: Sequence[float]) -> float:
+    return float(_covariance(np.array(others)[:, None])[0, 0]) ** 0.5
 
 
 def _about_two_axes(left: _Left) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge.estimator.lens import lens_of
 from edge.types import Array, Frame
-from msgs.geometry import nearest_rotation, so3_log
+from msgs.geometry import nearest_rotation, so3_exp, so3_log
 
 WIDTH_MAX_PX = 800  # pictures are shrunk to it: finer ones give no better turn, and cost time
 POINTS = 200
@@ -35,32 +35,30 @@ class Sight:
     end_ns: int
     start_xy: Array  # [N, 2]
     end_xy: Array  # [N, 2]
+    start_row_s: Array  # [N], exposure of the points' rows minus that of the frame: a rolling shutter
+    end_row_s: Array  # [N]
     off_max_rad: float  # how far off a point may be, with the configured focal length
 
-    def turn_cam_rad(self, focal_ratio: float = 1.0) -> Array | None:
+    def turn_cam_rad(self, focal_ratio: float = 1.0, rates_cam_radps: Array | None = None) -> Array | None:
         """Rotation vector [3] of R_cam0_cam1, in cam at the start; None unless most points agree on one.
 
-        `focal_ratio`: of the focal length to assume to the configured one.
+        Args:
+            focal_ratio: Of the focal length to assume to the configured one.
+            rates_cam_radps: [2, 3], how fast the camera turned at start and end, to take rows to the frame's time.
         """
-        a, b = _rays(self.start_xy / focal_ratio), _rays(self.end_xy / focal_ratio)
-        if len(a) < AGREEING_MIN:
-            return None
-        off_max_rad = self.off_max_rad / focal_ratio
-        agreeing = _agreeing(a, b, off_max_rad)
-        if agreeing.sum() < max(AGREEING_MIN, AGREEING_MIN_SHARE * len(a)):
-            return None
-        for _ in range(3):
-            R = nearest_rotation(a[agreeing].T @ b[agreeing])
-            agreeing = np.linalg.norm(b @ R.T - a, axis=-1) < off_max_rad
-            if agreeing.sum() < AGREEING_MIN:
-                return None
-        return so3_log(R)
+        start, end = _rays(self.start_xy / focal_ratio), _rays(self.end_xy / focal_ratio)
+        if rates_cam_radps is not None:
+            start = _moved(start, self.start_row_s[:, None] * rates_cam_radps[0])
+            end = _moved(end, self.end_row_s[:, None] * rates_cam_radps[1])
+        return _turn(start, end, self.off_max_rad / focal_ratio)
 
 
 class TurnTracker:
     """Follows points from picture to picture and gives a Sight every SPAN_NS, or when too few points are left."""
 
-    def __init__(self) -> None:
+    def __init__(self, readout_s: float = 0.0) -> None:
+        """`readout_s`: from the first row's exposure to the last one's, as [camera] readout_ms."""
+        self._readout_s = readout_s
         self.attempts = 0  # to follow points over a span: those that gave a Sight, and those that did not
         self._grey: NDArray[np.uint8] | None = None
         self._start_ns = self._last_ns = 0
@@ -117,21 +115,43 @@ class TurnTracker:
     def _sight(self, frame: Frame, now_ns: int, shrink: float) -> Sight:
         lens, inverse = lens_of(frame.K, frame.distortion), np.linalg.inv(frame.K)
         usable = np.ones(len(self._now_px), bool)
-        both = []
+        both, rows_s = list[Array](), list[Array]()
         for small_px in (self._start_px, self._now_px):
             px = (small_px.astype(np.float64) + 0.5) / shrink - 0.5
+            rows_s.append(self._readout_s * ((px[:, 1] + 0.5) / frame.size_wh[1] - 0.5))
             if lens is not None:
                 usable &= lens.shows(px)
                 px = lens.to_pinhole(px)
             both.append(px @ inverse[:2, :2].T + inverse[:2, 2])
         off_max_rad = OFF_MAX_PX / (shrink * frame.K[0, 0])
-        return Sight(self._start_ns, now_ns, both[0][usable], both[1][usable], off_max_rad)
+        (start_xy, end_xy), (start_row_s, end_row_s) = ([one[usable] for one in of] for of in (both, rows_s))
+        return Sight(self._start_ns, now_ns, start_xy, end_xy, start_row_s, end_row_s, off_max_rad)
 
 
 def _rays(xy: Array) -> Array:
     """[N, 2] pinhole coordinates to unit vectors [N, 3]."""
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=-1)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+
+def _moved(rays: Array, turns_rad: Array) -> Array:
+    """Vectors [N, 3], each turned by its rotation vector [N, 3]."""
+    return np.asarray(np.einsum("nij,nj->ni", so3_exp(turns_rad), rays))
+
+
+def _turn(start: Array, end: Array, off_max_rad: float) -> Array | None:
+    """Rotation vector [3] that turns the end's rays [N, 3] into the start's; None unless most of them agree on one."""
+    if len(start) < AGREEING_MIN:
+        return None
+    agreeing = _agreeing(start, end, off_max_rad)
+    if agreeing.sum() < max(AGREEING_MIN, AGREEING_MIN_SHARE * len(start)):
+        return None
+    for _ in range(3):
+        R = nearest_rotation(start[agreeing].T @ end[agreeing])
+        agreeing = np.linalg.norm(end @ R.T - start, axis=-1) < off_max_rad
+        if agreeing.sum() < AGREEING_MIN:
+            return None
+    return so3_log(R)
 
 
 def _agreeing(a: Array, b: Array, off_max_rad: float) -> NDArray[np.bool_]:

@@ -24,7 +24,7 @@ MOUNT = Rotation.from_euler("ZYX", [20.0, -10.0, 3.0], degrees=True) * Rotation.
 SPAN_S, SPANS = 0.2, 60
 SIZE_WH = (320, 180)
 K = np.array([[250.0, 0.0, 159.5], [0.0, 250.0, 89.5], [0.0, 0.0, 1.0]])
-Motion = Callable[[Array], Rotation]
+Motion = Callable[[Array], Rotation]  # at times [N] s
 
 
 def turned(roll: float = 0.15, pitch: float = 0.12, yaw: float = 0.2, even: bool = False) -> Motion:
@@ -47,17 +47,25 @@ def attitudes(motion: Motion, rate_hz: float = 50.0, noise_rad: float = 2e-4) ->
     return Attitudes(np.round(t_s * 1e9).astype(np.int64), (motion(t_s) * noise).as_matrix(), np.zeros(len(t_s), int))
 
 
-def sights(motion: Motion, mount: Rotation, late_s: float, focal: float = 1.0) -> list[Sight]:
-    """Points of a far scene, some of which move; with pictures of `focal` times the focal length that is believed."""
+def sights(
+    motion: Motion, mount: Rotation, late_s: float, focal: float = 1.0, readout_s: float = 0.0, told_s: float = 0.0
+) -> list[Sight]:
+    """Points of a far scene, some of which move; with pictures of `focal` times the focal length that is believed, one
+    high, whose rows are read out over `readout_s` seconds, of which the daemon was told `told_s`."""
     rng, found = np.random.default_rng(2), []
     for t_s in np.arange(SPANS) * SPAN_S:
-        start, end = (motion(np.array([s]))[0] * mount for s in (t_s, t_s + SPAN_S))
-        rays = np.concatenate([rng.uniform(-0.5, 0.5, (40, 2)), np.ones((40, 1))], axis=-1)
-        then = (end.inv() * start).apply(rays)
-        before, after = (focal * r[:, :2] / r[:, 2:] + rng.normal(0, 2e-4, (40, 2)) for r in (rays, then))
+        before = rng.uniform(-0.5, 0.5, (40, 2))
+        rays = np.concatenate([before, np.ones((40, 1))], axis=-1)
+        ned = (motion(t_s + readout_s * before[:, 1]) * mount).apply(rays)
+        after = before
+        for _ in range(6 if readout_s else 1):  # a point's row tells when it was seen, and that where
+            x, y, z = (motion(t_s + SPAN_S + readout_s * after[:, 1]) * mount).inv().apply(ned).T
+            after = np.stack([x / z, y / z], axis=-1)
+        rows_s = [told_s * points[:, 1] for points in (before, after)]
+        before, after = (focal * points + rng.normal(0, 2e-4, (40, 2)) for points in (before, after))
         after[:6] += 0.1
         start_ns, end_ns = (round((s + late_s) * 1e9) for s in (t_s, t_s + SPAN_S))
-        found.append(Sight(start_ns, end_ns, before, after, 3e-3))
+        found.append(Sight(start_ns, end_ns, before, after, *rows_s, 3e-3))
     return found
 
 
@@ -111,6 +119,19 @@ def test_two_axes_are_enough() -> None:
 def test_why_nothing_is_known_is_told(camera: Motion, vehicle: Motion, rate_hz: float, why: str) -> None:
     with pytest.raises(UnknownError, match=why):
         align(sights(camera, MOUNT, 0.06), SPANS, attitudes(vehicle, rate_hz))
+
+
+@pytest.mark.parametrize(("told_s", "least_deg", "most_deg"), [(0.02, 0.0, 0.3), (0.0, 0.5, 180.0)])
+def test_rows_that_are_exposed_one_after_the_other(told_s: float, least_deg: float, most_deg: float) -> None:
+    found = align(sights(turned(), MOUNT, 0.06, 1.0, 0.02, told_s), SPANS, attitudes(turned()))
+    assert least_deg < np.rad2deg(found.mount_sure_rad) < most_deg
+    assert off_deg(found, MOUNT) < np.rad2deg(found.mount_sure_rad)
+    assert abs(found.late_s - 0.06) < found.late_sure_s
+
+
+def test_rows_that_are_read_the_other_way_round_are_asked_about() -> None:
+    with pytest.raises(UnknownError, match="readout_ms"):
+        align(sights(turned(), MOUNT, 0.06, 1.0, 0.02, -0.02), SPANS, attitudes(turned()))
 
 
 def test_an_attitude_that_jumped_is_not_compared_across_the_jump() -> None:
