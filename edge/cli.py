@@ -10,6 +10,7 @@ import sys
 import threading
 from pathlib import Path
 
+from edge.align import command as align
 from edge.bench import command as bench
 from edge.errors import InputError
 from edge.logs import set_up_logging
@@ -85,6 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     calibrate.add_argument("--draw", type=Path, metavar="PNG", help="only write an image of the board, for printing")
     calibrate.set_defaults(act=_calibrate)
+
+    align.register(commands)
 
     keygen = commands.add_parser("keygen", help="write a new MAVLink signing key, for [mavlink] signing_key")
     keygen.add_argument("--out", type=Path, required=True, help="output file; an existing one is not overwritten")

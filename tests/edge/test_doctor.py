@@ -211,9 +211,11 @@ def test_what_the_running_daemon_says_of_its_links_is_taken(
     with flying(tmp_path, text):
         until(lacks_attitude)
         code, found = findings(cli, tmp_path, text)
+        aligned = cli("align", "--config", "config.toml")
     assert (code, found["daemon"]["verdict"]) == (1, "wrong")
     assert "no own attitude" in found["daemon"]["says"]
     assert "autopilot" in found["daemon"]["advice"]
+    assert (aligned.returncode, "a daemon is running (process " in aligned.stderr) == (2, True)
 
 
 def test_a_daemon_that_was_started_with_other_values_is_told_by_its_name(
