@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.align.attitudes import Attitudes
-from edge.align.turns import SPAN_NS, Sight
+from edge.align.turns import Sight
 from edge.tracking.own_ship import ATTITUDE_AHEAD_MAX_NS
 from edge.types import Array
 from msgs.geometry import R_FORWARD_CAM, euler_from_R, nearest_rotation, skew, so3_exp, so3_log
@@ -169,8 +169,8 @@ def _refuse_unseen(turns: _Turns, attempts: int) -> None:
     seen = len(turns.w_cam)
     if seen < max(SEEN_MIN, SEEN_MIN_SHARE * attempts):
         raise UnknownError(
-            f"the camera's turn was seen in only {seen} of {attempts} spans of {SPAN_NS / 1e9:g} s: show it a far "
-            "scene full of detail, in good light, with nothing near or moving, and turn more slowly; are [camera] "
+            f"the camera's turn was seen in only {seen} of {attempts} attempts to follow points: show it a "
+            "far scene full of detail, in good light, with nothing near or moving, and turn more slowly; are [camera] "
             "intrinsics and readout_ms of this camera?"
         )
 

@@ -14,6 +14,8 @@ from msgs.geometry import nearest_rotation, so3_exp, so3_log
 
 WIDTH_MAX_PX = 800  # pictures are shrunk to it: finer ones give no better turn, and cost time
 POINTS = 200
+# Least contrast of a point, in squares, of that of the strongest one: a glint of the sun must not hide a hazy horizon.
+CONTRAST_SHARE = 0.002
 APART_SHARE = 1 / 50  # least distance of two points, in widths of the picture
 # Longer: the attitude's errors at both ends weigh less. Shorter: it shows better when the turn began and ended.
 SPAN_NS = 200_000_000
@@ -93,7 +95,7 @@ class TurnTracker:
             covered = cv2.resize(frame.own_parts.covered, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
             mask = np.where(np.asarray(covered) > 0, np.uint8(0), np.uint8(255))
         apart_px = APART_SHARE * grey.shape[1]
-        found = cv2.goodFeaturesToTrack(grey, POINTS, 0.01, apart_px, mask=mask)
+        found = cv2.goodFeaturesToTrack(grey, POINTS, CONTRAST_SHARE, apart_px, mask=mask)
         points = np.empty((0, 2)) if found is None else np.asarray(found).reshape(-1, 2)
         self._start_px = self._now_px = points.astype(np.float32)
         self._begun = len(points)

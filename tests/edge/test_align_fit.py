@@ -172,7 +172,7 @@ def test_pictures_that_show_nothing_give_nothing() -> None:
     for number in range(60):
         blank = Frame(FrameMeta(number, number * 100_000_000, 0), np.full((180, 320, 3), 200, np.uint8), K)
         assert tracker.take(blank) is None
-    with pytest.raises(UnknownError, match=r"seen in only 0 of \d+ spans.*far"):
+    with pytest.raises(UnknownError, match=r"seen in only 0 of \d+ attempts.*far"):
         align([], tracker.attempts, attitudes(turned()))
 
 
@@ -193,3 +193,15 @@ def test_the_own_aircraft_in_the_picture_is_no_scene(masked: bool) -> None:
     assert w_cam is not None
     true = MOUNT.inv().apply([0.0, 0.0, 0.04])
     assert bool(np.abs(w_cam - true).max() < 1e-3) is masked
+
+
+def test_a_glint_does_not_hide_a_hazy_scene() -> None:
+    tracker, panorama, seen = TurnTracker(), Panorama(K, SIZE_WH), []
+    for number in range(3):
+        image = panorama.picture(Rotation.from_euler("z", 0.02 * number) * MOUNT)
+        image = (118 + 0.15 * image).astype(np.uint8)
+        image[50:54, 50:54], image[54:58, 50:54] = 255, 0
+        seen.append(tracker.take(Frame(FrameMeta(number, number * 100_000_000, 0), image, K)))
+    w_cam = None if seen[-1] is None else seen[-1].turn_cam_rad()
+    assert w_cam is not None
+    assert np.abs(w_cam - MOUNT.inv().apply([0.0, 0.0, 0.04])).max() < 1e-3
