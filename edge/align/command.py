@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SECONDS = 30.0
 SECONDS_MAX = 600.0
 FOCAL_OFF_MAX = 0.05
+CLOCK_SURE_MAX_MS = 10.0  # of the attitudes' stamps; more is told
 STEEP_DEG = 85.0  # of pitch, from where roll and yaw are hardly told apart: a matrix is given instead
 
 
@@ -52,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
         notes = [text for _, text in shortfalls(collected.counters, None, None)]
         found = align(collected.sights, collected.attempts, collected.attitudes)
     except UnknownError as error:
-        say_out(json.dumps({"well": False, "unknown": [str(error)]}) if options.json else f"not known: {error}")
+        say_out(json.dumps({"well": False, "unknown": [str(error)]}) if options.json else f"nothing is known: {error}")
         return 1
     tree = to_tree(found, file)
     say_out(json.dumps(tree | {"notes": notes}) if options.json else "\n".join(report(found, tree, notes, file)))
@@ -80,7 +81,12 @@ def to_tree(found: Alignment, file: ConfigFile) -> dict[str, Any]:
         "apart_deg": float(np.rad2deg(rotation_angle(configured, found.R_body_cam))),
         "apart_sure_deg": float(np.rad2deg(found.mount_sure_rad)),
     }
-    latency = {"ms": measured_ms, "sure_ms": sure_ms, "configured_ms": latency_ms}
+    latency = {
+        "ms": measured_ms,
+        "sure_ms": sure_ms,
+        "of_attitude_ms": 1e3 * found.clock_sure_s,
+        "configured_ms": latency_ms,
+    }
     off = abs(found.focal_ratio - 1.0)
     focal = {
         "ratio": found.focal_ratio,
@@ -110,10 +116,15 @@ def report(found: Alignment, tree: dict[str, Any], notes: list[str], file: Confi
         yield f"mount: {measured}; configured: {configured}; {apart}"
     if (latency := tree["latency"]) is not None:
         yield f"latency: {latency['ms']:.1f} ± {latency['sure_ms']:.1f} ms; configured: {latency['configured_ms']:g} ms"
+        if latency["of_attitude_ms"] > CLOCK_SURE_MAX_MS:
+            yield (
+                f"note: the autopilot's stamps are known to ± {latency['of_attitude_ms']:.0f} ms only, as it does not "
+                "answer TIMESYNC, or late; the latency fits them while its link stays as it is"
+            )
     if (focal := tree["focal"]) is not None:
         told = f"focal length: {focal['ratio']:.3f} ± {focal['sure']:.3f} times the configured one"
         yield f"{told}: it fits" if focal["fits"] else f"{told}: it does not fit, so ranges are wrong; calibrate anew"
-    yield from (f"not known: {sentence}" for sentence in tree["unknown"])
+    yield from tree["unknown"]
     lines = [*_mount_lines(found, tree, file), *_latency_lines(tree, file)]
     if lines:
         yield f"for {file.path}:"

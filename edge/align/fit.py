@@ -57,6 +57,7 @@ class Alignment:
     angles_sure_rad: Array  # [3] of `mount_angles_rad`
     late_s: float  # stamp minus exposure, with the configured latency already subtracted
     late_sure_s: float
+    clock_sure_s: float  # the part of it that is of the attitudes' stamps
     focal_ratio: float  # of the true focal length to the configured one
     focal_sure: float
     spans: int  # for which the turns of both are known
@@ -167,6 +168,8 @@ def _coarse(turns: _Turns) -> tuple[_State, bool]:
 
 def _refuse_unseen(turns: _Turns, attempts: int) -> None:
     seen = len(turns.w_cam)
+    if attempts < SEEN_MIN:
+        raise UnknownError(f"the camera's turn was seen only {seen} times, of {SEEN_MIN} at least: watch for longer")
     if seen < max(SEEN_MIN, SEEN_MIN_SHARE * attempts):
         raise UnknownError(
             f"the camera's turn was seen in only {seen} of {attempts} attempts to follow points: show it a "
@@ -279,15 +282,18 @@ def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
     turned_rad = np.abs(left.w_body).sum(axis=0)
     sure = {
         "mount": SURE * float(np.hypot(mount_std_rad, MOUNT_STD_RAD)),
-        "latency": SURE * float(np.sqrt(late_std_s**2 + LATE_STD_S**2 + turns.attitudes.clock_std_s**2)),
+        "latency": SURE * float(np.hypot(late_std_s, LATE_STD_S)),
         "focal": SURE * float(np.hypot(focal_std, FOCAL_STD)),
     }
+    # Stamps of attitudes that are wrong by a constant are the daemon's too: the latency that fits them is of use to it.
+    clock_sure_s = SURE * turns.attitudes.clock_std_s
     return Alignment(
         best.R_body_cam,
         sure["mount"],
         SURE * np.hypot(angles_std_rad, MOUNT_STD_RAD),
         best.late_s,
-        sure["latency"],
+        float(np.hypot(sure["latency"], clock_sure_s)),
+        clock_sure_s,
         best.focal_ratio,
         sure["focal"],
         len(left.sizes_rad),

@@ -76,8 +76,9 @@ class TurnTracker:
         now_ns, before = frame.meta.capture_ns, self._grey
         follows = before is not None and before.shape == grey.shape and 0 < now_ns - self._last_ns <= GAP_MAX_NS
         sight = None
-        if before is not None and follows and self._begun:
-            self._follow(before, grey)
+        if before is not None and follows:
+            if self._begun:
+                self._follow(before, grey)
             span_ns, left = now_ns - self._start_ns, len(self._now_px)
             few = left < max(AGREEING_MIN, KEPT_MIN_SHARE * self._begun)
             if span_ns < SPAN_NS and not few:

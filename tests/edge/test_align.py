@@ -134,7 +134,7 @@ def test_ctrl_c_ends_the_turning_and_says_what_is_missing(tmp_path: Path) -> Non
         process.send_signal(signal.SIGINT)
         said = process.stdout.read()
     assert process.returncode == 1
-    assert said.startswith("not known: the camera's turn was seen in only ")
+    assert said.startswith("nothing is known: the camera's turn was seen only ")
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,11 @@ def mounted(roll_deg: float, pitch_deg: float, yaw_deg: float) -> np.ndarray:
     return Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix() @ FORWARD_CAM
 
 
-def found(R_body_cam: np.ndarray, late_s: float = 0.02, focal: float = 1.0, **wanting: str) -> Alignment:
-    sure_rad = np.deg2rad([0.1, 0.2, 0.3])
-    return Alignment(R_body_cam, 0.005, sure_rad, late_s, 0.002, focal, 0.01, 150, np.full(3, 5.0), wanting)
+def found(
+    R_body_cam: np.ndarray, late_s: float = 0.02, clock_s: float = 0.001, focal: float = 1.0, **wanting: str
+) -> Alignment:
+    sure_rad, turned_rad = np.deg2rad([0.1, 0.2, 0.3]), np.full(3, 5.0)
+    return Alignment(R_body_cam, 0.005, sure_rad, late_s, 0.002, clock_s, focal, 0.01, 150, turned_rad, wanting)
 
 
 def configured(folder: Path, text: str) -> ConfigFile:
@@ -74,7 +76,7 @@ def test_what_is_not_known_is_not_printed(tmp_path: Path) -> None:
     alignment = found(mounted(0.0, -10.0, 0.0), mount="turn more about roll")
     well, lines = said(alignment, configured(tmp_path, CAMERA))
     assert not well
-    assert "not known: turn more about roll" in lines
+    assert "turn more about roll" in lines
     assert not any("pitch_deg" in line or line.startswith("mount: ") for line in lines)
     assert "latency_ms = 60.0" in lines
     well, lines = said(replace(alignment, wanting={"latency": "turn faster"}), configured(tmp_path, CAMERA))
@@ -103,3 +105,10 @@ def test_a_recording_has_no_latency_to_set(tmp_path: Path) -> None:
     well, lines = said(found(mounted(0.0, 0.0, 0.0)), configured(tmp_path, FILE))
     assert well
     assert '# a camera of type "file" has no latency_ms' in lines
+
+
+@pytest.mark.parametrize(("clock_s", "told"), [(0.044, True), (0.002, False)])
+def test_stamps_of_an_autopilot_that_are_hardly_known_are_told(tmp_path: Path, clock_s: float, told: bool) -> None:
+    well, lines = said(found(mounted(0.0, 0.0, 0.0), clock_s=clock_s), configured(tmp_path, CAMERA))
+    assert well
+    assert any("TIMESYNC" in line for line in lines) is told
