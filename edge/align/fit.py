@@ -77,6 +77,7 @@ def align(sights: Sequence[Sight], attempts: int, attitudes: Attitudes) -> Align
             f"attitude comes only {1e9 / attitudes.usual_gap_ns:.1f} times a second, and the daemon uses none that is "
             f"rarer than {1e9 / ATTITUDE_AHEAD_MAX_NS:.1f}: let the autopilot send it more often"
         )
+    attitudes = attitudes.smoothed()
     turns = _first_turns(sights, attempts, attitudes)
     _refuse_unseen(turns, attempts)
     state, alone = _coarse(turns)

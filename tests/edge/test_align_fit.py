@@ -102,6 +102,13 @@ def test_turning_about_one_axis_leaves_the_mount_unknown(motion: Motion, more: s
     assert abs(found.late_s - 0.06) < found.late_sure_s
 
 
+def test_noise_of_the_attitude_draws_no_latency_between_its_samples() -> None:
+    """The camera runs in step with the autopilot, so that all its pictures are taken at samples."""
+    found = align(sights(turned(), MOUNT, 0.06), SPANS, attitudes(turned(), noise_rad=4e-3))
+    assert not found.wanting
+    assert abs(found.late_s - 0.06) < found.late_sure_s < 0.005
+
+
 def test_two_axes_are_enough() -> None:
     found = align(sights(turned(roll=0.0), MOUNT, 0.06), SPANS, attitudes(turned(roll=0.0)))
     assert not found.wanting
