@@ -123,7 +123,11 @@ def report(found: Alignment, tree: dict[str, Any], notes: list[str], file: Confi
             )
     if (focal := tree["focal"]) is not None:
         told = f"focal length: {focal['ratio']:.3f} ± {focal['sure']:.3f} times the configured one"
-        yield f"{told}: it fits" if focal["fits"] else f"{told}: it does not fit, so ranges are wrong; calibrate anew"
+        yield (
+            f"{told}: it fits"
+            if focal["fits"]
+            else f"{told}: it does not fit, so ranges are wrong: calibrate anew, if all that was seen is far"
+        )
     yield from tree["unknown"]
     lines = [*_mount_lines(found, tree, file), *_latency_lines(tree, file)]
     if lines:

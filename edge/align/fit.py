@@ -38,6 +38,7 @@ LATE_STD_S = 0.0005  # at least: attitudes are stamped in whole milliseconds
 FOCAL_STD, MOUNT_STD_RAD = 0.003, np.deg2rad(0.05)  # at least: no scene is infinitely far, and nothing quite rigid
 RATE_OVER_NS = 60_000_000  # attitudes so far apart tell how fast the camera turned
 LATE_SURE_MAX_S, MOUNT_SURE_MAX_RAD, FOCAL_SURE_MAX = 0.015, np.deg2rad(1.0), 0.05  # known, if at most this unsure
+MISFIT_MIN = 20.0  # variances, that what depends on the turns must explain to be counted; noise does about 5
 # About a second axis, at least: what it leaves in squares, times what noise alone does, and turned in all.
 SECOND_OVER_NOISE, SECOND_MIN_DEG = 20.0, 20.0
 AXES = ("roll", "pitch", "yaw")
@@ -242,6 +243,9 @@ class _Left:
     variance: float  # of a component of a residual
     sizes_rad: Array  # [n] of the residuals of the turns that are known
     w_body: Array  # [n, 3], these turns of the body, rad
+    w_cam: Array  # [n, 3], what they are in cam
+    off_cam: Array  # [n, 3], the residuals
+    weights: Array  # [n]
 
 
 def _left(turns: _Turns, state: _State) -> _Left:
@@ -263,7 +267,7 @@ def _left(turns: _Turns, state: _State) -> _Left:
     information += UNTOLD * np.trace(information) * np.eye(5)
     variance = float((weights * sizes_rad**2).sum()) / max(3 * len(off) - 5, 1)
     pull = np.einsum("n,nki,nk->i", weights, J, off)
-    return _Left(information, pull, variance, sizes_rad, w_body[known])
+    return _Left(information, pull, variance, sizes_rad, w_body[known], true_cam, off, weights)
 
 
 def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
@@ -281,8 +285,9 @@ def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
     late_std_s = max(_std([one.late_s for one in others]), float(formal[0, 0]) ** 0.5)
     focal_std = max(_std([one.focal_ratio for one in others]), float(formal[4, 4]) ** 0.5)
     turned_rad = np.abs(left.w_body).sum(axis=0)
+    misfit_rad = _misfit(left)
     sure = {
-        "mount": SURE * float(np.hypot(mount_std_rad, MOUNT_STD_RAD)),
+        "mount": SURE * float(np.sqrt(mount_std_rad**2 + MOUNT_STD_RAD**2 + misfit_rad**2)),
         "latency": SURE * float(np.hypot(late_std_s, LATE_STD_S)),
         "focal": SURE * float(np.hypot(focal_std, FOCAL_STD)),
     }
@@ -291,7 +296,7 @@ def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
     return Alignment(
         best.R_body_cam,
         sure["mount"],
-        SURE * np.hypot(angles_std_rad, MOUNT_STD_RAD),
+        SURE * np.sqrt(angles_std_rad**2 + MOUNT_STD_RAD**2 + misfit_rad**2),
         best.late_s,
         float(np.hypot(sure["latency"], clock_sure_s)),
         clock_sure_s,
@@ -299,7 +304,7 @@ def _judged(turns: _Turns, best: _State, left: _Left) -> Alignment:
         sure["focal"],
         len(left.sizes_rad),
         turned_rad,
-        _wanting(sure, turned_rad),
+        _wanting(sure, turned_rad, misfit_rad),
     )
 
 
@@ -313,17 +318,36 @@ def _std(others: Sequence[float]) -> float:
     return float(_covariance(np.array(others)[:, None])[0, 0]) ** 0.5
 
 
+def _misfit(left: _Left) -> float:
+    """The share of the turns by which what is left depends on them; 0 if noise explains it.
+
+    It does so where the picture moves otherwise than by a turn of the camera, as with near things in it: then the mount
+    is wrong too, about as much.
+    """
+    root = np.sqrt(left.weights)[:, None]
+    map_cam = np.linalg.lstsq(root * left.w_cam, root * left.off_cam, rcond=1e-3)[0]
+    explained = float(((root * (left.w_cam @ map_cam)) ** 2).sum())
+    if explained < MISFIT_MIN * left.variance:
+        return 0.0
+    return float(np.sqrt(explained / ((root * left.w_cam) ** 2).sum()))
+
+
 def _about_two_axes(left: _Left) -> bool:
     """Turns about a single axis leave open how the camera is turned about it, and noise must not decide that."""
     n, second = len(left.w_body), float(np.linalg.eigvalsh(left.w_body.T @ left.w_body)[1])
     return second > SECOND_OVER_NOISE * n * left.variance and np.rad2deg(np.sqrt(n * second)) > SECOND_MIN_DEG
 
 
-def _wanting(sure: dict[str, float], turned_rad: Array) -> dict[str, str]:
+def _wanting(sure: dict[str, float], turned_rad: Array, misfit_rad: float) -> dict[str, str]:
     little = [axis for axis, rad in zip(AXES, turned_rad, strict=True) if rad < TURNED_LITTLE * turned_rad.max()]
     more = f"turn more about {' and '.join(little)}" if little else "turn more, and for longer"
     found = {}
-    if sure["mount"] > MOUNT_SURE_MAX_RAD:
+    if SURE * misfit_rad > MOUNT_SURE_MAX_RAD:
+        found["mount"] = (
+            f"the mount is not known to better than {np.rad2deg(sure['mount']):.1f}°: the picture moves as if part of "
+            "what is seen were near, or [camera] intrinsics or readout_ms wrong"
+        )
+    elif sure["mount"] > MOUNT_SURE_MAX_RAD:
         known_to = f" to better than {np.rad2deg(sure['mount']):.1f}°" if np.isfinite(sure["mount"]) else ""
         found["mount"] = f"the mount is not known{known_to}: {more}"
     if sure["latency"] > LATE_SURE_MAX_S:

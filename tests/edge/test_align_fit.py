@@ -49,18 +49,30 @@ def attitudes(motion: Motion, rate_hz: float = 50.0, noise_rad: float = 2e-4) ->
 
 
 def sights(
-    motion: Motion, mount: Rotation, late_s: float, focal: float = 1.0, readout_s: float = 0.0, told_s: float = 0.0
+    motion: Motion,
+    mount: Rotation,
+    late_s: float,
+    focal: float = 1.0,
+    readout_s: float = 0.0,
+    told_s: float = 0.0,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> list[Sight]:
-    """Points of a far scene, some of which move; with pictures of `focal` times the focal length that is believed, one
-    high, whose rows are read out over `readout_s` seconds, of which the daemon was told `told_s`."""
+    """Points of a far scene, some of which move.
+
+    Args:
+        focal: Of the pictures' focal length to the one that is believed.
+        readout_s: Over which the rows are exposed of pictures that are one focal length high; `told_s`: configured.
+        lever: The camera's place on the body, in distances of the points.
+    """
     rng, found = np.random.default_rng(2), []
     for t_s in np.arange(SPANS) * SPAN_S:
         before = rng.uniform(-0.5, 0.5, (40, 2))
         rays = np.concatenate([before, np.ones((40, 1))], axis=-1)
         ned = (motion(t_s + readout_s * before[:, 1]) * mount).apply(rays)
+        at, then_at = motion(np.array([t_s, t_s + SPAN_S])).apply(lever)
         after = before
         for _ in range(6 if readout_s else 1):  # a point's row tells when it was seen, and that where
-            x, y, z = (motion(t_s + SPAN_S + readout_s * after[:, 1]) * mount).inv().apply(ned).T
+            x, y, z = (motion(t_s + SPAN_S + readout_s * after[:, 1]) * mount).inv().apply(ned + at - then_at).T
             after = np.stack([x / z, y / z], axis=-1)
         rows_s = [told_s * points[:, 1] for points in (before, after)]
         before, after = (focal * points + rng.normal(0, 2e-4, (40, 2)) for points in (before, after))
@@ -140,6 +152,15 @@ def test_rows_that_are_exposed_one_after_the_other(told_s: float, least_deg: flo
 def test_rows_that_are_read_the_other_way_round_are_asked_about() -> None:
     with pytest.raises(UnknownError, match="readout_ms"):
         align(sights(turned(), MOUNT, 0.06, 1.0, 0.02, -0.02), SPANS, attitudes(turned()))
+
+
+@pytest.mark.parametrize(("lever", "known"), [((0.03, 0.0, 0.01), True), ((0.1, 0.0, 0.05), False)])
+def test_near_things_make_the_mount_unsure(lever: tuple[float, float, float], known: bool) -> None:
+    """With a camera that is moved while it turns."""
+    found = align(sights(turned(), MOUNT, 0.06, lever=lever), SPANS, attitudes(turned()))
+    assert ("mount" not in found.wanting) is known
+    assert known or "near" in found.wanting["mount"]
+    assert 0.2 < off_deg(found, MOUNT) < np.rad2deg(found.mount_sure_rad)
 
 
 def test_an_attitude_that_jumped_is_not_compared_across_the_jump() -> None:
