@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edge.config import ConfigFile
 
 SECONDS = 30.0
-SECONDS_MAX = 600.0
+SECONDS_MAX = 120.0  # the fit of more would take minutes on a small computer
 FOCAL_OFF_MAX = 0.05
 CLOCK_SURE_MAX_MS = 10.0  # of the attitudes' stamps; more is told
 STEEP_DEG = 85.0  # of pitch, from where roll and yaw are hardly told apart: a matrix is given instead
