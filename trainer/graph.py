@@ -24,10 +24,10 @@ from trainer.config import ConfigError
 from trainer.data import TrainingBatch
 from trainer.evaluate import Predictions, Predictor
 from trainer.half_storage import store_halved
+from trainer.heads import BESIDE_MOST
 from trainer.image_input import drop_unread, feed_pixels, fold_normalisation, quantised_as_pixels
 from trainer.model import PoseNet
 from trainer.pixel_quads import take_quads
-from trainer.presence import BESIDE_MOST
 from trainer.tally import Tally, windows_in
 from trainer.unfinished import unfinished
 

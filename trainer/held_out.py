@@ -21,7 +21,7 @@ from trainer.evaluate import (
 )
 from trainer.export import OpenView, acquire_window_px, airframe_names, stage_sampler
 from trainer.graph import onnx_predictor, read_contract
-from trainer.refine_plan import heads_told
+from trainer.heads import heads_told
 
 
 class Request(NamedTuple):

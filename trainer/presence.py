@@ -15,7 +15,6 @@ from trainer.refinement import Evidence, answer_count
 
 # A peak's score in float32 is not exact enough to tell its odds beyond these.
 SCORE_MARGIN = 1e-6
-BESIDE_MOST = 3
 
 
 class PresenceHead(BoxReader):

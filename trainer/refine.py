@@ -35,10 +35,11 @@ from trainer.config import (
     refuse_no_folder,
 )
 from trainer.data import Feed, Sampler, TrainingBatch
+from trainer.heads import TOLD_PREFIX, TOLD_PREFIX_BESIDE
 from trainer.losses import pose_residual, refinement_nll, to_tensors
 from trainer.model import Perception, PoseNet
 from trainer.presence import PresenceHead
-from trainer.refine_plan import TOLD_PREFIX, TOLD_PREFIX_BESIDE, RefinePlan, refined_on, refuse_beside
+from trainer.refine_plan import RefinePlan, refined_on, refuse_beside
 from trainer.refinement import RANGE, Evidence, RefinementHead
 from trainer.runlog import provenance
 from trainer.sources import refinement_sampler

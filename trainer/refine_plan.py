@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,21 +12,8 @@ from sim_replay.bop import BopError, names_split
 from sim_replay.datasets import open_dataset
 from trainer.checkpoint import added_heads, presence_beside
 from trainer.config import REFINED_BY_DEFAULT, ConfigError, DataConfig
-from trainer.presence import BESIDE_MOST
+from trainer.heads import BESIDE_MOST
 from trainer.sources import trained_scenes
-
-# The prefix of what the weights' `training` tells of each head's; those beside that of presence are numbered.
-TOLD_PREFIX = {"refinement": "refined", "presence": "presence", "choice": "choice"}
-TOLD_PREFIX_BESIDE = "presence_beside_"
-
-
-def heads_told(training: Mapping[str, object]) -> dict[str, str]:
-    """What `training` says of each trained head: the prefix of its keys, and the head's name."""
-    beside = (f"{TOLD_PREFIX_BESIDE}{i}" for i in range(1, 1 + BESIDE_MOST))
-    names = {prefix: f"{head} head" for head, prefix in TOLD_PREFIX.items()}
-    names |= {prefix: "presence head beside it" for prefix in beside}
-    order = ("refined", "presence", *(prefix for prefix in names if prefix.startswith(TOLD_PREFIX_BESIDE)), "choice")
-    return {prefix: names[prefix] for prefix in order if any(key.startswith(f"{prefix}_") for key in training)}
 
 
 class RefinePlan(NamedTuple):

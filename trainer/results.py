@@ -17,7 +17,7 @@ from sim_replay.evaluation.judge import is_seen, labels_sha256
 from sim_replay.offline import InputError
 from trainer.config import ConfigError, made_folder
 from trainer.evaluate_dataset import DatasetRequest, evaluate_dataset
-from trainer.refine_plan import heads_told
+from trainer.heads import heads_told
 
 # MF-UAVPose6D: the paper's network on its own dataset (tables in its section on results).
 PAPER = {

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from msgs.contract import ModelContract
 from trainer.config import ConfigError
-from trainer.refine_plan import heads_told
+from trainer.heads import heads_told
 
 if TYPE_CHECKING:
     from sim_replay.datasets import Dataset

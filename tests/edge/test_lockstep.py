@@ -173,7 +173,7 @@ def test_the_clock_is_the_host_s_until_it_is_stepped_and_never_goes_back() -> No
 
 def test_only_what_waits_for_the_host_reads_the_host_s_clock() -> None:
     """Cameras and dialled links that lock-step replaces, guards against a hang, tools that fly nothing."""
-    waits = {"cameras", "bench", "transports", "doctor.py", "watchdog.py", "supervisor.py", "clock.py"}
+    waits = {"align", "cameras", "bench", "transports", "doctor.py", "watchdog.py", "supervisor.py", "clock.py"}
     edge = Path(clock.__file__).parent
     readers = [path for path in edge.rglob("*.py") if re.search(r"\btime\.(monotonic|time)(_ns)?\(", path.read_text())]
     assert edge / "clock.py" in readers
