@@ -12,8 +12,10 @@ TOLD_PREFIX_BESIDE = "presence_beside_"
 
 def heads_told(training: Mapping[str, object]) -> dict[str, str]:
     """What `training` says of each trained head: the prefix of its keys, and the head's name."""
-    beside = (f"{TOLD_PREFIX_BESIDE}{i}" for i in range(1, 1 + BESIDE_MOST))
-    names = {prefix: f"{head} head" for head, prefix in TOLD_PREFIX.items()}
-    names |= {prefix: "presence head beside it" for prefix in beside}
-    order = ("refined", "presence", *(prefix for prefix in names if prefix.startswith(TOLD_PREFIX_BESIDE)), "choice")
-    return {prefix: names[prefix] for prefix in order if any(key.startswith(f"{prefix}_") for key in training)}
+    names = {
+        "refined": "refinement head",
+        "presence": "presence head",
+        **{f"{TOLD_PREFIX_BESIDE}{i}": "presence head beside it" for i in range(1, 1 + BESIDE_MOST)},
+        "choice": "choice head",
+    }
+    return {prefix: name for prefix, name in names.items() if any(key.startswith(f"{prefix}_") for key in training)}

@@ -1,8 +1,8 @@
 """The presence head: whether a peak is an aircraft, from all that the network sees there.
 
 The heatmap's own head sees three cells around a peak. This one sees the whole box, the decoders' features and what they
-make of them. Its inputs are detached: `trainer.refine` trains it alone, after the network. Several, trained separately,
-err on different things: their mean is better than each of them (docs/ablation.md#beside).
+make of them. Its inputs are detached: `trainer.refine` trains it alone, after the network. Several, trained on
+different things, each know something: their mean keeps most of it (docs/ablation.md#beside).
 """
 
 from __future__ import annotations

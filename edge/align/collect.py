@@ -120,7 +120,7 @@ def _watch(
         raise UnknownError(_nothing_came(seen, capture))
     if sys.stderr.isatty():
         say_aside("")
-    threading.Event().wait(AFTERWARDS_S)
+    time.sleep(AFTERWARDS_S)
     return sights
 
 
